@@ -20,7 +20,7 @@ from gaponet.base.errors import GAPONetError, NoGainError, RobotError, UsageErro
 from gaponet.base.executor import open_pool
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import read_json
-from gaponet.report.page import element, page, table
+from gaponet.report.page import render
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.drift import drift
 from gaponet.sysid.uncertainty import ParameterUncertainty
@@ -165,15 +165,9 @@ def fleet_page(kept: dict[str, list[Night]], name: str) -> str:
     ]  # fmt: skip
     moved = Counter(number for n in odd.values() for number in n["numbers"])
     said = ", ".join(f"{k} {verdict}" for verdict, k in count.items())
-    body = element("h1", f"Fleet, {name}") + element("p", f"{len(last)} robots: {said}", css="lead")
-    if lines:
-        heads = ["robot", "since", "nights", "what moved", "adapted, mrad", "what to do"]
-        body += element("h2", "Not as they were") + element("div", table(heads, lines), css="scroll facts")
-        body += element("p", f"nights: {', '.join(f'{mark} {what}' for what, mark in MARKS.items())}", css="small")
-    if moved:
-        body += element("h2", "What moved in how many") + table(
-            ["joint, number", "robots"], [[f"{j}, {f}", str(k)] for (j, f), k in moved.most_common()]
-        )
-    same = ", ".join(sorted(r for r, n in last.items() if n["verdict"] == SAME))
-    body += element("h2", "The same robots") + element("p", same or "none")
-    return page(f"Fleet, {name}", body)
+    return render(
+        "fleet.html.j2", title=f"Fleet, {name}", summary=f"{len(last)} robots: {said}", changed=lines,
+        legend=", ".join(f"{mark} {what}" for what, mark in MARKS.items()),
+        moved=[[f"{j}, {f}", str(k)] for (j, f), k in moved.most_common()],
+        unchanged=", ".join(sorted(r for r, n in last.items() if n["verdict"] == SAME)),
+    )  # fmt: skip

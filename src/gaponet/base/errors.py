@@ -56,11 +56,11 @@ class UsageError(GAPONetError):
 
 # Modules of optional dependencies → the extra that brings them.
 EXTRAS = {
-    "torch": "train", "onnx": "train", "onnxruntime": "deploy",
-    "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
-    "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view",
-    "rosbags": "ros", "h5py": "hdf5", "huggingface_hub": "hub", "fsspec": "hub", "s3fs": "s3", "gcsfs": "gs",
-    "tensorboard": "tensorboard", "wandb": "wandb", "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp", "ray": "ray",
+    "torch": "train", "onnx": "train", "onnxruntime": "deploy", "matplotlib": "report", "jinja2": "report",
+    "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym", "PIL": "view",
+    "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "rosbags": "ros", "h5py": "hdf5",
+    "huggingface_hub": "hub", "fsspec": "hub", "s3fs": "s3", "gcsfs": "gs", "tensorboard": "tensorboard",
+    "wandb": "wandb", "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp", "ray": "ray",
 }  # fmt: skip
 
 

@@ -1,10 +1,10 @@
-"""A result as files, in every form that someone may want.
+"""Files of an experiment's result.
 
-    NAME.md            for people            NAME.json   everything, exact
+    NAME.md            for people            NAME.json   all numbers
     NAME[-TABLE].csv   one per table         NAME[-FIGURE].svg, .png
     report.html        one offline page over all results of the folder
 
-The first table and the first figure are NAME.csv and NAME.svg, the others carry their own names.
+The first table and the first figure are NAME.csv and NAME.svg; the others carry their own names.
 """
 
 from __future__ import annotations
@@ -18,18 +18,17 @@ from typing_extensions import TypedDict
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import Json, Name, read_json, validated
-from gaponet.base.text import escape, escape_markdown
+from gaponet.base.text import escape_markdown
 from gaponet.experiments.result import Result, fact_rows
 from gaponet.report.figures.style import save
-from gaponet.report.page import element, facts_table, page, picture, tag
-from gaponet.report.page import table as html_table
+from gaponet.report.page import inline_image, render
 
 FORMAT = "gaponet experiment 1"
 KIND = "experiments"
 
 
 class TableRecord(TypedDict):
-    """A table of a result's .json; texts is what people read, rows the exact numbers."""
+    """A table of a result's .json; texts are for people, rows are the exact numbers."""
 
     name: str
     caption: str
@@ -58,39 +57,39 @@ def write(result: Result, folder: Path) -> list[Path]:
         All files written, the report last.
 
     Raises:
-        FolderError: folder is somebody else's, or another process writes into it.
+        FolderError: The folder belongs to something else, or another process writes into it.
     """
     with lock_folder(folder, KIND):
         files: list[Path] = []
-        for table, stem in zip(result.tables, stems(result.name, [t.name for t in result.tables]), strict=True):
+        for table, stem in zip(result.tables, _stems(result.name, [t.name for t in result.tables]), strict=True):
             files.append(folder / f"{stem}.csv")
             write_text(files[-1], table.csv())
-        pictures = stems(result.name, list(result.figures))
-        for figure, stem in zip(result.figures.values(), pictures, strict=True):
+        stems = _stems(result.name, list(result.figures))
+        for figure, stem in zip(result.figures.values(), stems, strict=True):
             files += save(figure, folder / f"{stem}.svg")
         files += [folder / f"{result.name}.md", folder / f"{result.name}.json"]
-        write_text(files[-2], _markdown(result, pictures))
-        figures = dict(zip(result.figures, pictures, strict=True))
+        write_text(files[-2], _markdown(result, stems))
         record = {
             "format": FORMAT, "name": result.name, "title": result.title, "virtual": result.virtual,
             "facts": dict(result.facts), "sentences": list(result.sentences),
-            "tables": [t.record() for t in result.tables if t.shown], "figures": figures,
+            "tables": [t.record() for t in result.tables if t.shown],
+            "figures": dict(zip(result.figures, stems, strict=True)),
         }  # fmt: skip
         write_json(files[-1], record)
         return [*files, write_report(folder)]
 
 
-def stems(name: str, parts: list[str]) -> list[str]:
-    """File names without suffix: NAME, then NAME-PART."""
+def _stems(name: str, parts: list[str]) -> list[str]:
+    """Return file names without suffix: NAME, then NAME-PART."""
     return [name if i == 0 else f"{name}-{part}" for i, part in enumerate(parts)]
 
 
-def _markdown(result: Result, pictures: list[str]) -> str:
+def _markdown(result: Result, stems: list[str]) -> str:
     parts = [f"# {escape_markdown(result.title)}", f"**{escape_markdown(result.virtual)}**"]
     if result.sentences:
         parts.append("\n".join(f"- {escape_markdown(s)}" for s in result.sentences))
     parts += [t.markdown() for t in result.tables if t.shown]
-    parts += [f"![]({stem}.svg)" for stem in pictures]
+    parts += [f"![]({stem}.svg)" for stem in stems]
     parts.append(
         "\n".join(f"- {escape_markdown(key)}: {escape_markdown(value)}" for key, value in fact_rows(result.facts))
     )
@@ -98,23 +97,24 @@ def _markdown(result: Result, pictures: list[str]) -> str:
 
 
 def write_report(folder: Path) -> Path:
-    """Write folder/report.html with a section for every result found in the folder, by name.
+    """Write folder/report.html with a section for every result in the folder, by name.
 
     Raises:
         DatasetError: No result there, or a figure of one is missing.
     """
-    records = found(folder)
+    records = read_results(folder)
     if not records:
         raise DatasetError(f"{folder}: no result of gaponet experiment here; run one with this folder as OUT")
-    contents = [Markup('<li><a href="#{}">{}</a></li>').format(escape(r["name"]), escape(r["title"])) for r in records]
-    body = element("h1", "Experiments") + element("ul", *contents) if len(records) > 1 else Markup("")
+    images = {r["name"]: [_image(folder / f"{stem}.svg") for stem in r["figures"].values()] for r in records}
+    facts = {r["name"]: fact_rows(r["facts"]) for r in records}
     path = folder / "report.html"
-    write_text(path, page("gaponet experiments", body + Markup("").join(_section(r, folder) for r in records)))
+    title = "gaponet experiments"
+    write_text(path, render("experiments.html.j2", title=title, records=records, images=images, facts=facts))
     return path
 
 
-def found(folder: Path) -> list[Record]:
-    """The results of a folder as their .json files hold them; other JSON files are passed over."""
+def read_results(folder: Path) -> list[Record]:
+    """Read the .json files of the results in a folder; other JSON files are skipped."""
     records, hint = [], "delete it and run its experiment again"
     for file in sorted(folder.glob("*.json")):
         record = read_json(Any, file, DatasetError, hint)
@@ -123,20 +123,7 @@ def found(folder: Path) -> list[Record]:
     return records
 
 
-def _section(record: Record, folder: Path) -> Markup:
-    head = Markup('<h1 id="{}">{}</h1>').format(escape(record["name"]), escape(record["title"]))
-    parts = [
-        head,
-        element("p", tag("VIRTUAL" in record["virtual"]), " ", record["virtual"]),
-        element("ul", *(element("li", sentence) for sentence in record["sentences"])),
-        *(_figure(folder / f"{stem}.svg") for stem in record["figures"].values()),
-    ]
-    for t in record["tables"]:
-        parts += [html_table(t["columns"], t["texts"]), element("p", t["caption"]) if t["caption"] else Markup("")]
-    return Markup("").join([*parts, facts_table(fact_rows(record["facts"]))])
-
-
-def _figure(file: Path) -> Markup:
+def _image(file: Path) -> Markup:
     if not file.is_file():
         raise DatasetError(f"{file}: is missing; run its experiment again, or delete its .json")
-    return element("figure", element("div", picture(file.read_bytes(), "image/svg+xml"), css="plot"))
+    return inline_image(file.read_bytes(), "image/svg+xml")

@@ -1,37 +1,91 @@
-"""One self-contained offline HTML page about an identified robot or a run: what was fitted to what, how well it does,
-what to beware of."""
+"""The offline HTML report about an identified robot or a run: data, errors, figures, warnings, commands."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, ModelError, UsageError
 from gaponet.base.files import write_text
 from gaponet.base.progress import Progress, no_progress
-from gaponet.base.result_table import ResultTable
 from gaponet.data.sequence import SequenceMeta
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
 from gaponet.report.candidate import is_robot, read_origin
 from gaponet.report.methods import method, title
-from gaponet.report.page import element, facts_table, figure, page, table, tag
-from gaponet.report.page import picture as image
-from gaponet.report.run_files import MEND, read_config, read_gap, read_metrics, read_progress, read_trajectories
-from gaponet.report.tables import by_group, mrad, totals
+from gaponet.report.page import PageFigure, inline_image, page_figure, render
+from gaponet.report.run_files import REPAIR_HINT, read_config, read_gap, read_metrics, read_progress, read_trajectories
+from gaponet.report.tables import by_group, mrad, mrad_and_degrees, totals
 from gaponet.report.verdict import added, verdict
 from gaponet.robot.folder import has_stored_robot, load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_stored_robot
 
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
-OPEN = 3  # motions shown without a click
+OPEN_TRAJECTORIES = 3  # motions shown without a click
+MAX_LISTED_MOTIONS = 6
+CARD_FACTS = ("dt", "payload_seen", "units", "hours", "steps", "seconds", "seed", "excess_delay", "parity_rad",
+              "motions", "versions", "dataset_hash")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    """Contents of an evaluated run or robot folder.
+
+    Attributes:
+        own: Method of the folder.
+        card: Card of the run's model; None for a robot folder.
+        config: config.json of the run; empty for a robot folder.
+        curve: Validations during training; empty for a robot folder.
+        gap: gap.json, if it exists.
+    """
+
+    robot: RobotSpec
+    own: str
+    card: dict[str, Any] | None
+    config: dict[str, Any]
+    metrics: dict[str, Any]
+    arrays: dict[str, Array]
+    curve: list[dict[str, Any]]
+    gap: dict[str, Any] | None
+
+    @classmethod
+    def read(cls, folder: Path, model: GapModel | None, robot: RobotSpec) -> _Evaluated:
+        """Read and check the folder.
+
+        Raises:
+            ModelError: A file is missing, damaged or incomplete.
+        """
+        metrics = read_metrics(folder)
+        evaluated = cls(
+            robot, "identified" if model is None else method(model.config.kind, robot),
+            None if model is None else model.card, {} if model is None else read_config(folder), metrics,
+            read_trajectories(folder, metrics, len(robot.operated)), read_progress(folder), read_gap(folder),
+        )  # fmt: skip
+        if missing := evaluated._missing():
+            raise ModelError(f"{folder}: {', '.join(missing)} is missing; {REPAIR_HINT}")
+        return evaluated
+
+    def _missing(self) -> list[str]:
+        """Name what a report needs and the folder lacks."""
+        card, metrics, methods = self.card, self.metrics, self.metrics["methods"]
+        missing = [] if card is None else [name for name in CARD_FACTS if name not in card]
+        complete = (
+            {"date", "command", "moves", "shown"} <= metrics.keys()
+            and set(methods["nominal"]["by_joint"]) <= set(metrics["moves"])  # joints that a recording holds
+            and set(metrics["moves"]) == set(self.robot.operated)
+        )
+        missing += [] if self.own in methods and complete else [f"a whole evaluation of {title(self.own)}"]
+        if card is not None:
+            missing += [] if self.curve else ["progress.jsonl"]
+            missing += ["motions"] if not missing and {"train", "val"} - set(card["motions"]) else []
+        return missing
 
 
 def write_report(
@@ -42,33 +96,38 @@ def write_report(
     progress: Progress = no_progress,
     picture: Picture | None = None,
 ) -> Path:
-    """Write report.html into a run or a robot folder from its newest evaluation, evaluating first where there is none.
+    """Write report.html into a run or robot folder from its newest evaluation; evaluate first if there is none.
 
     Args:
         run: Run of gaponet train, or robot folder of gaponet identify.
-        dataset: Evaluate on this dataset first; default the newest evaluation, or the test motions of the dataset that
+        dataset: Evaluate on this dataset first. Default: the newest evaluation, or the test motions of the dataset that
             was fitted to.
-        also: Further runs to compare (only when evaluating).
+        also: Further runs to compare, when evaluating.
         robot: Robot name or folder, if not the one that the run keeps.
-        picture: Draws the robot (view.portrait); left out where it can draw nothing.
+        picture: Draws the robot (view.portrait).
+
+    Returns:
+        The file.
+
+    Raises:
+        ModelError: The folder is damaged or incomplete.
+        DatasetError: The dataset of an evaluation is not there.
     """
     model = None if is_robot(run) else GapModel.load(run)
-    asked = None if robot is None else require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
-    spec = load_robot(run) if model is None else asked or load_stored_robot(run, model.card["robot"])
+    given = None if robot is None else require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
+    spec = load_robot(run) if model is None else given or load_stored_robot(run, model.card["robot"])
     if dataset is not None or also or not (run / "trajectories.npz").is_file():
-        _evaluate(run, dataset, also, asked, progress)
-    metrics = read_metrics(run)
-    arrays = read_trajectories(run, metrics, len(spec.operated))
-    config, curve, gap = {} if model is None else read_config(run), read_progress(run), read_gap(run)
-    own = "identified" if model is None else method(model.config.kind, spec)
-    _require_complete(run, model, own, metrics, curve, spec)
+        _evaluate(run, dataset, also, given, progress)
+    evaluated = _Evaluated.read(run, model, spec)
     progress(0, 1, "drawing")
-    commands = [config.get("command", ""), metrics["command"], shlex.join(["gaponet", "report", str(run)])]
-    photo = () if picture is None else _photo(picture, arrays, metrics, spec, own)
-    card = None if model is None else model.card
-    text = _page(card, own, config, metrics, arrays, curve, spec, gap, photo, commands)
+    commands = [
+        evaluated.config.get("command", ""),
+        evaluated.metrics["command"],
+        f"gaponet report {shlex.quote(str(run))}",
+    ]
+    values = _values(evaluated) | _photo(evaluated, picture) | {"commands": [c for c in commands if c]}
     path = run / "report.html"
-    write_text(path, text)
+    write_text(path, render("report.html.j2", **values))
     progress(1, 1, "drawing")
     return path
 
@@ -79,10 +138,10 @@ def _evaluate(
     from gaponet.report.evaluate import evaluate
 
     origin = read_origin(run) if is_robot(run) else read_config(run)
-    kept = "" if origin is None else origin["dataset"]
-    if dataset is None and "://" in kept:
-        raise DatasetError(f"{run}: fitted to {kept}; evaluate it first: gaponet eval {run} '{kept}'")
-    place = dataset or run / kept
+    fitted_to = "" if origin is None else origin["dataset"]
+    if dataset is None and "://" in fitted_to:
+        raise DatasetError(f"{run}: fitted to {fitted_to}; evaluate it first: gaponet eval {run} '{fitted_to}'")
+    place = dataset or run / fitted_to
     try:
         data = Dataset(place)
     except DatasetError as error:
@@ -91,138 +150,86 @@ def _evaluate(
     evaluate([run, *also], data, robot, progress=progress).save(run)
 
 
-def _require_complete(
-    run: Path,
-    model: GapModel | None,
-    own: str,
-    metrics: dict[str, Any],
-    curve: list[dict[str, Any]],
-    robot: RobotSpec,
-) -> None:
-    """Refuse what lacks something that a report says."""
-    told = ("dt", "payload_seen", "units", "hours", "steps", "seconds", "seed", "excess_delay", "parity_rad", "motions")
-    missing = [] if model is None else [name for name in (*told, "versions", "dataset_hash") if name not in model.card]
-    methods, parts = metrics["methods"], {"date", "command", "moves", "shown"}
-    whole = (
-        parts <= metrics.keys()
-        and set(methods["nominal"]["by_joint"]) <= set(metrics["moves"])  # joints that a recording holds
-        and set(metrics["moves"]) == set(robot.operated)
-    )
-    missing += [] if own in methods and whole else [f"a whole evaluation of {title(own)}"]
-    if model is not None:
-        missing += [] if curve else ["progress.jsonl"]
-        missing += ["motions"] if not missing and {"train", "val"} - set(model.card["motions"]) else []
-    if missing:
-        raise ModelError(f"{run}: {', '.join(missing)} is missing; {MEND}")
-
-
-def _page(
-    card: dict[str, Any] | None,
-    own: str,
-    config: dict[str, Any],
-    metrics: dict[str, Any],
-    arrays: dict[str, Array],
-    curve: list[dict[str, Any]],
-    robot: RobotSpec,
-    gap: dict[str, Any] | None,
-    photo: Iterable[Markup],
-    commands: list[str],
-) -> str:
+def _values(e: _Evaluated) -> dict[str, Any]:
+    """Return the values of the template."""
     from gaponet.report.figures import evaluation as draw
     from gaponet.report.figures.gap_figure import waterfall
 
-    methods, name = metrics["methods"], title(own)
-    best = int(np.argmin([m["mpjae"] for m in methods.values()]))
-    held_out = "on held-out recordings" if metrics["unseen"] else "(some recordings were used in training)"
+    methods, name = e.metrics["methods"], title(e.own)
     bars = [
-        figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
-        figure(draw.by_horizon(methods), "Does it grow? Error in the last half of the time since the common start."),
+        page_figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
+        page_figure(draw.by_horizon(methods), "Error in the last half of the time since the common start."),
     ]
     if len(methods["nominal"]["by_payload"]) > 1:
-        bars.append(figure(draw.by_payload(methods), "Payload in each hand."))
-    body = [
-        element("h1", f"{robot.description}: {name}"),
-        element("p", tag(metrics["virtual"]), " ", *_facts_line(card, metrics)),
-        element("p", " ".join(verdict(methods)), css="lead"),
-        *(element("div", text, css="warn") for text in warnings(card, own, metrics)),
-        *photo,
-        element("h2", f"Errors, whole-motion free run {held_out}"),
-        _table(totals(methods, _both), best), *_simulators(metrics.get("simulators", {})),
-        _explained(methods),
-        element("h2", "By joint"), _by_joint(methods, own, metrics),
-        element("div", *bars, css="row"),
-        element("h2", "Trajectories"), *_trajectories(arrays, metrics, robot),
-    ]  # fmt: skip
-    if gap is not None:
-        body += [
-            element("h2", "Where the gap comes from"),
-            figure(waterfall(gap), "What each step removes of the mean |error| (hollow: adds to it)."),
-        ]
-    if card is not None:
-        curve_figure = figure(
-            draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."
-        )
-        body += [element("h2", "Training"), element("div", curve_figure, _training_table(card, config), css="row")]
-    body += [element("h2", "By motion"), _table(by_group(methods, "motion", _both))]
-    body += [] if card is None else [element("h2", "What exactly"), _facts(card, metrics)]
-    body += [
-        element("h2", "Do it again"), *(element("p", element("code", line)) for line in commands if line),
-    ]  # fmt: skip
-    return page(f"{robot.name} {name}", Markup("").join(body))
+        bars.append(page_figure(draw.by_payload(methods), "Payload in each hand."))
+    joint_columns, joint_rows = _by_joint(e)
+    simulators = e.metrics.get("simulators", {}).items()
+    values: dict[str, Any] = {
+        "title": f"{e.robot.name} {name}", "heading": f"{e.robot.description}: {name}", "metrics": e.metrics,
+        "card": e.card, "verdict": " ".join(verdict(methods)), "warnings": warnings(e.card, e.own, e.metrics),
+        "totals": totals(methods, mrad_and_degrees), "best": int(np.argmin([m["mpjae"] for m in methods.values()])),
+        "simulators": "; ".join(f"{title(name)} {simulator}" for name, simulator in simulators),
+        "adapted_title": title("adapted"), "joint_columns": joint_columns, "joint_rows": joint_rows, "bars": bars,
+        "trajectories": _trajectories(e), "open_trajectories": OPEN_TRAJECTORIES,
+        "by_motion": by_group(methods, "motion", mrad_and_degrees), "waterfall": None,
+    }  # fmt: skip
+    if e.gap is not None:
+        caption = "Reduction of the mean |error| by each step (hollow: increase)."
+        values["waterfall"] = page_figure(waterfall(e.gap), caption)
+    if e.card is not None:
+        caption = "Free run over whole validation motions; the circled model was selected."
+        values["training_curve"] = page_figure(draw.training_curve(e.curve), caption)
+        values |= {"training_facts": _training_facts(e.card, e.config), "model_facts": _model_facts(e.card, e.metrics)}
+    return values
 
 
-def _simulators(ran: dict[str, str]) -> Iterator[Markup]:
-    if ran:
-        said = "; ".join(f"{title(name)} {simulator}" for name, simulator in ran.items())
-        yield element("p", f"Simulators, by their hashes: {said}.", css="small")
+def _by_joint(e: _Evaluated) -> tuple[list[str], list[list[str]]]:
+    """Return columns and rows: errors of every method, static and dynamic error of the folder's own, motions."""
+    methods, own = e.metrics["methods"], title(e.own)
+    table, joints = by_group(methods, "joint"), methods[e.own]["by_joint"]
+    rows = []
+    for joint, *errors in table.texts():
+        moving = e.metrics["moves"][joint]
+        moves = f"{moving} of {e.metrics['sequences']}" if moving else "none: stands still"
+        rows.append([joint, *errors, *(mrad(joints[joint][k]) for k in ("static", "dynamic")), moves])
+    return [*table.columns, f"{own} static", f"{own} dynamic", "moves in"], rows
 
 
-def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec) -> Iterator[Markup]:
+def _trajectories(e: _Evaluated) -> list[PageFigure]:
     from gaponet.report.figures import evaluation as draw
 
-    drawn = draw.trajectories(arrays, metrics["shown"], robot.operated, list(metrics["methods"]))
-    shown = []
-    for row, fig in drawn.items():
-        facts = metrics["shown"][row]
-        shown.append(
-            figure(fig, element("b", facts["motion"]), f" (unit {facts['unit_id']}, {facts['payload_mass']:g} kg)")
-        )
-    yield element(
-        "p", "The 20 s with most motion of each recording, of the joints that move the three with the largest nominal "
-        "error. The zoom (shaded above) is where the command turns or stops: there lag and sag are seen. Errors of "
-        "one motion are on one scale; Δa is a network's correction, where there is any.", css="small",
-    )  # fmt: skip
-    yield from shown[:OPEN]
-    if shown[OPEN:]:
-        yield element("details", element("summary", f"{len(shown) - OPEN} more motions"), *shown[OPEN:])
+    figures = []
+    for row, fig in draw.trajectories(
+        e.arrays, e.metrics["shown"], e.robot.operated, list(e.metrics["methods"])
+    ).items():
+        shown = e.metrics["shown"][row]
+        caption = f" (unit {shown['unit_id']}, {shown['payload_mass']:g} kg)"
+        figures.append(page_figure(fig, caption, shown["motion"]))
+    return figures
 
 
-def _photo(
-    draw: Picture, arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec, own: str
-) -> Iterator[Markup]:
-    """The robot in the motion with most travel, or a sentence that says why it is not seen."""
+def _photo(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
+    """Draw the robot in the motion with the longest travel. Return photo, or the reason for its absence."""
+    metrics, arrays = e.metrics, e.arrays
     travel = [np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in range(len(metrics["shown"]))]
-    if not travel:
-        return
+    if picture is None or not travel:
+        return {"photo": None, "photo_error": ""}
     row = int(np.argmax(travel))
-    facts = metrics["shown"][row]
+    shown = metrics["shown"][row]
     meta = SequenceMeta(
-        robot.name, facts["unit_id"], facts["motion"], facts["payload_mass"], virtual=metrics["virtual"]
+        e.robot.name, shown["unit_id"], shown["motion"], shown["payload_mass"], virtual=metrics["virtual"]
     )
-    shown = {n: arrays[f"{row}/{n}"] for n in dict.fromkeys(("command", "nominal", own, "recorded"))}
-    shown["command"] = np.roll(shown["command"], 1, axis=0)  # a command of row t says where to be at t + 1
-    shown["command"][0] = shown["recorded"][0]
+    qpos = {n: arrays[f"{row}/{n}"] for n in dict.fromkeys(("command", "nominal", e.own, "recorded"))}
+    qpos["command"] = np.roll(qpos["command"], 1, axis=0)  # the command of row t is the target at t + 1
+    qpos["command"][0] = qpos["recorded"][0]
     try:
-        png = draw(robot, meta, facts["dt"], shown)
+        return {"photo": inline_image(picture(e.robot, meta, shown["dt"], qpos), "image/png"), "photo_error": ""}
     except UsageError as error:
-        yield element("p", f"No picture of the robot: {error}", css="small")
-        return
-    caption = "When the nominal simulator is furthest from the robot; the shadow is the recording."
-    yield element("figure", element("div", image(png, "image/png"), css="photo"), element("figcaption", caption))
+        return {"photo": None, "photo_error": str(error)}
 
 
 def warnings(card: dict[str, Any] | None, own: str, metrics: dict[str, Any]) -> list[str]:
-    """What a careful colleague would say about these numbers; own is the method, with the card of its model if any."""
+    """Return warnings about the evaluation; own is its method, card that of its model if any."""
     out, methods = [], metrics["methods"]
     if metrics["virtual"]:
         out.append("The recordings come from a virtual robot: these numbers say nothing about real hardware.")
@@ -241,8 +248,8 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
     better = [n for n, m in methods.items() if n not in (own, "adapted") and m["mpjae"] <= methods[own]["mpjae"]]
     if better:
         out.append(f"The model does not beat {', '.join(map(title, better))}: do not use it.")
-    seen, asked = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]
-    outside = [p for p in asked if not min(seen) <= p <= max(seen)]
+    seen, evaluated = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]
+    outside = [p for p in evaluated if not min(seen) <= p <= max(seen)]
     if outside:
         out.append(f"Payloads {outside} kg lie outside those trained on ({min(seen):g} to {max(seen):g} kg).")
     if len(card["units"]) == 1:
@@ -253,8 +260,7 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
     if card["excess_delay"] > span + 1e-6:
         out.append(
             f"The robot lags the simulator by {card['excess_delay'] * 1e3:.0f} ms, the history spans "
-            f"{span * 1e3:.0f} ms: "
-            "raise --model.history or --model.stride."
+            f"{span * 1e3:.0f} ms: raise --model.history or --model.stride."
         )
     done, planned = card.get("stages", {}).get("warm_start_rounds", (0, 0))
     if done < planned:
@@ -265,83 +271,40 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
     return out
 
 
-def _facts_line(card: dict[str, Any] | None, metrics: dict[str, Any]) -> list[str]:
-    trained = "" if card is None else f"trained {card['hours']:.2f} h of logs, {card['steps']:,} control steps; "
+def _training_facts(card: dict[str, Any], config: dict[str, Any]) -> list[list[str]]:
+    shape, ppo, motions = card["model"], config["ppo"], card["motions"]
+    more = " …" if len(motions["val"]) > MAX_LISTED_MOTIONS else ""
     return [
-        f"{metrics['date']}: {metrics['sequences']} recordings, {len(metrics['motions'])} motions; {trained}simulator ",
-        element("code", metrics["simulator_hash"]),
-    ]  # fmt: skip
-
-
-def _both(value: float) -> str:
-    return f"{mrad(value)} ({np.degrees(value):.2f}°)"
-
-
-def _explained(methods: dict[str, Any]) -> Markup:
-    text = {
-        "MPJAE": "mean |q_sim − q_robot| over all joints and steps, averaged over motions. The simulator starts where "
-        "the recording starts and is given its commands, nothing else. 10 mrad = 0.57°.",
-        "RMSE": "root of the mean squared error, mrad: large errors count more.",
-        "static": "size of a joint's median error over a motion, mrad: what stays, such as sag and zero offsets.",
-        "dynamic": "mean distance from that median, mrad: what comes and goes, such as lag, friction and backlash.",
-        "Q_dis": "sum of |error| × Δt over a motion, mean of the joints: grows with the motion's length.",
-        "≥ 0.05 rad": "share of steps with an error of 2.9° or more (0.1 rad: 5.7°).",
-        "correlation": "Pearson's r between simulated and recorded angle of joints that moved.",
-    }  # fmt: skip
-    if "adapted" in methods:
-        text[title("adapted")] = "the model in the simulator adapted to the unit (gaponet adapt)."
-    return element("div", facts_table([[k, v] for k, v in text.items()]), css="small")
-
-
-def _by_joint(methods: dict[str, Any], own: str, metrics: dict[str, Any]) -> Markup:
-    mean, joints = by_group(methods, "joint"), methods[own]["by_joint"]
-    rows = []
-    for joint, *errors in mean.texts():
-        moving = metrics["moves"][joint]
-        moves = f"{moving} of {metrics['sequences']}" if moving else "none: stands still"
-        rows.append([joint, *errors, *(mrad(joints[joint][k]) for k in ("static", "dynamic")), moves])
-    return table([*mean.columns, f"{title(own)} static", f"{title(own)} dynamic", "moves in"], rows)
-
-
-def _table(made: ResultTable, best: int | None = None) -> Markup:
-    return table(made.columns, made.texts(), best)
-
-
-def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:
-    r2, shape, ppo, motions = card.get("sensor_r2"), card["model"], config["ppo"], card["motions"]
-    rows = [
         ["trained on", f"{len(motions['train'])} motions, {card['hours']:.2f} h, units {', '.join(card['units'])}"],
         ["trained", GapModel.how_trained(card)],
         ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
-        ["validated on", ", ".join(motions["val"][:6]) + (" …" if len(motions["val"]) > 6 else "")],
+        ["validated on", ", ".join(motions["val"][:MAX_LISTED_MOTIONS]) + more],
         ["observation", f"{shape['history']} past frames, payload {'in' if shape['payload_input'] else 'out'}"],
         ["sensors", shape.get("sensors", "–") if shape["kind"] == "gaponet" else "–"],
-        ["sensor predictor R²", _r2(r2)],
+        ["sensor predictor R²", _r2(card.get("sensor_r2"))],
         ["steps, time", f"{card['steps']:,} control steps in {card['seconds'] / 60:.1f} min"],
         ["PPO", f"{ppo['num_envs']} environments, {ppo['epochs']} epochs, σ {ppo['std']:g} rad"],
         ["seed", str(card["seed"])],
         ["ONNX against torch", f"{card['parity_rad']:.1e} rad"],
-    ]  # fmt: skip
-    return facts_table(rows)
+    ]
 
 
-def _r2(found: dict[str, Any] | None) -> str:
-    """Held-out R² of the sensor predictor."""
-    if found is None:
+def _r2(r2: dict[str, Any] | None) -> str:
+    """Format the R² of the sensor predictor on the test states."""
+    if r2 is None:
         return "–"
-    joints = ", ".join(f"{j} {v:.2f}" for j, v in found["by_joint"].items())
-    return f"{found['mean']:.3f} on held-out states ({joints})"
+    joints = ", ".join(f"{j} {v:.2f}" for j, v in r2["by_joint"].items())
+    return f"{r2['mean']:.3f} on held-out states ({joints})"
 
 
-def _facts(card: dict[str, Any], metrics: dict[str, Any]) -> Markup:
-    rows = [
+def _model_facts(card: dict[str, Any], metrics: dict[str, Any]) -> list[list[str]]:
+    largest = ", ".join(f"{n} {d['max']:.3f}" for n, d in metrics["delta"].items())
+    return [
         ["robot, joints", f"{card['robot']}: {', '.join(card['joint_names'])}"],
         ["simulator", f"{metrics['simulator_hash']}; kp {card['kp']}, kd {card['kd']}"],
         ["dataset", f"{metrics['dataset']} (trained on {card['dataset_hash']})"],
         ["rate", ", ".join(f"{1 / dt:.2f} Hz" for dt in card["dt"])],
-        ["largest |Δa|", f"limit {card['model']['delta_max']} rad; seen "
-         + ", ".join(f"{n} {d['max']:.3f}" for n, d in metrics["delta"].items())],
+        ["largest |Δa|", f"limit {card['model']['delta_max']} rad; seen {largest}"],
         ["artifacts", ", ".join(f"{n} {a['weights']} (seed {a['seed']})" for n, a in metrics["artifacts"].items())],
         ["versions", ", ".join(f"{k} {v}" for k, v in card["versions"].items())],
-    ]  # fmt: skip
-    return facts_table(rows)
+    ]

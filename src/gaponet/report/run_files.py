@@ -14,7 +14,7 @@ from gaponet.base.errors import ModelError
 from gaponet.base.structure import Count, Json, Number, parse_json, read_json, read_npz
 from gaponet.report.methods import IDENTIFIED, METHODS
 
-MEND = "give a complete run folder of gaponet train, or evaluate again"
+REPAIR_HINT = "give a complete run folder of gaponet train, or evaluate again"
 Method = Annotated[str, Predicate(lambda name: name.removeprefix(IDENTIFIED) in METHODS)]
 GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion")
 
@@ -129,42 +129,44 @@ def read_config(run: Path) -> dict[str, Any]:
     Raises:
         ModelError: Missing or damaged, as of all functions here; with file and field.
     """
-    return dict(read_json(_Config, run / "config.json", ModelError, MEND, allow_extra=True))
+    return dict(read_json(_Config, run / "config.json", ModelError, REPAIR_HINT, allow_extra=True))
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
     """metrics.json of a run: the same groups in every method as in the nominal one; absent numbers are NaN."""
     file = run / "metrics.json"
-    metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, MEND, allow_extra=True)}
+    metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, REPAIR_HINT, allow_extra=True)}
     for key in ("methods", "ratio_to_nominal"):
         metrics[key] = {FORMER_METHODS.get(name, name): value for name, value in metrics[key].items()}
     methods = metrics["methods"]
     if "nominal" not in methods or not set(methods) <= set(metrics["ratio_to_nominal"]):
-        raise ModelError(f"{file}: methods: nominal is missing, or a method has no ratio to it; {MEND}")
+        raise ModelError(f"{file}: methods: nominal is missing, or a method has no ratio to it; {REPAIR_HINT}")
     for name, scores in methods.items():
         for group in GROUPS:
             if set(scores[group]) != set(methods["nominal"][group]):
-                raise ModelError(f"{file}: methods.{name}.{group}: should have what nominal has; {MEND}")
+                raise ModelError(f"{file}: methods.{name}.{group}: should have what nominal has; {REPAIR_HINT}")
         for group in ("by_payload", "by_horizon"):
             if not all(_is_number(key) for key in scores[group] if key != "whole"):
-                raise ModelError(f"{file}: methods.{name}.{group}: should be named by numbers; {MEND}")
+                raise ModelError(f"{file}: methods.{name}.{group}: should be named by numbers; {REPAIR_HINT}")
         if "whole" not in scores["by_horizon"]:
-            raise ModelError(f"{file}: methods.{name}.by_horizon.whole: is missing; {MEND}")
+            raise ModelError(f"{file}: methods.{name}.by_horizon.whole: is missing; {REPAIR_HINT}")
     return metrics
 
 
 def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[str, Array]:
     """trajectories.npz of a run: for each sequence shown row/METHOD, recorded and command, (T, joints) rad."""
     file = run / "trajectories.npz"
-    arrays = read_npz(file, ModelError, MEND)
+    arrays = read_npz(file, ModelError, REPAIR_HINT)
     for row in range(len(metrics.get("shown", []))):
         names = [f"{row}/{m}" for m in ("recorded", "command", *metrics["methods"])]
         shapes = {arrays[name].shape if name in arrays else () for name in names}
         shape = max(shapes, key=len)
         if len(shapes) != 1 or len(shape) != 2 or shape[0] < 2 or shape[1] != joints:
-            raise ModelError(f"{file}: sequence {row} has arrays of {joints} joints missing or of other sizes; {MEND}")
+            raise ModelError(
+                f"{file}: sequence {row} has arrays of {joints} joints missing or of other sizes; {REPAIR_HINT}"
+            )
     if not all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values()):
-        raise ModelError(f"{file}: holds NaN or other types than float32; {MEND}")
+        raise ModelError(f"{file}: holds NaN or other types than float32; {REPAIR_HINT}")
     return arrays
 
 
@@ -175,7 +177,7 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
         return []
     lines = file.read_bytes().split(b"\n")[:-1]
     return [
-        {**parse_json(_Validation, line, f"{file}:{number}", ModelError, MEND, allow_extra=True)}
+        {**parse_json(_Validation, line, f"{file}:{number}", ModelError, REPAIR_HINT, allow_extra=True)}
         for number, line in enumerate(lines, 1)
         if line.strip()
     ]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from gaponet.base.result_table import ResultTable
 from gaponet.report.methods import title
 
@@ -12,6 +14,11 @@ from gaponet.report.methods import title
 def mrad(value: float | None) -> str:
     """rad → milliradian text; a dash where there is none, as of the standard error over one motion."""
     return "–" if value is None or value != value else f"{value * 1e3:.2f}"
+
+
+def mrad_and_degrees(value: float) -> str:
+    """Format an angle in rad as milliradian and degrees."""
+    return f"{mrad(value)} ({np.degrees(value):.2f}°)"
 
 
 def totals(

@@ -15,9 +15,9 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import Corrector, replay
-from gaponet.sysid.robot_rollouts import WINDOW
 from gaponet.sysid.identify import identify
 from gaponet.sysid.refit import refit
+from gaponet.sysid.robot_rollouts import WINDOW
 
 LEFT_OUT = "left out"  # starts the note of a network that validation left out
 ADAPTATION_S = 30.0  # of the test's session
