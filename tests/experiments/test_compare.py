@@ -26,7 +26,7 @@ def result(make_study, make_outcomes, monkeypatch, tmp_path):
     new = {"new": summary(0.03, 0.03, "b")}
     runs = [{"seed": i, "known": summary(0.005, 0.01 * i), "parameters": 1234, "seconds": 90.0} | new for i in (1, 3)]
     cells = {"mlp": [SimpleNamespace(folder=tmp_path)]}
-    monkeypatch.setattr(module, "choose", lambda runs, data: (study.data.entries[:6], True))
+    monkeypatch.setattr(module, "select_entries", lambda runs, data: (study.data.entries[:6], True))
     base = {"nominal": {"known": summary(0.01, 0.03)} | new, "delay_offset": {"known": summary(0.01, 0.02)} | new}
     return Compare(("mlp",)).result(study, make_outcomes({"mlp": runs}, base, cells))
 

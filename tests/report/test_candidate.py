@@ -10,8 +10,8 @@ import gaponet as gp
 from gaponet.base.errors import DatasetError, RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.report.candidate import Candidate, choose
-from gaponet.report.verdict import added, next_step, verdict
+from gaponet.report.candidate import Candidate, select_entries
+from gaponet.report.verdict import network_gain, next_step, verdict
 from gaponet.report.view.side_by_side import pick, side_by_side
 from gaponet.robot.folder import PROVENANCE_FILE, save_robot
 
@@ -49,27 +49,27 @@ def test_an_identified_folder_is_taken_where_a_run_is(fitted, data, arm, capsys)
     assert shown.seen is False
     assert main(["eval", str(fitted), str(data.path)]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "Identification leaves" in said
+    assert "After identification the error is" in said
     assert f"next: gaponet export {fitted}" in said
 
 
 def test_one_unit_alone_can_be_asked(fitted, data):
-    assert choose([fitted], data, units=("a",)) == choose([fitted], data)
+    assert select_entries([fitted], data, units=("a",)) == select_entries([fitted], data)
     with pytest.raises(DatasetError, match="no unit 'other'; it holds: a"):
-        choose([fitted], data, units=("other",))
+        select_entries([fitted], data, units=("other",))
 
 
 def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_recordings(fitted, data):
     (fitted / PROVENANCE_FILE).unlink()
-    assert choose([fitted], data) == (data.entries, False)
+    assert select_entries([fitted], data) == (data.entries, False)
     (fitted / PROVENANCE_FILE).write_text('{"parts": 3}')
     with pytest.raises(RobotError, match=r"identified\.json.*identify again"):
-        choose([fitted], data)
+        select_entries([fitted], data)
 
 
 def test_a_run_has_seen_what_its_robot_was_identified_from(fitted, data, tmp_path):
     run = untrained(tmp_path / "run", gp.load_robot(fitted), data, train=("motion2",), val=(), test=("motion0",))
-    assert choose([run], data, ("motion0",))[1] is False
+    assert select_entries([run], data, ("motion0",))[1] is False
 
 
 def test_a_robot_of_which_nothing_is_identified_is_told_apart(arm, data, tmp_path):
@@ -90,12 +90,12 @@ def scores(**errors):
 def test_what_the_network_adds_is_said_when_it_is_nothing(tmp_path):
     useless = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(3.0, 3.2))
     said = verdict(useless)
-    assert said[1] == "Identification leaves 3.10 mrad, 84 % less."
-    assert "its network adds 0.00 ± 0.00 mrad to identification: leave it out" in said[2]
+    assert said[1] == "After identification the error is 3.10 mrad, 84 % less."
+    assert "reduces the error of identification by 0.00 ± 0.00 mrad: leave the network out" in said[2]
     assert next_step(useless, "data", tmp_path) == f"gaponet export {tmp_path / 'robot'} --to mjcf"
     useful = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(2.0, 2.1))
-    assert "its network adds 1.05 ± 0.05 mrad to identification, 34 % of what that leaves" in verdict(useful)[2]
+    assert "reduces the error of identification by 1.05 ± 0.05 mrad, 34 %." in verdict(useful)[2]
     assert next_step(useful, "data", tmp_path) == f"gaponet report {tmp_path}"
     alone = scores(nominal=(20.0, 18.0), mlp=(9.0, 8.0))
-    assert added(alone, "mlp").base == "nominal"
+    assert network_gain(alone, "mlp").base == "nominal"
     assert next_step(scores(nominal=(20.0, 18.0)), "data") == "gaponet identify data --out my_robot"

@@ -11,7 +11,7 @@ from runs import untrained
 from gaponet.base.errors import DatasetError, ModelError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.report.candidate import Candidate, choose
+from gaponet.report.candidate import Candidate, select_entries
 from gaponet.report.evaluate import evaluate
 from gaponet.report.gap import gap_by_step
 from gaponet.report.view.side_by_side import side_by_side
@@ -111,27 +111,27 @@ def test_a_dataset_keeps_the_nominal_robot_where_an_identified_one_is_given(arm,
 
 def test_what_any_of_the_runs_has_seen_is_not_unseen(arm, data, run, tmp_path):
     other = untrained(tmp_path / "other", arm, data, kind="mlp", train=("m2", "m3"), val=("m0",), test=("m1",))
-    assert [e.meta.motion for e in choose([run], data)[0]] == ["m3"]
+    assert [e.meta.motion for e in select_entries([run], data)[0]] == ["m3"]
     with pytest.raises(DatasetError, match="every sequence was used in training"):
-        choose([run, other], data)
-    assert choose([run], data, ("m3",))[1] is True
-    assert choose([run, other], data, ("m3",))[1] is False
+        select_entries([run, other], data)
+    assert select_entries([run], data, ("m3",))[1] is True
+    assert select_entries([run, other], data, ("m3",))[1] is False
     assert evaluate([run, other], data, arm, ("m3",)).result["unseen"] is False
     less = untrained(tmp_path / "less", arm, data, kind="mlp", train=("m0",), val=("m1",), test=("m2", "m3"))
-    assert [e.meta.motion for e in choose([less], data)[0]] == ["m2", "m3"]
-    assert [e.meta.motion for e in choose([less, run], data)[0]] == ["m3"]  # m2 was the other's to choose by
+    assert [e.meta.motion for e in select_entries([less], data)[0]] == ["m2", "m3"]
+    assert [e.meta.motion for e in select_entries([less, run], data)[0]] == ["m3"]  # m2 was the other's to choose by
 
 
 def test_a_motion_trained_on_is_not_unseen_when_another_unit_plays_it(arm, run, tmp_path):
     again = Dataset.create(tmp_path / "unit-b", arm)
     for i in (0, 3):
         again.append(record(arm, commands(80, i), f"m{i}", kp=0.7, unit="b"))
-    entries, unseen = choose([run], again)
+    entries, unseen = select_entries([run], again)
     assert ([e.meta.motion for e in entries], unseen) == (["m3"], True)
-    assert choose([run], again, ("m0",))[1] is False
+    assert select_entries([run], again, ("m0",))[1] is False
     trained = Dataset.create(tmp_path / "unit-c", arm)
     trained.append(record(arm, commands(80, 0), "m0", kp=0.7, unit="c"))
-    entries, unseen = choose([run], trained)
+    entries, unseen = select_entries([run], trained)
     assert ([e.meta.motion for e in entries], unseen) == (["m0"], False)
 
 
@@ -145,7 +145,7 @@ def test_a_split_by_unit_tests_motions_that_were_trained_on_with_other_units(arm
     val = {i: h for i, h in ours.items() if i.startswith("m2")}
     parts = {"train": {i: h for i, h in ours.items() if i not in val}, "val": val, "test": theirs}
     (run / "split.json").write_text(json.dumps(parts))
-    entries, unseen = choose([run], both)
+    entries, unseen = select_entries([run], both)
     assert ({e.hash for e in entries}, unseen) == (set(theirs.values()), True)
 
 

@@ -13,7 +13,7 @@ from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.report.candidate import Candidate
 from gaponet.report.figures.gap_figure import waterfall
-from gaponet.report.gap import CAUSES, causes, floor, gap_by_step, removed
+from gaponet.report.gap import CAUSES, cause_steps, error_floor, gap_by_step, reductions
 from gaponet.report.methods import title
 from gaponet.report.run_files import read_gap
 from gaponet.report.verdict import LEARNED
@@ -35,10 +35,10 @@ def test_the_floor_is_what_two_repetitions_differ_by(tmp_path):
     first = recordings(robot, 1, rows=400)[0]
     noise = np.random.default_rng(1).normal(0, 0.002, (2, *first.qpos.shape))
     same = [replace(first, qpos=(first.qpos + n).astype(np.float32)) for n in noise]
-    for joint in floor(same, robot).values():
+    for joint in error_floor(same, robot).values():
         assert joint["repeatability"] == pytest.approx(0.002 * np.sqrt(2 / np.pi), rel=0.1)
         assert joint["both"] == joint["repeatability"]
-    assert all(f["repeatability"] is None for f in floor(same[:1], robot).values())
+    assert all(f["repeatability"] is None for f in error_floor(same[:1], robot).values())
 
 
 @pytest.mark.parametrize("kind", LEARNED)
@@ -80,11 +80,11 @@ def test_each_bar_says_what_it_removes_and_the_floor_what_it_is():
 def test_causes_lead_from_the_nominal_simulator_to_the_identified_one(tmp_path):
     robot = write_arm(tmp_path / "arm")
     found = robot.with_servos({"elbow": {"kp": 15.0, "frictionloss": 0.1, "stribeck": 0.05, "stribeck_speed": 0.1}})
-    steps = causes(found)
+    steps = cause_steps(found)
     assert [name for name, _ in steps] == ["gain", "friction", "creep", "stribeck"]
     assert model_hash(steps[-1][1]) == model_hash(found)
     assert steps[0][1].frictionloss[1] != 0.1
-    assert causes(robot) == []
+    assert cause_steps(robot) == []
 
 
 def test_a_servo_with_less_damping_than_its_files_kd_is_the_last_step_too(tmp_path):
@@ -92,7 +92,7 @@ def test_a_servo_with_less_damping_than_its_files_kd_is_the_last_step_too(tmp_pa
     robot = replace(robot, kd=np.full_like(robot.kd, 0.5))
     found = robot.with_servos({"elbow": {"damping": -0.3}})
     assert found.kd[1] == pytest.approx(0.2)
-    assert model_hash(causes(found)[-1][1]) == model_hash(found)
+    assert model_hash(cause_steps(found)[-1][1]) == model_hash(found)
 
 
 def test_what_a_step_removes_has_a_standard_error_over_motions(tmp_path):
@@ -100,8 +100,8 @@ def test_what_a_step_removes_has_a_standard_error_over_motions(tmp_path):
     sequences = recordings(robot, 3, rows=50)
     off = lambda sizes: [Run.of(s, s.qpos + x, robot) for s, x in zip(sequences, sizes, strict=True)]  # noqa: E731
     done = {"nominal": off([0.03, 0.02, 0.01]), "gain": off([0.02, 0.01, 0.0])}
-    assert removed(done)["gain"] == pytest.approx([0.01, 0.0], abs=1e-6)
-    less, error = removed({"nominal": off([0.03, 0.03, 0.03]), "gain": off([0.0, 0.01, 0.02])})["gain"]
+    assert reductions(done)["gain"] == pytest.approx([0.01, 0.0], abs=1e-6)
+    less, error = reductions({"nominal": off([0.03, 0.03, 0.03]), "gain": off([0.0, 0.01, 0.02])})["gain"]
     assert (less, error) == pytest.approx((0.02, 0.01 / np.sqrt(3)), abs=1e-6)
 
 
@@ -113,7 +113,7 @@ def test_a_motion_that_repeats_itself_tells_repeatability(tmp_path):
     thrice = replace(once, ctrl=np.tile(once.ctrl, (5, 1))[:270], qpos=qpos[:270].astype(np.float32),
                      qvel=np.zeros((270, 2), np.float32))  # fmt: skip
     assert [len(p) for p in Repetitions.periods(thrice)] == [60, 60, 60]  # without the first, and the last is not whole
-    for joint in floor([thrice], robot).values():
+    for joint in error_floor([thrice], robot).values():
         assert joint["repeatability"] == pytest.approx(0.002 * np.sqrt(2 / np.pi), rel=0.1)
     assert not Repetitions.periods(once)
     assert not Repetitions.periods(replace(thrice, ctrl=np.concatenate([thrice.ctrl[:-1], start])))

@@ -1,65 +1,82 @@
-"""What the report says, and that it is one page that needs nothing else."""
+"""The report is one offline page that says what a visitor needs to know."""
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
+from arm import write_arm
 from reports import amend, evaluated_run
 
 import gaponet as gp
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
+from gaponet.nn.artifact import GapModel
+from gaponet.report import report
 from gaponet.report.figures import evaluation as figures
-from gaponet.report.figures.gap_figure import waterfall
-from gaponet.report.report import _r2, write_report
+from gaponet.report.report import warnings, write_report
 from gaponet.report.run_files import read_gap
 from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """An evaluated run whose model corrects an identified simulator."""
+    folder = tmp_path_factory.mktemp("report")
+    arm = write_arm(folder / "arm")
+    fitted = arm.with_servos({"elbow": {"kp": 11.0}})
+    return evaluated_run(arm, Dataset.create(folder / "data", arm), folder / "run", fitted)
 
 
 @pytest.fixture
-def run(arm, tmp_path):
-    return evaluated_run(arm, Dataset.create(tmp_path / "data", arm), tmp_path / "run")
+def run(evaluated, tmp_path):
+    """A copy that a test may change."""
+    shutil.copytree(evaluated, tmp_path / "run")
+    return tmp_path / "run"
 
 
-def test_the_page_is_one_offline_file_that_says_what_a_visitor_asks(run):
-    page = write_report(run).read_text()
+def test_the_page_is_one_offline_file_that_names_the_method_everywhere(evaluated):
+    gp.gap(evaluated.parent / "data", run=evaluated)
+    assert list(read_gap(evaluated)["left"]) == ["nominal", "delay", "offset", "gain", "identified+gaponet"]
+    page = write_report(evaluated).read_text()  # the figures are SVG with their words in it
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page)
     for text in (
         "Undertrained: the budget ended after 3 of 10 rounds", "3 of 10 rounds of the supervised start, no PPO",
         "none: stands still", "elbow</td>", "°)", "Pearson", "median error", "gaponet train data --out run",
-        f"gaponet eval {run} {run.parent / 'data'}", json.loads((run / "metrics.json").read_text())["date"],
-        "prefers-color-scheme: dark", "width=device-width", "command",
+        f"gaponet eval {evaluated} {evaluated.parent / 'data'}",
+        json.loads((evaluated / "metrics.json").read_text())["date"], "prefers-color-scheme: dark",
+        "width=device-width", "command", "Where the gap comes from",
+        "reduces the error of identification by 0.00 ± 0.00 mrad: leave the network out",
     ):  # fmt: skip
         assert text in page, text
-
-
-def test_a_model_that_corrects_an_identified_simulator_is_called_so_in_every_table_and_figure(arm, tmp_path, capsys):
-    data, fitted = Dataset.create(tmp_path / "data", arm), arm.with_servos({"elbow": {"kp": 11.0}})
-    run = evaluated_run(arm, data, tmp_path / "run", fitted)
-    page = write_report(run).read_text()  # the figures are SVG with their words in it
+    assert "train longer" not in page
     assert page.count("identification + GAPONet") > 10
     assert not re.findall(r"(?<!identification \+ )GAPONet", page)
-    assert list(gp.gap(data, arm, run=run)["left"]) == ["nominal", "delay", "offset", "gain", "identified+gaponet"]
-    assert waterfall(read_gap(run)).axes[0].get_yticklabels()[4].get_text() == "identification + GAPONet"
-    assert "Where the gap comes from" in write_report(run).read_text()
-    for words in (["runs", str(tmp_path)], ["eval", str(run), str(data.path)]):
-        assert main(words) == 0
-        said = " ".join(capsys.readouterr().out.split())
-        assert "GAPONet" in said
-        assert not re.findall(r"(?<!identification \+ )GAPONet", said)
+
+
+@pytest.mark.parametrize("command", ["runs", "eval"])
+def test_a_table_in_the_terminal_names_the_method(evaluated, command, capsys):
+    where = {"runs": [evaluated.parent], "eval": [evaluated, evaluated.parent / "data"]}[command]
+    assert main([command, *map(str, where)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "GAPONet" in said
+    assert not re.findall(r"(?<!identification \+ )GAPONet", said)
 
 
 def test_a_trained_run_is_not_called_undertrained(run):
     amend(run, stages={"warm_start_rounds": [10, 10], "ppo_updates": 40})
-    page = write_report(run).read_text()
-    assert "Undertrained" not in page
-    assert "supervised start (10 rounds), 40 updates of PPO" in page
+    card = GapModel.load(run).card
+    said = warnings(card, "identified+gaponet", json.loads((run / "metrics.json").read_text()))
+    assert not any("Undertrained" in text for text in said)
+    assert GapModel.how_trained(card) == "supervised start (10 rounds), 40 updates of PPO"
 
 
-def test_the_robot_is_pictured_or_a_sentence_says_why_not(run):
-    seen = []
+def test_the_robot_is_drawn_or_the_page_says_why_not(evaluated):
+    robot = load_robot(evaluated / "robot")
+    contents, seen = report._Evaluated.read(evaluated, GapModel.load(evaluated), robot), []
 
     def draw(robot, meta, dt, qpos):
         seen.append((robot.name, meta.motion, dt, list(qpos)))
@@ -69,16 +86,16 @@ def test_the_robot_is_pictured_or_a_sentence_says_why_not(run):
     def blind(*_):
         raise UsageError("no OpenGL here <b>")
 
-    assert '<img src="data:image/png;base64,UE5H">' in write_report(run, picture=draw).read_text()
-    assert seen[0][3] == ["command", "nominal", "gaponet", "recorded"]
-    assert "No picture of the robot: no OpenGL here &lt;b&gt;" in write_report(run, picture=blind).read_text()
+    assert report._photo(contents, draw)["photo"] == '<img src="data:image/png;base64,UE5H">'
+    assert seen[0][3] == ["command", "nominal", "identified+gaponet", "recorded"]
+    assert report._photo(contents, blind)["photo_error"] == "no OpenGL here <b>"
 
 
 @pytest.mark.parametrize("absent", ["date", "command", "moves", "shown"])
-def test_an_evaluation_of_before_is_refused_with_what_to_do(run, absent):
+def test_an_incomplete_evaluation_is_refused_with_what_to_do(run, absent):
     metrics = json.loads((run / "metrics.json").read_text())
     (run / "metrics.json").write_text(json.dumps({k: v for k, v in metrics.items() if k != absent}))
-    with pytest.raises(ModelError, match=r"evaluation of GAPONet is missing; .* or evaluate again"):
+    with pytest.raises(ModelError, match=r"evaluation of identification \+ GAPONet is missing; .* or evaluate again"):
         write_report(run)
 
 
@@ -101,28 +118,17 @@ def test_trajectories_show_the_command_and_errors_of_a_motion_on_one_scale_movin
     assert np.ptp(axes[0].get_ylim()) >= 0.06
 
 
-def test_the_sensor_predictor_is_said_by_joint():
-    assert _r2(None) == "–"
+def test_the_sensor_predictor_is_described_by_joint():
+    assert report._r2(None) == "–"
     said = "0.900 on held-out states (elbow 0.80, wrist 1.00)"
-    assert _r2({"mean": 0.9, "by_joint": {"elbow": 0.8, "wrist": 1.0}}) == said
+    assert report._r2({"mean": 0.9, "by_joint": {"elbow": 0.8, "wrist": 1.0}}) == said
 
 
-def test_an_identified_robot_has_a_page_without_any_training(arm, tmp_path):
-    data, run = Dataset.create(tmp_path / "data", arm), tmp_path / "run"
-    evaluated_run(arm, data, run)
-    fitted = tmp_path / "fitted"
-    save_robot(arm.with_servos({"elbow": {"kp": 11.0}}), fitted)
-    page = write_report(fitted, data.path).read_text()
-    assert "Identification leaves" in page
-    assert "not a held-out result" in page  # it does not say what it was identified from
+def test_an_identified_robot_has_a_page_without_training(evaluated, tmp_path):
+    arm = load_robot(evaluated.parent / "arm")
+    save_robot(arm.with_servos({"elbow": {"kp": 11.0}}), tmp_path / "fitted")
+    page = write_report(tmp_path / "fitted", evaluated.parent / "data").read_text()
+    assert "After identification the error is" in page
+    assert "not a held-out result" in page  # the folder does not say what it was identified from
     assert "GAPONet" not in page
     assert "<h2>Training</h2>" not in page
-
-
-def test_a_network_that_adds_nothing_to_identification_is_said_to(arm, tmp_path):
-    fitted = arm.with_servos({"elbow": {"kp": 11.0}})
-    page = write_report(
-        evaluated_run(arm, Dataset.create(tmp_path / "data", arm), tmp_path / "run", fitted)
-    ).read_text()
-    assert "its network adds 0.00 ± 0.00 mrad to identification: leave it out" in page
-    assert "train longer" not in page

@@ -16,7 +16,7 @@ from gaponet.nn.config import Kind
 from gaponet.nn.training.config import TrainConfig
 from gaponet.report.methods import title
 from gaponet.report.tables import mrad
-from gaponet.report.verdict import Added
+from gaponet.report.verdict import NetworkGain
 from gaponet.robot.folder import STORED_ROBOT
 
 
@@ -62,10 +62,13 @@ def train(
         f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "
         f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
-    worth = Added("identified", val["added"], val.get("error", 0.0), val["start"])
-    screen.say(f"the network adds {mrad(worth.less)} ± {mrad(worth.error)} mrad on validation motions (paired)")
+    gain = NetworkGain("identified", val["added"], val.get("error", 0.0), val["start"])
+    screen.say(
+        f"the network reduces the error by {mrad(gain.reduction)} ± {mrad(gain.standard_error)} mrad on validation "
+        "motions (paired)"
+    )
     step = f"gaponet eval {out} {quote(dataset)}"
-    if not worth.helps and val["start"] != val["nominal"]:
+    if not gain.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"
         screen.say("that is within what motions scatter, or less than 2 %: the identified robot is as good without it")
     screen.say(f"model in {trained.path}; next: {step}")

@@ -19,7 +19,7 @@ from gaponet.experiments.outcomes import BASELINES, Show, StudyOutcomes, summari
 from gaponet.experiments.result import Result
 from gaponet.experiments.study import DEFAULT_MODELS, Study
 from gaponet.experiments.train_cell import Outcome
-from gaponet.report.candidate import choose
+from gaponet.report.candidate import select_entries
 from gaponet.report.figures.charts import bars
 from gaponet.report.figures.style import joint_label
 from gaponet.report.methods import palette, title
@@ -67,7 +67,7 @@ class Compare:
         baselines = outcomes.baselines(word)
         runs: Runs = {name: [baselines[name]] for name in BASELINES if name in baselines}
         runs |= {word: list(outcomes.of_word(word)) for word in self.models if outcomes.of_word(word)}
-        entries, unseen = choose([outcomes.cells[word][0].folder], study.data)
+        entries, unseen = select_entries([outcomes.cells[word][0].folder], study.data)
         seeds = max(map(len, runs.values()))
         heading = (
             f"Whole-motion free run on {len(entries)} {'held-out ' if unseen else ''}sequences, mean ± std over "

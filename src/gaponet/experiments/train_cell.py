@@ -17,7 +17,7 @@ from gaponet.experiments.cells import RESULT_FILE, SETUP_FILE, Cell, Report, rea
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.budget import Budget, Status
-from gaponet.report.candidate import choose
+from gaponet.report.candidate import select_entries
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import load_dataset
 from gaponet.sim.metrics import runs, summary
@@ -99,7 +99,7 @@ def evaluate_model(
 ) -> Outcome:
     """Evaluate a run's artifact on its test motions, by group of units."""
     model = GapModel.load(run)
-    sequences = dataset.sequences(choose([run], dataset)[0])
+    sequences = dataset.sequences(select_entries([run], dataset)[0])
     for dt in sorted({s.dt for s in sequences}):
         model.require(robot, dt)
     return _by_group(sequences, robot, model.corrector(robot), holdout, nthread)
@@ -109,7 +109,7 @@ def evaluate_baselines(
     run: Path, dataset: Dataset, nominal: RobotSpec, identified: RobotSpec | None, holdout: tuple[str, ...]
 ) -> Outcome:
     """Evaluate the nominal simulator, the run's delay + offset and the identified simulator on its test motions."""
-    sequences = dataset.sequences(choose([run], dataset)[0])
+    sequences = dataset.sequences(select_entries([run], dataset)[0])
     outcomes = {
         "nominal": _by_group(sequences, nominal, None, holdout),
         "delay_offset": _by_group(sequences, nominal, DelayOffset.read(run).corrector(nominal), holdout),

@@ -1,4 +1,4 @@
-"""What is compared with recordings: an identified robot folder, or a run of gaponet train, a model on top of one."""
+"""Candidates of an evaluation: an identified robot folder, or a run, whose model corrects a simulator."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from gaponet.robot.folder import PROVENANCE_FILE, STORED_ROBOT
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_same_robot, require_stored_robot
 
-DATA = "data of the robot that the run was trained for"
+DATA_HINT = "data of the robot that the run was trained for"
 
 
 class _Origin(TypedDict):
-    """What a robot was identified from: dataset (address, or path from the folder), recordings and motions by part,
-    and what that left on validation motions, rad."""
+    """Data that a robot was identified from: dataset (address, or path from the folder), recordings and motions by
+    split, and the error on validation motions, rad."""
 
     dataset: str
     parts: RunSplit
@@ -36,7 +36,7 @@ class _Origin(TypedDict):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A simulator, and perhaps a model that corrects it.
+    """A simulator, with or without a model that corrects it.
 
     Attributes:
         folder: Robot folder, or run.
@@ -50,14 +50,14 @@ class Candidate:
 
     @classmethod
     def load(cls, folder: Path, robot: RobotSpec) -> Candidate:
-        """A robot folder or a run.
+        """Load a robot folder or a run.
 
         Args:
-            robot: The dataset's, of which this must be the same robot before identification.
+            robot: The dataset's robot; the candidate must be the same robot before identification.
 
         Raises:
             ModelError, RobotError: It is neither, or of another robot.
-            UsageError: Nothing was identified of the robot.
+            UsageError: The robot is not identified.
         """
         if not is_robot(folder):
             return cls(folder, corrected_robot(folder, robot), GapModel.load(folder))
@@ -70,52 +70,59 @@ class Candidate:
 
     @property
     def method(self) -> str:
-        """Its name among the methods compared."""
+        """Key of report.methods.METHODS."""
         return "identified" if self.model is None else method(self.model.config.kind, self.robot)
 
     @property
     def kind(self) -> str:
-        """What the folder is to gaponet.base.files."""
+        """Kind of the folder for gaponet.base.files.lock_folder."""
         return "robot" if self.model is None else "run"
 
     def corrector(self) -> DeltaCorrector | None:
-        """What alters targets on the way, in sim.replay."""
+        """Return the corrector of targets for sim.replay."""
         return None if self.model is None else self.model.corrector(self.robot)
 
     def adaptations(self) -> Mapping[str, Adaptation]:
-        """Units that the model was adapted to."""
+        """Return the units that the model was adapted to."""
         return {} if self.model is None else Adaptation.load(self.folder, self.model.weights_hash())
 
 
 def is_robot(folder: Path) -> bool:
-    """Whether a folder is a robot's own, not a run or a dataset that keeps one."""
+    """Return True for a robot folder, False for a run or a dataset with a stored robot."""
     return (folder / "robot.toml").is_file()
 
 
 def corrected_robot(run: Path, robot: RobotSpec) -> RobotSpec:
-    """The simulator that a run's model corrects, as the run keeps it: the nominal one, or an identified one.
+    """Return the simulator that a run's model corrects, as the run stores it: nominal or identified.
 
     Raises:
-        ModelError: They differ before identification: errors would be told against another baseline.
+        ModelError: The robots differ before identification, so that errors would have another baseline.
     """
-    return require_stored_robot(run, robot, ModelError, DATA)
+    return require_stored_robot(run, robot, ModelError, DATA_HINT)
 
 
-def choose(
+def select_entries(
     folders: list[Path], dataset: Dataset, motions: tuple[str, ...] = (), units: tuple[str, ...] = ()
 ) -> tuple[list[Entry], bool]:
-    """Entries to evaluate, and whether none of them was seen by any of the candidates.
+    """Select recordings for an evaluation. Return them, and True if no candidate was fitted to any of them.
 
-    By default the first one's test part, or else everything, each without what any has seen; where all motions were
-    seen, recordings that were not. A robot folder that does not say what it was identified from counts as having seen
-    everything, and gets everything. Of all these the ones of `units`, if such are named.
+    The default is the test set of the first candidate, or else all recordings, each time without recordings that any
+    candidate was fitted to. If all motions were used, the default is recordings that were not used. A robot folder
+    without an origin counts as fitted to everything and is evaluated on everything.
+
+    Args:
+        motions: Only these motions.
+        units: Only these units.
+
+    Raises:
+        DatasetError: Every recording was used in training.
     """
-    seen = [Seen.by(folder) for folder in folders]
-    if None in seen:
+    data = [FittedData.of_folder(folder) for folder in folders]
+    if None in data:
         return dataset.select(motions, units), False
-    known = [s for s in seen if s is not None]
+    known = [d for d in data if d is not None]
     mine = dataset.select(units=units)
-    fresh = [e for e in mine if not any(e in s for s in known)]
+    fresh = [e for e in mine if not any(e in d for d in known)]
     if motions:
         entries = dataset.select(motions, units)
     else:
@@ -129,10 +136,16 @@ def choose(
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What was trained, identified, chosen or adapted on: recordings, and their motions, whoever played them.
+class FittedData:
+    """Recordings and motions that a folder was trained, identified, validated or adapted on.
 
-    The own test part is unseen, whatever it was held out by: a split by unit or payload tests motions trained on.
+    A recording of the test set is not among them, whatever the split: a split by unit or payload tests motions that
+    were trained on.
+
+    Attributes:
+        hashes: Content hashes of the recordings.
+        motions: Names of their motions.
+        test: Content hashes of the test set.
     """
 
     hashes: frozenset[str]
@@ -140,8 +153,8 @@ class Seen:
     test: frozenset[str]
 
     @classmethod
-    def by(cls, folder: Path) -> Seen | None:
-        """What a run or a robot folder has seen; None where a robot folder does not say."""
+    def of_folder(cls, folder: Path) -> FittedData | None:
+        """Read the data of a run or a robot folder; None if a robot folder has no origin."""
         if is_robot(folder):
             origin = read_origin(folder)
             return None if origin is None else cls._of(origin["parts"], origin["motions"])
@@ -152,23 +165,23 @@ class Seen:
         return cls._of(split_of_run(folder), model.card.get("motions", {}), logs)
 
     @classmethod
-    def _of(cls, split: Any, motions: Mapping[str, Any], more: set[str] | None = None) -> Seen:
+    def _of(cls, split: Any, motions: Mapping[str, Any], more: set[str] | None = None) -> FittedData:
         hashes = {h for part in ("train", "val") for h in split[part].values()} | (more or set())
-        played = {m for part in ("train", "val") for m in motions.get(part, ())}
-        return cls(frozenset(hashes), frozenset(played), frozenset(split["test"].values()) - hashes)
+        used = {m for part in ("train", "val") for m in motions.get(part, ())}
+        return cls(frozenset(hashes), frozenset(used), frozenset(split["test"].values()) - hashes)
 
     def __contains__(self, entry: Entry) -> bool:
         return entry.hash in self.hashes or (entry.hash not in self.test and entry.meta.motion in self.motions)
 
 
 def split_of_run(run: Path) -> dict[str, dict[str, str]]:
-    """{part: {sequence id: content hash}} of a run."""
+    """Read {split: {sequence id: content hash}} of a run."""
     hint = "give a run folder of gaponet train"
     return dict(read_json(RunSplit, run / "split.json", ModelError, hint))  # type: ignore[arg-type]
 
 
 def read_origin(folder: Path) -> _Origin | None:
-    """What a robot folder was identified from; None where nobody noted it.
+    """Read the data that a robot folder was identified from; None if it is not stated.
 
     Raises:
         RobotError: Damaged.

@@ -1,4 +1,4 @@
-"""Nominal, identified and learned simulators side by side: free runs with the shipped artifact (ONNX, not torch)."""
+"""Evaluation of nominal, identified and learned simulators: open-loop rollouts with the exported artifact (ONNX)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.delay_offset import DelayOffset
-from gaponet.report.candidate import Candidate, choose, is_robot
+from gaponet.report.candidate import Candidate, is_robot, select_entries
 from gaponet.report.methods import IDENTIFIED, title
 from gaponet.report.verdict import LEARNED
 from gaponet.robot.spec import RobotSpec
@@ -33,7 +33,7 @@ from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 
 T = TypeVar("T")
-SHOWN = 8  # sequences whose trajectories are kept for the report
+STORED_TRAJECTORIES = 8  # for the report
 ORDER = (
     "nominal",
     "delay_offset",
@@ -47,12 +47,12 @@ ORDER = (
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Free runs by method, their metrics, and the corrections applied by each learned model.
+    """Rollouts by method, their metrics, and the corrections applied by each learned model.
 
     Attributes:
-        result: methods → method → metrics (mpjae rad, q_dis rad·s, …), and by_joint, by_motion, … the same; unseen says
-            whether no recording was used in training.
-        runs: Method → free runs, one per sequence.
+        result: methods → method → metrics (mpjae rad, q_dis rad·s, …; by_joint, by_motion, … the same); unseen is
+            true if no recording was used in training.
+        runs: Method → rollouts, one per sequence.
         ctrl: Commands, (T, n operated) rad, one array per sequence.
         deltas: Method → corrections applied, (T, n operated) rad, one array per sequence.
     """
@@ -63,9 +63,9 @@ class Evaluation:
     deltas: dict[str, list[Array]]
 
     def save(self, folder: Path) -> None:
-        """Write metrics.json and trajectories.npz, all that the report needs, into a run or robot folder."""
+        """Write metrics.json and trajectories.npz, which the report reads, into a run or robot folder."""
         reals = self.runs["nominal"]
-        picked = evenly(list(range(len(reals))), SHOWN)
+        picked = evenly_spaced(list(range(len(reals))), STORED_TRAJECTORIES)
         shown = [reals[i].meta for i in picked]
         result = self.result | {
             "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -97,38 +97,44 @@ def evaluate(
     target: RobotSpec | None = None,
     units: tuple[str, ...] = (),
 ) -> Evaluation:
-    """Step every method through the chosen sequences, from the recorded start, the recording not looked at again.
+    """Roll out every method from the first recorded state under the recorded commands.
 
     Args:
-        folders: Identified robots and training runs; nothing that one of them was fitted or chosen on is chosen or
-            called unseen. The first one's test motions and delay + offset baseline apply.
-        robot: The dataset's, which must be theirs before identification: the baseline is theirs.
-        motions: Only these; default: the test motions of the dataset trained on; of another, all that was never
-            trained on.
-        target: Another simulator, to be shown as it is and with the first of folders transferred into it.
-        units: Only recordings of these.
+        folders: Identified robots and training runs. Recordings that any of them was fitted to are not selected by
+            default and not called unseen. The test motions and the delay + offset baseline are those of the first.
+        robot: The dataset's robot; the folders' robots must equal it before identification.
+        motions: Only these; default: the test motions of the dataset trained on; of another dataset, all motions that
+            were never trained on.
+        target: Another simulator, evaluated as it is and with the first folder transferred into it.
+        units: Only recordings of these units.
+
+    Raises:
+        UsageError: Two runs of one method, or several identified simulators.
+        ModelError, RobotError: A folder does not fit the robot.
     """
     dataset.require_robot(robot)
-    known: dict[str, Candidate] = {}
+    candidates: dict[str, Candidate] = {}
     for path in folders:
-        one = Candidate.load(path, robot)
-        if one.method in known:
-            raise UsageError(f"{path}: a second run of {title(one.method)}; give runs of different methods")
-        known[one.method] = one
-    first = next(iter(known.values()))
-    models = {name: c.model for name, c in known.items() if c.model is not None}
+        candidate = Candidate.load(path, robot)
+        if candidate.method in candidates:
+            raise UsageError(f"{path}: a second run of {title(candidate.method)}; give runs of different methods")
+        candidates[candidate.method] = candidate
+    first = next(iter(candidates.values()))
+    models = {name: c.model for name, c in candidates.items() if c.model is not None}
     nominal = first.robot.before_identification
-    entries, unseen = choose(list(folders), dataset, motions, units)
+    entries, unseen = select_entries(list(folders), dataset, motions, units)
     sequences = dataset.sequences(entries)
     for (name, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
-        model.require(known[name].robot, dt)
+        model.require(candidates[name].robot, dt)
     done_runs: dict[str, list[Run]] = {}
     deltas: dict[str, list[Array]] = {}
     op = robot.operated_index
     ctrl = [s.ctrl[:, op] for s in sequences]
     moved = [np.ptp(c, axis=0) > MOVED for c in ctrl]
     simulators: dict[str, str] = {}
-    for name, simulator, corrector in itertools.chain(_methods(known, nominal), _transferred(target, first, nominal)):
+    for name, simulator, corrector in itertools.chain(
+        _methods(candidates, nominal), _transferred(target, first, nominal)
+    ):
         simulators[name] = model_hash(simulator)
         twins = replay(sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True)
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
@@ -169,33 +175,33 @@ def _command(folders: ListOf[Path], dataset: Path | str, motions: tuple[str, ...
     return shlex.join(words + (["--motions", ",".join(motions)] if motions else []))
 
 
-def evenly(items: list[T], most: int) -> list[T]:
-    """All, or so many of them evenly spaced, the first and the last among them."""
-    if len(items) <= most:
+def evenly_spaced(items: list[T], limit: int) -> list[T]:
+    """Return at most `limit` items, evenly spaced, with the first and the last."""
+    if len(items) <= limit:
         return items
-    return [items[round(i)] for i in np.linspace(0, len(items) - 1, most)]
+    return [items[round(i)] for i in np.linspace(0, len(items) - 1, limit)]
 
 
-def _methods(known: dict[str, Candidate], nominal: RobotSpec) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
-    """Name, simulator and corrector of everything compared, in the order of ORDER."""
+def _methods(candidates: dict[str, Candidate], nominal: RobotSpec) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
+    """Yield name, simulator and corrector of every method, in the order of ORDER."""
     yield "nominal", nominal, None
-    folder = next(iter(known.values())).folder
+    folder = next(iter(candidates.values())).folder
     if (folder / "delay_offset.json").is_file():
         yield "delay_offset", nominal, DelayOffset.read(folder).corrector(nominal)
-    identified = {model_hash(c.robot): c.robot for c in known.values() if c.robot.nominal is not None}
+    identified = {model_hash(c.robot): c.robot for c in candidates.values() if c.robot.nominal is not None}
     if len(identified) > 1:
         raise UsageError("these start from different identified simulators; compare those of one identification")
     for robot in identified.values():
         yield "identified", robot, None
-    for name in sorted(known, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):
-        if known[name].model is not None:
-            yield name, known[name].robot, known[name].corrector()
+    for name in sorted(candidates, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):
+        if candidates[name].model is not None:
+            yield name, candidates[name].robot, candidates[name].corrector()
 
 
 def _transferred(
     target: RobotSpec | None, first: Candidate, nominal: RobotSpec
 ) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
-    """The same of another simulator, whose gains, where a log says others, change by as much as the nominal ones."""
+    """Yield the same of another simulator; gains of a log change it by as much as they change the nominal one."""
     if target is None:
         return
     simulator = replace(target, nominal=target.nominal or nominal)
@@ -206,23 +212,23 @@ def _transferred(
 
 def _by_unit(
     sequences: list[Sequence],
-    one: Candidate,
+    candidate: Candidate,
     adapted: Mapping[str, Adaptation],
     progress: Callable[[int, int], None],
 ) -> list[Twin]:
-    """The model in each unit's own simulator; in the common one where a unit is not adapted."""
+    """Roll out the model in each unit's adapted simulator, or in the common one for other units."""
     twins: dict[int, Twin] = {}
     for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
         rows = [i for i, s in enumerate(sequences) if s.meta.unit_id == unit]
-        physics = adapted[unit].robot(one.robot) if unit in adapted else one.robot
-        part = replay([sequences[i] for i in rows], physics, one.corrector(), lock_idle=True)
+        physics = adapted[unit].robot(candidate.robot) if unit in adapted else candidate.robot
+        part = replay([sequences[i] for i in rows], physics, candidate.corrector(), lock_idle=True)
         twins |= dict(zip(rows, part, strict=True))
         progress(len(twins), len(sequences))
     return [twins[i] for i in range(len(sequences))]
 
 
 def _delta_summary(parts: list[Array], sequences: list[Sequence], limit: float) -> dict[str, float]:
-    """Size of the corrections: mean and largest |Δa| rad, mean rate rad/s, share of them at the limit Δ_max (rad)."""
+    """Return mean and largest |Δa|, rad, their mean rate, rad/s, and the share at the limit Δ_max (rad)."""
     dt = float(np.median([s.dt for s in sequences]))
     return {
         "mean": float(np.mean([np.abs(d).mean() for d in parts])),

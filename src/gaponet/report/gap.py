@@ -1,5 +1,5 @@
-"""Where the gap comes from: what each step from the nominal simulator to the identified one, and to a model on top of
-it, removes; and the floor."""
+"""Sources of the gap: the error after each step from the nominal to the identified simulator and to a model on top of
+it, and the error floor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.nn.delay_offset import DelayOffset
-from gaponet.report.candidate import Candidate, choose
+from gaponet.report.candidate import Candidate, select_entries
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Run, metrics, runs, standard_error
 from gaponet.sim.metrics import summary as errors_of
@@ -28,53 +28,55 @@ from gaponet.sim.replay import Corrector, replay
 
 
 def gap_by_step(
-    one: Candidate,
+    candidate: Candidate,
     dataset: Dataset,
     motions: tuple[str, ...] = (),
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
-    """Mean |error| left after each step, in free run over whole motions that the robot folder or the run never saw.
+    """Mean |error| after each step, in open-loop rollouts of motions that the candidate was not fitted to.
 
     Steps: nominal; of a run, delay (fitted on the training motions) and offset (delay and offset); of an identified
-    simulator its CAUSES, one after the other, and that friction holds ("creep": "friction" itself creeps as MuJoCo's
-    does); of a run, its model. Standard errors are over motions, of what a step removes motion by motion (paired);
-    what causes remove depends on their order. "unexplained" is what is left above the floor.
+    simulator its CAUSES, one after the other, and static friction that holds ("creep": with the step "friction" alone,
+    friction creeps as MuJoCo's does); of a run, its model. Standard errors are over motions, of paired reductions. The
+    reduction by a cause depends on the order of causes. "unexplained" is the error above the floor.
 
     Args:
-        one: An identified robot, or a run: its recordings, baseline, simulator and model apply.
+        candidate: An identified robot, or a run; its recordings, baseline, simulator and model are used.
 
     Returns:
         {"methods": {nominal, identified, …: metrics.summary}, "left": {step: rad}, "removed": {step: [rad, standard
         error]}, "unexplained": rad, "by_joint": {joint: the same and "floor"}, "by_payload": {kg: {step: rad}},
-        "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …}; a floor that is unknown is None, and so is
-        what is left above it.
+        "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …}; an unknown floor is None, and so is the
+        error above it.
     """
-    robot = one.robot
+    robot = candidate.robot
     dataset.require_robot(robot)
     nominal = robot.before_identification
-    entries, unseen = choose([one.folder], dataset, motions)
+    entries, unseen = select_entries([candidate.folder], dataset, motions)
     sequences = dataset.sequences(entries)
-    found, done = causes(robot), {}
-    for name, physics, corrector in _steps(one, found):
-        told = with_note(progress, name)
-        twins = replay(sequences, physics, corrector, lock_idle=True, progress=told, creeps=name == "friction")
+    causes, done = cause_steps(robot), {}
+    for name, physics, corrector in _steps(candidate, causes):
+        report = with_note(progress, name)
+        twins = replay(sequences, physics, corrector, lock_idle=True, progress=report, creeps=name == "friction")
         done[name] = runs(sequences, [t.qpos for t in twins], robot)
     units = {s.meta.unit_id for s in sequences}
     others = (dataset.sequences([e])[0] for e in dataset.entries if e.meta.unit_id in units)
-    floors = floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
+    floors = error_floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
     floors["all"] = {k: _mean([f[k] for f in floors.values()]) for k in ("encoder", "repeatability", "both")}
     last = list(done)[-1]
     methods = {"nominal": "nominal"} | ({"delay_offset": "offset"} if "offset" in done else {})
-    methods |= ({"identified": found[-1][0]} if found else {}) | ({one.method: last} if one.model is not None else {})
+    methods |= ({"identified": causes[-1][0]} if causes else {}) | (
+        {candidate.method: last} if candidate.model is not None else {}
+    )
     return {
         "methods": {name: errors_of(done[step], robot) for name, step in methods.items()},
         "left": {name: metrics(part)["mpjae"] for name, part in done.items()},
-        "removed": removed(done),
+        "removed": reductions(done),
         "unexplained": _above(metrics(done[last])["mpjae"], floors["all"]["both"]),
         "by_joint": {
             j: {
                 "left": {n: metrics(part, [i])["mpjae"] for n, part in done.items()},
-                "removed": removed(done, [i]),
+                "removed": reductions(done, [i]),
                 "unexplained": _above(metrics(done[last], [i])["mpjae"], floors[j]["both"]),
                 "floor": floors[j],
             }
@@ -91,26 +93,26 @@ def gap_by_step(
         "hours": sum(e.rows * e.dt for e in entries) / 3600,
         "simulator_hash": model_hash(nominal),
         "simulators": {"nominal": model_hash(nominal)}
-        | ({"identified": model_hash(robot)} if found else {}),
+        | ({"identified": model_hash(robot)} if causes else {}),
         "dataset": dataset.path.name,
         "robot": robot.name,
     }  # fmt: skip
 
 
-def _steps(one: Candidate, found: list[tuple[str, RobotSpec]]) -> list[tuple[str, RobotSpec, Corrector | None]]:
-    """Name, simulator and correction of each step, from the nominal simulator over the causes to the model."""
-    nominal = one.robot.before_identification
+def _steps(candidate: Candidate, causes: list[tuple[str, RobotSpec]]) -> list[tuple[str, RobotSpec, Corrector | None]]:
+    """Return name, simulator and corrector of each step, from the nominal simulator over the causes to the model."""
+    nominal = candidate.robot.before_identification
     start: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
-    middle: list[tuple[str, RobotSpec, Corrector | None]] = [(cause, physics, None) for cause, physics in found]
-    if one.model is None:
+    middle: list[tuple[str, RobotSpec, Corrector | None]] = [(cause, physics, None) for cause, physics in causes]
+    if candidate.model is None:
         return start + middle
-    fitted = DelayOffset.read(one.folder)
+    fitted = DelayOffset.read(candidate.folder)
     only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
     start += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
-    return [*start, *middle, (one.method, one.robot, one.corrector())]
+    return [*start, *middle, (candidate.method, candidate.robot, candidate.corrector())]
 
 
-# What an identified simulator differs in from the nominal one, in the order in which steps adopt it.
+# Fields in which an identified simulator differs from the nominal one, in the order of the steps.
 CAUSES = {
     "gain": ("kp", "kd", "damping", "armature", "delay", "target_speed", "offset", "effort_limit"),
     "friction": ("frictionloss",),
@@ -122,8 +124,8 @@ CAUSES = {
 }
 
 
-def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
-    """The simulators between the nominal and the identified one; the last one is the identified one itself."""
+def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
+    """Return the simulators from the first cause on; the last one is the identified simulator."""
     if simulator.nominal is None:
         return []
     robot, steps = simulator.before_identification, []
@@ -141,8 +143,8 @@ def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
     return steps
 
 
-def removed(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
-    """How far each step lowers the error, and its standard error over motions, rad."""
+def reductions(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
+    """Return the reduction of the error by each step and its standard error over motions, rad."""
     held = {name: [(r, c) for r in part if (c := r.holds(columns)) is None or c] for name, part in done.items()}
     errors = {name: np.array([np.abs(r.error if c is None else r.error[:, c]).mean() for r, c in part])
               for name, part in held.items()}  # fmt: skip
@@ -150,7 +152,7 @@ def removed(done: dict[str, list[Run]], columns: list[int] | None = None) -> dic
     return {name: [float(x.mean()), standard_error(x)] for name, x in less.items()}
 
 
-def floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
+def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
     """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability", "both"}, rad; None if unknown.
 
     An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from one repetition, or
@@ -165,13 +167,14 @@ def floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str
         for period in Repetitions.periods(s):
             groups[*same, "period"].add(period)
     repeated = [g.result() for g in groups.values() if g.count > 1]
-    spread = Repetitions.summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
-    found: dict[str, dict[str, float | None]] = {}
+    std = Repetitions.summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
+    floors: dict[str, dict[str, float | None]] = {}
     for i, joint in enumerate(robot.operated):
         encoder = encoder_step([a[:, i] for a in angles]) / 4 or None
-        again = spread[joint] * np.sqrt(2 / np.pi) if joint in spread else None
-        found[joint] = {"encoder": encoder, "repeatability": again, "both": max(encoder or 0.0, again or 0.0) or None}
-    return found
+        repeatability = std[joint] * np.sqrt(2 / np.pi) if joint in std else None
+        both = max(encoder or 0.0, repeatability or 0.0) or None
+        floors[joint] = {"encoder": encoder, "repeatability": repeatability, "both": both}
+    return floors
 
 
 def _mean(values: ListOf[float | None]) -> float | None:

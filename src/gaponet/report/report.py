@@ -22,7 +22,7 @@ from gaponet.report.methods import method, title
 from gaponet.report.page import PageFigure, inline_image, page_figure, render
 from gaponet.report.run_files import REPAIR_HINT, read_config, read_gap, read_metrics, read_progress, read_trajectories
 from gaponet.report.tables import by_group, mrad, mrad_and_degrees, totals
-from gaponet.report.verdict import added, verdict
+from gaponet.report.verdict import network_gain, verdict
 from gaponet.robot.folder import has_stored_robot, load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_stored_robot
@@ -264,7 +264,7 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
         )
     done, planned = card.get("stages", {}).get("warm_start_rounds", (0, 0))
     if done < planned:
-        longer = "" if "identified" in methods and not added(methods, own).helps else "; train longer"
+        longer = "" if "identified" in methods and not network_gain(methods, own).helps else "; train longer"
         out.append(f"Undertrained: the budget ended after {done} of {planned} rounds of the supervised start{longer}.")
     if card.get("interrupted"):
         out.append("Training was interrupted before its budget was out.")

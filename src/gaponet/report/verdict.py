@@ -1,4 +1,4 @@
-"""What errors by method say in a sentence or two: what is left, what a network adds, and which command comes next."""
+"""Conclusions from the errors of methods: the remaining error, the gain of a network, the next command."""
 
 from __future__ import annotations
 
@@ -13,84 +13,82 @@ from gaponet.robot.folder import STORED_ROBOT
 from gaponet.sim.metrics import standard_error
 
 LEARNED = ("inverse", "mlp", "shared_mlp", "paper", "gaponet")  # kinds of model
-ALONE = ("nominal", "delay_offset", "identified")  # methods without a network
-WORTH = 0.02  # share of what is left that a network must remove, besides its standard error
+WITHOUT_NETWORK = ("nominal", "delay_offset", "identified")
+MIN_RELATIVE_REDUCTION = 0.02  # of the base's error, by a network that is worth having
 
 Scores = dict[str, Any]  # method → its metrics (metrics.summary)
 
 
-class Added(NamedTuple):
-    """What a network removes of the error of the best method without one, rad.
+class NetworkGain(NamedTuple):
+    """Reduction of the error by a network, rad.
 
     Attributes:
-        base: That method.
-        less: Mean over motions, negative where the network is worse.
-        error: Its standard error over motions (paired); NaN of one motion.
-        left: What the base leaves.
+        base: The best method without a network.
+        reduction: Mean over motions; negative if the network is worse.
+        standard_error: Standard error of the reduction over motions (paired); NaN for one motion.
+        base_error: Error of the base.
     """
 
     base: str
-    less: float
-    error: float
-    left: float
+    reduction: float
+    standard_error: float
+    base_error: float
 
     @property
     def helps(self) -> bool:
-        """Whether it is worth having: more than its standard error and than WORTH."""
-        return self.less > max(np.nan_to_num(self.error), WORTH * self.left)
+        """True if the reduction exceeds its standard error and MIN_RELATIVE_REDUCTION."""
+        return self.reduction > max(np.nan_to_num(self.standard_error), MIN_RELATIVE_REDUCTION * self.base_error)
 
 
-def added(methods: Scores, own: str) -> Added:
-    """What the network of method `own` adds."""
+def network_gain(methods: Scores, own: str) -> NetworkGain:
+    """Return the gain of the network of method `own`."""
     base = "identified" if own.startswith(IDENTIFIED) else min(
-        (name for name in ALONE if name in methods), key=lambda name: methods[name]["mpjae"]
+        (name for name in WITHOUT_NETWORK if name in methods), key=lambda name: methods[name]["mpjae"]
     )  # fmt: skip
     before, after = (methods[name] for name in (base, own))
-    apart = [before["by_motion"][m]["mpjae"] - after["by_motion"][m]["mpjae"] for m in before["by_motion"]]
-    return Added(base, before["mpjae"] - after["mpjae"], standard_error(np.array(apart)), before["mpjae"])
+    paired = [before["by_motion"][m]["mpjae"] - after["by_motion"][m]["mpjae"] for m in before["by_motion"]]
+    error = standard_error(np.array(paired))
+    return NetworkGain(base, before["mpjae"] - after["mpjae"], error, before["mpjae"])
 
 
 def verdict(methods: Scores) -> list[str]:
-    """Sentences: the nominal error, what identification leaves of it, and what each network adds, be it 0.00."""
+    """Return sentences: the nominal error, the error after identification, and the gain of each network."""
     nominal = methods["nominal"]["mpjae"]
     by_joint = methods["nominal"]["by_joint"]
     worst = max(by_joint, key=lambda joint: by_joint[joint]["mpjae"])
-    said = [
+    sentences = [
         f"The nominal simulator is {_mrad(nominal)} mrad ({np.degrees(nominal):.2f}°) from the robot, most at {worst} "
         f"({_mrad(by_joint[worst]['mpjae'])})."
     ]
     if "identified" in methods:
-        left = methods["identified"]["mpjae"]
-        said.append(
-            f"Identification leaves {_mrad(left)} mrad, {_change(left, nominal)}"
-            + ("." if left < nominal else ": identify again, on logs like these.")
-        )
-    for own in methods:
-        if own.removeprefix(IDENTIFIED) in LEARNED:
-            said.append(_network(methods, own))
-    return said
+        error = methods["identified"]["mpjae"]
+        change = f"{100 * abs(1 - error / nominal):.0f} % {'less' if error <= nominal else 'MORE'}"
+        end = "." if error < nominal else ": identify again, on logs like these."
+        sentences.append(f"After identification the error is {_mrad(error)} mrad, {change}{end}")
+    return sentences + [_about_network(methods, own) for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
 
 
-def _network(methods: Scores, own: str) -> str:
-    more, left = added(methods, own), methods[own]["mpjae"]
-    error = "" if np.isnan(more.error) else f" ± {_mrad(more.error)}"
-    what = (
-        f"{title(own)} leaves {_mrad(left)} mrad: its network adds {_mrad(more.less)}{error} mrad to {title(more.base)}"
+def _about_network(methods: Scores, own: str) -> str:
+    gain, error = network_gain(methods, own), methods[own]["mpjae"]
+    uncertainty = "" if np.isnan(gain.standard_error) else f" ± {_mrad(gain.standard_error)}"
+    text = (
+        f"With {title(own)} the error is {_mrad(error)} mrad: its network reduces the error of {title(gain.base)} by "
+        f"{_mrad(gain.reduction)}{uncertainty} mrad"
     )
-    if more.helps:
-        return f"{what}, {100 * more.less / more.left:.0f} % of what that leaves."
-    return f"{what}: leave it out."
+    return (
+        f"{text}, {100 * gain.reduction / gain.base_error:.0f} %." if gain.helps else f"{text}: leave the network out."
+    )
 
 
 def next_step(methods: Scores, dataset: str, folder: Path | None = None, reported: bool = False) -> str:
-    """The command that fits: identify where nothing was identified, export where a network adds nothing, else report.
+    """Return the next command: identify, or export without a useful network, else report.
 
     Args:
-        folder: The identified robot's, or the run's.
-        reported: The report is there; a run's model is exported.
+        folder: Folder of the identified robot or of the run.
+        reported: The report exists; a run's model is exported.
     """
     networks = [own for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
-    if any(added(methods, own).helps for own in networks):
+    if any(network_gain(methods, own).helps for own in networks):
         return shlex.join(
             ["gaponet", *(["export", str(folder), "--to", "torch"] if reported else ["report", str(folder)])]
         )
@@ -101,7 +99,3 @@ def next_step(methods: Scores, dataset: str, folder: Path | None = None, reporte
 
 def _mrad(value: float) -> str:
     return f"{round(1e3 * value, 2) + 0.0:.2f}"  # no −0.00
-
-
-def _change(left: float, before: float) -> str:
-    return f"{100 * abs(1 - left / before):.0f} % {'less' if left <= before else 'MORE'}"

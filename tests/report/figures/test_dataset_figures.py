@@ -7,7 +7,7 @@ from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import DatasetError
 from gaponet.data.store import Dataset
-from gaponet.report.evaluate import evenly
+from gaponet.report.evaluate import evenly_spaced
 from gaponet.report.figures import dataset_figures as draw
 from gaponet.report.figures.draw_dataset import PICTURES, draw_all, liveliest, swing
 from gaponet.report.figures.style import save
@@ -76,8 +76,8 @@ def test_spikes_are_no_swing():
 
 
 def test_items_are_chosen_evenly():
-    assert evenly([1, 2, 3], 5) == [1, 2, 3]
-    assert evenly(list(range(101)), 3) == [0, 50, 100]
+    assert evenly_spaced([1, 2, 3], 5) == [1, 2, 3]
+    assert evenly_spaced(list(range(101)), 3) == [0, 50, 100]
 
 
 def test_virtual_stands_in_the_title(dataset, arm):

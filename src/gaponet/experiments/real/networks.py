@@ -18,7 +18,7 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.budget import Budget
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
-from gaponet.report.verdict import Added
+from gaponet.report.verdict import NetworkGain
 
 BASES = {"": nominal, "identification + ": identified}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
@@ -65,8 +65,8 @@ def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
         trainer.run()
     model = GapModel.load(training)
     val = model.card["val_mpjae"]
-    gain = Added(base, val["added"], val.get("error", np.nan), val["start"])
-    note = f"{100 * gain.less / gain.left:.0f} % less on validation"
+    gain = NetworkGain(base, val["added"], val.get("error", np.nan), val["start"])
+    note = f"{100 * gain.reduction / gain.base_error:.0f} % less on validation"
     if base and not gain.helps:
         return replace(start, note=f"{LEFT_OUT}: {note}")
     return replace(start, corrector=model.corrector(start.robot), note=note)

@@ -36,7 +36,7 @@ from gaponet.experiments.virtual.statistics import (
 )
 from gaponet.experiments.virtual.tracking_runs import ExampleMotion, Score, align, track
 from gaponet.experiments.virtual.unseen_motions import UnseenMotion, from_files, generated, require_unseen
-from gaponet.report.candidate import choose
+from gaponet.report.candidate import select_entries
 from gaponet.report.figures.charts import JointTrajectory, against, draw_bars
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 from gaponet.report.methods import colour, title
@@ -74,7 +74,7 @@ class Tracking(UnitExperiment):
         """Execute the motions on the unit; recordings of a real robot allow alignment alone."""
         robot, trained = session.robot, session.trained
         if not any(e.meta.virtual for e in session.data.entries):
-            entries, unseen = choose([t.run for t in trained], session.data)
+            entries, unseen = select_entries([t.run for t in trained], session.data)
             scores = align(session.data.sequences(entries), ["recorded"] * len(entries), robot, trained, progress)
             motions = len({e.meta.motion for e in entries})
             return TrackingScores(scores, None, [], {"test_motions": motions, "unseen": unseen})

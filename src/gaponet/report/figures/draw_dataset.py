@@ -16,7 +16,7 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.data.repeatability import MOVED
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
-from gaponet.report.evaluate import evenly
+from gaponet.report.evaluate import evenly_spaced
 from gaponet.report.figures import dataset_figures as draw
 from gaponet.report.figures.style import save
 from gaponet.report.provenance import robot_label
@@ -79,7 +79,7 @@ class _Nothing(Exception):  # noqa: N818
 def joint_ranges(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     """Positions of each operated joint, of sequences that command it to move."""
     kept: dict[str, list[Array]] = defaultdict(list)
-    entries = evenly(dataset.entries, RANGE_SEQUENCES)
+    entries = evenly_spaced(dataset.entries, RANGE_SEQUENCES)
     stride = max(1, sum(e.rows for e in entries) // RANGE_ROWS)
     for entry in entries:
         arrays = dataset.channels(entry, ("ctrl", "qpos"))
@@ -105,7 +105,7 @@ def composition(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
 def torque_temperature(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     """The motion whose torques change most, at up to four payloads, and the joints that bear it."""
     group = liveliest(dataset, robot)
-    payloads = evenly(sorted({e.meta.payload_mass for e in group}), 4)
+    payloads = evenly_spaced(sorted({e.meta.payload_mass for e in group}), 4)
     takes = {p: shown(dataset.read(next(e for e in group if e.meta.payload_mass == p))) for p in payloads}
     heaviest = takes[max(takes)]
     assert heaviest.tau is not None
@@ -139,7 +139,7 @@ def gap_by_payload(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     whole = [g for g in groups if {e.meta.payload_mass for e in g} == payloads]
     if len(payloads) < 2 or not whole:
         raise _Nothing("no motion was played with several payloads")
-    chosen = evenly(whole, max(1, GAP_SEQUENCES // len(payloads)))
+    chosen = evenly_spaced(whole, max(1, GAP_SEQUENCES // len(payloads)))
     entries = [next(e for e in g if e.meta.payload_mass == p) for g in chosen for p in sorted(payloads)]
     pair_dataset(dataset, robot, tell, entries)
     errors: dict[float, list[Array]] = defaultdict(list)
@@ -180,7 +180,7 @@ def liveliest(dataset: Dataset, robot: RobotSpec) -> list[Entry]:
         rows = dataset.channels(entry, ("tau",))["tau"][: round(SHOWN_S / entry.dt)]
         return float(swing(rows[:, robot.operated_index]).mean())
 
-    return max(evenly(list(full.values()), MOTIONS), key=torque)
+    return max(evenly_spaced(list(full.values()), MOTIONS), key=torque)
 
 
 def swing(values: Array) -> Array:

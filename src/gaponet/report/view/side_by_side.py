@@ -14,7 +14,7 @@ from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import busiest
 from gaponet.data.store import Dataset, Entry
-from gaponet.report.candidate import Candidate, Seen
+from gaponet.report.candidate import Candidate, FittedData
 from gaponet.report.methods import colour, title
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import Corrector, replay
@@ -96,7 +96,7 @@ def pick(
 ) -> Entry:
     """The first sequence that fits; among those that no run has seen, where one of them fits."""
     entries = dataset.select((motion,) if motion else ())
-    entries = sorted(entries, key=lambda e: was_seen(e, runs))
+    entries = sorted(entries, key=lambda e: was_used(e, runs))
     asked = [
         e for e in entries
         if unit in ("", e.meta.unit_id) and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
@@ -144,10 +144,10 @@ def side_by_side(
     op = robot.operated_index
     motions = tuple(Copy(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
     known = [*runs, *([robot.folder] if robot.nominal is not None else [])]
-    return SideBySide(real, robot, motions, was_seen(entry, known) if known else None)
+    return SideBySide(real, robot, motions, was_used(entry, known) if known else None)
 
 
-def was_seen(entry: Entry, folders: ListOf[Path]) -> bool:
-    """Whether any of the runs or robot folders was fitted or chosen on a recording, or does not say."""
-    seen = [Seen.by(folder) for folder in folders]
-    return any(s is None or entry in s for s in seen)
+def was_used(entry: Entry, folders: ListOf[Path]) -> bool:
+    """Return True if any run or robot folder was fitted or validated on a recording, or does not say."""
+    data = [FittedData.of_folder(folder) for folder in folders]
+    return any(d is None or entry in d for d in data)
