@@ -6,7 +6,8 @@ FOLDER holds weights.npz (their state dict by its names) and pairs.npz (model_ob
 their code). Exit code 1 above 1e-6.
 
 With --logs, the network corrects the targets of the nominal H1-2 over the recordings in that folder (the set h1_2 of
-`gaponet bench real`). Nothing is fitted to them, so every recording is a test. ± is the standard error over commands.
+`gaponet experiment real`). Nothing is fitted to them, so every recording is a test. ± is the standard error over
+commands.
 Differences to the nominal simulator are paired.
 
 pairs.npz does not show what the inputs mean: they are independent normal numbers (correlation between blocks of ten

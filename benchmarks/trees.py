@@ -1,6 +1,6 @@
 """A rival of networks: gradient-boosted trees on the same labels, one ensemble for each joint.
 
-    gaponet bench real --method benchmarks/trees.py:on_identified        needs scikit-learn
+    gaponet experiment real --method benchmarks/trees.py:on_identified        needs scikit-learn
 
 They see position, speed and a − q of all operated joints and the payload; fitted on the states that the labels lead to,
 then on those that the trees themselves lead to as well. Among the methods of the real robots they stand on top of

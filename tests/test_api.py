@@ -17,7 +17,7 @@ def test_public_names_are_there_and_what_is_not_says_what_is():
     assert {"import_logs", "train", "evaluate", "GapModel"} <= set(dir(gp))
     for name in dir(gp):
         assert getattr(gp, name) is not None
-    with pytest.raises(AttributeError, match=r"no attribute 'fit'; it offers import_logs, doctor, pair, gap"):
+    with pytest.raises(AttributeError, match=r"no attribute 'fit'; it offers adapt_model, adapt_robot, check"):
         gp.fit  # noqa: B018
 
 
@@ -36,16 +36,16 @@ def test_from_a_dataset_to_an_evaluated_model(tmp_path, capsys):
     data = Dataset.create(tmp_path / "data", robot)
     for sequence in recordings(robot, 8, kp=0.5, delay=2):
         data.append(sequence)
-    assert gp.pair(data, robot) == 8
-    nominal = gp.gap(data, robot)["methods"]["nominal"]["mpjae"]
-    assert gp.doctor(data, robot).verdict
+    assert gp.pair(data, robot=robot).simulated == 8
+    nominal = gp.gap(data, robot=robot).mpjae["nominal"]
+    assert gp.doctor(data, robot=robot).verdict
     small = TrainConfig(
         ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
         warm_start=PretrainingConfig(rounds=2, num_envs=16, steps=60, gradient_steps=60, batch_size=256),
     )
-    model = gp.train(data, tmp_path / "run", budget=str(2 * 16 * 60), config=small, robot=robot)
-    found = gp.evaluate(model, data, robot=robot).result
-    assert found["unseen"]
-    assert found["methods"]["gaponet"]["mpjae"] < 0.8 * nominal
+    model = gp.train(data, out=tmp_path / "run", budget=str(2 * 16 * 60), config=small, robot=robot).model
+    found = gp.evaluate(model, data, robot=robot)
+    assert found.unseen
+    assert found.mpjae["gaponet"] < 0.8 * nominal
     loop = model.loop()
     assert np.isfinite(loop.delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()

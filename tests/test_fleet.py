@@ -1,4 +1,4 @@
-"""gaponet fleet: a night of many robots, those that drifted adapted, and who since when."""
+"""gaponet check --fleet: a night of many robots, those that drifted adapted, and who since when."""
 
 import json
 from dataclasses import replace
@@ -49,7 +49,7 @@ def asked(site, name, capsys):
     code = 0
     words = [site / "robots", site / name, "--out", site / "out", "--night", name, "--workers", "2", "--json"]
     try:
-        code = main(["fleet", *map(str, words)])
+        code = main(["check", "--fleet", *map(str, words)])
     except SystemExit as end:
         code = end.code
     return code, json.loads(capsys.readouterr().out)["robots"]
@@ -64,8 +64,8 @@ def test_two_nights_of_three_arms(site, capsys):
     assert {tuple(number) for number in second["a2"]["numbers"]} == {("shoulder", "kp"), ("elbow", "kp")}
     before, after = second["a2"]["adapted"]
     assert after < 0.5 * before
-    today = ParameterUncertainty.load(load_robot(site / "out" / "calibrated" / "a2"))
-    assert [s["made_by"] for s in today.sources][-1] == "calibrate"
+    today = ParameterUncertainty.load(load_robot(site / "out" / "adapted" / "a2"))
+    assert [s["made_by"] for s in today.sources][-1] == "adapt"
     assert since(history(site / "out" / "a2.json")) == "night2"
     page = (site / "out" / "fleet.html").read_text(encoding="utf-8")
     assert "3 robots: 1 same, 1 drifted, 1 not asked" in page
@@ -89,5 +89,5 @@ def test_it_drifted_since_the_first_night_in_a_row():
 
 
 def test_a_folder_without_robots_is_refused(tmp_path, capsys):
-    assert main(["fleet", str(tmp_path), str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert main(["check", "--fleet", str(tmp_path), str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "holds no robot folders" in capsys.readouterr().err

@@ -75,7 +75,9 @@ def together(rank: int) -> dict:
 
 
 def train(place: Path, name: str, resume: bool = False) -> dict:
-    return api.train(place / "data", place / name, str(STEPS), CONFIG, robot=place / "arm", resume=resume).card
+    return api.train(
+        place / "data", out=place / name, budget=str(STEPS), config=CONFIG, robot=place / "arm", resume=resume
+    ).card
 
 
 def interrupted_in_ppo(tick):

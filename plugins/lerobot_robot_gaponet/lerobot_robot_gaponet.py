@@ -317,9 +317,9 @@ class GaponetCorrect(ProcessorStep):
     """Corrects joint targets, once per control period, by a model at its rate, or by an identified robot at its.
 
     For a robot that is not gaponet_so101: the correction is bounded in size and rate, but nothing watches the arm. As
-    last step of a policy's postprocessor (gaponet attach) actions are tensors (..., n) of all joints, one or a chunk
-    (1, T, n) to be sent one a period, and no state is known; as a robot action processor they are named, and the
-    observation is used.
+    last step of a policy's postprocessor (gaponet export --to lerobot) actions are tensors (..., n) of all joints, one
+    or a chunk (1, T, n) to be sent one a period, and no state is known; as a robot action processor they are named, and
+    the observation is used.
     """
 
     model: str = ""

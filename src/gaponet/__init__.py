@@ -2,51 +2,103 @@
 
     import gaponet as gp
 
-    gp.import_logs("LOGS", "so101", "data", unit_id="lab", payload_mass=0.0)
-    gp.train("data", "run", budget="10m")
-    gp.evaluate("run", "data").result["methods"]
+    gp.import_logs("LOGS", robot="so101", out="data", unit_id="lab", payload_mass=0.0)
+    gp.identify("data", out="my_so101")
+    print(gp.evaluate("./my_so101", "data").mpjae)
 
-The names below are what is public. `import gaponet` loads numpy alone; simulator, torch and file formats are imported
-by the functions that use them.
+The names below are public. `import gaponet` loads numpy alone; simulator, torch and file formats are imported by the
+functions that use them.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 
-from gaponet.base.errors import GAPONetError
+from gaponet.base.errors import GAPONetError as GAPONetError
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from typing import Any
+    from gaponet.api import adapt_model as adapt_model
+    from gaponet.api import adapt_robot as adapt_robot
+    from gaponet.api import check as check
+    from gaponet.api import collect as collect
+    from gaponet.api import doctor as doctor
+    from gaponet.api import evaluate as evaluate
+    from gaponet.api import excite as excite
+    from gaponet.api import export_network as export_network
+    from gaponet.api import export_robot as export_robot
+    from gaponet.api import gap as gap
+    from gaponet.api import identify as identify
+    from gaponet.api import identify_torque as identify_torque
+    from gaponet.api import import_logs as import_logs
+    from gaponet.api import pair as pair
+    from gaponet.api import randomization as randomization
+    from gaponet.api import replay as replay
+    from gaponet.api import train as train
+    from gaponet.api.results import AdaptResult as AdaptResult
+    from gaponet.api.results import CheckResult as CheckResult
+    from gaponet.api.results import CollectResult as CollectResult
+    from gaponet.api.results import DoctorResult as DoctorResult
+    from gaponet.api.results import EvalResult as EvalResult
+    from gaponet.api.results import ExciteResult as ExciteResult
+    from gaponet.api.results import ExportResult as ExportResult
+    from gaponet.api.results import GapResult as GapResult
+    from gaponet.api.results import IdentifyResult as IdentifyResult
+    from gaponet.api.results import ImportResult as ImportResult
+    from gaponet.api.results import PairResult as PairResult
+    from gaponet.api.results import ReplayResult as ReplayResult
+    from gaponet.api.results import TorqueResult as TorqueResult
+    from gaponet.api.results import TrainResult as TrainResult
+    from gaponet.base.progress import progress_bar as progress_bar
+    from gaponet.data.store import Dataset as Dataset
+    from gaponet.deploy.aligned_sim import AlignedSim as AlignedSim
+    from gaponet.deploy.compensator import Compensator as Compensator
+    from gaponet.deploy.mujoco_loop import MujocoAligner as MujocoAligner
+    from gaponet.hw.control.controller import Controller as Controller
+    from gaponet.hw.targets.client import RemoteRobot as RemoteRobot
+    from gaponet.nn.artifact import GapModel as GapModel
+    from gaponet.nn.config import ModelConfig as ModelConfig
+    from gaponet.nn.training.config import TrainConfig as TrainConfig
+    from gaponet.robot.spec import RobotSpec as RobotSpec
+    from gaponet.robot.spec import load_robot as load_robot
+    from gaponet.share.reading import open_dataset as open_dataset
+else:
+    _MODULES = {  # public name → module
+        **dict.fromkeys(
+            ("adapt_model", "adapt_robot", "check", "collect", "doctor", "evaluate", "excite", "export_network",
+             "export_robot", "gap", "identify", "identify_torque", "import_logs", "pair", "randomization", "replay",
+             "train"),
+            "gaponet.api",
+        ),
+        **dict.fromkeys(
+            ("AdaptResult", "CheckResult", "CollectResult", "DoctorResult", "EvalResult", "ExciteResult",
+             "ExportResult", "GapResult", "IdentifyResult", "ImportResult", "PairResult", "ReplayResult",
+             "TorqueResult", "TrainResult"),
+            "gaponet.api.results",
+        ),
+        "progress_bar": "gaponet.base.progress",
+        "Dataset": "gaponet.data.store",
+        "open_dataset": "gaponet.share.reading",
+        "load_robot": "gaponet.robot.spec",
+        "RobotSpec": "gaponet.robot.spec",
+        "ModelConfig": "gaponet.nn.config",
+        "TrainConfig": "gaponet.nn.training.config",
+        "GapModel": "gaponet.nn.artifact",
+        "AlignedSim": "gaponet.deploy.aligned_sim",
+        "MujocoAligner": "gaponet.deploy.mujoco_loop",
+        "Compensator": "gaponet.deploy.compensator",
+        "Controller": "gaponet.hw.control.controller",
+        "RemoteRobot": "gaponet.hw.targets.client",
+    }  # fmt: skip
+
+    def __getattr__(name: str) -> object:
+        """Import a public name at its first use (PEP 562)."""
+        if name in _MODULES:
+            return getattr(import_module(_MODULES[name]), name)
+        raise AttributeError(f"module 'gaponet' has no attribute '{name}'; it offers {', '.join(_MODULES)}")
+
+    def __dir__() -> list[str]:
+        return ["GAPONetError", "__version__", *_MODULES]
+
 
 __version__ = "0.1.0"
-
-_HOMES = {  # name → module
-    **dict.fromkeys(
-        ("import_logs", "doctor", "pair", "gap", "identify", "train", "evaluate", "adapt_model", "adapt_robot"),
-        "gaponet.api",
-    ),
-    "Dataset": "gaponet.data.store",
-    "open_dataset": "gaponet.share.reading",
-    "load_robot": "gaponet.robot.spec",
-    "RobotSpec": "gaponet.robot.spec",
-    "GapModel": "gaponet.nn.artifact",
-    "AlignedSim": "gaponet.deploy.aligned_sim",
-    "MujocoAligner": "gaponet.deploy.mujoco_loop",
-    "Compensator": "gaponet.deploy.compensator",
-    "Controller": "gaponet.hw.control.controller",
-    "RemoteRobot": "gaponet.hw.targets.client",
-}
-__all__ = ["GAPONetError", "__version__", *_HOMES]
-
-
-def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for (PEP 562)."""
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module 'gaponet' has no attribute '{name}'; it offers {', '.join(_HOMES)}")
-
-
-def __dir__() -> list[str]:
-    return __all__

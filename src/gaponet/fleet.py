@@ -15,8 +15,9 @@ from pathlib import Path
 
 from typing_extensions import TypedDict
 
-from gaponet.api import adapt_robot, unit_recordings
-from gaponet.base.errors import GAPONetError, NoGainError, RobotError, UsageError
+from gaponet.api import adapt_robot
+from gaponet.api.logs import unit_recordings
+from gaponet.base.errors import GAPONetError, NoGainError, UsageError
 from gaponet.base.executor import open_pool
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import read_json
@@ -63,15 +64,14 @@ class Job:
 def ask(job: Job) -> Night:
     """One robot's night."""
     began, spec = time.process_time(), load_robot(job.robot)
-    known = ParameterUncertainty.require(spec, RobotError)
+    known = ParameterUncertainty.require(spec)
     with unit_recordings(job.logs, spec, job.unit, (), job.payload_mass) as (_, sequences):
         found = drift(spec, known, sequences, 1)
     adapted, advice = None, found.advice
     if found.verdict == "drifted" and job.out is not None:
         try:
-            made = adapt_robot(spec, job.logs, job.out, job.unit, (), payload_mass=job.payload_mass)
-            before, after = (1e3 * float(made.errors[when].mean()) for when in ("before", "after"))
-            adapted = before, after
+            made = adapt_robot(spec, job.logs, out=job.out, unit=job.unit, payload_mass=job.payload_mass)
+            adapted = 1e3 * made.before, 1e3 * made.after
         except NoGainError:
             advice += "; an adaptation does not follow these logs better"
     return {

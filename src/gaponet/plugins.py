@@ -4,7 +4,7 @@ A package names them in its metadata, as entry points of one of three groups:
 
     gaponet.formats   a module that reads logs (gaponet.data.formats says what it has)
     gaponet.drivers   a function (robot, **options) that returns a Driver (gaponet.hw.control.driver)
-    gaponet.methods   a function that `gaponet bench real --method NAME` compares (docs/benchmark.md)
+    gaponet.methods   a function that `gaponet experiment real --method NAME` compares (docs/benchmark.md)
 
 A built-in name cannot be replaced. A failure of an extension is logged once as a warning, and gaponet continues
 without the extension.

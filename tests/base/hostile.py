@@ -403,7 +403,7 @@ def pushed(change: Callable[[Path], None]) -> Callable[[Path], None]:
     return make
 
 
-PULL, BENCH = ("pull", "file://{}/bucket", "{}/back"), ("bench", "latency", "{}/run")
+PULL, BENCH = ("pull", "file://{}/bucket", "{}/back"), ("export", "{}/run", "--to", "torch")
 PICKLE = (*IMPORT, "--allow-pickle")
 CONE = asset('<mesh name="m" builtin="cone" params="100000000 1"/>')
 NKEY = before('<size nkey="300000000"/>')

@@ -114,6 +114,6 @@ def test_a_command_runs_nothing_of_the_folder_however_it_is_started(poisoned, ho
         words = [sys.executable, "-m", "gaponet", "formats"]
         said = subprocess.run(words, cwd=poisoned, capture_output=True, text=True).stdout
     else:
-        said = python(poisoned, SCRIPT, "formats", PYTHONPATH=f":{os.environ.get('PYTHONPATH', '')}")
+        said = python(poisoned, SCRIPT, "import", "--formats", PYTHONPATH=f":{os.environ.get('PYTHONPATH', '')}")
     assert "rosbag" in said
     assert ran(poisoned) == []

@@ -1,4 +1,4 @@
-"""gaponet attach, and the LeRobot plug-in on stand-ins for what LeRobot 0.6 publishes; its own run is make lerobot."""
+"""gaponet export --to lerobot, and the LeRobot plug-in on stand-ins for LeRobot 0.6; its own run is make lerobot."""
 
 import importlib.util
 import json
@@ -76,16 +76,18 @@ def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_of
     file = policy / "policy_postprocessor.json"
     file.write_text(json.dumps(POLICY))
     for mass in ("0.1", "0.2"):
-        assert main(["attach", str(policy), str(known), "--payload-mass", mass]) == 0
+        assert main(["export", str(known), "--to", "lerobot", "--into", str(policy), "--payload-mass", mass]) == 0
     *before, step = json.loads(file.read_text())["steps"]
     assert before == POLICY["steps"]
     assert (step["registry_name"], step["config"]["payload_mass"]) == ("gaponet_correct", 0.2)
     assert plugin.GaponetCorrect(**step["config"]).get_config() == {"model": ""} | step["config"]
-    assert main(["attach", str(policy), "--off"]) == 0
+    assert main(["export", str(known), "--to", "lerobot", "--into", str(policy), "--remove"]) == 0
     assert json.loads(file.read_text()) == POLICY
-    for words, said in (([str(policy)], "or --off"), ([str(tmp_path), str(known)], "has no policy_postprocessor.json"),
-                        ([str(policy), str(policy)], "is neither a robot folder")):  # fmt: skip
-        assert main(["attach", *words]) == 2
+    for into, holder, said in (
+        ([], known, "with --into POLICY"), (["--into", str(tmp_path)], known, "has no policy_postprocessor.json"),
+        (["--into", str(policy)], policy, "is neither a robot folder"),
+    ):  # fmt: skip
+        assert main(["export", str(holder), "--to", "lerobot", *into]) == 2
         assert said in capsys.readouterr().err
 
 

@@ -110,7 +110,7 @@ def test_a_robot_folder_is_adapted_without_a_model_or_not_at_all(robot, logs, tm
     data = Dataset.create(tmp_path / "data", robot)
     for log in logs:
         data.append(log)
-    found = api.adapt_robot(robot, data, tmp_path / "today", seconds=16.0)
+    found = api.adapt_robot(robot, data, out=tmp_path / "today", seconds=16.0)
     assert found.errors["after"].mean() < 0.2 * found.errors["before"].mean()
     written = load_robot(tmp_path / "today")
     np.testing.assert_allclose(written.kp, 0.6 * robot.kp, rtol=0.2)
@@ -118,7 +118,7 @@ def test_a_robot_folder_is_adapted_without_a_model_or_not_at_all(robot, logs, tm
     same = Dataset.create(tmp_path / "same", robot)
     same.append(record(robot, commands(450, 0), "m0"))
     with pytest.raises(NoGainError, match="nothing is written"):
-        api.adapt_robot(robot, same, tmp_path / "again", seconds=8.0)
+        api.adapt_robot(robot, same, out=tmp_path / "again", seconds=8.0)
     assert not (tmp_path / "again" / "robot.toml").exists()
 
 
@@ -127,7 +127,7 @@ def test_one_short_command_adapts_nothing_and_windows_of_several_are_judged_by_m
     for payload in (0.0, 0.1):
         data.append(record(robot, commands(60, 0), "m0", payload))
     with pytest.raises(NoGainError, match="is all there is of each joint"):
-        api.adapt_robot(robot, data, tmp_path / "one")
+        api.adapt_robot(robot, data, out=tmp_path / "one")
     several = [record(robot, commands(450, seed), f"m{seed}", kp=0.7) for seed in range(3)]
     found = refit(several, robot, judge=True)
     assert (len(found.judged[0]), found.kept) == (3, True)

@@ -37,10 +37,10 @@ def fitted(arm, data, tmp_path):
 
 
 def test_an_identified_folder_is_taken_where_a_run_is(fitted, data, arm, capsys):
-    found = gp.evaluate(fitted, data).result
+    found = gp.evaluate(fitted, data).to_dict()
     assert (list(found["methods"]), found["motions"], found["unseen"]) == (["nominal", "identified"], ["motion2"], True)
     assert found["ratio_to_nominal"]["identified"] < 0.5
-    by_cause = gp.gap(data, robot=fitted)  # no training for the picture
+    by_cause = gp.gap(data, robot=fitted).to_dict()  # no training for the picture
     assert list(by_cause["left"]) == ["nominal", "gain", "friction", "creep"]
     assert by_cause["methods"]["identified"]["mpjae"] == pytest.approx(found["methods"]["identified"]["mpjae"])
     assert (fitted / "gap.png").is_file()

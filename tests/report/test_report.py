@@ -57,9 +57,9 @@ def test_the_page_is_one_offline_file_that_names_the_method_everywhere(evaluated
     assert not re.findall(r"(?<!identification \+ )GAPONet", page)
 
 
-@pytest.mark.parametrize("command", ["runs", "eval"])
+@pytest.mark.parametrize("command", ["report", "eval"])
 def test_a_table_in_the_terminal_names_the_method(evaluated, command, capsys):
-    where = {"runs": [evaluated.parent], "eval": [evaluated, evaluated.parent / "data"]}[command]
+    where = {"report": [evaluated.parent, "--list"], "eval": [evaluated, evaluated.parent / "data"]}[command]
     assert main([command, *map(str, where)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "GAPONet" in said

@@ -1,4 +1,4 @@
-"""gaponet torque: friction, inertia and delay of arms that are driven by torque or current."""
+"""gaponet identify: friction, inertia and delay of arms that are driven by torque or current."""
 
 import json
 
@@ -60,7 +60,7 @@ def robot(tmp_path_factory):
 def test_a_driven_arm_is_found_and_moves_as_the_simulator_does_after(robot, tmp_path, capsys, unit, words):
     data = imported(tmp_path, robot, {f"m{k}": drive(robot, k, unit) for k in range(4)})
     capsys.readouterr()
-    assert main(["torque", data, "--out", str(tmp_path / "found"), "--json", *words]) == 0
+    assert main(["identify", data, "--out", str(tmp_path / "found"), "--json", *words]) == 0
     said = json.loads(capsys.readouterr().out)
     for i, found in enumerate(said["joints"].values()):
         assert found["constant"] == pytest.approx(unit, rel=0.03)
@@ -80,7 +80,7 @@ def test_a_push_by_hand_is_not_taken_for_friction(robot, tmp_path, capsys):
         table[400:520, 3] += 5.0  # told, and held by somebody
     data = imported(tmp_path, robot, logs)
     capsys.readouterr()
-    assert main(["torque", data, "--out", str(tmp_path / "found"), "--json"]) == 0
+    assert main(["identify", data, "--out", str(tmp_path / "found"), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)["joints"]["shoulder"]
     assert said["frictionloss"] == pytest.approx(0.12, rel=0.2)
     assert said["armature"] == pytest.approx(0.05, rel=0.2)
@@ -88,17 +88,13 @@ def test_a_push_by_hand_is_not_taken_for_friction(robot, tmp_path, capsys):
 
 def test_commands_for_positions_say_that_there_are_none(robot, tmp_path, capsys):
     data = imported(tmp_path, robot, {"one": drive(robot, 0, rows=1800)})
-    for words in (
-        ["gap", data],
-        ["identify", data, "--out", str(tmp_path / "x")],
-        ["train", data, "--out", str(tmp_path / "y")],
-    ):
+    for words in (["gap", data], ["train", data, "--out", str(tmp_path / "y")]):
         capsys.readouterr()
         assert main(words) == 2, words
-        assert "gaponet torque" in capsys.readouterr().err
+        assert "gaponet identify" in capsys.readouterr().err
     assert main(["doctor", data]) == 0
     assert (
-        main(["torque", data, "--out", str(tmp_path / "found")]) == 0
+        main(["identify", data, "--out", str(tmp_path / "found")]) == 0
     )  # one recording: its parts fit and judge in turn
 
 
@@ -109,6 +105,6 @@ def test_logs_of_positions_alone_have_no_torque_to_fit(robot, tmp_path, capsys):
     (tmp_path / "logs/logs.toml").write_text(TOLD.replace('tau = "tau_{joint}"\n', ""))
     words = ["--robot", str(robot.folder), "--unit-id", "a", "--payload-mass", "0", "--out", str(tmp_path / "data")]
     assert main(["import", str(tmp_path / "logs"), *words]) == 0
-    assert main(["torque", str(tmp_path / "data"), "--out", str(tmp_path / "found")]) == 2
+    assert main(["identify", str(tmp_path / "data"), "--out", str(tmp_path / "found")]) == 2
     assert "has no torque of every operated joint" in capsys.readouterr().err
     assert not (tmp_path / "found").exists()

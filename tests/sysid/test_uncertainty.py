@@ -155,26 +155,26 @@ def test_a_folder_of_an_older_version_loads(folder, tmp_path):
 
 def test_a_folder_without_it_loads_and_show_says_what_to_do(arm, capsys):
     assert ParameterUncertainty.load(arm) is None
-    assert main(["show", str(arm.folder)]) == 2
+    assert main(["robot", "show", str(arm.folder)]) == 2
     assert "keeps only values" in capsys.readouterr().err
 
 
 def test_an_adaptation_keeps_what_it_learned(arm, folder, tmp_path):
     data = dataset(arm, tmp_path / "data", played(arm, 60, 3, kp=0.7))
-    api.adapt_robot(load_robot(folder), data, tmp_path / "today", seconds=24.0)
+    api.adapt_robot(load_robot(folder), data, out=tmp_path / "today", seconds=24.0)
     mine = ParameterUncertainty.load(load_robot(tmp_path / "today"))
     assert [s["made_by"] for s in mine.sources] == ["identify", "adapt"]
     assert mine.sources[1]["logs"].keys() == {"m60", "m61", "m62"}
 
 
 def test_show_prints_and_draws(folder, tmp_path, capsys):
-    assert main(["show", str(folder), "--out", str(tmp_path / "known.svg"), "--json"]) == 0
+    assert main(["robot", "show", str(folder), "--out", str(tmp_path / "known.svg"), "--json"]) == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
     assert found["joints"]["elbow"]["standard_errors"]["kp"] > 0
     assert "± standard error" in said.err
     assert "elbow" in (tmp_path / "known.svg").read_text()
-    assert main(["show", str(folder), "--out", str(tmp_path / "known.pdf")]) == 2
+    assert main(["robot", "show", str(folder), "--out", str(tmp_path / "known.pdf")]) == 2
 
 
 def test_the_same_robot_is_the_same(arm, folder, tmp_path, capsys):

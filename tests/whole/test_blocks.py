@@ -157,12 +157,12 @@ def quick(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Identification of seconds, done once; and a network that nobody trained. Both have tests of their own."""
     original = gaponet.api.identify
 
-    def identify(dataset: str, out: str, **others: object) -> None:
+    def identify(dataset: str, *, out: str, **others: object) -> None:
         if not (place / "identified").exists():
-            original(dataset, place / "identified", windows=4, terms=(), table=False, budget="1s")
+            original(dataset, out=place / "identified", windows=4, terms=(), table=False, budget="1s")
         shutil.copytree(place / "identified", out)
 
-    def train(dataset: str, out: str, budget: str) -> GapModel:
+    def train(dataset: str, *, out: str, budget: str, progress: object) -> GapModel:
         parts = {"train": ("m0", "m1"), "val": ("m2",), "test": ("m3",)}
         return GapModel.load(untrained(Path(out), load_robot("so101"), Dataset(dataset), **parts))
 
@@ -205,8 +205,8 @@ def test_the_python_blocks_of_a_page_run(page, place, quick, tmp_path, monkeypat
 
 
 QUICK = {  # Page → commands of it that take seconds; the others are parsed
-    "README.md": ("import", "doctor", "gap", "show", "export my_so101 --to randomization", "replay", "adapt"),
-    "logs.md": ("formats",),
+    "README.md": ("import", "doctor", "gap", "robot show", "export my_so101 --to randomization", "replay", "adapt"),
+    "logs.md": ("import --formats",),
     "ten-minutes.md": ("robot", "import", "doctor", "gap"),
     "install.md": ("--version", "--tyro-print-completion"),
 }
@@ -222,7 +222,7 @@ def test_quick_commands_of_a_page_run_in_its_order(page, place, quick, tmp_path,
     told = io.StringIO()
     for argv in filter(None, map(words, lines(PATHS[page]))):
         if argv[0] == "identify" and page == "README.md":
-            gaponet.api.identify(argv[1], argv[3])
+            gaponet.api.identify(argv[1], out=argv[3])
         elif " ".join(argv).startswith(QUICK[page]):
             argv = [{"ROLLOUTS": "LOGS"}.get(word, word) for word in argv]
             with redirect_stdout(told), suppress(SystemExit) if argv[0].startswith("--tyro") else nullcontext():

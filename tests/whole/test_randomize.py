@@ -37,7 +37,7 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
             exec(compile(text, "randomize.md", "exec"), {})
             continue
         for line in text.strip().splitlines():
-            if line.startswith("gaponet fleet"):
+            if line.startswith("gaponet check --fleet"):
                 shutil.copytree("my_arm", "robots/a")
             try:
                 codes[line] = main(line.removeprefix("gaponet ").split())

@@ -75,14 +75,14 @@ def test_identify_writes_a_robot_folder_that_other_commands_take(place, capsys, 
 
 
 def test_runs_lists_both_with_the_best_first(place, capsys):
-    assert main(["runs", str(place), "--json"]) == 0
+    assert main(["report", "--list", str(place), "--json"]) == 0
     captured = capsys.readouterr()
     found = json.loads(captured.out)["runs"]
     assert {r["run"] for r in found} == {"gaponet V", "mlp V"}
     assert all(r["virtual"] and r["finished"] for r in found)
     assert found[0]["val_ratio"] <= found[1]["val_ratio"]
     assert "VIRTUAL" in captured.err
-    assert main(["runs", str(place / "data")]) == 2
+    assert main(["report", "--list", str(place / "data")]) == 2
     assert "no run here or below" in capsys.readouterr().err
 
 

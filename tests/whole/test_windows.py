@@ -50,12 +50,12 @@ from gaponet.cli.main import main
 from gaponet.nn.training.config import TrainConfig, PretrainingConfig
 
 work = Path(sys.argv[1])
-gp.import_logs(work / "logs", "so101", work / "data", unit_id="a", payload_mass=0.0)
+gp.import_logs(work / "logs", robot="so101", out=work / "data", unit_id="a", payload_mass=0.0)
 small = PretrainingConfig(rounds=1, num_envs=4, steps=20, gradient_steps=5, batch_size=64, sensor_states=16)
-gp.train(work / "data", work / "run", budget="120", config=TrainConfig(warm_start=small))
-for words in ("doctor data", "gap data", "eval run data", "report run", "runs ."):
+gp.train(work / "data", out=work / "run", budget="120", config=TrainConfig(warm_start=small))
+for words in ("doctor data", "gap data", "eval run data", "report run", "report . --list"):
     name, *rest = words.split()
-    assert main([name, *(str(work / w) for w in rest)]) == 0, words
+    assert main([name, *(w if w.startswith("--") else str(work / w) for w in rest)]) == 0, words
 assert (work / "run" / "report.html").is_file()
 print("all the way")
 """

@@ -31,7 +31,7 @@ def with_note(progress: Progress, note: str) -> Callable[[int, int], None]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
-    """Show a progress bar; yields update(done, total, note)."""
+    """Show a progress bar on stderr; yields update(done, total, note), to be given as `progress`."""
     with _progress(title) as show:
 
         def update(done: float, total: float, note: str = "") -> None:

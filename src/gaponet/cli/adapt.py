@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from gaponet import api
+from gaponet.api.results import AdaptResult
 from gaponet.base.errors import UsageError
-from gaponet.cli.identify import COLUMNS
+from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Folder, Json, Robot, Unit, like
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
-from gaponet.robot.spec import RobotSpec, robot_argument
+from gaponet.robot.spec import robot_argument
 
 Known = Annotated[
     Folder, tyro.conf.arg(help="Robot folder (with --out), or run folder of gaponet train.", metavar="ROBOT|RUN")
@@ -58,50 +57,46 @@ def adapt(
         if robot is not None or mixed_gains:
             raise UsageError("--robot and --mixed-gains are for the adaptation of a run")
         told = None if unknown or payload_mass == "recorded" else _mass(payload_mass)
-        made = api.adapt_robot(run, dataset, out, unit, motions, seconds, unknown, told)
-        before, after = (float(e.mean()) for e in made.errors.values())
+        with progress_bar("adapting") as update:
+            made = api.adapt_robot(
+                run, dataset, out=out, unit=unit, motions=motions, seconds=seconds, unknown_payload=unknown,
+                payload_mass=told, progress=update,
+            )  # fmt: skip
         screen.say(
-            f"{mrad(before)} → {mrad(after)} mrad over {len(made.errors['after'])} recording(s) of unit {made.unit} "
-            f"({after / before:.2f}); robot folder {out}"
+            f"{mrad(made.before)} → {mrad(made.after)} mrad over {made.recordings} recording(s) of unit {made.unit_id} "
+            f"({made.after / made.before:.2f}); robot folder {out}"
         )
-        servos = _servos(made.robot)
-        _show(screen, made.unit, servos, made.payload_mass, made.payload_std)
+        _show(screen, made)
         screen.say(f"next: gaponet run --motion FILE --robot {robot_argument(out)} --compensate")
-        screen.result({
-            "unit_id": made.unit, "before": before, "after": after, "servos": servos, "robot": str(out),
-            "payload_mass": made.payload_mass, "payload_std": made.payload_std,
-        })  # fmt: skip
+        screen.result(made.to_dict())
         return
     if out is not None:
         raise UsageError(f"{run}: is no robot folder (no robot.toml); --out is for those, a run keeps its adaptations")
     if not unknown and payload_mass != "recorded":
         raise UsageError(f"--payload-mass {payload_mass}: a run takes recorded or unknown")
-    found = api.adapt_model(run, dataset, unit, motions, seconds, unknown, robot, mixed_gains)
-    _show(screen, found.unit_id, found.servos, found.payload_mass, found.payload_std)
-    screen.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; kept in {run}")
+    with progress_bar("adapting") as update:
+        made = api.adapt_model(
+            run, dataset, unit=unit, motions=motions, seconds=seconds, unknown_payload=unknown, robot=robot,
+            mixed_gains=mixed_gains, progress=update,
+        )  # fmt: skip
+    _show(screen, made)
+    screen.say(f"window RMS {mrad(made.before)} → {mrad(made.after)} mrad of the fitted windows; stored in {run}")
     screen.say(f"next: gaponet eval {run} {dataset}")
-    screen.result(asdict(found))
+    screen.result(made.to_dict())
 
 
-def _show(
-    screen: Out, unit: str, servos: Mapping[str, Mapping[Any, float]], mass: float | None, std: float | None
-) -> None:
-    """A unit's servos, and its payload."""
+def _show(screen: Out, made: AdaptResult) -> None:
+    """Print a unit's servos and its payload."""
     from gaponet.sysid.refit import FIELDS
+    from gaponet.sysid.uncertainty_table import FIELD_UNITS
 
-    screen.table(f"Unit {unit}", ["joint", *(COLUMNS[f][0] for f in FIELDS)], [
-        [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in FIELDS)] for j, v in servos.items()
+    screen.table(f"Unit {made.unit_id}", ["joint", *(FIELD_UNITS[f][0] for f in FIELDS)], [
+        [j, *(f"{v[f] * FIELD_UNITS[f][1]:.3g}" for f in FIELDS)] for j, v in made.servos.items()
     ])  # fmt: skip
-    if mass is not None:
-        spread = f" ± {std:.2f}" if std is not None and isfinite(std) else ""  # it takes two windows to tell
-        screen.say(f"payload {mass:.2f}{spread} kg in each hand that carries")
-
-
-def _servos(robot: RobotSpec) -> dict[str, dict[str, float]]:
-    from gaponet.sysid.refit import FIELDS
-
-    at = robot.joint_names.index
-    return {j: {f: float(getattr(robot, f)[at(j)]) for f in FIELDS} for j in robot.operated}
+    if made.payload_mass is not None:
+        std = made.payload_std
+        deviation = f" ± {std:.2f}" if std is not None and isfinite(std) else ""  # it needs two windows
+        screen.say(f"payload {made.payload_mass:.2f}{deviation} kg in each hand that carries")
 
 
 def _mass(text: str) -> float:

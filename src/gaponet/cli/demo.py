@@ -53,9 +53,10 @@ def demo(
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
         screen.say(f": how far is the simulator from the robot?  (gaponet gap {dataset})", "1 Measure")
         holdout = _make_dataset(dataset, data, robot, screen)
-        gap = api.gap(str(dataset), robot)
-        show_methods(screen, gap, ("joint",))
-        for sentence in verdict(gap["methods"]):
+        with progress_bar("gap") as update:
+            gap = api.gap(str(dataset), robot=robot, progress=update)
+        show_methods(screen, gap.to_dict(), ("joint",))
+        for sentence in verdict(gap.methods):
             screen.say(sentence)
         screen.say(f": which causes explain that?  (gaponet identify {dataset} --out {known})", "2 Identify")
         if not (known / "robot.toml").is_file():
@@ -66,13 +67,18 @@ def demo(
         )
         resume, config = (run / "checkpoint.pt").is_file(), TrainConfig(warm_start=QUICK)
         try:
-            api.train(Dataset(dataset), run, network, config, robot=known, holdout_units=holdout, resume=resume)
+            with progress_bar("training gaponet") as update:
+                api.train(
+                    Dataset(dataset), out=run, budget=network, config=config, robot=known, holdout_units=holdout,
+                    resume=resume, progress=update,
+                )  # fmt: skip
         except ModelError:  # a machine with much other work
             screen.say(
                 f"{network} were over before a network learned anything; --network 5m gives it more", "", "yellow"
             )
             run = known
-    found = api.evaluate(run, str(dataset)).result
+    with progress_bar("evaluating") as update:
+        found = api.evaluate(run, str(dataset), progress=update).to_dict()
     show_methods(screen, found, ("joint", "payload"))
     with progress_bar("report") as update:
         path = write_report(run, progress=update, picture=portrait)

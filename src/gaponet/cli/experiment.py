@@ -12,6 +12,7 @@ import tyro
 
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.progress import progress_bar, progress_bars
+from gaponet.cli.experiment_real import real
 from gaponet.cli.out import Out, writes
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.compare import Compare, with_identified
@@ -117,9 +118,9 @@ def _command(kind: type[Any]) -> Any:
 
 
 def experiment(action: None) -> None:
-    """Run an experiment: the paper's figures and tables, comparisons of models."""
+    """Run an experiment: the paper, comparisons of models, real recordings."""
 
 
 # Each is run while the command line is parsed; the function that remains to be called does nothing.
-ACTION: Any = Union[tuple(map(_command, EXPERIMENTS))]  # noqa: UP007
+ACTION: Any = Union[(*map(_command, EXPERIMENTS), Annotated[None, tyro.conf.subcommand("real", constructor=real)])]
 experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

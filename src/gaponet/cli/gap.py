@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from gaponet import api
 from gaponet.base.executor import LOCAL
+from gaponet.base.progress import progress_bar
 from gaponet.base.result_table import ResultTable
 from gaponet.cli.options import Json, Motions, Robot, Source, like
 from gaponet.cli.out import Out
@@ -34,18 +36,17 @@ def gap(
     """
     out = Out(json)
     data, spec = open_dataset(dataset, robot, run)
-    if executor != LOCAL:
-        api.pair(data, spec, executor)
-    found = api.gap(data, spec, motions, run)
+    with progress_bar("gap") as update:
+        result = api.gap(data, robot=spec, motions=motions, run=run, executor=executor, progress=update)
     folder = run or (spec.folder if robot is None else Path(robot))
-    if "left" not in found:
-        show_methods(out, found)
+    if not result.by_cause:
+        show_methods(out, result.to_dict())
     else:
-        _show_steps(out, found)
+        _show_steps(out, result.table)
         if (folder / "gap.png").is_file():
             out.say(f"figure: {folder / 'gap.png'}")
-    show_verdict(out, found["methods"], dataset, folder if "left" in found else None)
-    out.result(found)
+    show_verdict(out, result.methods, dataset, folder if result.by_cause else None)
+    out.result(result.to_dict())
 
 
 def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None, reported: bool = False) -> None:
@@ -72,7 +73,7 @@ def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GRO
             out.show(f"By {group}{UNITS.get(group, '')}", by_group(methods, group))
 
 
-def _show_steps(out: Out, found: dict[str, Any]) -> None:
+def _show_steps(out: Out, found: Mapping[str, Any]) -> None:
     """What is left after each step, in all and by joint and payload, and what the step removes in all."""
     who = "VIRTUAL robot" if found["virtual"] else "real robot"
     kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"

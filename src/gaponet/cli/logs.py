@@ -1,7 +1,8 @@
-"""gaponet import, formats, doctor."""
+"""gaponet import, doctor."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -9,18 +10,17 @@ import numpy as np
 import tyro
 
 from gaponet import api
+from gaponet.api.results import DoctorResult, ImportResult
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder
-from gaponet.cli.options import Flag, Json, Logs, Source, like
+from gaponet.base.progress import progress_bar
+from gaponet.cli.options import Flag, Json, Source, like
 from gaponet.cli.out import Out
-from gaponet.data.signals import FAST
 from gaponet.plugins import attempt
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
-    from gaponet.data.doctor import Diagnosis
-    from gaponet.data.importer import ImportReport
     from gaponet.data.offsets import JointOffset
     from gaponet.data.store import Entry
 
@@ -29,8 +29,8 @@ MAX_ROWS = 60
 
 @like(api.import_logs)
 def import_logs(
-    src: Logs,
-    robot: str,
+    src: tyro.conf.Positional[Path | None] = None,
+    robot: str = "",
     out: Path | None = None,
     unit_id: str | None = None,
     payload_mass: float | None = None,
@@ -49,6 +49,7 @@ def import_logs(
     strict: bool = False,
     allow_pickle: bool = False,
     guess: bool = False,
+    formats: Flag = False,
     json: Json = False,
 ) -> None:
     """Read a robot's logs into a dataset; the same call adds what is new.
@@ -56,27 +57,19 @@ def import_logs(
     A bad log refuses them all (--skip-bad leaves it out instead).
 
     Args:
+        src: File or folder of logs.
         robot: Robot name or folder.
         out: Dataset folder; appended to where it exists.
-        payload_side: Which hand carries it: both (default), or the side of one payload mount.
         map: A joint's name in the log and the robot's, as a=b; may be repeated.
-        format: Format of the logs; default by looking. gaponet formats lists them.
-        logs: A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder of the logs.
-        position_unit: Unit of positions, where the format leaves it open; velocities are that per second.
-            signed_percent: LeRobot's older −100..100.
-        time_unit: Unit of time, where the format leaves it open.
-        rate: Hz, of logs without a clock.
-        cut: Cut long recordings into equal pieces of about so long, s; each is a motion of its own.
-        level: What the motions move; whole_body by default.
-        kp: Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what the format
-            states, else the robot's.
-        kd: The same of the damping gain, N·m·s/rad.
-        skip_bad: Cut bad rows and leave out logs that cannot be read, and list both, instead of refusing all.
-        strict: Refuse logs whose velocity, torque or temperature is nonsense in some rows, instead of making up for it
-            there and saying so.
-        allow_pickle: Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only.
+        format: Format of the logs; default by inspection; --formats lists them.
         guess: Print a logs.toml for these logs, filled in as far as they show it, and import nothing.
+        formats: List the formats that are read, and what each needs.
     """
+    if formats:
+        _show_formats(Out(json))
+        return
+    if src is None or not robot:
+        raise UsageError("give a folder of logs and --robot ROBOT (or --formats, to see which formats are read)")
     spec = load_robot(robot)
     if guess:
         from gaponet.data.describe.guess import guess_logs
@@ -87,13 +80,14 @@ def import_logs(
         return
     if out is None:
         raise UsageError("say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)")
-    report = api.import_logs(
-        src, spec, out, unit_id, payload_mass, payload_side=payload_side, level=level, fmt=format,
-        joint_map=joint_map(map), logs=logs, position_unit=position_unit, time_unit=time_unit, rate=rate, cut=cut,
-        kp=kp, kd=kd,
-        skip_bad=skip_bad, allow_pickle=allow_pickle, strict=strict,
-    )  # fmt: skip
-    _show_import(Out(json), report, spec)
+    with progress_bar("importing") as update:
+        made = api.import_logs(
+            src, robot=spec, out=out, unit_id=unit_id, payload_mass=payload_mass, payload_side=payload_side,
+            level=level, format=format, joint_map=joint_map(map), logs=logs, position_unit=position_unit,
+            time_unit=time_unit, rate=rate, cut=cut, kp=kp, kd=kd, skip_bad=skip_bad, allow_pickle=allow_pickle,
+            strict=strict, progress=update,
+        )  # fmt: skip
+    _show_import(Out(json), made)
 
 
 def doctor(
@@ -112,10 +106,11 @@ def doctor(
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
-    diagnosis = api.doctor(data, spec)
+    with progress_bar("examining") as update:
+        diagnosis = api.doctor(data, robot=spec, progress=update)
     out.say(f", {Diagnosis.inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
-    mended = Finding.proposal(diagnosis.findings) if fix else ""
+    mended = Finding.proposal(list(diagnosis.findings)) if fix else ""
     for line in mended.splitlines():
         out.say(line)
     drawn: list[Path] = []
@@ -123,19 +118,17 @@ def doctor(
         from gaponet.report.figures.draw_findings import draw_findings
 
         with lock_folder(figures, "figures"):
-            drawn = draw_findings(data, spec, diagnosis.findings, figures)
+            drawn = draw_findings(data, spec, list(diagnosis.findings), figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")
     out.say(f"next: gaponet doctor {dataset} --fix" if diagnosis.count("error") else f"next: gaponet gap {dataset}")
     out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": mended,
-                "figures": [str(path) for path in drawn]} | diagnosis.as_dict())  # fmt: skip
+                "figures": [str(path) for path in drawn]} | diagnosis.to_dict())  # fmt: skip
 
 
-def formats(json: Json = False) -> None:
-    """List the log formats that are read, and what each needs."""
+def _show_formats(out: Out) -> None:
     from gaponet.data.formats import about, module
     from gaponet.data.formats import formats as known
 
-    out = Out(json)
     extras = {fmt: attempt(where, lambda fmt=fmt: str(module(fmt).EXTRA), None) for fmt, where in known().items()}  # type: ignore[misc]
     rows = {fmt: (about(fmt), extra) for fmt, extra in extras.items() if extra is not None}
     out.table("Formats that gaponet import reads", ["format", "what it is", "needs"], [
@@ -145,7 +138,7 @@ def formats(json: Json = False) -> None:
     out.result({fmt: {"about": what, "extra": extra} for fmt, (what, extra) in rows.items()})
 
 
-def _cuts(entries: list[Entry]) -> dict[str, list[str]]:
+def _cuts(entries: ListOf[Entry]) -> dict[str, list[str]]:
     """Why recordings were cut → which."""
     found: dict[str, list[str]] = {}
     for entry in entries:
@@ -154,7 +147,7 @@ def _cuts(entries: list[Entry]) -> dict[str, list[str]]:
     return found
 
 
-def _nonsense(entries: list[Entry]) -> list[str]:
+def _nonsense(entries: ListOf[Entry]) -> list[str]:
     """What was nonsense in some rows, a line for each channel (data.describe.limits)."""
     told: dict[str, list[tuple[Entry, dict[str, Any]]]] = {}
     for entry in entries:
@@ -168,7 +161,7 @@ def _nonsense(entries: list[Entry]) -> list[str]:
     ]
 
 
-def _unrecorded(entries: list[Entry], robot: RobotSpec) -> list[str]:
+def _unrecorded(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
     """A line about operated joints that the logs do not hold."""
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
     if not lacking:
@@ -187,16 +180,15 @@ def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
     return {a.strip(): b.strip() for a, b in (pair.split("=") for pair in pairs)} or None
 
 
-def _show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
-    """What came in, the lag and the offsets of each joint, and what to do next."""
-    entries, data = report.entries or report.present, report.dataset
-    minutes = sum(e.rows * e.dt for e in entries) / 60
-    rates = sorted({round(1 / e.dt, 2) for e in entries})
+def _show_import(out: Out, made: ImportResult) -> None:
+    """Print what was added, the lag and the offsets of each joint, and the next command."""
+    entries, data, robot, table = made.entries, made.dataset, made.robot, made.to_dict()
+    minutes, rates = table["minutes"], table["rate_hz"]
     units = ", ".join(dict.fromkeys(e.meta.unit_id for e in entries))
     payloads = ", ".join(f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries}))
     virtual = "VIRTUAL " if any(e.meta.virtual for e in entries) else ""
-    if report.present:
-        out.say(f"{len(report.present)} there already, {len(report.entries)} added")
+    if made.present:
+        out.say(f"{len(made.present)} there already, {len(made.added)} added")
     out.say(
         f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
         f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
@@ -205,22 +197,16 @@ def _show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
         out.say(f"  {', '.join(motions)}: {cut}; what follows was left out", "note", "cyan")
     for line in (*_nonsense(entries), *_unrecorded(entries, robot)):
         out.say(f"  {line}", "note", "cyan")
-    for line in report.cut[:MAX_ROWS]:
+    for line in made.cut[:MAX_ROWS]:
         out.say(f"  {line}", "cut", "yellow")
-    if len(report.cut) > MAX_ROWS:
-        out.say(f"  … and {len(report.cut) - MAX_ROWS} more; --json lists all", "cut", "yellow")
-    lags = {name: _fast_lags(entries, name) for name in robot.operated}
-    offsets = report.offsets.joints if report.offsets else {}
-    _show_offsets(out, lags, offsets)
+    if len(made.cut) > MAX_ROWS:
+        out.say(f"  … and {len(made.cut) - MAX_ROWS} more; --json lists all", "cut", "yellow")
+    offsets = made.offsets.joints if made.offsets else {}
+    _show_offsets(out, table["fast_lag_s"], offsets)
     if offsets:
         out.say(f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data.")
     out.say(f"Next: gaponet doctor {data.path!s}")
-    out.result({
-        "dataset": str(data.path), "imported": [e.id for e in report.entries],
-        "present": [e.id for e in report.present], "sequences": len(data), "minutes": minutes,
-        "rate_hz": rates, "fast_lag_s": lags, "delay_s": {e.id: e.findings.get("delay_s", {}) for e in entries},
-        "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False, "cut": report.cut,
-    })  # fmt: skip
+    out.result(table)
 
 
 def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, JointOffset]) -> None:
@@ -249,7 +235,7 @@ def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, Joi
         out.say(f"zero not identified for {joints}: {reason}")
 
 
-def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
+def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:
     """Tables of sequences and joints, the findings, the verdict."""
     shown = diagnosis.sequences[:MAX_ROWS]
     columns = ["motion", "kg", "s", "Hz", "jitter", "gap", "lag"]
@@ -268,16 +254,6 @@ def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
     ])  # fmt: skip
     out.findings(diagnosis.findings)
     out.say("", diagnosis.verdict)
-
-
-def _fast_lags(entries: list[Entry], joint: str) -> list[float]:
-    """Lags of a joint in the sequences that command it fast, s."""
-
-    def of(entry: Entry, name: str) -> float | None:
-        return entry.findings.get(name, {}).get(joint)  # a collected recording has none
-
-    found = [of(e, "delay_s") for e in entries if (of(e, "fast_speed") or 0) >= FAST]
-    return [lag for lag in found if lag is not None]
 
 
 def _lag(values: dict[str, float] | None) -> str:

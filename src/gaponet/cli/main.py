@@ -21,26 +21,25 @@ from gaponet.plugins import load
 # Task → commands.
 TASKS = {
     "Start here": ("start", "demo"),
-    "Logs": ("import", "formats", "doctor", "data", "excite", "collect", "robot"),
+    "Logs": ("import", "doctor", "data", "excite", "collect", "robot"),
     "The gap": ("gap", "view"),
-    "Closing it": ("identify", "show", "torque", "adapt", "train", "export"),
-    "Is it closed?": ("eval", "check", "fleet", "replay", "report", "runs", "experiment"),
-    "On a robot, real or virtual": ("run", "record", "virtual", "attach"),
-    "Share it, compare it": ("push", "pull", "bench"),
+    "Closing it": ("identify", "adapt", "train", "export"),
+    "Is it closed?": ("eval", "check", "replay", "report", "experiment"),
+    "On a robot, real or virtual": ("run", "record", "virtual"),
+    "Share it": ("push", "pull"),
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
 COMMANDS = {
     **{
         name: f"gaponet.cli.{name}:{name}"
         for name in (
-            "start", "demo", "data", "excite", "collect", "robot", "gap", "view", "identify", "torque", "adapt",
-            "train", "export", "replay", "report", "runs", "experiment", "run", "record", "virtual", "attach", "bench",
+            "start", "demo", "data", "excite", "collect", "robot", "gap", "view", "identify", "adapt", "train",
+            "export", "check", "replay", "report", "experiment", "run", "record", "virtual",
         )
     },
-    **{name: f"gaponet.cli.logs:{name}" for name in ("formats", "doctor")},
-    **{name: f"gaponet.cli.known:{name}" for name in ("show", "check", "fleet")},
     **{name: f"gaponet.cli.share:{name}" for name in ("push", "pull")},
     "import": "gaponet.cli.logs:import_logs",
+    "doctor": "gaponet.cli.logs:doctor",
     "eval": "gaponet.cli.train:evaluate",
 }  # fmt: skip
 # Command, or command with its first argument → what replaces it.
@@ -49,7 +48,15 @@ REMOVED = {
     "calibrate": "gaponet adapt",
     "experiment unit": "gaponet experiment compare --holdout-units UNIT",
     "experiment data": "gaponet experiment compare --models gaponet:train_share=0.25 gaponet:train_share=0.5 gaponet",
-    **{f"bench {part}": f"python benchmarks/speed.py {part}" for part in ("sim", "train", "latency", "aligned")},
+    "formats": "gaponet import --formats",
+    "torque": "gaponet identify",
+    "show": "gaponet robot show",
+    "fleet": "gaponet check --fleet",
+    "runs": "gaponet report --list",
+    "attach": "gaponet export --to lerobot",
+    "bench real": "gaponet experiment real",
+    **{f"bench {what}": f"python benchmarks/speed.py {what}" for what in ("sim", "train", "latency", "aligned")},
+    "bench": "gaponet experiment real",
 }
 ABOUT = "Close the gap between simulated and real motors from joint logs."
 

@@ -1,4 +1,4 @@
-"""gaponet robot new, check, list, link."""
+"""gaponet robot new, check, list, link, show."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tyro
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
-from gaponet.cli.options import Flag, Json, Model
+from gaponet.cli.options import Flag, Folder, Json, Model
 from gaponet.cli.out import Out
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
 from gaponet.share.reading import open_dataset
@@ -19,7 +19,8 @@ from gaponet.share.reading import open_dataset
 if TYPE_CHECKING:
     from gaponet.robot.new import NewRobot
 
-POSTURES = 300  # of the logs
+MAX_POSTURES = 300  # of the logs
+MAX_COLUMNS = 4  # of a table
 
 
 def list_robots(json: Json = False) -> None:
@@ -161,7 +162,7 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple
         data, _ = open_dataset(dataset, spec)
         payloads = payloads or tuple(sorted({e.meta.payload_mass for e in data.entries}))
         rows = np.concatenate([data.read(e).qpos for e in data.entries])
-        postures = rows[:: max(1, len(rows) // POSTURES)].astype(float)
+        postures = rows[:: max(1, len(rows) // MAX_POSTURES)].astype(float)
     findings = check.check_robot(spec, payloads or (0.0,), postures)
     out.table(f"{spec.name}: {spec.description}; N·m/rad, N·m·s/rad, N·m, rad",
               ["joint", "operated", "kp", "kd", "limit", "range"], [
@@ -204,14 +205,65 @@ def as_dict(spec: RobotSpec) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def show(
+    robot: Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify or gaponet adapt.", metavar="ROBOT")],
+    out: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Show an identified robot's parameters and their standard errors.
+
+    Args:
+        out: Picture to write, .png or .svg.
+    """
+    from gaponet.report.figures.uncertainty import picture
+    from gaponet.sysid.uncertainty import ParameterUncertainty
+    from gaponet.sysid.uncertainty_table import FIELD_UNITS, sentences, summarize, table_rows
+
+    screen = Out(json)
+    if not (robot / "robot.toml").is_file():
+        raise UsageError(f"{robot}: is no robot folder (no robot.toml); give what gaponet identify wrote")
+    spec = load_robot(robot)
+    known = ParameterUncertainty.require(spec)
+    sure = {j: summarize(known, j) for j in known.joints}
+    fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
+    for start in range(0, len(fields), MAX_COLUMNS):
+        part = fields[start : start + MAX_COLUMNS]
+        title = f"{spec.name}, ± standard error" if start == 0 else "The same"
+        screen.table(title, ["joint", *(FIELD_UNITS[f][0] for f in part)], table_rows(known, part))
+    for line in sentences(known):
+        screen.say(line)
+    if out is not None:
+        from gaponet.base.files import atomic_write
+
+        if out.suffix not in (".png", ".svg"):
+            raise UsageError(f"--out {out}: a picture is a .png or an .svg")
+        with atomic_write(out) as temporary:
+            picture(known, f"{spec.name}: what is known").savefig(temporary, format=out.suffix[1:], dpi=200)
+        screen.say(f"picture: {out}")
+    screen.result({
+        "robot": spec.name, "sources": known.sources, "held": known.validated,
+        "joints": {
+            j: {
+                "values": c.values, "standard_errors": c.errors, "together": c.sets,
+                "left": known.joints[j].residual_rms,
+                "band_90": known.joints[j].residual_p90, "predicted": known.joints[j].parameter_rms,
+                "scale": known.joints[j].residual_rms / max(known.joints[j].parameter_rms, 1e-12),
+            }
+            for j, c in sure.items()
+        },
+        "picture": None if out is None else str(out),
+    })  # fmt: skip
+
+
 # Each is run while the command line is parsed; what is left to call is nothing.
 Action = (
     Annotated[None, tyro.conf.subcommand("new", constructor=new)]
     | Annotated[None, tyro.conf.subcommand("check", constructor=check)]
     | Annotated[None, tyro.conf.subcommand("list", constructor=list_robots)]
     | Annotated[None, tyro.conf.subcommand("link", constructor=link)]
+    | Annotated[None, tyro.conf.subcommand("show", constructor=show)]
 )
 
 
 def robot(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
-    """Make a robot folder from a vendor's model, or check one."""
+    """Make, check or show a robot folder; listen to a robot."""

@@ -1,4 +1,4 @@
-"""gaponet runs."""
+"""The list of training runs, for gaponet report --list."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import UsageError
-from gaponet.cli.options import Folder, Json
 from gaponet.cli.out import Out
 from gaponet.nn.artifact import CARD, GapModel
 from gaponet.report.methods import method, title
@@ -14,22 +13,14 @@ from gaponet.report.run_files import read_config, read_metrics, read_progress
 from gaponet.robot.folder import load_stored_robot
 
 
-def runs(
-    folder: Folder = Path("."),
-    json: Json = False,
-) -> None:
-    """List the training runs below a folder, best first.
-
-    Args:
-        folder: Where to look; run folders may lie at any depth.
-    """
+def show_runs(screen: Out, folder: Path) -> None:
+    """List the training runs in a folder and below it, best first."""
     found = [
         _facts(p.parent, folder) for p in sorted(folder.rglob("config.json")) if (p.parent / "split.json").is_file()
     ]
     if not found:
         raise UsageError(f"{folder}: no run here or below (a run has config.json and split.json); train one first")
     found.sort(key=lambda r: r["val_ratio"] if r["val_ratio"] is not None else float("inf"))
-    screen = Out(json)
     screen.table(
         f"Runs in {folder}: mean |error| of whole held-out motions in free run, mrad (of nominal)",
         ["run", "model", "seed", "minutes", "validation", "evaluated"],

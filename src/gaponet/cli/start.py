@@ -104,7 +104,7 @@ def start(
         kd: Likewise, N·m·s/rad.
         effort_limit: Likewise, N·m.
         map: A joint's name in the log and the robot's, as a=b; may be repeated.
-        format: Format of the logs; gaponet formats lists them.
+        format: Format of the logs; gaponet import --formats lists them.
         position_unit: Unit of positions, where the format leaves it open.
         time_unit: Unit of time, where the format leaves it open.
         rate: Hz, of logs without a clock.

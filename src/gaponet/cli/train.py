@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
@@ -9,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from gaponet import api
+from gaponet.base.progress import no_progress, progress_bar
 from gaponet.cli.gap import show_methods, show_verdict
 from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
@@ -52,8 +54,12 @@ def train(
     screen = Out(json)
     config = config.paper_recipe() if recipe == "paper" else config
     config = config.fast() if fast else config
-    trained = api.train(dataset, out, budget, config, model, robot, holdout_units, resume, log)
-    if started():  # the first rank says it for all
+    with nullcontext(no_progress) if started() else progress_bar(f"training {model}") as update:
+        trained = api.train(
+            dataset, out=out, budget=budget, config=config, model=model, robot=robot, holdout_units=holdout_units,
+            resume=resume, log=log, progress=update,
+        )  # fmt: skip
+    if started():  # the first rank prints for all
         return
     card = trained.card
     val = card["val_mpjae"]
@@ -71,9 +77,8 @@ def train(
     if not gain.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"
         screen.say("that is within what motions scatter, or less than 2 %: the identified robot is as good without it")
-    screen.say(f"model in {trained.path}; next: {step}")
-    shown = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
-    screen.result({k: card[k] for k in shown})
+    screen.say(f"model in {trained.model.path}; next: {step}")
+    screen.result(trained.to_dict())
 
 
 @like(api.evaluate)
@@ -88,14 +93,18 @@ def evaluate(
 ) -> None:
     """Measure robots and runs on motions that they never saw."""
     out = Out(json)
-    evaluation = api.evaluate(run, dataset, also, motions, robot, units)
-    if not evaluation.result["unseen"]:
+    with progress_bar("evaluating") as update:
+        result = api.evaluate(
+            run, dataset, also=also, motions=motions, robot=robot, units=units, progress=update
+        )  # fmt: skip
+    table = result.to_dict()
+    if not result.unseen:
         out.say(
             "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"
         )
-    for name, delta in evaluation.result["delta"].items():
+    for name, delta in table["delta"].items():
         if delta["at_limit"]:
             out.say(f"{title(name)}: {delta['at_limit']:.2%} of the corrections are at the limit (--model.delta-max)")
-    show_methods(out, evaluation.result)
-    show_verdict(out, evaluation.result["methods"], dataset, run)
-    out.result(evaluation.result)
+    show_methods(out, table)
+    show_verdict(out, result.methods, dataset, run)
+    out.result(table)

@@ -69,7 +69,7 @@ class Log:
                 raise LogError(
                     f"{self.source}: no {name} channel (it has {', '.join(self.channels) or 'none'}); "
                     "a log needs commanded and measured joint positions; of a robot that is driven by torque say the "
-                    "position's name for ctrl too, and see gaponet torque"
+                    "position's name for ctrl too, and see gaponet identify"
                 )
         bad = _bad.get()
         if bad is not None:

@@ -33,7 +33,7 @@ COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal
 STEM = "real"
 HEADING = """# Real robots
 
-`gaponet bench real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in free run from the
+`gaponet experiment real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in free run from the
 recorded start. ± is the standard error over independent motions, of differences to the nominal simulator paired;
 "floor" is what two recordings of one command differ by."""
 

@@ -156,7 +156,7 @@ class TrainConfig:
         return self.threads or (int(said) if said.isdigit() else 0) or os.cpu_count() or 1
 
     def fast(self) -> TrainConfig:
-        """The same with PPO of one pass over each batch and a smaller critic; gaponet bench train shows the gain."""
+        """Return the settings with one PPO pass over each batch and a smaller critic."""
         return replace(self, ppo=replace(self.ppo, epochs=1, critic_hidden=(128,)))
 
     def paper_recipe(self) -> TrainConfig:

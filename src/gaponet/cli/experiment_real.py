@@ -1,9 +1,9 @@
-"""gaponet bench real: methods on public recordings of real robots."""
+"""gaponet experiment real: methods on public recordings of real robots."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -11,8 +11,7 @@ from gaponet.cli.options import Json
 from gaponet.cli.out import Out
 
 
-def bench(
-    what: tyro.conf.Positional[Literal["real"]],
+def real(
     data: Path | None = None,
     out: Path = Path("bench_real"),
     sets: tuple[str, ...] = (),
@@ -24,7 +23,6 @@ def bench(
     """Compare methods on public recordings of real robots.
 
     Args:
-        what: real: docs/benchmark.md.
         data: Folder of the public recordings; default GAPONET_DATA, else ../shared/data.
         out: Folder for datasets, table and figure.
         sets: Only these data sets.

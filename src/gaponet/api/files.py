@@ -1,0 +1,148 @@
+"""Identified robots and trained networks for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from gaponet.api.opening import Place
+from gaponet.api.results import ExportResult
+from gaponet.base.progress import Progress, no_progress
+from gaponet.robot.folder import STORED_ROBOT, has_stored_robot
+from gaponet.robot.spec import load_robot
+
+if TYPE_CHECKING:
+    from gaponet.export.folder import Exported
+    from gaponet.export.ranges import Engine, Ranges, Scope
+
+RobotTarget = Literal["mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json"]
+NetworkTarget = Literal["onnx", "torch", "actuator-net"]
+
+
+def export_robot(
+    robot: Place,
+    *,
+    to: RobotTarget,
+    out: Place | None = None,
+    data: str | None = None,
+    into: Place | None = None,
+    prefix: str = "",
+    payload_mass: float = 0.0,
+    progress: Progress = no_progress,
+) -> ExportResult:
+    """Write an identified robot, or the simulator of a run, for another program.
+
+    Args:
+        robot: Robot folder, or run folder of `train`.
+        to: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py that needs no gaponet; urdf (or
+            SDF: damping, friction, effort limits); json (the numbers).
+        out: Folder; default one with that name in the robot or run.
+        data: Dataset on which a servo model's nearest plain servos are fitted, and every form is measured; default the
+            one that the robot was identified from, and without any the robot's own simulated motions.
+        into: For mjcf and urdf: a file of the user's own; an edited copy is written (mjcf: default the robot's).
+        prefix: Prefix of joint names in that file.
+        payload_mass: kg in each hand.
+        progress: Called with done, total and a note.
+
+    Raises:
+        RobotError: The file cannot be edited.
+        UsageError: No recording was made with this payload and the robot's gains.
+    """
+    from gaponet.export import folder as files
+    from gaponet.export.forms import recordings_of
+
+    holder = Path(robot)
+    spec, source = load_robot(simulator_folder(holder)), None if into is None else Path(into)
+    recordings, folder = recordings_of(simulator_folder(holder), data, spec), Path(out) if out else holder / to
+    made = files.export_robot(spec, to, folder, recordings, source, prefix, payload_mass, progress)
+    return _exported(made, folder, to, spec.name)
+
+
+def export_network(
+    run: Place,
+    *,
+    to: NetworkTarget = "onnx",
+    out: Place | None = None,
+    data: str | None = None,
+    payload_mass: float = 0.0,
+) -> ExportResult:
+    """Write the trained network of a run for another program.
+
+    Args:
+        run: Run folder of `train`.
+        to: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac Lab),
+            actuator-net (one network per joint: past of target − position and speed in, torque out; the form of mjlab,
+            Newton and Isaac Lab).
+        out: Folder; default one with that name in the run, for onnx the run's model folder.
+        data: For actuator-net: where the run's recordings are now; default where they were.
+        payload_mass: kg in each hand.
+
+    Raises:
+        ModelError, UsageError: The run holds no such model, or its payload is beyond those trained on.
+    """
+    from gaponet.export.folder import export_model, export_networks
+    from gaponet.nn.artifact import GapModel
+
+    holder = Path(run)
+    if to == "onnx":
+        return _export_onnx(holder, None if out is None else Path(out))
+    model, folder = GapModel.load(holder), Path(out) if out else holder / to
+    if to == "torch":
+        return _network(folder, to, model.card["robot"], export_model(model, holder, folder, payload_mass))
+    made = export_networks(model, holder, folder, data, payload_mass)
+    return _exported(made, folder, to, model.card["robot"])
+
+
+def randomization(
+    robot: Place, *, out: Place, engine: Engine = "json", scope: Scope = "today", units: tuple[Place, ...] = ()
+) -> tuple[Path, Ranges]:
+    """Write the ranges of an identified robot's parameters, for domain randomisation.
+
+    Args:
+        robot: Robot folder that `identify` or `adapt_robot` wrote, or run folder.
+        out: Folder.
+        engine: Engine whose terms are used, beside sampled units (randomization.json).
+        scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot: over its type.
+        units: For any-robot: robot folders of the type.
+
+    Returns:
+        The file, and the ranges with sampled units.
+    """
+    from gaponet.export.ranges import ranges, write_ranges
+
+    made = ranges(simulator_folder(Path(robot)), scope, tuple(map(Path, units)))
+    return write_ranges(made, engine, Path(out)), made
+
+
+def simulator_folder(holder: Path) -> Path:
+    """Return the robot folder of a run or an artifact, or the folder itself."""
+    return holder / STORED_ROBOT if has_stored_robot(holder) else holder
+
+
+def _exported(made: Exported, folder: Path, to: str, robot: str) -> ExportResult:
+    script = folder / "check.py"
+    return ExportResult(
+        path=made.file or folder, to=to, robot=robot, errors=made.left, motions=made.motions, virtual=made.virtual,
+        notes=tuple(made.notes), check=script if script.is_file() else None,
+    )  # fmt: skip
+
+
+def _export_onnx(run: Path, out: Path | None) -> ExportResult:
+    from gaponet.nn.artifact import CARD, GapModel
+    from gaponet.nn.onnx_export import drawn_states, trained_network
+    from gaponet.nn.onnx_export import export as write
+    from gaponet.robot.folder import load_stored_robot, save_robot
+
+    path = out or run / "model"
+    card, config = GapModel.read_card(run / "model" / CARD)
+    net = trained_network(run, config, len(card["joint_names"]))
+    parity = write(net, path, card, drawn_states(net))
+    if path != run / "model" and has_stored_robot(run):
+        save_robot(load_stored_robot(run, card["robot"]), path / STORED_ROBOT)  # commands can then be transferred
+    return _network(path, "onnx", card["robot"], parity)
+
+
+def _network(path: Path, to: str, robot: str, parity: float) -> ExportResult:
+    return ExportResult(
+        path=path, to=to, robot=robot, errors={}, motions=0, virtual=False, notes=(), parity=parity
+    )  # fmt: skip

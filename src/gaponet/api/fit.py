@@ -1,0 +1,373 @@
+"""Fits to recordings: identify, train, adapt_robot, adapt_model."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as ListOf
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from gaponet.api.logs import unit_recordings
+from gaponet.api.opening import Place, as_dataset, as_robot, as_run, require_commands
+from gaponet.api.results import AdaptResult, IdentifyResult, TorqueResult, TrainResult
+from gaponet.base.errors import NoGainError, UsageError
+from gaponet.base.files import write_json, write_text
+from gaponet.base.progress import Progress, no_progress
+from gaponet.data.store import Dataset
+from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, PROVENANCE_FILE, UNCERTAINTY_FILE
+from gaponet.robot.spec import RobotSpec, load_robot
+
+if TYPE_CHECKING:
+    from gaponet.data.sequence import Sequence
+    from gaponet.data.store import Entry
+    from gaponet.nn.artifact import GapModel
+    from gaponet.nn.config import Kind
+    from gaponet.nn.training.config import TrainConfig
+    from gaponet.sysid.fit import Covariance
+    from gaponet.sysid.uncertainty import ParameterUncertainty
+
+Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"]
+
+MIN_MOTIONS_TO_SPLIT = 3  # with fewer motions, halves of the recordings fit and validate in turn
+
+
+def identify(
+    dataset: Dataset | Place,
+    *,
+    out: Place,
+    windows: int = 40,
+    robot: RobotSpec | Place | None = None,
+    units: tuple[str, ...] = (),
+    holdout_units: tuple[str, ...] = (),
+    terms: tuple[Term, ...] = ("stribeck", "load"),
+    table: bool = True,
+    shared: bool = False,
+    threads: int = 0,
+    budget: str | None = None,
+    stops: bool = False,
+    progress: Progress = no_progress,
+) -> IdentifyResult:
+    """Fit the servos of the simulator, and the table under the robot, to the training motions.
+
+    A robot folder is written if it follows the validation motions better than the given robot; otherwise nothing is.
+    Recordings made with several gains are fitted together, each in a simulator with its own gains.
+
+    Args:
+        dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
+        out: Robot folder to write; `train(…, robot=out)` starts from it.
+        windows: Number of 8 s rollouts that are fitted, taken evenly from the training motions.
+        robot: Start of the fit, if not the robot that the dataset keeps.
+        units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
+        holdout_units: Units to leave out, as in training.
+        terms: Terms of the servo model to try; each is accepted only if validation motions improve.
+        table: Look for a table under the robot's tips ([[tip]] in robot.toml).
+        shared: Give joints with one type of servo ([[servo]] in robot.toml) the same servo model.
+        threads: 0 for all cores.
+        budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.
+        stops: Add an end stop to joints that stayed behind several commands; otherwise they are reported.
+        progress: Called with done, total and a note.
+
+    Raises:
+        DatasetError, UsageError: A unit is not there.
+        NoGainError: Nothing that was fitted does better; it names the joints and what to record.
+    """
+    from gaponet.base.files import lock_folder
+    from gaponet.data.split import split_entries
+    from gaponet.nn.training.budget import Budget
+    from gaponet.robot.folder import save_robot
+    from gaponet.sim.replay import whole_errors
+    from gaponet.sysid.fit import BETTER
+    from gaponet.sysid.identify import identify as fit
+
+    data, spec = as_dataset(dataset, robot)
+    data.require_robot(spec)
+    require_commands(data)
+    all_units = {e.meta.unit_id for e in data.entries}
+    if set(units) - all_units:
+        raise UsageError(f"--units {min(set(units) - all_units)}: not in {data.path}")
+    left_out = (all_units - set(units) if units else set()) | set(holdout_units)
+    split = split_entries(data, tuple(sorted(left_out)))
+    began, val, folder = time.monotonic(), data.sequences(split["val"]), Path(out)
+    seconds = None if budget is None else Budget.parse(budget).seconds
+    if budget is not None and seconds is None:
+        raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
+    with lock_folder(folder, "robot"):
+        fitted = fit(
+            data.sequences(split["train"]), spec, val, windows, terms, table, shared, threads, progress, seconds, stops
+        )
+        given, after = (whole_errors(val, one, threads) for one in (spec, fitted.judged or fitted.robot))
+        if not fitted.better or after.mean() > (1 - BETTER) * given.mean():
+            raise NoGainError(fitted.no_gain(spec, given, after))
+        save_robot(fitted.robot, folder)
+        nominal = given if spec.nominal is None else whole_errors(val, spec.nominal, threads)
+        errors = {"nominal": nominal, "identified": after}
+        _save_origin(folder, data, split, {name: float(e.mean()) for name, e in errors.items()})
+        _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, fitted.judged)
+    return IdentifyResult(
+        robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began
+    )  # fmt: skip
+
+
+def identify_torque(
+    dataset: Dataset | Place, *, out: Place, current: bool = False, robot: RobotSpec | Place | None = None
+) -> TorqueResult:
+    """Fit friction, inertia and delay of a robot that is driven by torque.
+
+    The fit is measured on recordings that were not fitted: the error of the simulator some time after a recorded state,
+    with the recorded torque as its input. A robot folder is written only if that error falls.
+
+    Args:
+        dataset: Recordings with the torque (tau) of every operated joint. Where no position was commanded, logs.toml
+            names the position's column for ctrl too.
+        out: Robot folder to write.
+        current: The recorded torque is a current, or its constant is unknown: fit N·m per unit too.
+        robot: Start of the fit, if not the robot that the dataset keeps.
+
+    Raises:
+        UsageError: A recording lacks torque.
+        NoGainError: The fit is no better than the robot as given.
+    """
+    from gaponet.base.files import lock_folder
+    from gaponet.data.split import split_entries
+    from gaponet.robot.folder import save_robot
+    from gaponet.sysid.torque_motors import driven
+
+    data, spec = as_dataset(dataset, robot)
+    data.require_robot(spec)
+    few = len({e.meta.motion for e in data.entries}) < MIN_MOTIONS_TO_SPLIT
+    split = {"train": data.entries, "val": data.entries, "test": []} if few else split_entries(data, ())
+    folder, train_set = Path(out), data.sequences(split["train"])
+    with lock_folder(folder, "robot"):
+        fitted = driven(train_set, train_set if few else data.sequences(split["val"]), spec, current)
+        before, after = (float(np.mean(x)) for x in fitted.angle[0.5])
+        if not after < before:
+            raise NoGainError(
+                f"nothing is written: half a second on, the error is {1e3 * after:.2f} mrad with the fit and "
+                f"{1e3 * before:.2f} mrad with {spec.name} as given"
+            )
+        save_robot(fitted.robot, folder)
+        _save_origin(folder, data, split, {"nominal": before, "identified": after})
+    return TorqueResult(
+        robot=fitted.robot, folder=folder, before=before, after=after, fit=fitted,
+        virtual=any(e.meta.virtual for e in data.entries),
+    )  # fmt: skip
+
+
+def _save_origin(
+    folder: Path, data: Dataset, split: Mapping[str, ListOf[Entry]], val_mpjae: Mapping[str, float]
+) -> None:
+    """Write what a robot folder was identified from: dataset, recordings and motions by split, validation errors."""
+    write_json(folder / PROVENANCE_FILE, {
+        "dataset": data.address or os.path.relpath(data.path, folder),
+        "parts": {name: {e.id: e.hash for e in entries} for name, entries in split.items()},
+        "motions": {name: sorted({e.meta.motion for e in entries}) for name, entries in split.items()},
+        "val_mpjae": dict(val_mpjae),
+    })  # fmt: skip
+
+
+def _save_uncertainty(
+    folder: Path, sequences: list[Sequence], validation: list[Sequence], covariance: Covariance,
+    before: ParameterUncertainty | None, validated: RobotSpec | None = None,
+) -> None:  # fmt: skip
+    """Write the parameter uncertainty of a robot folder."""
+    from gaponet.sysid.evidence import estimate_uncertainty
+
+    for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
+        (folder / name).unlink(missing_ok=True)
+    estimate_uncertainty(load_robot(folder), sequences, validation, covariance, before, validated).save(folder)
+
+
+def train(
+    dataset: Dataset | Place,
+    *,
+    out: Place,
+    budget: str = "10m",
+    config: TrainConfig | None = None,
+    model: Kind | None = None,
+    robot: RobotSpec | Place | None = None,
+    holdout_units: tuple[str, ...] = (),
+    resume: bool = False,
+    log: tuple[str, ...] = (),
+    progress: Progress = no_progress,
+) -> TrainResult:
+    """Train a delta-action model; the run keeps the model with the least error in rollouts of validation motions.
+
+    Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model
+    (nn/training/ranks.py).
+
+    Args:
+        dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
+        out: Run folder.
+        budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
+        config: Everything else; default `TrainConfig()`.
+        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, inverse;
+            default that of the config.
+        robot: Another robot than the one that the dataset keeps, e.g. the folder that `identify` wrote.
+        holdout_units: Units never trained on; their test motions stay in the test split.
+        resume: Continue the run in `out`.
+        log: tensorboard, wandb.
+        progress: Called with done, total and a note.
+
+    Returns:
+        The exported model; RUN/model holds it.
+
+    Raises:
+        ModelError: The budget bought no training step.
+        DatasetError, UsageError: The recordings, the config or the folder do not fit; the message says what.
+    """
+    from gaponet.base.files import lock_folder
+    from gaponet.nn.training import ranks
+    from gaponet.nn.training.budget import Budget
+    from gaponet.nn.training.config import TrainConfig
+    from gaponet.nn.training.trainer import Trainer
+
+    config = config or TrainConfig()
+    config = replace(config, model=replace(config.model, kind=model)) if model else config
+    with ranks.joined(config.device), ranks.on_first(lock_folder(Path(out), "run")):
+        data, spec = as_dataset(dataset, robot)
+        require_commands(data)
+        show = lambda status: progress(status.fraction, 1.0, status.note)  # noqa: E731
+        trainer = Trainer(data, spec, Path(out), config, Budget.parse(budget), resume, holdout_units, show, log)
+        trained = trainer.run()
+    return TrainResult(model=trained, card=trained.card)
+
+
+def adapt_model(
+    run: GapModel | Place,
+    dataset: Dataset | Place,
+    *,
+    unit: str = "",
+    motions: tuple[str, ...] = (),
+    seconds: float = 30.0,
+    unknown_payload: bool = False,
+    robot: RobotSpec | Place | None = None,
+    mixed_gains: bool = False,
+    progress: Progress = no_progress,
+) -> AdaptResult:
+    """Fit the servo parameters of one unit under a trained model, to a short log.
+
+    Gain, damping, friction, zero offset and delay of each joint are fitted. The model stays as it is. The run keeps the
+    result, and `evaluate` then shows the unit with it too.
+
+    Args:
+        run: Run folder, or a trained model.
+        dataset: Recordings of the unit, perhaps among others.
+        unit: Unit to adapt to, where the dataset holds several.
+        motions: Only these; default: those that the run was trained on, so that its test motions stay unseen, or all
+            where the unit played none of them.
+        seconds: Duration of the recordings to use, in windows of 8 s.
+        unknown_payload: Ignore the recordings' payload and estimate it; all must carry the same.
+        robot: Another robot than the one that the dataset keeps.
+        mixed_gains: Accept recordings made with different kp or kd together.
+        progress: Called with done, total and a note.
+
+    Raises:
+        UsageError, ModelError: The unit is not named, or the model fits another robot.
+    """
+    from gaponet.data.sequence import require_same_gains
+    from gaponet.nn.adaptation import Adaptation
+    from gaponet.nn.artifact import GapModel
+    from gaponet.report.candidate import corrected_robot
+
+    folder = as_run(run)
+    data, spec = as_dataset(dataset, robot, folder)
+    data.require_robot(spec)
+    model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
+    entries = Adaptation.recordings(data, model, unit, motions)
+    if not mixed_gains:
+        require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
+    fitted = Adaptation.fit(model, simulator, data.sequences(entries), seconds, unknown_payload, _window_rms(progress))
+    fitted.save(folder)
+    return AdaptResult(
+        unit_id=fitted.unit_id, servos={j: {str(f): v for f, v in s.items()} for j, s in fitted.servos.items()},
+        before=fitted.before, after=fitted.after, payload_mass=fitted.payload_mass, payload_std=fitted.payload_std,
+        robot=None, folder=folder, recordings=len(entries),
+    )  # fmt: skip
+
+
+def adapt_robot(
+    robot: RobotSpec | Place,
+    source: Dataset | Place,
+    *,
+    out: Place,
+    unit: str = "",
+    motions: tuple[str, ...] = (),
+    seconds: float = 30.0,
+    unknown_payload: bool = False,
+    payload_mass: float | None = None,
+    progress: Progress = no_progress,
+) -> AdaptResult:
+    """Fit the servo parameters of one unit on one day to a short log: a robot folder in, a robot folder out.
+
+    Parameters that the log does not determine keep their values.
+
+    Args:
+        robot: The folder that `identify` wrote, or a nominal robot.
+        source: A dataset, or logs that `import_logs` reads.
+        out: Robot folder to write.
+        unit: Unit to adapt to, where the dataset holds several.
+        motions: Only these.
+        seconds: Duration of the recordings to fit, in windows of 8 s; all of them are used for validation.
+        unknown_payload: Ignore the recordings' payload and estimate it; all must carry the same.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+        progress: Called with done, total and a note.
+
+    Raises:
+        UsageError: The unit is not named.
+        NoGainError: The fit does not follow the recordings, or motions that it was not given, better than the given
+            robot; nothing is written.
+    """
+    from gaponet.base.files import lock_folder
+    from gaponet.robot.folder import save_robot
+    from gaponet.sim.replay import whole_errors
+    from gaponet.sysid.fit import BETTER
+    from gaponet.sysid.refit import FIELDS, refit
+    from gaponet.sysid.uncertainty import ParameterUncertainty
+
+    folder, spec = Path(out), as_robot(Path(robot) if isinstance(robot, str) and "/" in robot else robot)
+    uncertainty = ParameterUncertainty.load(spec)
+    with (
+        lock_folder(folder, "robot"),
+        unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
+    ):
+        gains_stated = all(s.meta.known_gains[1] is not None for s in sequences)
+        fitted = refit(
+            sequences, spec, seconds, unknown_payload, None, _window_rms(progress), gains_stated,
+            judge=not unknown_payload,
+        )  # fmt: skip
+        if not fitted.kept:
+            before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
+            why = f"has an error of {after:.2f} mrad after and {before:.2f} before" if before else "is missing"
+            raise NoGainError(
+                f"nothing is written: a motion that the fit does not see {why}, so keep {spec.name} as it is; "
+                "or give motions that move each joint more"
+            )
+        if fitted.payload_mass is not None:
+            mass = float(fitted.payload_mass)
+            sequences = [replace(s, meta=replace(s.meta, payload_mass=mass)) for s in sequences]
+        before, after = (float(whole_errors(sequences, r).mean()) for r in (spec, fitted.robot))
+        if after > (1 - BETTER) * before:
+            raise NoGainError(
+                f"nothing is written: over all {len(sequences)} recording(s) the error is {1e3 * after:.2f} mrad with "
+                f"the fit and {1e3 * before:.2f} mrad with {spec.name}; give longer logs (--seconds), or keep the robot"
+            )
+        save_robot(fitted.robot, folder)
+        if (spec.folder / PROVENANCE_FILE).is_file():  # identification's training motions stay on record
+            write_text(folder / PROVENANCE_FILE, (spec.folder / PROVENANCE_FILE).read_text(encoding="utf-8"))
+        _save_uncertainty(folder, sequences, [], {}, uncertainty)
+    robot, joints = fitted.robot, zip(fitted.robot.operated, fitted.robot.operated_index, strict=True)
+    return AdaptResult(
+        unit_id=unit, servos={j: {f: float(getattr(robot, f)[i]) for f in FIELDS} for j, i in joints},
+        before=before, after=after, payload_mass=fitted.payload_mass, payload_std=fitted.payload_std, robot=robot,
+        folder=folder, recordings=len(sequences),
+    )  # fmt: skip
+
+
+def _window_rms(progress: Progress) -> Callable[[int, int, float], None]:
+    """Return a callback of refit, whose third argument is the RMS error of the windows, rad."""
+    return lambda done, total, rms: progress(done, total, f"window RMS {rms * 1e3:.2f} mrad")

@@ -1,0 +1,327 @@
+"""From a robot, real or virtual, to a dataset: excite, collect, import_logs, doctor, pair."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from gaponet.api.opening import Place, as_dataset, as_robot
+from gaponet.api.results import CollectResult, DoctorResult, ExciteResult, ImportResult, PairResult, Prediction
+from gaponet.base.errors import DatasetError, UsageError
+from gaponet.base.progress import Progress, no_progress, with_note
+from gaponet.data.store import Dataset
+from gaponet.robot.folder import MOVE_STORED_ROBOT
+from gaponet.robot.spec import RobotSpec
+
+if TYPE_CHECKING:
+    from gaponet.data.sequence import Sequence
+    from gaponet.sysid.motion.plan import Plan
+    from gaponet.sysid.uncertainty import ParameterUncertainty
+
+DEFAULT_MINUTES, DEFAULT_FURTHER_MINUTES = 10.0, 0.5  # of motions for a new robot, and for an identified one
+
+
+def import_logs(
+    src: Place,
+    *,
+    robot: RobotSpec | Place,
+    out: Place,
+    unit_id: str | None = None,
+    payload_mass: float | None = None,
+    payload_side: str | None = None,
+    format: str | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    logs: Place | None = None,
+    position_unit: str | None = None,
+    time_unit: str | None = None,
+    rate: float | None = None,
+    cut: float | None = None,
+    level: str | None = None,
+    kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (),
+    skip_bad: bool = False,
+    strict: bool = False,
+    allow_pickle: bool = False,
+    progress: Progress = no_progress,
+) -> ImportResult:
+    """Read logs into a dataset, with delays and static offsets of the unit; a bad log refuses them all.
+
+    The same call again adds what is missing.
+
+    Args:
+        src: File or folder of logs; `gaponet import --formats` lists what is read.
+        robot: The robot that was recorded.
+        out: Dataset folder; appended to where it exists.
+        unit_id: Name of the recorded robot, the same for all its logs. Needed unless the format states it.
+        payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
+        payload_side: Hand that carries it: both (default), or the side of one payload mount.
+        format: Format of the logs; default by inspection.
+        joint_map: Joint name in the logs → joint name of the robot.
+        logs: A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder of the logs.
+        position_unit: rad, deg, fraction or signed_percent, where the format leaves it open.
+        time_unit: s, ms, us or ns, where the format leaves it open.
+        rate: Hz, of logs without a clock.
+        cut: Cut long recordings into equal pieces of about this length, s; each is a motion of its own.
+        level: joint, upper_body or whole_body (default): what the motions move.
+        kp: Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what the format
+            states, else the robot's.
+        kd: Damping gain while recording, N·m·s/rad, likewise.
+        skip_bad: Cut bad rows and leave out unreadable logs, instead of refusing all.
+        strict: Refuse logs with implausible velocity, torque or temperature, instead of repairing them.
+        allow_pickle: Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only.
+        progress: Called with done, total and a note.
+
+    Raises:
+        LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what to do.
+    """
+    from gaponet.data.importer import import_logs as read_logs
+    from gaponet.sim.dynamics import gravity_of
+    from gaponet.sim.model import model_hash, require_stored_robot
+
+    spec = as_robot(robot)
+    if Dataset.peek(out, spec) is not None:
+        require_stored_robot(Path(out), spec, DatasetError, MOVE_STORED_ROBOT)
+    report = read_logs(
+        src, spec, unit_id, payload_mass, out, payload_side=payload_side, fmt=format,
+        joint_map=None if joint_map is None else dict(joint_map), logs=logs, position_unit=position_unit,
+        time_unit=time_unit, rate=rate, cut=cut, level=level, kp=kp, kd=kd, skip_bad=skip_bad, strict=strict,
+        allow_pickle=allow_pickle, gravity=gravity_of(spec), simulator=model_hash(spec), progress=progress,
+    )  # fmt: skip
+    return ImportResult(
+        dataset=report.dataset, robot=spec, added=tuple(report.entries), present=tuple(report.present),
+        offsets=report.offsets, cut=tuple(report.cut),
+    )  # fmt: skip
+
+
+def doctor(
+    dataset: Dataset | Place,
+    *,
+    robot: RobotSpec | Place | None = None,
+    executor: str | Executor = "local",
+    progress: Progress = no_progress,
+) -> DoctorResult:
+    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
+
+    Args:
+        dataset: Recordings; also the address of a dataset that was pushed to a bucket.
+        robot: Another robot than the one that the dataset keeps.
+        executor: Where many unchecked recordings are read: local, ray, ray:ADDRESS, or one of concurrent.futures.
+        progress: Called with done, total and a note.
+
+    Raises:
+        DatasetError: The folder is no dataset, or damaged.
+    """
+    from gaponet.data.doctor import Diagnosis
+    from gaponet.sim.dynamics import gravity_of, tips_of
+    from gaponet.sim.model import model_hash
+
+    data, spec = as_dataset(dataset, robot)
+    found = Diagnosis.of(data, spec, progress, gravity_of(spec), tips_of(spec), model_hash(spec), executor)
+    return DoctorResult(
+        verdict=found.verdict, findings=tuple(found.findings), sequences=tuple(found.sequences),
+        joints=tuple(found.joints),
+    )  # fmt: skip
+
+
+def pair(
+    dataset: Dataset | Place,
+    *,
+    robot: RobotSpec | Place | None = None,
+    executor: str | Executor = "local",
+    progress: Progress = no_progress,
+) -> PairResult:
+    """Simulate the commands of every recording in the nominal simulator and store the result beside it.
+
+    Recordings that have a paired simulation keep it.
+
+    Args:
+        dataset: Recordings.
+        robot: Another robot than the one that the dataset keeps.
+        executor: Where they are simulated: local, ray, ray:ADDRESS (docs/scale.md), or one of concurrent.futures.
+        progress: Called with done, total and a note.
+
+    Raises:
+        DatasetError, JointMismatchError: The folder is no dataset, or one of another robot.
+    """
+    from gaponet.sim.replay import pair_dataset
+
+    data, spec = as_dataset(dataset, robot)
+    made = pair_dataset(data, spec, with_note(progress, "control steps"), executor=executor)
+    return PairResult(dataset=data, simulated=made, present=len(data) - made)
+
+
+def collect(
+    *,
+    out: Place,
+    robot: RobotSpec | Place = "h1_2",
+    fleet: str | Path = "hard",
+    recipe: str = "small",
+    payloads: tuple[float, ...] = (),
+    units: tuple[str, ...] = (),
+    seed: int = 0,
+    nproc: int = 0,
+    executor: str | Executor = "local",
+    progress: Progress = no_progress,
+) -> CollectResult:
+    """Record motions of virtual robots into a dataset; the same call again records what is missing.
+
+    Args:
+        out: Dataset folder.
+        robot: A robot of the package, or a folder with robot.toml.
+        fleet: Virtual units: hard, easy, shifted, unnamed, firm (hard at nine times the gains), or a .toml file.
+        recipe: demo (under a minute), small (about two), simlifter (30 h: a quarter of an hour), arm (any robot), or a
+            .toml file.
+        payloads: kg per hand instead of the recipe's.
+        units: Units of the fleet instead of the recipe's.
+        seed: Seed of motions, noise and start states.
+        nproc: Processes, or jobs at a time; 0 for one per core. More than one starts fresh interpreters: a script that
+            calls this needs `if __name__ == "__main__":`.
+        executor: Where it is played: local, ray or ray:ADDRESS (docs/scale.md).
+        progress: Called with done, total and a note.
+
+    Raises:
+        UsageError: The recipe names a motion, unit or file that does not exist.
+        DatasetError, FolderError: `out` is another robot's, or holds something else.
+    """
+    from dataclasses import replace
+
+    from gaponet.testing import collect as recording
+    from gaponet.testing.fleet import load_fleet
+
+    spec, plan = as_robot(robot), recording.load_recipe(recipe)
+    plan = replace(plan, payloads=payloads or plan.payloads, units=units or plan.units)
+    made = recording.collect(spec, load_fleet(fleet, spec), plan, out, seed, nproc, progress, executor=executor)
+    return CollectResult(
+        dataset=Path(out), written=made.written, present=made.present, hours=made.hours, seconds=made.wall_s
+    )
+
+
+def excite(
+    robot: RobotSpec | Place,
+    *,
+    out: Place,
+    further: bool = False,
+    minutes: float | None = None,
+    payloads: tuple[float, ...] = (0.0,),
+    rate: float = 50.0,
+    format: Literal["txt", "csv", "npz"] = "txt",
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> ExciteResult:
+    """Write motions to play on a robot, and instructions to print.
+
+    Args:
+        robot: Robot whose range, torque and payload limits bound the motions; an identified one for `further`.
+        out: Folder for the motion files and sheet.md.
+        further: Choose the motions that reduce an identified robot's standard errors most.
+        minutes: Duration of all motions; default 10, for `further` 0.5. 10 identify gains, friction and delay; 40 train
+            a good model.
+        payloads: kg in each hand; every motion is played with each. For `further` the choices.
+        rate: Commands per second, Hz.
+        format: txt (SAGE, 50 Hz), csv (with time) or npz; `gaponet run` and `gaponet record` play each.
+        seed: Seed of the motions.
+        progress: Called with done, total and a note.
+
+    Raises:
+        UsageError: No motion fits, or the robot folder holds no parameter uncertainty.
+    """
+    from gaponet.base.files import lock_folder, write_text
+    from gaponet.sysid.motion.files import write_motion
+    from gaponet.sysid.motion.plan import make_plan, sheet
+
+    spec, masses, folder = as_robot(robot), tuple(sorted(set(payloads))), Path(out)
+    prediction = None
+    with lock_folder(folder, "motions"):
+        if further:
+            seconds = 60 * (DEFAULT_FURTHER_MINUTES if minutes is None else minutes)
+            plan, prediction = _further_motions(spec, seconds, masses, seed, progress)
+        else:
+            plan = make_plan(spec, DEFAULT_MINUTES if minutes is None else minutes, masses, seed)
+        files = {motion.name: f"{i:02d}_{motion.name}.{format}" for i, motion in enumerate(plan.motions, 1)}
+        for motion in plan.motions:
+            write_motion(folder / files[motion.name], motion, spec, rate)
+        write_text(folder / "sheet.md", sheet(spec, plan, files, rate, spec.folder if further else None))
+    return ExciteResult(
+        folder=folder, motions=tuple(files.values()), minutes=plan.minutes, payloads=tuple(plan.payloads),
+        sheet=folder / "sheet.md", prediction=prediction,
+    )  # fmt: skip
+
+
+def _further_motions(
+    spec: RobotSpec, seconds: float, payloads: tuple[float, ...], seed: int, progress: Progress
+) -> tuple[Plan, Prediction]:
+    """Choose the motions that reduce the standard errors most."""
+    from gaponet.sysid.motion.experiment_design import ExperimentDesign, candidates, expected, open_gains
+    from gaponet.sysid.motion.library import Library
+    from gaponet.sysid.motion.plan import Plan
+
+    uncertainty = ParameterUncertainty.require(spec)
+    if payloads[0] < 0 or (payloads[-1] > 0 and not spec.payload_mounts):
+        raise UsageError(f"--payloads {payloads}: give kg ≥ 0; {spec.name} has {len(spec.payload_mounts)} mounts")
+    motions = candidates(Library(spec, seed, payloads[-1]), progress)
+    pairs = [(mass, motion) for mass in payloads for motion in motions]
+    design = ExperimentDesign.from_recordings(
+        spec, uncertainty, [s for mass in payloads for s in expected(spec, motions, mass)]
+    )
+    picks = sorted(design.choose(seconds), key=lambda i: pairs[i][0])
+    if not picks:
+        raise UsageError(f"--minutes {seconds / 60:g}: no motion is so short; give {design.seconds.min() / 60:.2f}")
+    before, after = (_standard_errors(uncertainty, design.after(chosen)) for chosen in ([], picks))
+    chosen = tuple(pairs[i] for i in picks)
+    return Plan(chosen), Prediction(
+        before=before, after=after, useful_seconds=design.worth(),
+        undetermined=open_gains(spec, uncertainty, design, motions, payloads),
+        played=tuple((mass, motion.name) for mass, motion in chosen),
+    )  # fmt: skip
+
+
+def _standard_errors(uncertainty: ParameterUncertainty, covariance: np.ndarray) -> dict[str, dict[str, float]]:
+    """Return joint → field → standard error, SI."""
+    return {
+        joint: dict(
+            zip(uncertainty.fields, np.sqrt(np.diag(uncertainty.si(joint, covariance[i])[1])).tolist(), strict=True)
+        )
+        for i, joint in enumerate(uncertainty.joints)
+    }
+
+
+@contextmanager
+def unit_recordings(
+    source: Dataset | Place,
+    robot: RobotSpec,
+    unit: str = "",
+    motions: tuple[str, ...] = (),
+    payload_mass: float | None = None,
+) -> Iterator[tuple[str, list[Sequence]]]:
+    """Read one unit's recordings from a dataset, or from logs that are imported into a temporary folder.
+
+    Args:
+        source: A dataset, or logs that `import_logs` reads.
+        unit: Unit to read, where there are several.
+        motions: Only these.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+
+    Yields:
+        The unit's id and its recordings.
+
+    Raises:
+        UsageError: The unit is not there, or there are several and none is named.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        if isinstance(source, (str, Path)) and Path(source).exists() and not (Path(source) / "dataset.json").is_file():
+            target = Path(place) / "data"
+            data = import_logs(source, robot=robot, out=target, unit_id=unit or None, payload_mass=payload_mass).dataset
+        else:
+            data, _ = as_dataset(source, robot)
+        data.require_robot(robot)
+        units = sorted({e.meta.unit_id for e in data.entries})
+        if unit not in units and (unit or len(units) != 1):
+            raise UsageError(f"--unit {unit or '(none)'}: {source} holds units {', '.join(units)}; name one")
+        unit = unit or units[0]
+        yield unit, data.sequences([e for e in data.select(motions) if e.meta.unit_id == unit])

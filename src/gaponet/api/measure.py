@@ -1,0 +1,229 @@
+"""Errors of simulators against recordings: gap, evaluate, check, replay."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gaponet.api.logs import import_logs, pair, unit_recordings
+from gaponet.api.opening import (
+    Place,
+    as_dataset,
+    as_robot,
+    as_run,
+    require_commands,
+)
+from gaponet.api.results import CheckResult, EvalResult, GapResult, ReplayResult
+from gaponet.base.errors import UsageError
+from gaponet.base.files import FOLDER_MARKER, write_text
+from gaponet.base.progress import Progress, no_progress
+from gaponet.data.store import Dataset
+from gaponet.robot.spec import RobotSpec, load_robot
+
+if TYPE_CHECKING:
+    from gaponet.base.arrays import Array
+    from gaponet.nn.artifact import GapModel
+
+
+def gap(
+    dataset: Dataset | Place,
+    *,
+    robot: RobotSpec | Place | None = None,
+    motions: tuple[str, ...] = (),
+    run: GapModel | Place | None = None,
+    executor: str = "local",
+    progress: Progress = no_progress,
+) -> GapResult:
+    """Measure the error of the nominal simulator in open-loop rollouts; for an identified robot also by cause.
+
+    Args:
+        dataset: Recordings; those without a paired simulation are simulated first. Also the address of a dataset that
+            was pushed to a bucket.
+        robot: Another robot than the one that the dataset keeps. An identified one is measured as `run` is.
+        motions: Only these.
+        run: Robot folder that `identify` wrote, or a run of `train`. The result then says how much each identified
+            cause and the model reduce the error, and the floor, on motions that were not used in training; the folder
+            keeps it as gap.json, gap.svg and gap.png.
+        executor: Where recordings are simulated: local, ray or ray:ADDRESS (docs/scale.md).
+        progress: Called with done, total and a note.
+    """
+    from gaponet.sim.metrics import Run, summary
+    from gaponet.sim.model import model_hash
+
+    spec = None if robot is None else as_robot(robot)
+    if run is not None or (spec is not None and spec.nominal is not None):
+        return _gap_by_cause(dataset, spec, None if run is None else as_run(run), motions, progress)
+    data, spec = as_dataset(dataset, spec)
+    require_commands(data)
+    pair(data, robot=spec, executor=executor, progress=progress)
+    entries, simulator = data.select(motions), model_hash(spec)
+    pairs = (data.pair(e, simulator) for e in entries)
+    methods = {"nominal": summary((Run.of(p.real, p.sim.qpos, spec) for p in pairs), spec)}
+    return GapResult(methods=methods, table={
+        "methods": methods,
+        "dataset": data.path.name,
+        "sequences": len(entries),
+        "hours": sum(e.rows * e.dt for e in entries) / 3600,
+        "virtual": any(e.meta.virtual for e in entries),
+        "robot": spec.name,
+        "simulator_hash": simulator,
+    })  # fmt: skip
+
+
+def _gap_by_cause(
+    dataset: Dataset | Place, robot: RobotSpec | None, folder: Path | None, motions: tuple[str, ...], progress: Progress
+) -> GapResult:
+    from gaponet.report.candidate import Candidate
+    from gaponet.report.figures.gap_figure import write_gap
+    from gaponet.report.gap import gap_by_step
+
+    data, spec = as_dataset(dataset, robot, folder)
+    candidate = Candidate(spec.folder, spec, None) if folder is None else Candidate.load(folder, spec)
+    table = gap_by_step(candidate, data, motions, progress)
+    if (
+        folder is not None or (candidate.folder / FOLDER_MARKER).is_file()
+    ):  # a folder of the user's own is not written to
+        write_gap(table, candidate.folder, candidate.kind)
+    return GapResult(methods=table["methods"], table=table)
+
+
+def evaluate(
+    run: GapModel | Place,
+    dataset: Dataset | Place,
+    *,
+    also: tuple[Place, ...] = (),
+    motions: tuple[str, ...] = (),
+    robot: RobotSpec | Place | None = None,
+    units: tuple[str, ...] = (),
+    progress: Progress = no_progress,
+) -> EvalResult:
+    """Measure simulators on recordings that were not used in training: nominal, identified, and with the model.
+
+    Args:
+        run: Robot folder that `identify` wrote; or run folder, or a trained model. The result is kept in it.
+        dataset: The dataset trained on (its test motions are used) or another.
+        also: Further runs to compare, e.g. the MLP's.
+        motions: Only these.
+        robot: Another robot than the one that the dataset keeps. If it is not the simulator that the run was trained
+            in, it is shown as it is, and with the run transferred into it (deploy/transfer.py).
+        units: Only recordings of these, such as the one held out from training.
+        progress: Called with done, total and a note.
+
+    Raises:
+        DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or
+            transfer was never measured so far from the simulator of the run.
+    """
+    from gaponet.report import evaluate as measuring
+    from gaponet.report.candidate import is_robot
+    from gaponet.robot.folder import has_stored_robot, load_stored_robot
+    from gaponet.sim.model import model_hash
+
+    folder = as_run(run)
+    data, spec = as_dataset(dataset, robot, folder)
+    target, own = None, spec
+    if robot is not None and (is_robot(folder) or has_stored_robot(folder)):
+        own = load_robot(folder) if is_robot(folder) else load_stored_robot(folder, spec.name)
+    if model_hash(own) != model_hash(spec):
+        target, spec = spec, own.nominal or own
+    evaluation = measuring.evaluate([folder, *map(Path, also)], data, spec, motions, progress, target, units)
+    evaluation.save(folder)
+    return EvalResult(
+        methods=evaluation.result["methods"], unseen=evaluation.result["unseen"], evaluation=evaluation
+    )  # fmt: skip
+
+
+def check(
+    robot: RobotSpec | Place,
+    logs: Dataset | Place,
+    *,
+    unit: str = "",
+    motions: tuple[str, ...] = (),
+    payload_mass: float | None = None,
+    threads: int = 0,
+) -> CheckResult:
+    """Compare new logs with an identified robot: is it unchanged, and what changed?
+
+    Args:
+        robot: Robot folder that `identify` or `adapt_robot` wrote.
+        logs: A dataset, or logs that `import_logs` reads.
+        unit: Unit to check, where there are several.
+        motions: Only these.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+        threads: 0 for all cores.
+
+    Raises:
+        RobotError: The robot folder holds no parameter uncertainty.
+        UsageError: The recordings are too short, or move no joint.
+    """
+    from gaponet.sysid.drift import drift
+    from gaponet.sysid.uncertainty import ParameterUncertainty
+
+    spec = as_robot(Path(robot) if isinstance(robot, str) else robot)
+    uncertainty = ParameterUncertainty.require(spec)
+    with unit_recordings(logs, spec, unit, motions, payload_mass) as (_, sequences):
+        drifted = drift(spec, uncertainty, sequences, threads)
+    return CheckResult(verdict=drifted.verdict, advice=drifted.advice, recordings=len(sequences), drift=drifted)
+
+
+def replay(
+    logs: Place,
+    *,
+    robot: RobotSpec | Place,
+    data: str | None = None,
+    described: Place | None = None,
+    payload_mass: float = 0.0,
+    progress: Progress = no_progress,
+) -> ReplayResult:
+    """Predict what an identified robot would do in the rollouts of a policy.
+
+    The targets of a rollout are played as they stand. A policy that observes the state would have answered the
+    difference. The band holds nine tenths of every validation motion, and the uncertainty of the servos in this motion.
+
+    Args:
+        logs: File or folder of rollouts, in any format that `import_logs` reads: targets as commands, and states.
+        robot: Robot folder that `identify` wrote.
+        data: Dataset whose validation motions give the band; default that of the identification.
+        described: A logs.toml that says what the rollouts' columns mean.
+        payload_mass: kg in each hand.
+        progress: Called with done, total and a note.
+
+    Raises:
+        UsageError: Neither recordings nor an uncertainty of the robot exist.
+    """
+    from gaponet.data.reading import read_first
+    from gaponet.export.forms import recordings_of
+    from gaponet.export.rollout import SHARE, answers, drawn_robots, summary, validation_error
+    from gaponet.sysid.uncertainty import ParameterUncertainty
+
+    spec = as_robot(Path(robot) if isinstance(robot, str) else robot)
+    uncertainty, recordings = ParameterUncertainty.load(spec), recordings_of(spec.folder, data, spec)
+    drawn = drawn_robots(spec) if uncertainty is not None else []
+    errors: Array
+    if recordings is not None:
+        errors = validation_error(spec, recordings[1])
+    elif uncertainty is not None:
+        errors = np.array([uncertainty.joints[j].residual_p90 for j in spec.operated])
+    else:
+        raise UsageError(
+            f"{spec.folder}: nothing says how far it is from its robot; give --data, or what identify wrote"
+        )
+    with tempfile.TemporaryDirectory() as place:
+        toml = None if described is None else Path(described)
+        _, _, guessed = read_first(Path(logs), spec, toml)
+        if guessed:
+            write_text(toml := Path(place) / "logs.toml", guessed)
+        report = import_logs(
+            logs, robot=spec, out=Path(place) / "data", unit_id="rollout", payload_mass=payload_mass, logs=toml,
+            progress=progress,
+        )  # fmt: skip
+        rollouts = report.dataset.sequences(list(report.added))
+    found = answers(spec, rollouts, errors, drawn)
+    joints = summary(found, spec.operated)
+    differ = sorted((j for j, s in joints.items() if s["inside"] < SHARE), key=lambda j: joints[j]["inside"])
+    return ReplayResult(
+        robot=spec, joints=joints, differ=tuple(differ), rollouts=tuple(found), share=SHARE, drawn=len(drawn),
+        band_from_recordings=recordings is not None,
+    )  # fmt: skip

@@ -1,0 +1,53 @@
+"""Datasets, robots and runs as arguments: a path, an address, or an object."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gaponet.base.errors import UsageError
+from gaponet.data.store import Dataset
+from gaponet.robot.spec import RobotSpec, load_robot
+
+if TYPE_CHECKING:
+    from gaponet.nn.artifact import GapModel
+
+Place = str | Path
+
+
+def as_robot(robot: RobotSpec | Place) -> RobotSpec:
+    """Return a robot, loaded where a name or a folder is given."""
+    return robot if isinstance(robot, RobotSpec) else load_robot(robot)
+
+
+def as_run(run: GapModel | Place) -> Path:
+    """Return the folder of a run; a trained model lies in it."""
+    if isinstance(run, (str, Path)):
+        return Path(run)
+    return run.path.parent if run.path.name == "model" else run.path
+
+
+def as_dataset(
+    dataset: Dataset | Place, robot: RobotSpec | Place | None, run: Path | None = None
+) -> tuple[Dataset, RobotSpec]:
+    """Return a dataset and its robot, or the robot that is given."""
+    from gaponet.share.reading import open_dataset
+
+    return open_dataset(dataset, robot, run)
+
+
+def driven_by_torque(data: Dataset) -> bool:
+    """True if no positions were commanded: the commands of the first recording equal its measured positions."""
+    first = data.read(data.entries[0]) if data.entries else None
+    return first is not None and np.array_equal(first.ctrl, first.qpos) and bool(np.ptp(first.qpos))
+
+
+def require_commands(data: Dataset) -> None:
+    """Refuse recordings without commanded positions."""
+    if driven_by_torque(data):
+        raise UsageError(
+            f"{data.path}: no position was commanded, so there is nothing to follow; this robot is driven by torque: "
+            f"gaponet identify {data.path} --out ROBOT fits its friction, inertia and delay, and says how far it is"
+        )

@@ -1,0 +1,506 @@
+"""Results of the public functions: one frozen class each.
+
+`to_dict` returns plain dictionaries, lists, numbers and text. It is what the command of the same name prints with
+`--json`. Angles are in rad, torques in N·m, times in s, masses in kg.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+
+if TYPE_CHECKING:
+    from gaponet.data.offsets import UnitOffsets
+    from gaponet.data.store import Dataset, Entry
+    from gaponet.export.rollout import Answer
+    from gaponet.nn.artifact import GapModel
+    from gaponet.report.evaluate import Evaluation
+    from gaponet.robot.finding import Finding
+    from gaponet.robot.spec import RobotSpec
+    from gaponet.sysid.drift import Drift
+    from gaponet.sysid.fit import Identified
+    from gaponet.sysid.torque_motors import Driven
+
+Metrics = dict[str, Any]  # mpjae rad, q_dis rad·s, …, and by_joint, by_payload, by_unit, by_motion, by_horizon
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportResult:
+    """Logs that were read into a dataset.
+
+    Attributes:
+        added: Sequences that were added.
+        present: Sequences of the same logs that the dataset held before.
+        offsets: Lag and static errors of the unit; None without a gravity model or with several units.
+        cut: Rows that were cut and logs that were left out, one line each.
+    """
+
+    dataset: Dataset
+    robot: RobotSpec
+    added: tuple[Entry, ...]
+    present: tuple[Entry, ...]
+    offsets: UnitOffsets | None
+    cut: tuple[str, ...]
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Sequences that were added, or those that were present where nothing was added."""
+        return self.added or self.present
+
+    def fast_lags(self, joint: str) -> list[float]:
+        """Lags of a joint in the sequences that command it fast, s."""
+        from gaponet.data.signals import FAST
+
+        def finding(entry: Entry, name: str) -> float | None:
+            return entry.findings.get(name, {}).get(joint)  # a collected recording has none
+
+        lags = [finding(e, "delay_s") for e in self.entries if (finding(e, "fast_speed") or 0) >= FAST]
+        return [lag for lag in lags if lag is not None]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        offsets = self.offsets.joints if self.offsets else {}
+        return {
+            "dataset": str(self.dataset.path), "imported": [e.id for e in self.added],
+            "present": [e.id for e in self.present], "sequences": len(self.dataset),
+            "minutes": sum(e.rows * e.dt for e in self.entries) / 60,
+            "rate_hz": sorted({round(1 / e.dt, 2) for e in self.entries}),
+            "fast_lag_s": {joint: self.fast_lags(joint) for joint in self.robot.operated},
+            "delay_s": {e.id: e.findings.get("delay_s", {}) for e in self.entries},
+            "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False,
+            "cut": list(self.cut),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorResult:
+    """Problems of a dataset.
+
+    Attributes:
+        verdict: One sentence.
+        findings: Problems, the worst first.
+        sequences, joints: One row of numbers per sequence and per joint.
+    """
+
+    verdict: str
+    findings: tuple[Finding, ...]
+    sequences: tuple[Mapping[str, Any], ...]
+    joints: tuple[Mapping[str, Any], ...]
+
+    def count(self, level: str) -> int:
+        """Return the number of findings of a level: error, warning or note."""
+        return sum(f.level == level for f in self.findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return {
+            "verdict": self.verdict, "findings": [asdict(f) for f in self.findings],
+            "sequences": [dict(row) for row in self.sequences], "joints": [dict(row) for row in self.joints],
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairResult:
+    """Recordings with a paired simulation.
+
+    Attributes:
+        simulated: Recordings that were simulated now.
+        present: Recordings whose simulation was there before.
+    """
+
+    dataset: Dataset
+    simulated: int
+    present: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return {"dataset": str(self.dataset.path), "simulated": self.simulated, "present": self.present}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GapResult:
+    """Error of the simulator, in open-loop rollouts of whole motions.
+
+    Attributes:
+        methods: Method (nominal; also identified, and a model) → metrics.
+        table: Everything that `to_dict` returns. Of an identified robot or a run it holds the error after each cause,
+            the floor, and the same by joint and payload.
+    """
+
+    methods: dict[str, Metrics]
+    table: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def mpjae(self) -> dict[str, float]:
+        """Method → mean absolute joint position error, rad."""
+        return {name: float(metrics["mpjae"]) for name, metrics in self.methods.items()}
+
+    @property
+    def by_cause(self) -> bool:
+        """True if the result says what each identified cause removes."""
+        return "left" in self.table
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return dict(self.table)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalResult:
+    """Errors of robots and runs on motions of a dataset.
+
+    Attributes:
+        methods: Method → metrics.
+        unseen: True if no recording was used in training.
+        evaluation: Rollouts, commands and corrections of each method.
+    """
+
+    methods: dict[str, Metrics]
+    unseen: bool
+    evaluation: Evaluation = field(repr=False)
+
+    @property
+    def mpjae(self) -> dict[str, float]:
+        """Method → mean absolute joint position error, rad."""
+        return {name: float(metrics["mpjae"]) for name, metrics in self.methods.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return dict(self.evaluation.result)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifyResult:
+    """An identified robot and its error on validation motions.
+
+    Attributes:
+        robot: The robot with identified servos, as written to `folder`.
+        errors: nominal and identified → mean |error| of each whole validation motion, (motions,) rad.
+        fit: Standard errors, terms that were tried, warnings.
+        seconds: Duration of the fit.
+    """
+
+    robot: RobotSpec
+    folder: Path
+    errors: Mapping[str, Array]
+    fit: Identified = field(repr=False)
+    seconds: float
+
+    @property
+    def val_mpjae(self) -> dict[str, float]:
+        """nominal and identified → mean over the validation motions, rad."""
+        return {name: float(errors.mean()) for name, errors in self.errors.items()}
+
+    def values(self) -> dict[str, dict[str, float]]:
+        """Operated joint → servo field → value, SI; fields without information are left out."""
+        from gaponet.sysid.uncertainty_table import FIELD_UNITS
+
+        robot = self.robot
+        return {
+            joint: {
+                f: float(getattr(robot, f)[i])
+                for f in FIELD_UNITS
+                if np.isfinite(getattr(robot, f)[i]) and (f != "effort_limit" or f in self.fit.std[joint])
+            }
+            for joint, i in zip(robot.operated, robot.operated_index, strict=True)
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        from gaponet.sim.metrics import standard_error
+
+        fit = self.fit
+        return {
+            "chosen": fit.chosen, "joints": self.values(), "std": fit.std, "val_mpjae": self.val_mpjae,
+            "val_standard_error": {name: standard_error(errors) for name, errors in self.errors.items()},
+            "terms": {t.name: {"gain": t.gain[0], "standard_error": t.gain[1], "kept": t.kept} for t in fit.tried},
+            "shared": {
+                t.name: {"own": t.before.mean(), "one": t.after.mean(), "standard_error": t.gain[1]} for t in fit.shared
+            },
+            "table": vars(self.robot.table) if self.robot.table else None,
+            "touching": list(fit.touch.motions) if fit.touch else [],
+            "warnings": list(fit.warnings), "undetermined": fit.undetermined,
+            "seconds": self.seconds, "robot": str(self.folder),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueResult:
+    """An identified torque-driven robot.
+
+    Attributes:
+        robot: The robot with identified armature, damping, friction and delay, as written to `folder`.
+        before, after: Mean |error| half a second after a recorded state, driven by the recorded torque, rad.
+        fit: Values, standard errors and errors by joint.
+    """
+
+    robot: RobotSpec
+    folder: Path
+    before: float
+    after: float
+    virtual: bool
+    fit: Driven = field(repr=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        from gaponet.sysid.torque_motors import TERMS
+
+        fit, robot = self.fit, self.robot
+        joints = {
+            joint: {f: float(getattr(robot, f)[i]) for f in (*TERMS, "delay")}
+            | {"bias": float(fit.bias[j]), "constant": float(fit.constant[j])}
+            for j, (joint, i) in enumerate(zip(robot.operated, robot.operated_index, strict=True))
+        }
+        return {
+            "joints": joints, "std": fit.std, "torque": fit.torque, "windows": fit.windows,
+            "angle": {str(h): x for h, x in fit.angle.items()}, "robot": str(self.folder),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainResult:
+    """A trained model.
+
+    Attributes:
+        model: The exported model that was best on validation motions.
+        card: What its card.json says: training, data, errors.
+    """
+
+    model: GapModel
+    card: dict[str, Any] = field(repr=False)
+
+    @property
+    def val_mpjae(self) -> dict[str, float]:
+        """nominal, start (the simulator without the network) and model → mean error on validation motions, rad."""
+        return {name: float(self.card["val_mpjae"][name]) for name in ("nominal", "start", "model")}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        keys = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
+        return {key: self.card[key] for key in keys}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptResult:
+    """Servo parameters of one unit on one day.
+
+    Attributes:
+        servos: Operated joint → kp N·m/rad, damping N·m·s/rad, frictionloss N·m, offset rad, delay s.
+        before, after: Mean error of whole recordings (robot), or RMS error of the fitted windows (model), rad.
+        payload_mass, payload_std: Estimated payload in each hand and its standard error, kg; None where it was given.
+        robot: The adapted robot; None for a model.
+        folder: Robot folder or run folder that holds the result.
+        recordings: Number of recordings behind `before` and `after`.
+    """
+
+    unit_id: str
+    servos: Mapping[str, Mapping[str, float]]
+    before: float
+    after: float
+    payload_mass: float | None
+    payload_std: float | None
+    robot: RobotSpec | None
+    folder: Path
+    recordings: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return {
+            "unit_id": self.unit_id, "before": self.before, "after": self.after,
+            "servos": {joint: dict(servo) for joint, servo in self.servos.items()}, "robot": str(self.folder),
+            "payload_mass": self.payload_mass, "payload_std": self.payload_std,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckResult:
+    """Comparison of new logs with an identified robot.
+
+    Attributes:
+        verdict: same, drifted, contradictory or different.
+        advice: What to do.
+        recordings: Number of recordings that were compared.
+        drift: Every parameter that changed, with its significance.
+    """
+
+    verdict: str
+    advice: str
+    recordings: int
+    drift: Drift = field(repr=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        d = self.drift
+        plain = lambda moved: {**vars(moved), "sigmas": moved.sigmas}  # noqa: E731
+        return {
+            "verdict": self.verdict, "advice": self.advice, "recordings": self.recordings, "seconds": d.seconds,
+            "moved": [plain(m) for m in d.moved], "largest": {j: plain(m) for j, m in d.largest.items()},
+            "against": [vars(a) for a in d.against], "threshold": d.threshold, "far": d.far,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayResult:
+    """Motion that the identified robot would make in rollouts of a policy.
+
+    Attributes:
+        joints: Operated joint → errors (rad) and share of time inside the band.
+        differ: Joints that leave the band for too long, the worst first.
+        rollouts: Targets, rollout, predicted motion and band of each rollout, (T, joints) rad.
+        share: Share of the error distribution that the band holds.
+        drawn: Number of parameter samples behind the band.
+        band_from_recordings: False if the recordings are gone and the band comes from the robot folder.
+    """
+
+    robot: RobotSpec
+    joints: Mapping[str, Mapping[str, Any]]
+    differ: tuple[str, ...]
+    rollouts: tuple[Answer, ...] = field(repr=False)
+    share: float
+    drawn: int
+    band_from_recordings: bool
+
+    def save(self, path: Path) -> None:
+        """Write target, rollout, robot, low and high of each rollout, (T, joints) rad, and dt, s, to an .npz file."""
+        from gaponet.base.files import atomic_write
+
+        arrays: dict[str, Any] = {
+            "names": np.array([a.name for a in self.rollouts]), "joints": np.array(self.robot.operated)
+        }  # fmt: skip
+        for k, a in enumerate(self.rollouts):
+            series = {"target": a.target, "rollout": a.rollout, "robot": a.robot}
+            series |= {"low": a.robot - a.half, "high": a.robot + a.half, "dt": np.array(a.dt)}
+            arrays |= {f"{name}_{k}": values for name, values in series.items()}
+        with atomic_write(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return {
+            "robot": self.robot.name, "rollouts": [a.name for a in self.rollouts],
+            "joints": {j: dict(s) for j, s in self.joints.items()}, "differ": list(self.differ),
+            "band": {"share": self.share, "drawn": self.drawn},
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportResult:
+    """Files for another program.
+
+    Attributes:
+        path: Folder or file that was written.
+        to: Program or format.
+        robot: Name of the robot.
+        errors: Form of the robot → mean |error| over the motions that judged it, rad; empty for a network.
+        motions: Number of those motions.
+        virtual: True if no real robot played them.
+        notes: What the form leaves out, and what the user has to decide.
+        parity: Largest difference between the file and the trained network, rad; None for a robot.
+        check: Script that checks the export in the other program without gaponet; None where there is none.
+    """
+
+    path: Path
+    to: str
+    robot: str
+    errors: Mapping[str, float]
+    motions: int
+    virtual: bool
+    notes: tuple[str, ...]
+    parity: float | None = None
+    check: Path | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        if self.parity is not None:
+            return {"path": str(self.path), "to": self.to, "parity_rad": self.parity}
+        return {
+            "path": str(self.path), "to": self.to, "robot": self.robot, "left": dict(self.errors),
+            "notes": list(self.notes),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectResult:
+    """Recordings of virtual robots.
+
+    Attributes:
+        written: Recordings made now.
+        present: Recordings that were there before.
+        hours: Recorded time of `written`, h.
+        seconds: Wall time.
+    """
+
+    dataset: Path
+    written: int
+    present: int
+    hours: float
+    seconds: float
+
+    @property
+    def times_real_time(self) -> float:
+        """Recorded time over wall time."""
+        return self.hours * 3600 / self.seconds if self.seconds > 0 else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return {
+            "virtual": True, "times_real_time": self.times_real_time, "dataset": str(self.dataset),
+            "written": self.written, "present": self.present, "hours": self.hours, "wall_s": self.seconds,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExciteResult:
+    """Motion files to play on a robot.
+
+    Attributes:
+        motions: File names in `folder`, in the order of playing.
+        minutes: Duration of all motions with all payloads.
+        payloads: Payloads, kg in each hand.
+        sheet: Instructions to print.
+        prediction: Standard errors of an identified robot before and after the motions; else None.
+    """
+
+    folder: Path
+    motions: tuple[str, ...]
+    minutes: float
+    payloads: tuple[float, ...]
+    sheet: Path
+    prediction: Prediction | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        told = {} if self.prediction is None else self.prediction.to_dict()
+        return {"motions": list(self.motions), "minutes": self.minutes, "payloads": list(self.payloads),
+                "sheet": str(self.sheet), **told}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """Standard errors of an identified robot's parameters, before and after further motions.
+
+    Attributes:
+        before, after: Joint → servo field → standard error, SI.
+        useful_seconds: Playing time after which half a minute more reduces the errors by less than 5 %.
+        undetermined: Joint → why its gains stay undetermined.
+        played: Payload (kg) and name of each motion.
+    """
+
+    before: Mapping[str, Mapping[str, float]]
+    after: Mapping[str, Mapping[str, float]]
+    useful_seconds: float
+    undetermined: Mapping[str, str]
+    played: tuple[tuple[float, str], ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain data."""
+        return {
+            "errors": self.before, "errors_then": self.after, "worth_seconds": self.useful_seconds,
+            "open": dict(self.undetermined), "played": [list(pair) for pair in self.played],
+        }  # fmt: skip

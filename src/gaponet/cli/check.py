@@ -1,0 +1,127 @@
+"""gaponet check: are new logs still of the identified robot; of many robots, every night."""
+
+from __future__ import annotations
+
+import sys
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from gaponet import api
+from gaponet.base.errors import UsageError
+from gaponet.cli.options import Flag, Folder, Json, Motions, Unit, like
+from gaponet.cli.out import Out
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.uncertainty import ParameterUncertainty
+
+if TYPE_CHECKING:
+    from gaponet.sysid.drift import Moved
+
+Robot = Annotated[
+    Folder,
+    tyro.conf.arg(help="Robot folder of gaponet identify or adapt; with --fleet a folder of those.", metavar="ROBOT"),
+]
+Logs = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(
+        help="Dataset folder or address, or logs that gaponet import reads; with --fleet a folder of each robot's logs "
+        "or dataset, or one dataset of all units.",
+        metavar="LOGS",
+    ),
+]
+
+
+@like(api.check)
+def check(
+    robot: Robot,
+    logs: Logs,
+    unit: Unit = "",
+    motions: Motions = (),
+    payload_mass: float | None = None,
+    threads: int = 0,
+    fleet: Flag = False,
+    out: Path | None = None,
+    night: str = "",
+    adapt: bool = True,
+    executor: str = "local",
+    workers: int = 0,
+    json: Json = False,
+) -> None:
+    """Is this still the robot that was identified? What changed?
+
+    The exit code is 0 where it is, 1 where it is not, 2 where that cannot be decided. With --fleet many robots are
+    checked, those that drifted are adapted, and one page shows them; the same command again continues.
+
+    Args:
+        fleet: Check a folder of robots: who drifted, by what, since when. The options below are for this.
+        out: Folder for fleet.html, adapted/ROBOT, and ROBOT.json with its nights.
+        night: Name of the night; default today.
+        adapt: Adapt robots that drifted.
+        executor: Local, ray or ray:ADDRESS (docs/scale.md); all machines see the folders.
+        workers: Robots at a time; 0 for one per core.
+    """
+    screen = Out(json)
+    if fleet:
+        if out is None:
+            raise UsageError("--fleet: give a folder for the page and the results, --out FOLDER")
+        _check_fleet(screen, robot, logs, out, night, adapt, payload_mass, executor, workers)
+        return
+    if not (robot / "robot.toml").is_file():
+        raise UsageError(f"{robot}: is no robot folder (no robot.toml); give what gaponet identify wrote")
+    made = api.check(robot, logs, unit=unit, motions=motions, payload_mass=payload_mass, threads=threads)
+    drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
+    named = {m.joint for m in drift.moved}
+    screen.table(
+        f"{made.recordings} recordings, {drift.seconds:.0f} s: what changed most, in standard deviations",
+        ["joint", "number", "by", "deviations", "moves it, mrad", "left anyway, mrad", ""],
+        [
+            _row(m, uncertainty, m.joint in named)
+            for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))
+        ],
+    )
+    for a in drift.against:
+        what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} deviations"
+        screen.say(f"  {what}", "warning", "yellow")
+    screen.say(f"{made.verdict}: {made.advice}")
+    screen.result(made.to_dict())
+    if made.verdict != "same":
+        sys.stdout.flush()
+        raise SystemExit(1)
+
+
+def _check_fleet(
+    screen: Out, robots: Path, logs: str, out: Path, night: str, adapt: bool, payload_mass: float | None,
+    executor: str, workers: int,
+) -> None:  # fmt: skip
+    from gaponet import fleet
+    from gaponet.base.progress import progress_bar
+
+    when, found = night or date.today().isoformat(), dict[str, fleet.Night]()
+    with progress_bar("checking") as update:
+        for name, mine, count in fleet.night(robots, Path(logs), out, when, adapt, payload_mass, executor, workers):
+            found[name] = mine
+            update(len(found), count, f"{name}: {mine['verdict']}")
+    odd = {name: mine for name, mine in sorted(found.items()) if mine["verdict"] != fleet.SAME}
+    if odd:
+        screen.table(f"Not as they were, {when}", ["robot", "since", "what moved, or what is wrong"], [
+            [name, fleet.since(fleet.history(out / f"{name}.json")), "; ".join(n["moved"]) or n["advice"]]
+            for name, n in odd.items()
+        ])  # fmt: skip
+    took = sum(n["took"] for n in found.values())
+    screen.say(f"{len(found) - len(odd)} of {len(found)} are the same; {took:.0f} s of processor; {out / 'fleet.html'}")
+    screen.result({"night": when, "robots": found, "page": str(out / "fleet.html")})
+    if odd:
+        sys.stdout.flush()
+        raise SystemExit(1)
+
+
+def _row(m: Moved, known: ParameterUncertainty, counts: bool) -> list[str]:
+    from gaponet.sysid.uncertainty_table import format_change
+
+    mine = [k.residual_rms for j, k in known.joints.items() if m.joint == j or m.joint not in known.joints]
+    left = sum(mine) / len(mine)
+    by = format_change(m.field, m.by, known, m.joint)
+    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * left:.2f}",
+            "moved" if counts else ""]  # fmt: skip
