@@ -111,7 +111,7 @@ def test_a_robot_folder_is_adapted_without_a_model_or_not_at_all(robot, logs, tm
     for log in logs:
         data.append(log)
     found = api.adapt_robot(robot, data, out=tmp_path / "today", seconds=16.0)
-    assert found.errors["after"].mean() < 0.2 * found.errors["before"].mean()
+    assert found.after < 0.2 * found.before
     written = load_robot(tmp_path / "today")
     np.testing.assert_allclose(written.kp, 0.6 * robot.kp, rtol=0.2)
     np.testing.assert_array_equal(written.nominal.kp, robot.kp)
@@ -126,7 +126,7 @@ def test_one_short_command_adapts_nothing_and_windows_of_several_are_judged_by_m
     data = Dataset.create(tmp_path / "data", robot)
     for payload in (0.0, 0.1):
         data.append(record(robot, commands(60, 0), "m0", payload))
-    with pytest.raises(NoGainError, match="is all there is of each joint"):
+    with pytest.raises(NoGainError, match="no joint has a motion that the fit does not see"):
         api.adapt_robot(robot, data, out=tmp_path / "one")
     several = [record(robot, commands(450, seed), f"m{seed}", kp=0.7) for seed in range(3)]
     found = refit(several, robot, judge=True)

@@ -342,10 +342,13 @@ def adapt_robot(
         )  # fmt: skip
         if not fitted.kept:
             before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
-            why = f"has an error of {after:.2f} mrad after and {before:.2f} before" if before else "is missing"
+            why = (
+                f"the error of motions that the fit does not see is {after:.2f} mrad, and {before:.2f} without the fit"
+                if before
+                else "no joint has a motion that the fit does not see"
+            )
             raise NoGainError(
-                f"nothing is written: a motion that the fit does not see {why}, so keep {spec.name} as it is; "
-                "or give motions that move each joint more"
+                f"nothing is written: {why}; keep {spec.name} as it is, or record motions that move each joint more"
             )
         if fitted.payload_mass is not None:
             mass = float(fitted.payload_mass)
