@@ -118,7 +118,7 @@ def _command(kind: type[Any]) -> Any:
 
 
 def experiment(action: None) -> None:
-    """Run an experiment: the paper, comparisons of models, real recordings."""
+    """Run an experiment: the paper, comparisons, real recordings."""
 
 
 # Each is run while the command line is parsed; the function that remains to be called does nothing.
