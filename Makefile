@@ -71,7 +71,7 @@ adversary: setup
 
 # Ten small robots that nobody tuned on, beside the plain script: minutes, resumable; exit code 1 where one loses.
 tournament: setup
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/robots.py tournament_work --robots 10 --small
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/tournament.py tournament_work --robots 10 --small
 
 # Changed files at random into everything that reads files: a quarter of an hour; counts as JSON, exit code 1 where one
 # ends in anything but one clear error. FUZZ="--only sage --mutants 1000 --keep failed" looks at one reader.

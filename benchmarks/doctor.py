@@ -1,9 +1,9 @@
-"""What gaponet doctor finds on robots that nobody tuned on: faults that combine, and alarms at logs that are good.
+"""Faults of logs that gaponet doctor detects on random robots (random_robots.py), and its false alarms.
 
-    python benchmarks/doctor.py --robots 10 [--page docs/results/doctor.md]
+    python benchmarks/doctor.py --robots 10        # the table of docs/results/doctor.md
 
-A fault counts as found where a warning or an error says its kind (KINDS) that the good logs of the same robot have not.
-All robots are virtual (strangers.py); faults of labels need a payload, so an arm.
+A fault is detected if a warning or an error of its kind (FAULTS) appears that the unchanged logs do not have. All
+robots are VIRTUAL. Faults of payload labels need a payload, so an arm.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from strangers import Recording, Stranger, draw
+from random_robots import RandomRobot, Recording, draw_robot
 
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.log import Channel, Log
@@ -31,18 +31,18 @@ MOTIONS, SECONDS = 8, 18.0
 Logs = list[Recording]
 
 
-def every(change: Callable[[Recording], Recording]) -> Callable[[Stranger, Logs], Logs]:
-    """The same fault in all logs."""
+def every(change: Callable[[Recording], Recording]) -> Callable[[RandomRobot, Logs], Logs]:
+    """Put a fault into all logs."""
     return lambda robot, logs: [change(log) for log in logs]
 
 
-def one(change: Callable[[Recording], Recording]) -> Callable[[Stranger, Logs], Logs]:
-    """A fault in the fourth log."""
+def one(change: Callable[[Recording], Recording]) -> Callable[[RandomRobot, Logs], Logs]:
+    """Put a fault into the fourth log."""
     return lambda robot, logs: [change(log) if i == 3 else log for i, log in enumerate(logs)]
 
 
 def shifted(seconds: float) -> Callable[[Recording], Recording]:
-    """Commands so much later than they were."""
+    """Delay the commands."""
 
     def change(log: Recording) -> Recording:
         rows = np.clip(np.searchsorted(log.time, log.time - seconds, side="right") - 1, 0, len(log.time) - 1)
@@ -52,18 +52,18 @@ def shifted(seconds: float) -> Callable[[Recording], Recording]:
 
 
 def state(log: Recording, values: Callable[[np.ndarray], np.ndarray]) -> Recording:
-    """Other positions and velocities."""
+    """Change positions and velocities."""
     return replace(log, qpos=values(log.qpos), qvel=None if log.qvel is None else values(log.qvel))
 
 
 def drifted(log: Recording) -> Recording:
-    """The state's clock runs 2,000 ppm fast."""
+    """Let the clock of the state run 2,000 ppm fast."""
     at = np.minimum(log.time * 1.002, log.time[-1])
     return state(log, lambda x: np.stack([np.interp(at, log.time, c) for c in x.T], axis=1))
 
 
 def averaged(log: Recording) -> Recording:
-    """The mean of the last 150 ms is logged."""
+    """Log the mean of the last 150 ms."""
     total = lambda x: np.concatenate([np.zeros((1, x.shape[1])), x.cumsum(axis=0)])  # noqa: E731
     first = np.searchsorted(log.time, log.time - 0.15, side="right")
     end = np.arange(1, len(log.time) + 1)
@@ -71,38 +71,38 @@ def averaged(log: Recording) -> Recording:
 
 
 def velocities(log: Recording) -> Recording:
-    """Velocity commands where positions should be."""
+    """Log velocity commands as positions."""
     return replace(log, ctrl=np.clip(np.gradient(log.ctrl, log.time, axis=0), -3, 3))
 
 
-def played(robot: Stranger, logs: Logs, number: int, told: Callable[[np.ndarray], np.ndarray]) -> Recording:
-    """A log of another motion than the commands say."""
+def played(robot: RandomRobot, logs: Logs, number: int, told: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """Play a motion that differs from the logged commands."""
     told_it = robot.commands(number, SECONDS)
     log = robot.play(logs[number].motion, told(told_it), logs[number].payload, number)
     return replace(log, ctrl=told_it[np.minimum(np.round(log.time * robot.rate).astype(int), len(told_it) - 1)])
 
 
-def e_stop(robot: Stranger, logs: Logs) -> Logs:
-    """The brakes are on for four seconds of one motion."""
+def e_stop(robot: RandomRobot, logs: Logs) -> Logs:
+    """Hold the brakes for four seconds of one motion."""
     a, b = (round(x * robot.rate) for x in (7, 11))
     hold = lambda u: np.concatenate([u[:a], np.repeat(u[a : a + 1], b - a, axis=0), u[b:]])  # noqa: E731
     return [played(robot, logs, i, hold) if i == 3 else log for i, log in enumerate(logs)]
 
 
-def two_units(robot: Stranger, logs: Logs) -> Logs:
-    """Half of the logs are of a second robot of the same type."""
+def two_units(robot: RandomRobot, logs: Logs) -> Logs:
+    """Replace half of the logs by those of a second robot of the same type."""
     rng, n = np.random.default_rng(robot.seed), len(robot.joints)
-    law = replace(robot.law, offset=rng.normal(0, 0.015, n), kp=robot.law.kp * rng.uniform(0.85, 1.15, n),
-                  friction=robot.law.friction * rng.uniform(0.6, 1.6, n))  # fmt: skip
-    other = replace(robot, law=law)
+    servo = replace(robot.servo, offset=rng.normal(0, 0.015, n), kp=robot.servo.kp * rng.uniform(0.85, 1.15, n),
+                  friction=robot.servo.friction * rng.uniform(0.6, 1.6, n))  # fmt: skip
+    other = replace(robot, servo=servo)
     return [
         other.play(x.motion, robot.commands(i, SECONDS), x.payload, i) if i >= len(logs) / 2 else x
         for i, x in enumerate(logs)
     ]
 
 
-def degrees(robot: Stranger, logs: Logs) -> Logs:
-    """One joint hardly moves, and is logged in degrees."""
+def degrees(robot: RandomRobot, logs: Logs) -> Logs:
+    """Log a joint that hardly moves in degrees."""
     j, found = len(robot.joints) // 2, []
     for i, x in enumerate(logs):
         ctrl = robot.commands(i, SECONDS)
@@ -115,19 +115,19 @@ def degrees(robot: Stranger, logs: Logs) -> Logs:
     return found
 
 
-def torques(robot: Stranger, logs: Logs) -> Logs:
-    """Torques where positions should be."""
-    robot = replace(robot, dirt=replace(robot.dirt, torque=True, dropped=0.0))
+def torques(robot: RandomRobot, logs: Logs) -> Logs:
+    """Log torques as positions."""
+    robot = replace(robot, log_noise=replace(robot.log_noise, torque=True, dropped=0.0))
     again = [robot.play(x.motion, robot.commands(i, SECONDS), x.payload, i) for i, x in enumerate(logs)]
     return [replace(x, ctrl=x.tau, tau=None) for x in again if x.tau is not None]
 
 
-def swapped(robot: Stranger, logs: Logs) -> Logs:
-    """Each log has the other one's payload on its label."""
+def swapped(robot: RandomRobot, logs: Logs) -> Logs:
+    """Swap the payload labels."""
     return [replace(x, payload=0.0 if x.payload else robot.payload) for x in logs] if robot.payload else []
 
 
-FAULTS: dict[str, tuple[Callable[[Stranger, Logs], Logs], tuple[str, ...]]] = {
+FAULTS: dict[str, tuple[Callable[[RandomRobot, Logs], Logs], tuple[str, ...]]] = {
     "velocity commands as positions": (every(velocities), ("command",)),
     "torque commands as positions": (torques, ("command",)),
     "payload labels swapped": (swapped, ("payload",)),
@@ -143,8 +143,8 @@ FAULTS: dict[str, tuple[Callable[[Stranger, Logs], Logs], tuple[str, ...]]] = {
 }
 
 
-def examine(robot: Stranger, spec: RobotSpec, logs: Logs, folder: Path) -> list[Finding]:
-    """Warnings and errors of the doctor."""
+def examine(robot: RandomRobot, spec: RobotSpec, logs: Logs, folder: Path) -> list[Finding]:
+    """Return the doctor's warnings and errors."""
     data = Dataset.create(folder, spec)
     for log in logs:
         names = {c: v for c in ("ctrl", "qpos", "qvel", "tau") if (v := getattr(log, c)) is not None}
@@ -154,10 +154,10 @@ def examine(robot: Stranger, spec: RobotSpec, logs: Logs, folder: Path) -> list[
     return [f for f in found if f.level in ("warning", "error")]
 
 
-def drawn(first: int, count: int) -> Iterator[Stranger]:
-    """Robots of up to 250 Hz; every second one carries something, where it has a hand."""
+def drawn(first: int, count: int) -> Iterator[RandomRobot]:
+    """Draw robots of up to 250 Hz; those with a hand carry a payload."""
     for seed in range(first, first + count):
-        robot = draw(seed)
+        robot = draw_robot(seed)
         robot = replace(robot, rate=min(robot.rate, 250.0))
         if robot.body == "arm" or "ur5e" in robot.body or "xarm" in robot.body:
             robot = replace(
@@ -167,12 +167,11 @@ def drawn(first: int, count: int) -> Iterator[Stranger]:
 
 
 def main() -> None:
-    """Play faults, count."""
+    """Simulate the faults and count detections."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, default=10)
     parser.add_argument("--first", type=int, default=300)
     parser.add_argument("--faults", nargs="*", default=list(FAULTS))
-    parser.add_argument("--page", type=Path)
     args = parser.parse_args()
     hits: dict[str, list[bool]] = {name: [] for name in args.faults}
     alarms: Counter[str] = Counter()
@@ -190,7 +189,9 @@ def main() -> None:
             known = Counter((f.check, f.joints) for f in good)
             alarms.update({f.check for f in good})
             clean += not good
-            print(f"== {robot.seed} {robot.body} {len(robot.joints)} joints {robot.rate:g} Hz {robot.laws}", flush=True)
+            print(
+                f"== {robot.seed} {robot.body} {len(robot.joints)} joints {robot.rate:g} Hz {robot.effects}", flush=True
+            )
             for f in good:
                 print(f"   good: {f.level} {f.check}: {f.message[:200]}", flush=True)
             for number, name in enumerate(args.faults):
@@ -207,8 +208,6 @@ def main() -> None:
     told = ", ".join(f"{check} {count}" for check, count in alarms.most_common()) or "none"
     lines += ["", f"Good logs of the same {args.robots} robots: {clean} without a warning; warnings by kind: {told}."]
     print("\n".join(lines))
-    if args.page:
-        args.page.write_text("\n".join(["# What the doctor finds\n", *lines]) + "\n")
 
 
 if __name__ == "__main__":

@@ -106,20 +106,8 @@ def cases(given: Path) -> dict[str, Case]:
         return ["train", data, "--out", str(out), "--budget", "4000", *resume, *TRAIN]
 
     def experiment(out: Path) -> list[str]:
-        return [
-            "experiment",
-            "data",
-            data,
-            "--out",
-            str(out),
-            "--quick",
-            "--models",
-            "mlp",
-            "--seeds",
-            "1",
-            "--shares",
-            "1.0",
-        ]
+        return ["experiment", "data", data, "--out", str(out), "--quick", "--models", "mlp", "--seeds", "1",
+                "--shares", "1.0"]  # fmt: skip
 
     return {
         "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),
@@ -212,13 +200,7 @@ class Trial:
         text = self.log.read_text(errors="replace") if self.log.is_file() else ""
         if code not in meant or "Traceback" in text:
             self.wrong.append(f"{what}: exit {code}: {text.strip().splitlines()[-1:] or ''}")
-        elif code == 2 and text.strip().splitlines()[-1].split(":")[0] not in (
-            "Folder",
-            "File",
-            "Usage",
-            "Dataset",
-            "Model",
-        ):
+        elif code == 2 and text.strip().splitlines()[-1].split(":")[0] not in REFUSALS:
             self.wrong.append(f"{what}: no one-line error: {text.strip().splitlines()[-1]}")
         self.log.unlink(missing_ok=True)
 

@@ -55,7 +55,7 @@ def test_a_folder_named_like_the_robot_in_the_current_directory_changes_nothing(
         assert found["simulator_hash"] == model_hash(arm)
         assert gap_by_step(Candidate.load(run, robot), dataset)["left"]["nominal"] == pytest.approx(before)
     assert main(["gap", str(data.path)]) == 2  # no run here that keeps one
-    assert "keeps no robot, and the package has no 'arm'; say which robot it is with --robot" in capsys.readouterr().err
+    assert "stores no robot, and the package has no 'arm'; say which robot it is" in capsys.readouterr().err
 
 
 def test_another_robots_simulator_is_refused_whatever_its_name(data, run, tmp_path):

@@ -71,8 +71,8 @@ def test_a_finger_that_follows_another_and_a_base_that_hangs_are_said_to_be_held
         '<actuator><position joint="thumb" kp="2"/></actuator></mujoco>'
     )
     notes = make(tmp_path, file).notes
-    assert any(note.startswith("tip moves with thumb and is held still here") for note in notes)
-    assert any("the base is held still here" in note for note in notes)
+    assert any(note.startswith("tip moves with thumb and is fixed here") for note in notes)
+    assert any("the base is fixed here" in note for note in notes)
 
 
 def test_frozen_joints_stand_where_the_keyframe_says(tmp_path):
@@ -210,7 +210,7 @@ def test_a_package_elsewhere_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("wanted", "words"),
     [
-        ({"joints": ("left_slide",)}, "is a slide joint, and gaponet knows angles alone"),
+        ({"joints": ("left_slide",)}, "is a slide joint, and gaponet supports angles only"),
         ({"joints": ("base",)}, "is a free joint"),
         ({"joints": ("*knee*",)}, "no such joint; there are: shoulder, elbow, roll, hip"),
         ({"kp": ("hip=1",)}, "has no position gain for roll: give those of the controller that recorded"),

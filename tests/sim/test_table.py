@@ -65,7 +65,7 @@ def test_a_found_table_is_saved_and_changes_the_simulator(arm, tmp_path):
 
 
 def test_a_table_that_nothing_may_touch_is_refused(tmp_path):
-    with pytest.raises(RobotError, match=r"\[table\] is touched by nothing; name what may touch it in a \[\[tip\]\]"):
+    with pytest.raises(RobotError, match=r"\[table\]: no \[\[tip\]\] can touch it"):
         write_arm(tmp_path / "arm", toml=TOML + "[table]\nheight = -0.05\n")
     stranger = write_arm(tmp_path / "b", toml=TOML + TIP.replace("fore", "jaw") + "[table]\nheight = -0.05\n")
     with pytest.raises(RobotError, match=r"a \[\[tip\]\] names body 'jaw', which is missing"):

@@ -1,4 +1,4 @@
-"""Two robots of the tournament (benchmarks/robots.py), whom nobody tuned on, by commands alone."""
+"""Two robots of the tournament (benchmarks/tournament.py), whom nobody tuned on, by commands alone."""
 
 import importlib.util
 import sys
@@ -12,7 +12,7 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 @pytest.mark.parametrize("seed", [6001, 6006])
 def test_identification_is_never_worse_than_the_file_of_a_robot_it_never_met(seed, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    spec = importlib.util.spec_from_file_location("tournament", BENCHMARKS / "robots.py")  # tests have robots too
+    spec = importlib.util.spec_from_file_location("tournament", BENCHMARKS / "tournament.py")  # tests have robots too
     robots = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "tournament", robots)
     spec.loader.exec_module(robots)

@@ -1,7 +1,7 @@
-"""Whether a robot would hit itself, or what it stands on: distances between capsules, and to a plane, along a command.
+"""Collision check of commands: distances between capsules of the robot, and from capsules to the floor or table.
 
-Shapes come from `collision.toml` in the robot's folder: capsules per body, groups of bodies that are not compared, and
-the height of the floor or table. A robot without that file is not checked.
+`collision.toml` in the robot's folder holds capsules per body, groups of bodies that are not compared, and the height
+of the floor or table. A robot without that file is not checked.
 """
 
 from __future__ import annotations
@@ -23,17 +23,15 @@ from gaponet.robot.spec import RobotSpec
 
 Metres = Annotated[float, Interval(ge=-100, le=100)]
 Point = tuple[Metres, Metres, Metres]
-CLEARANCE_M = 0.03  # m kept between shells: a loaded arm sags by centimetres below what it is told
-POSTURE_STEP_RAD = 0.03  # rad between postures that are looked at: a hand 0.7 m away moves by less than the clearance
-
-
+CLEARANCE_M = 0.03  # between capsules: a loaded arm sags by centimetres below its command
+POSTURE_STEP_RAD = 0.03  # between checked postures: a hand at 0.7 m moves by less than the clearance
 Radius = Annotated[float, Interval(ge=0, le=100)]
 Capsule = TypedDict("Capsule", {"body": str, "from": Point, "to": Point, "radius": Radius})
 
 
 @dataclass(frozen=True)
 class Box:
-    """Half lengths along the axes of the body, for looking at only."""
+    """Box for display only; `size` holds half lengths along the axes of the body, m."""
 
     body: str
     pos: Point
@@ -42,7 +40,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Plane:
-    """Floor or table, level: its height in the MJCF's world, and the bodies (beginnings of names) that stand on it."""
+    """Level floor or table: its height in the MJCF's world, and prefixes of the bodies that stand on it."""
 
     height: Metres = 0.0
     stands: str = ""
@@ -50,7 +48,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Shapes:
-    """collision.toml, or look.toml, which may hold boxes too."""
+    """Content of collision.toml, or of look.toml, which may also hold boxes."""
 
     capsule: Annotated[tuple[Capsule, ...], Len(0, 1000)] = ()
     same_limb: tuple[str, ...] = ()
@@ -60,12 +58,12 @@ class Shapes:
 
 
 class Collision:
-    """Capsules of one robot, the pairs of them that may meet, and those that may meet the plane.
+    """Collision model of a robot: capsules, the pairs that can collide, and the capsules that can hit the plane.
 
     Attributes:
-        checked: Whether there are shapes at all.
-        clearance: Free space that a command keeps, m.
-        height: Where the plane is, m in the MJCF's world; None without one.
+        checked: True if the robot has shapes.
+        clearance: Minimum distance of a command, m.
+        height: Height of the plane in the MJCF's world, m; None without a plane.
     """
 
     def __init__(
@@ -73,8 +71,8 @@ class Collision:
     ) -> None:
         """
         Args:
-            height: Where the plane is, m, instead of what collision.toml says.
-            unchecked: Do without shapes.
+            height: Height of the plane, m, instead of that of collision.toml.
+            unchecked: Ignore collision.toml.
         """
         self.model = model
         self.data = mujoco.MjData(model)
@@ -101,29 +99,30 @@ class Collision:
         self.above = np.array(above, int)
 
     def distances(self, qpos: Array) -> Array:
-        """Free space of every pair, then of every shell above the plane, (T, n) rad → (T, pairs + shells) m."""
-        position, turn = np.empty((len(qpos), len(self.body), 3)), np.empty((len(qpos), len(self.body), 9))
+        """Return the distance of every pair, then of every capsule to the plane, (T, n) rad → (T, pairs + capsules) "
+        "m."""
+        position, rotation = np.empty((len(qpos), len(self.body), 3)), np.empty((len(qpos), len(self.body), 9))
         data, body = self.data, self.body
         for t, q in enumerate(qpos):
             data.qpos = q
             mujoco.mj_kinematics(self.model, data)
-            position[t], turn[t] = data.xpos[body], data.xmat[body]
-        ends = self.ends @ turn.reshape(*turn.shape[:2], 3, 3).swapaxes(-1, -2) + position[:, :, None]
+            position[t], rotation[t] = data.xpos[body], data.xmat[body]
+        ends = self.ends @ rotation.reshape(*rotation.shape[:2], 3, 3).swapaxes(-1, -2) + position[:, :, None]
         i, k = self.pairs.T
         between = segment_distance(ends[:, i, 0], ends[:, i, 1], ends[:, k, 0], ends[:, k, 1])
         low = ends[:, self.above][..., 2].min(axis=-1) - (self.height or 0.0)
         return np.concatenate([between - self.radius[i] - self.radius[k], low - self.radius[self.above]], axis=1)
 
     def distance(self, qpos: Array) -> Array:
-        """The least free space at each posture, (T, n) rad → (T,) m; inf without shapes."""
+        """Return the smallest distance at each posture, (T, n) rad → (T,) m; inf without shapes."""
         return self.distances(qpos).min(axis=1, initial=np.inf)
 
     def along(self, ctrl: Array) -> Array:
-        """Free space (pairs + shells,) m that a command (T, n) rad leaves, wherever that is; rows are thinned out."""
+        """Return the smallest distance of each pair and capsule along a command, (T, n) rad → (pairs + capsules,) m."""
         return self.distances(thinned(ctrl)).min(axis=0, initial=np.inf)
 
     def nearest(self, free: Array) -> str:
-        """Which two come nearest, of free space (pairs + shells,) m, for messages."""
+        """Name the nearest pair for messages, from distances (pairs + capsules,) m."""
         at = int(np.argmin(free))
         if at < len(self.pairs):
             return " and ".join(self.names[c] for c in self.pairs[at])
@@ -131,16 +130,16 @@ class Collision:
 
 
 def thinned(ctrl: Array, step: float = POSTURE_STEP_RAD) -> Array:
-    """Rows of a command (T, n) rad between which no joint goes further than `step` rad, if its own rows allow that."""
-    gone = np.concatenate([[0.0], np.abs(np.diff(ctrl, axis=0)).max(axis=1).cumsum()])
-    marks = np.searchsorted(gone, np.arange(0.0, gone[-1], step))
+    """Select rows of a command (T, n) rad, so that no joint moves more than `step` rad between them if possible."""
+    travelled = np.concatenate([[0.0], np.abs(np.diff(ctrl, axis=0)).max(axis=1).cumsum()])
+    marks = np.searchsorted(travelled, np.arange(0.0, travelled[-1], step))
     return ctrl[np.unique(np.append(marks, len(ctrl) - 1))]
 
 
 def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
-    """Distance between segments a0–a1 and b0–b1, (…, 3) each → (…).
+    """Return the distance between segments a0–a1 and b0–b1, (…, 3) each → (…).
 
-    The nearest points of the two lines, clamped to the segments one after the other (Ericson, Real-Time Collision
+    The nearest points of the two lines are clamped to the segments in turn (Ericson, Real-Time Collision
     Detection, 5.1.9).
     """
     u, v, w = a1 - a0, b1 - b0, a0 - b0
@@ -154,10 +153,10 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
 
 
 def read_shapes(folder: Path) -> Shapes:
-    """collision.toml of a robot folder; without the file, no shapes.
+    """Read collision.toml of a robot folder; without the file, return no shapes.
 
     Raises:
-        RobotError: With the file and the field.
+        RobotError: It names the file and the field.
     """
     path = folder / "collision.toml"
     return read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields") if path.is_file() else Shapes()
@@ -172,5 +171,5 @@ def _require_bodies(robot: RobotSpec, model: mujoco.MjModel, shapes: Shapes) -> 
 
 
 def _grouped(a: str, b: str, groups: list[list[str]]) -> bool:
-    """Whether both bodies begin with words of one group."""
+    """Return True if one group has prefixes of both bodies."""
     return any(a.startswith(tuple(group)) and b.startswith(tuple(group)) for group in groups)

@@ -1,4 +1,4 @@
-"""Gains, torque limit and home of each joint: from a model's actuators, or from the user, and which."""
+"""Gains, torque limit and home of each joint, from the model's actuators or from the user, with their sources."""
 
 from __future__ import annotations
 
@@ -18,7 +18,12 @@ ON_JOINT = [int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPAREN
 
 @dataclass(frozen=True)
 class Drive:
-    """One joint's drive, N·m/rad, N·m·s/rad, N·m and rad; each with its source. actuator: the name of its own."""
+    """Drive of one joint, with the sources of its numbers.
+
+    Attributes:
+        actuator: Name of the joint's only actuator, else "".
+        kp, kd, limit, home: N·m/rad, N·m·s/rad, N·m, rad.
+    """
 
     name: str
     actuator: str
@@ -38,45 +43,53 @@ def drives(
     given: dict[str, tuple[str, ...]],
     file: str,
 ) -> tuple[Drive, ...]:
-    """Drives of these hinges; given: kp, kd and effort_limit as the user wrote them.
+    """Determine the drives of hinge joints.
+
+    Args:
+        pose: Home pose, (nq).
+        given: The user's options kp, kd and effort_limit, such as ("100", "*wrist*=20").
+        file: Name of the model, for sources and messages.
 
     Raises:
-        UsageError: A word is no number or names no joint, or a joint's kp is said nowhere.
+        UsageError: An option is no number or names no joint, or a joint has no kp.
     """
-    said = {name: _given(name, words, joints) for name, words in given.items()}
-    found, without = [], []
+    options = {name: _parse_option(name, words, joints) for name, words in given.items()}
+    result, without_gain = [], []
     for name in joints:
         j = model.joint(name).id
-        mine = np.flatnonzero(np.isin(model.actuator_trntype, ON_JOINT) & (model.actuator_trnid[:, 0] == j)).tolist()
-        kp, kd = _gains(model, mine)
+        actuators = np.flatnonzero(
+            np.isin(model.actuator_trntype, ON_JOINT) & (model.actuator_trnid[:, 0] == j)
+        ).tolist()
+        kp, kd = _gains(model, actuators)
         sources = dict.fromkeys(("kp", "kd"), f"its actuator in {file}")
-        if not kp and name not in said["kp"]:
-            without.append(name)
+        if not kp and name not in options["kp"]:
+            without_gain.append(name)
         if not kd:
-            sources["kd"] = f"its actuator in {file} has none" if mine else f"{file} has none"
-        if name in said["kp"]:
-            kp, kd, sources["kp"], sources["kd"] = said["kp"][name], 0.0, "--kp", "--kp was given without --kd"
-        if name in said["kd"]:
-            kd, sources["kd"] = said["kd"][name], "--kd"
-        limits = [*_limits(model, j, mine, file), (NO_LIMIT, f"{file} has none: write the motor's")]
+            sources["kd"] = f"its actuator in {file} has none" if actuators else f"{file} has none"
+        if name in options["kp"]:
+            kp, kd, sources["kp"], sources["kd"] = options["kp"][name], 0.0, "--kp", "--kp was given without --kd"
+        if name in options["kd"]:
+            kd, sources["kd"] = options["kd"][name], "--kd"
+        limits = [*_limits(model, j, actuators, file), (NO_LIMIT, f"{file} has none: write the motor's")]
         limit, why = min(limits, key=lambda x: x[0])
-        if name in said["effort_limit"]:
-            limit, why = said["effort_limit"][name], "--effort-limit"
-        actuator = model.actuator(mine[0]).name if len(mine) == 1 else ""
+        if name in options["effort_limit"]:
+            limit, why = options["effort_limit"][name], "--effort-limit"
+        actuator = model.actuator(actuators[0]).name if len(actuators) == 1 else ""
         home = float(pose[model.jnt_qposadr[j]])
-        found.append(Drive(name, actuator, kp, sources["kp"], kd, sources["kd"], limit, why, home))
-    if without:
+        result.append(Drive(name, actuator, kp, sources["kp"], kd, sources["kd"], limit, why, home))
+    if without_gain:
         raise UsageError(
-            f"{file} has no position gain for {abbreviate(without)}: give those of the controller that recorded the "
+            f"{file} has no position gain for {abbreviate(without_gain)}: give those of the controller that recorded "
+            "the "
             "logs, "
-            "--kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); where nobody knows them a guess will do, "
-            "gaponet identify finds them within a factor of 50"
+            "--kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); where nobody knows them a guess is enough, "
+            "gaponet identify corrects it within a factor of 50"
         )
-    return tuple(found)
+    return tuple(result)
 
 
 def _gains(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
-    """kp and kd at the joint, of all actuators that pull it towards a position or brake it."""
+    """Return kp and kd at the joint, summed over its position and damping actuators."""
     kp = kd = 0.0
     for a in actuators:
         if model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE:
@@ -87,7 +100,7 @@ def _gains(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
 
 
 def _limits(model: mujoco.MjModel, j: int, actuators: list[int], file: str) -> Iterator[tuple[float, str]]:
-    """Every torque limit that the model has for a joint, the smaller of both directions."""
+    """Yield the torque limits that the model states for a joint, with sources; of both directions, the smaller."""
     if model.jnt_actfrclimited[j]:
         yield float(np.abs(model.jnt_actfrcrange[j]).min()), f"actuatorfrcrange (in a URDF, effort) in {file}"
     for a in actuators:
@@ -99,12 +112,12 @@ def _limits(model: mujoco.MjModel, j: int, actuators: list[int], file: str) -> I
             yield float(gear * most), f"ctrlrange of its motor in {file}"
 
 
-def _given(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, float]:
-    """("100", "*wrist*=20") → joint → number; the later word wins."""
-    found: dict[str, float] = {}
+def _parse_option(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, float]:
+    """Convert ("100", "*wrist*=20") to joint → number; a later word overrides earlier ones."""
+    values: dict[str, float] = {}
     for word in words:
         pattern, _, number = word.rpartition("=")
-        hit = [j for j in joints if fnmatchcase(j, pattern or "*")]
+        matches = [j for j in joints if fnmatchcase(j, pattern or "*")]
         try:
             value = float(number)
         except ValueError:
@@ -112,7 +125,7 @@ def _given(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, fl
         flag = f"--{name.replace('_', '-')} {word}"
         if not (np.isfinite(value) and 0 <= value <= NO_LIMIT):
             raise UsageError(f"{flag}: give a number from 0 to {NO_LIMIT:g}, or PATTERN=NUMBER")
-        if not hit:
+        if not matches:
             raise UsageError(f"{flag}: no such joint; there are: {', '.join(joints)}")
-        found |= dict.fromkeys(hit, value)
-    return found
+        values |= dict.fromkeys(matches, value)
+    return values

@@ -1,4 +1,4 @@
-"""Finding: one line of the doctor's report."""
+"""Findings of checks of recordings and robots."""
 
 from __future__ import annotations
 
@@ -9,16 +9,21 @@ from typing import Any
 from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 
-# ok; note, a fact to know; warning, usable but look first; error, do not train on it before it is mended.
+# note: a fact; warning: usable after a look; error: correct it before training.
 LEVELS = ("ok", "note", "warning", "error")
-
-
-Mend = dict[str, dict[str, Any]]  # table of logs.toml → joint → value
+Mend = dict[str, dict[str, Any]]  # table of logs.toml → joint → corrected value
 
 
 @dataclass(frozen=True)
 class Finding:
-    """`message` is for people and says what to do; `values` are the numbers in it, `mend` what logs.toml would say."""
+    """One line of the doctor's report.
+
+    Attributes:
+        level: One of LEVELS.
+        message: States the problem and what to do.
+        values: Numbers of the message.
+        mend: Corrections for logs.toml.
+    """
 
     level: str
     check: str
@@ -29,7 +34,7 @@ class Finding:
 
     @staticmethod
     def proposal(findings: list[Finding]) -> str:
-        """Lines to add to a logs.toml where the findings say how, and as comments what it cannot mend."""
+        """Return lines for logs.toml: corrections, and as comments the findings that it cannot correct."""
         bad = [f for f in findings if f.level in ("warning", "error")]
         lines = [
             "# gaponet doctor --fix: a proposal, applied to nothing. Look it over, add it to the logs.toml of these "
@@ -53,12 +58,12 @@ class Finding:
         return "\n".join(lines) + "\n"
 
 
-def abbreviate(motions: list[str]) -> str:
-    """Up to three names, each once, and how many more."""
-    motions = list(dict.fromkeys(motions))
-    return ", ".join(motions[:3]) + (f" and {len(motions) - 3} more" if len(motions) > 3 else "")
+def abbreviate(names: list[str]) -> str:
+    """List up to three different names and count the others."""
+    names = list(dict.fromkeys(names))
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def masked_names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
-    """Joint names where mask (n) is true."""
-    return tuple(name for name, yes in zip(robot.joint_names, mask, strict=True) if yes)
+    """Return the joint names where mask (n) is true."""
+    return tuple(name for name, selected in zip(robot.joint_names, mask, strict=True) if selected)

@@ -1,9 +1,9 @@
-"""What a compiled model simulates, in lines of rounded numbers: two models with the same lines move the same.
+"""Fingerprint of a compiled model: lines of rounded numbers. Two models with equal lines have equal dynamics.
 
-The lines do not depend on how a model was written: bodies welded together are one link, inertias are tensors about the
-link's centre, and all places are those of the reference pose. Comments, file names, geoms that touch nothing, sites,
-cameras and sensors leave no trace. Numbers are rounded far below what matters and far above what two compilers differ
-by; steps are no decimal fractions, since a figure from a file could lie half way between two of those.
+The lines do not depend on how a model was written. Bodies welded together are one link, inertias are tensors about the
+link's centre, and positions are those of the reference pose. Comments, file names, geoms without contact, sites,
+cameras and sensors are ignored. Rounding steps are far below any physical effect and far above the differences between
+compilers. They are no decimal fractions, because a number from a file could lie half way between two of those.
 """
 
 from __future__ import annotations
@@ -15,25 +15,26 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 
-ODD = 1.0471975511965976
-LENGTH, MASS, INERTIA, HULL = 1e-7 * ODD, 1e-7 * ODD, 1e-11 * ODD, 1e-4 * ODD  # m, kg, kg·m², m of a mesh that touches
-JOINT = ("solref", "solimp", "margin", "actgravcomp")
-DOF = ("armature", "frictionloss", "solref", "solimp")
-ACTUATOR = (
+NO_DECIMAL = 1.0471975511965976
+LENGTH_STEP, MASS_STEP, INERTIA_STEP = 1e-7 * NO_DECIMAL, 1e-7 * NO_DECIMAL, 1e-11 * NO_DECIMAL  # m, kg, kg·m²
+MESH_STEP = 1e-4 * NO_DECIMAL  # m, of the extent of a mesh
+JOINT_FIELDS = ("solref", "solimp", "margin", "actgravcomp")
+DOF_FIELDS = ("armature", "frictionloss", "solref", "solimp")
+ACTUATOR_FIELDS = (
     "trntype", "gear", "gaintype", "gainprm", "biastype", "biasprm", "dyntype", "dynprm", "armature", "damping",
     "dampingpoly", "delay", "history", "user",
 )  # fmt: skip
-OPTION = (
+OPTIONS = (
     "integrator", "cone", "solver", "gravity", "wind", "density", "viscosity", "impratio", "iterations", "tolerance",
     "ls_iterations", "ls_tolerance", "noslip_iterations", "noslip_tolerance", "ccd_iterations", "ccd_tolerance",
 )  # fmt: skip
-IDLE_FLAGS = {"mjDSBL_WARMSTART", "mjDSBL_SENSOR", "mjDSBL_MIDPHASE", "mjDSBL_AUTORESET", "mjDSBL_ISLAND"}
-GEOM = ("type", "contype", "conaffinity", "condim", "priority", "friction", "margin", "gap", "solref", "solimp",
+IGNORED_FLAGS = {"mjDSBL_WARMSTART", "mjDSBL_SENSOR", "mjDSBL_MIDPHASE", "mjDSBL_AUTORESET", "mjDSBL_ISLAND"}
+GEOM_FIELDS = ("type", "contype", "conaffinity", "condim", "priority", "friction", "margin", "gap", "solref", "solimp",
         "solmix", "fluid")  # fmt: skip
 
 
 def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
-    """Everything that decides how the model moves, one thing per line; the time step is left to the caller."""
+    """Yield what determines the dynamics of a model, one item per line, without the time step."""
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
@@ -45,12 +46,14 @@ def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
     for j in range(model.njnt):
         yield from _joint(model, data, j, link)
     for i in range(model.nu):
-        text = " ".join(f"{f} {_exact(getattr(model, f'actuator_{f}', np.zeros(model.nu))[i])}" for f in ACTUATOR)
+        text = " ".join(
+            f"{f} {_exact(getattr(model, f'actuator_{f}', np.zeros(model.nu))[i])}" for f in ACTUATOR_FIELDS
+        )
         limits = [_range(model, "actuator", kind, i) for kind in ("force", "ctrl", "act")]
         yield f"actuator of {model.joint(model.actuator_trnid[i, 0]).name} {text} {' '.join(limits)}"
     for body in range(1, model.nbody):
         if model.body(body).name.startswith("payload_"):
-            yield f"mount {model.body(body).name} on {link[body]} at {_near(data.xpos[body], LENGTH)}"
+            yield f"mount {model.body(body).name} on {link[body]} at {_rounded(data.xpos[body], LENGTH_STEP)}"
     if model.neq or model.ntendon:
         yield from _couplings(model, data, link)
     touching = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -59,31 +62,31 @@ def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _options(model: mujoco.MjModel) -> Iterator[str]:
-    for name in OPTION:
+    for name in OPTIONS:
         yield f"{name} {_exact(getattr(model.opt, name))}"
     for kind, flags in ((mujoco.mjtDisableBit, "disableflags"), (mujoco.mjtEnableBit, "enableflags")):
-        bits = [bit for bit in kind.__members__.values() if "BL_" in bit.name]  # not their number
+        bits = [bit for bit in kind.__members__.values() if "BL_" in bit.name]  # not the count of flags
         names = {bit.name for bit in bits if getattr(model.opt, flags) & bit.value}
-        yield f"{flags} {' '.join(sorted(names - IDLE_FLAGS))}"
+        yield f"{flags} {' '.join(sorted(names - IGNORED_FLAGS))}"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
         yield " ".join(_exact(getattr(model.opt, f)) for f in ("o_margin", "o_solref", "o_solimp", "o_friction"))
 
 
 def _inertia(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> str:
-    """Mass, centre and tensor about it of everything welded to a body, and what of its weight is taken off it."""
-    part = np.flatnonzero(model.body_weldid == root)
-    mass, centre = model.body_mass[part], data.xipos[part]
-    turn = data.ximat[part].reshape(-1, 3, 3)
-    own = turn @ (model.body_inertia[part, :, None] * turn.mT)
+    """Return mass, centre, inertia tensor and gravity compensation of the bodies welded to a body."""
+    bodies = np.flatnonzero(model.body_weldid == root)
+    mass, centre = model.body_mass[bodies], data.xipos[bodies]
+    rotation = data.ximat[bodies].reshape(-1, 3, 3)
+    inertia = rotation @ (model.body_inertia[bodies, :, None] * rotation.mT)
     total = mass.sum()
     middle = mass @ centre / max(total, mujoco.mjMINVAL)
-    away = centre - middle
-    own += mass[:, None, None] * ((away**2).sum(1)[:, None, None] * np.eye(3) - away[:, :, None] * away[:, None, :])
-    tensor = own.sum(axis=0)[np.triu_indices(3)]
-    lifted = mass * model.body_gravcomp[part]
+    arm = centre - middle
+    inertia += mass[:, None, None] * ((arm**2).sum(1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None, :])
+    tensor = inertia.sum(axis=0)[np.triu_indices(3)]
+    compensated = mass * model.body_gravcomp[bodies]
     return (
-        f": {_near(total, MASS)} at {_near(middle, LENGTH)} inertia {_near(tensor, INERTIA)} "
-        f"gravcomp {_near(lifted.sum(), MASS)} at {_near(lifted @ centre, LENGTH)}"
+        f": {_rounded(total, MASS_STEP)} at {_rounded(middle, LENGTH_STEP)} inertia {_rounded(tensor, INERTIA_STEP)} "
+        f"gravcomp {_rounded(compensated.sum(), MASS_STEP)} at {_rounded(compensated @ centre, LENGTH_STEP)}"
     )
 
 
@@ -91,22 +94,22 @@ def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, link: dict[int, i
     dof, at = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
     yield (
         f"joint {model.joint(j).name} of {link[int(model.jnt_bodyid[j])]} type {model.jnt_type[j]} "
-        f"axis {_near(data.xaxis[j], LENGTH)} at {_near(data.xanchor[j], LENGTH)}"
+        f"axis {_rounded(data.xaxis[j], LENGTH_STEP)} at {_rounded(data.xanchor[j], LENGTH_STEP)}"
     )
-    springs = [model.jnt_stiffness[j], *np.ravel(_of(model, "jnt_stiffnesspoly", j))]
-    dampers = [model.dof_damping[dof], *np.ravel(_of(model, "dof_dampingpoly", dof))]
+    springs = [model.jnt_stiffness[j], *np.ravel(_row(model, "jnt_stiffnesspoly", j))]
+    dampers = [model.dof_damping[dof], *np.ravel(_row(model, "dof_dampingpoly", dof))]
     rest = model.qpos_spring[at] if any(springs) else 0.0
     yield f"ref {_exact(model.qpos0[at])} spring {_exact(springs)} at {_exact(rest)} damping {_exact(dampers)}"
-    yield " ".join(f"{f} {_exact(getattr(model, f'jnt_{f}')[j])}" for f in JOINT)
-    yield " ".join(f"{f} {_exact(getattr(model, f'dof_{f}')[dof])}" for f in DOF)
+    yield " ".join(f"{f} {_exact(getattr(model, f'jnt_{f}')[j])}" for f in JOINT_FIELDS)
+    yield " ".join(f"{f} {_exact(getattr(model, f'dof_{f}')[dof])}" for f in DOF_FIELDS)
     limits = f"{_exact(model.jnt_range[j])}" if model.jnt_limited[j] else "none"
     yield f"range {limits} {_range(model, 'jnt', 'actfrc', j)}"
 
 
 def _couplings(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int]) -> Iterator[str]:
-    """Equality constraints and tendons, as they are stored, with the sites that they may hang on."""
+    """Yield equality constraints, tendons and sites, which they may refer to."""
     for s in range(model.nsite):
-        yield f"site {s} on {link[int(model.site_bodyid[s])]} at {_near(data.site_xpos[s], LENGTH)}"
+        yield f"site {s} on {link[int(model.site_bodyid[s])]} at {_rounded(data.site_xpos[s], LENGTH_STEP)}"
     for name in ("type", "obj1id", "obj2id", "objtype", "active0", "solref", "solimp", "data"):
         yield f"equality {name} {_exact(getattr(model, f'eq_{name}'))}"
     names = ("adr", "num", "limited", "range", "margin", "stiffness", "damping", "frictionloss", "armature",
@@ -117,21 +120,23 @@ def _couplings(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int])
 
 
 def _geoms(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int], touching: bool) -> Iterator[str]:
-    """Geoms that may touch or feel the medium; of a mesh the middle and the extent of its vertices."""
+    """Yield geoms that can collide or interact with a fluid; a mesh by the mean and extent of its vertices."""
     paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
     for g in range(model.ngeom):
-        meets = touching and (model.geom_contype[g] or model.geom_conaffinity[g] or g in paired)
-        if not meets and not model.geom_fluid[g].any():
+        collides = touching and (model.geom_contype[g] or model.geom_conaffinity[g] or g in paired)
+        if not collides and not model.geom_fluid[g].any():
             continue
-        place, turn = data.geom_xpos[g], data.geom_xmat[g].reshape(3, 3)
-        text = " ".join(f"{f} {_exact(getattr(model, f'geom_{f}')[g])}" for f in GEOM)
+        position, rotation = data.geom_xpos[g], data.geom_xmat[g].reshape(3, 3)
+        text = " ".join(f"{f} {_exact(getattr(model, f'geom_{f}')[g])}" for f in GEOM_FIELDS)
         if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
             start, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-            v = place + model.mesh_vert[start : start + count].astype(float) @ turn.T
-            shape = f"{count} vertices {_near([v.mean(axis=0), v.min(axis=0), v.max(axis=0)], HULL)}"
+            v = position + model.mesh_vert[start : start + count].astype(float) @ rotation.T
+            shape = f"{count} vertices {_rounded([v.mean(axis=0), v.min(axis=0), v.max(axis=0)], MESH_STEP)}"
         else:
-            shape = f"{_exact(model.geom_size[g])} at {_near(place, LENGTH)} {_near(turn, LENGTH)}"
+            shape = (
+                f"{_exact(model.geom_size[g])} at {_rounded(position, LENGTH_STEP)} {_rounded(rotation, LENGTH_STEP)}"
+            )
         yield f"geom on {link[int(model.geom_bodyid[g])]} {text} {shape}"
     if touching:
         yield f"exclude {_exact(model.exclude_signature)}"
@@ -139,25 +144,25 @@ def _geoms(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int], tou
             yield f"pair {name} {_exact(getattr(model, f'pair_{name}'))}"
 
 
-def _range(model: mujoco.MjModel, of: str, kind: str, i: int) -> str:
-    limited = getattr(model, f"{of}_{kind}limited")[i]
-    return f"{kind} {_exact(getattr(model, f'{of}_{kind}range')[i]) if limited else 'free'}"
+def _range(model: mujoco.MjModel, prefix: str, kind: str, i: int) -> str:
+    limited = getattr(model, f"{prefix}_{kind}limited")[i]
+    return f"{kind} {_exact(getattr(model, f'{prefix}_{kind}range')[i]) if limited else 'free'}"
 
 
-def _of(model: mujoco.MjModel, name: str, i: int) -> Array:
-    """A row of an array that older versions lack."""
-    found = getattr(model, name, None)
-    return np.zeros(0) if found is None else np.asarray(found[i])
+def _row(model: mujoco.MjModel, name: str, i: int) -> Array:
+    """Return a row of an array; empty if this version of MuJoCo lacks the array."""
+    values = getattr(model, name, None)
+    return np.zeros(0) if values is None else np.asarray(values[i])
 
 
 def _exact(values: object) -> str:
-    """Figures as files have them, seven digits; zeros at the end, more or fewer by version, do not count."""
+    """Format numbers with seven digits, without trailing zeros: their count differs between versions of MuJoCo."""
     texts = [f"{x + 0.0:.7g}" for x in np.ravel(np.asarray(values, float))]
     while texts and texts[-1] == "0":
         texts.pop()
     return " ".join(texts) or "0"
 
 
-def _near(values: object, step: float) -> str:
-    """Computed figures in whole steps."""
+def _rounded(values: object, step: float) -> str:
+    """Format computed numbers in whole steps."""
     return " ".join(str(int(x)) for x in np.round(np.ravel(np.asarray(values, float)) / step))

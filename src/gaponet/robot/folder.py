@@ -1,4 +1,4 @@
-"""The robot folder that a run or a dataset keeps: complete, wherever it lies and whatever lies around it."""
+"""Robot folders inside runs and datasets: complete copies that may be moved."""
 
 from __future__ import annotations
 
@@ -11,41 +11,40 @@ from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import lock_folder, write_text
 from gaponet.robot.spec import PACKAGE_FOLDER, SERVO_FIELDS, SERVO_TERMS, RobotSpec, load_robot, packaged_robots
 
-STORED_ROBOT = "robot"  # folder of a run or a dataset
+STORED_ROBOT = "robot"  # subfolder of a run or a dataset
 MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"
 PROVENANCE_FILE = "identified.json"  # what a robot was identified from (report/candidate.py)
 UNCERTAINTY_FILE = "uncertainty.json"  # of its values (sysid/uncertainty.py)
 OLD_UNCERTAINTY_FILE = "known.json"  # the same in folders that older versions wrote
-BESIDE = ("collision.toml", "look.toml", PROVENANCE_FILE, UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE)
-IDENTIFIED_MARK = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
+COPIED_FILES = ("collision.toml", "look.toml", PROVENANCE_FILE, UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE)
+IDENTIFIED_HEADING = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
 IDENTIFIED_TABLES = re.compile(r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL)
-FILES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
+FILE_REFERENCES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
 
 
 def save_robot(robot: RobotSpec, folder: Path) -> None:
-    """Write the nominal robot's folder again, and [identified.JOINT] tables where parameters were identified.
+    """Write a robot folder: robot.toml with [identified.JOINT] tables for identified parameters, and robot.xml.
 
-    The copy needs nothing outside it: an MJCF that includes or names files is written anew without them
-    (gaponet.robot.self_contained).
+    An MJCF that includes or names files is written without them (gaponet.robot.self_contained).
 
     Args:
-        robot: Loaded by load_robot, or made from such a one by with_servos.
-        folder: Where to; one that gaponet has not made is refused.
+        robot: Result of load_robot, or derived from one by with_servos.
+        folder: Destination; a folder that gaponet has not made is refused.
 
     Raises:
-        RobotError: A copy in one file would not move as the robot does.
+        RobotError: The MJCF in one file would have other dynamics.
     """
     from gaponet.robot.self_contained import self_contained_mjcf
 
     if folder.resolve() == robot.folder.resolve():
         raise UsageError(f"{folder}: is the robot's own folder; choose another")
-    text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_MARK)[0]
+    text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_HEADING)[0]
     text = IDENTIFIED_TABLES.sub("", re.sub(r"(?m)^mjcf\s*=.*\n", "", text)).rstrip() + "\n"
-    for name, usual in (("carries_payload", True), ("gain_scale", 1.0)):
+    for name, default in (("carries_payload", True), ("gain_scale", 1.0)):
         value, text = getattr(robot, name), re.sub(rf"(?m)^{name}\s*=.*\n", "", text)
-        text = text if value == usual else f"{name} = {str(value).lower()}\n{text}"
+        text = text if value == default else f"{name} = {str(value).lower()}\n{text}"
     if robot.nominal is not None:
-        text += f"\n{IDENTIFIED_MARK}\n" + "".join(_servo(robot, joint) for joint in robot.operated)
+        text += f"\n{IDENTIFIED_HEADING}\n" + "".join(_servo(robot, joint) for joint in robot.operated)
         if robot.table is not None and robot.table != robot.nominal.table:
             lines = [f"{name} = {value!r}\n" for name, value in vars(robot.table).items()]
             text += "[identified_table]\n" + "".join(lines)
@@ -54,45 +53,45 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
                 f'[identified_mount."{m.side}"]\npos = {list(m.pos)}\nmass = {m.mass!r}\n' for m in robot.payload_mounts
             )
     xml = robot.mjcf.read_text(encoding="utf-8")
-    xml = self_contained_mjcf(robot.mjcf) if FILES.search(xml) else xml
-    beside = {name: robot.folder / name for name in BESIDE if (robot.folder / name).is_file()}
+    xml = self_contained_mjcf(robot.mjcf) if FILE_REFERENCES.search(xml) else xml
+    copied = {name: robot.folder / name for name in COPIED_FILES if (robot.folder / name).is_file()}
     with lock_folder(folder, "robot"):
-        (folder / "robot.toml").unlink(missing_ok=True)  # without it, nothing is kept: it comes last
+        (folder / "robot.toml").unlink(missing_ok=True)  # its presence marks a complete folder: it is written last
         write_text(folder / "robot.xml", xml)
-        for name, file in beside.items():
+        for name, file in copied.items():
             write_text(folder / name, file.read_text(encoding="utf-8"))
         write_text(folder / "robot.toml", text)
     load_robot(folder)
 
 
 def require_self_contained(folder: Path) -> None:
-    """Refuse a folder whose MJCF names other files: a stranger's could name anybody's."""
+    """Refuse a stored robot whose MJCF names other files: a downloaded one could name any file of this machine."""
     file = folder / "robot.xml"
-    if not file.is_file() or FILES.search(file.read_text(encoding="utf-8", errors="replace")):
-        raise RobotError(f"{file}: is missing, or names other files; a robot that was kept needs none")
+    if not file.is_file() or FILE_REFERENCES.search(file.read_text(encoding="utf-8", errors="replace")):
+        raise RobotError(f"{file}: is missing, or names other files; a stored robot needs none")
 
 
 def load_stored_robot(holder: Path, name: str) -> RobotSpec:
-    """The robot that a run or a dataset keeps, or in one written before they kept any, the package's of that name.
+    """Load the robot that a run or a dataset stores.
 
-    Never a folder of that name elsewhere.
+    Older ones store none; for them, return the packaged robot of that name, but never another folder of that name.
     """
     if has_stored_robot(holder):
         return load_robot(holder / STORED_ROBOT)
     if name in packaged_robots():
         return load_robot(PACKAGE_FOLDER / name)
     raise RobotError(
-        f"{holder}: keeps no robot, and the package has no '{name}'; say which robot it is with --robot ./FOLDER"
+        f"{holder}: stores no robot, and the package has no '{name}'; say which robot it is with --robot ./FOLDER"
     )
 
 
 def has_stored_robot(holder: Path) -> bool:
-    """Whether there is a robot folder in a run or a dataset."""
+    """Return True if a run or a dataset stores its robot."""
     return (holder / STORED_ROBOT / "robot.toml").is_file()
 
 
 def stored_robot_holder(artifact: Path) -> Path:
-    """Where the simulator of a model lies: in its folder where that was exported, else in its run."""
+    """Return the folder that stores a model's robot: an exported model itself, else its run."""
     return artifact if has_stored_robot(artifact) else artifact.parent
 
 

@@ -1,4 +1,4 @@
-"""Joints of a model that are clamped at a value."""
+"""Joints of a model fixed at a value."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from gaponet.base.errors import RobotError
 
 
 def units_per_si(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
-    """Return how many of the specification's units are one rad or m of a joint: an MJCF may hold degrees."""
+    """Return the specification's units per rad or m of a joint: an MJCF may use degrees."""
     return math.degrees(1) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
 
 
 def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
-    """Clamp a hinge or slide joint of a body with a quaternion at a value, rad or m.
+    """Fix a hinge or slide joint at a value, rad or m; the body's orientation must be a quaternion.
 
     Raises:
-        RobotError: Another joint of its body comes before it, and it is not clamped at its reference.
+        RobotError: Another joint of its body comes before it, and the value is not its reference.
     """
     body, move = joint.parent, value - joint.ref / units_per_si(spec, joint)
     if move and body.joints[0].name != joint.name:

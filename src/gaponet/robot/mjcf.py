@@ -1,4 +1,4 @@
-"""Reading someone's MJCF: valid, of a size that a robot has, and without files that never end."""
+"""Reading of untrusted MJCF files: valid, of a robot's size, and without endless files."""
 
 from __future__ import annotations
 
@@ -17,55 +17,64 @@ from gaponet.base.sandbox import sandboxed
 if TYPE_CHECKING:
     import mujoco
 
-ELEMENTS = 20_000  # after <replicate> and the like: the largest public humanoids have some hundreds
-CELLS = 1 << 24  # pixels of a texture, samples of a height field
-BYTES = 256 << 20  # of one file, or of a simulation's memory
+MAX_ELEMENTS = 20_000  # after <replicate> and the like; the largest public humanoids have hundreds
+MAX_CELLS = 1 << 24  # pixels of a texture, samples of a height field
+MAX_BYTES = 256 << 20  # of one file, or of a simulation's memory
 MAX_VALUE = 1e10  # kg, kg·m², m: MuJoCo's own mjMAXVAL
 PACKAGED = Path(__file__).resolve().with_name("robots")
-# What costs no more than it says. Anything else (meshes, textures, attached models, …) is tried in the sandbox.
-PLAIN = {
+# Elements whose cost is visible in the file. Others (meshes, textures, attached models) are read in the sandbox first.
+PLAIN_TAGS = {
     "mujoco", "compiler", "option", "flag", "size", "memory", "default", "worldbody", "body", "frame", "inertial",
     "joint", "freejoint", "geom", "site", "light", "camera", "statistic", "visual", "global", "headlight", "map",
     "scale", "rgba", "quality", "contact", "pair", "exclude", "actuator", "position", "velocity", "motor", "general",
     "keyframe", "key", "sensor", "jointpos", "jointvel", "actuatorfrc", "gyro", "accelerometer", "framepos",
 }  # fmt: skip
-PLAIN_ELEMENTS = 2000
-COUNTS = {"nsample", "resolution", "builtin", "file", "num", "dim"}  # attributes that make more than they say
-USER = [f"nuser_{kind}" for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")]
-SOLVERS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations", "sdf_initpoints")
-LARGEST = {"size": dict.fromkeys(("nuserdata", "nkey", *USER), 1000), "option": dict.fromkeys(SOLVERS, 1000)}
-_TRIED: set[frozenset[tuple[str, int, int]]] = set()
+MAX_PLAIN_ELEMENTS = 2000
+EXPANDING_ATTRIBUTES = {"nsample", "resolution", "builtin", "file", "num", "dim"}  # create more than the file shows
+USER_SIZES = [f"nuser_{kind}" for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")]
+SOLVER_ITERATIONS = (
+    "iterations",
+    "ls_iterations",
+    "noslip_iterations",
+    "ccd_iterations",
+    "sdf_iterations",
+    "sdf_initpoints",
+)
+MAX_ATTRIBUTES = {
+    "size": dict.fromkeys(("nuserdata", "nkey", *USER_SIZES), 1000),
+    "option": dict.fromkeys(SOLVER_ITERATIONS, 1000),
+}
+_ACCEPTED: set[frozenset[tuple[str, int, int]]] = set()
 
 
 def read_mjcf(path: Path, tried: bool = False) -> mujoco.MjSpec:
-    """An MJCF as a specification that can be changed and compiled.
+    """Read an MJCF as a specification, which can be changed and compiled.
 
-    What is made of plain elements alone, or lies in the package, is as small as it looks; anything else is tried in the
-    sandbox first, once for each state of its files.
+    A file of plain elements, or of the package, is as small as it looks. Others are first read in the sandbox, once for
+    each state of their files.
 
     Args:
-        path: The file.
-        tried: The caller has tried it.
+        tried: The caller has read it in the sandbox.
 
     Raises:
-        RobotError: Not MJCF, larger than a robot, or it names something that is not a file.
+        RobotError: It is not MJCF, is larger than a robot, or names something that is not a file.
     """
     import mujoco
 
-    look = inspect_mjcf(path)
-    state = frozenset(look.files)
-    if not (tried or look.plain or state in _TRIED or path.resolve().is_relative_to(PACKAGED)):
+    inspection = inspect_mjcf(path)
+    state = frozenset(inspection.files)
+    if not (tried or inspection.plain or state in _ACCEPTED or path.resolve().is_relative_to(PACKAGED)):
         _try(path)
-        _TRIED.add(state)
+        _ACCEPTED.add(state)
     with mujoco_errors(path, "not valid MJCF"):
         return mujoco.MjSpec.from_file(str(path))
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
-    """The model of a specification that was read from `path`.
+    """Compile a specification that was read from `path`.
 
     Raises:
-        RobotError: It does not compile, or a mass, inertia or position in it is above MAX_VALUE.
+        RobotError: It does not compile, or a mass, inertia or position is above MAX_VALUE.
     """
     with mujoco_errors(path, "does not compile"):
         model = spec.compile()
@@ -77,8 +86,8 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
 
 
 @contextmanager
-def mujoco_errors(path: Path, what: str) -> Iterator[None]:
-    """MuJoCo's errors as one line."""
+def mujoco_errors(path: Path, problem: str) -> Iterator[None]:
+    """Raise errors of MuJoCo as a RobotError of one line: path, problem, MuJoCo's text."""
     import mujoco
 
     try:
@@ -87,8 +96,8 @@ def mujoco_errors(path: Path, what: str) -> Iterator[None]:
         text = " ".join(str(error).split())
         if sandbox.in_sandbox() and "allocat" in text:
             raise MemoryError from None
-        text = "MuJoCo does not say why; does it ask for too much?" if "unknown exception" in text else text
-        raise RobotError(f"{path}: {what}: {text}") from None
+        text = "MuJoCo gives no reason; is the model too large?" if "unknown exception" in text else text
+        raise RobotError(f"{path}: {problem}: {text}") from None
 
 
 @sandboxed(RobotError, "mujoco", 0.5)
@@ -97,64 +106,70 @@ def _try(path: Path) -> None:
 
 
 def require_simulable(model: mujoco.MjModel, path: Path) -> None:
-    """Refuse a model whose simulation takes more than BYTES, or does not come through a step."""
+    """Refuse a model whose simulation needs more than MAX_BYTES or fails in its first step."""
     import mujoco
 
     data = mujoco.MjData(model)
-    if mujoco.mj_sizeModel(model) + data.nbuffer > BYTES:
-        raise RobotError(f"{path}: a simulation of it takes more than {BYTES >> 20} MiB; gaponet does not load it")
+    if mujoco.mj_sizeModel(model) + data.nbuffer > MAX_BYTES:
+        raise RobotError(f"{path}: a simulation of it takes more than {MAX_BYTES >> 20} MiB; gaponet does not load it")
     mujoco.mj_step(model, data)
 
 
 @dataclass
-class _Look:
-    """What an MJCF is made of: files (path, size, time), how many elements in all, and whether all are PLAIN."""
+class _Inspection:
+    """Content of an MJCF: its files (path, size, time), the number of elements, and whether all are plain."""
 
     files: set[tuple[str, int, int]] = field(default_factory=set)
     count: float = 0.0
     plain: bool = True
 
 
-def inspect_mjcf(path: Path) -> _Look:
-    """Refuse a file that is no XML, or makes or names more than a robot has."""
-    look = _Look()
-    _count(path, path.parent, {path.resolve()}, look, 1.0)
-    look.plain = look.plain and look.count <= PLAIN_ELEMENTS
-    return look
+def inspect_mjcf(path: Path) -> _Inspection:
+    """Inspect an MJCF before MuJoCo reads it; refuses files that are not XML or are larger than a robot."""
+    inspection = _Inspection()
+    _count(path, path.parent, {path.resolve()}, inspection, 1.0)
+    inspection.plain = inspection.plain and inspection.count <= MAX_PLAIN_ELEMENTS
+    return inspection
 
 
-def _count(path: Path, folder: Path, seen: set[Path], look: _Look, times: float) -> None:
-    """Count what a file makes, its <include>s too; refuses too much."""
-    if not path.is_file() or path.stat().st_size > BYTES:
-        raise RobotError(f"{path}: is missing, not a file, or has more than {BYTES >> 20} MiB")
+def _count(path: Path, folder: Path, seen: set[Path], inspection: _Inspection, times: float) -> None:
+    """Count the elements of a file and its <include>s; refuses too many."""
+    if not path.is_file() or path.stat().st_size > MAX_BYTES:
+        raise RobotError(f"{path}: is missing, not a file, or has more than {MAX_BYTES >> 20} MiB")
     try:
         root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # an encoding that nobody knows
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # an unknown encoding
         raise RobotError(f"{path}: not valid MJCF: {error}") from None
     open_tags = [(root, times)]
     while open_tags:
         tag, times = open_tags.pop()
         times *= _copies(tag)
-        look.count += times
-        look.plain = look.plain and tag.tag in PLAIN and not COUNTS & tag.attrib.keys()
-        if look.count > ELEMENTS or _extent(tag, "width", "height") > CELLS or _extent(tag, "nrow", "ncol") > CELLS:
+        inspection.count += times
+        inspection.plain = inspection.plain and tag.tag in PLAIN_TAGS and not EXPANDING_ATTRIBUTES & tag.attrib.keys()
+        if (
+            inspection.count > MAX_ELEMENTS
+            or _extent(tag, "width", "height") > MAX_CELLS
+            or _extent(tag, "nrow", "ncol") > MAX_CELLS
+        ):
             raise RobotError(f"{path}: <{tag.tag}> makes a model far larger than a robot; gaponet does not load it")
-        if tag.tag == "size" and _bytes(tag.get("memory", "0")) > BYTES:
-            raise RobotError(f"{path}: <size memory> is above {BYTES >> 20} MiB; delete it, MuJoCo finds its own")
-        for name in LARGEST.get(tag.tag, {}).keys() & tag.attrib.keys():
-            if not _extent(tag, name) <= LARGEST[tag.tag][name]:
-                most = LARGEST[tag.tag][name]
+        if tag.tag == "size" and _bytes(tag.get("memory", "0")) > MAX_BYTES:
+            raise RobotError(
+                f"{path}: <size memory> is above {MAX_BYTES >> 20} MiB; delete it, MuJoCo chooses the size"
+            )
+        for name in MAX_ATTRIBUTES.get(tag.tag, {}).keys() & tag.attrib.keys():
+            if not _extent(tag, name) <= MAX_ATTRIBUTES[tag.tag][name]:
+                most = MAX_ATTRIBUTES[tag.tag][name]
                 raise RobotError(f"{path}: <{tag.tag} {name}> is above {most}, more than a robot needs; delete it")
         if tag.tag == "include":
             other = folder / tag.get("file", "")
             if other.resolve() in seen:
                 raise RobotError(f"{path}: includes {other.name} twice")
-            _count(other, folder, seen | {other.resolve()}, look, times)
+            _count(other, folder, seen | {other.resolve()}, inspection, times)
         open_tags += [(child, times) for child in tag]
-    _require_files(root, path, folder, look)
+    _require_files(root, path, folder, inspection)
 
 
-def _require_files(root: ElementTree.Element, path: Path, folder: Path, look: _Look) -> None:
+def _require_files(root: ElementTree.Element, path: Path, folder: Path, inspection: _Inspection) -> None:
     places = {folder} | {
         folder / tag.get(key, "") for tag in root.iter("compiler") for key in ("meshdir", "texturedir", "assetdir")
     }
@@ -163,14 +178,14 @@ def _require_files(root: ElementTree.Element, path: Path, folder: Path, look: _L
             file = place / name
             if not file.exists() or file.is_dir():
                 continue
-            told = file.stat()
-            look.files.add((str(file.resolve()), told.st_size, told.st_mtime_ns))
-            if not file.is_file() or told.st_size > BYTES:
-                raise RobotError(f"{path}: {name} is not a file, or has more than {BYTES >> 20} MiB")
+            status = file.stat()
+            inspection.files.add((str(file.resolve()), status.st_size, status.st_mtime_ns))
+            if not file.is_file() or status.st_size > MAX_BYTES:
+                raise RobotError(f"{path}: {name} is not a file, or has more than {MAX_BYTES >> 20} MiB")
 
 
 def _copies(tag: ElementTree.Element) -> float:
-    """How often an element's content is made."""
+    """Return how many copies of its content an element creates."""
     if tag.tag not in ("replicate", "composite", "flexcomp"):
         return 1.0
     return math.prod(max(1.0, abs(x)) for x in _numbers(tag.get("count", "1")))
@@ -186,9 +201,9 @@ def _bytes(text: str) -> float:
 
 
 def _numbers(text: str) -> list[float]:
-    """The numbers of an attribute; infinity where MuJoCo may read something that Python does not."""
+    """Parse the numbers of an attribute; infinity if MuJoCo may read more than Python."""
     try:
-        found = [float(word) for word in text.split()]
+        numbers = [float(word) for word in text.split()]
     except ValueError:
         return [math.inf]
-    return [math.inf if math.isnan(x) else x for x in found]
+    return [math.inf if math.isnan(x) else x for x in numbers]

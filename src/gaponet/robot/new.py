@@ -1,4 +1,4 @@
-"""A robot folder from a vendor's model: joints that are not logged are frozen, and every number has its source."""
+"""Robot folders from vendors' models: unlogged joints become fixed, and every number states its source."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from gaponet.robot.self_contained import self_contained_text
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.robot.vendor import read_vendor
 
-HANDS = ("attachment", "tcp", "tool", "flange", "palm", "grip", "hand", "wrist")  # beginnings of words
-IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+HAND_PREFIXES = ("attachment", "tcp", "tool", "flange", "palm", "grip", "hand", "wrist")
+IMPLICIT_INTEGRATORS = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """What the user says about the robot; joints are named by name or pattern (*_elbow_*).
+    """Options of `gaponet robot new`; joints are given by name or pattern (*_elbow_*).
 
     Attributes:
-        joints: That are logged; all others are frozen. None: those with an actuator, or all hinges if none has one.
-        operated: Those of them that are to be corrected; none: all.
-        kp, kd, effort_limit: "100", or "*wrist*=20"; the later wins. In N·m/rad, N·m·s/rad, N·m.
-        mounts: "hand=BODY" or "hand=BODY:x,y,z", m: where payloads go; none: found by name.
+        joints: Logged joints; all others are fixed. Default: those with an actuator, or all hinges if none has one.
+        operated: Logged joints that the operator corrects; default: all.
+        kp, kd, effort_limit: "100" or "*wrist*=20", N·m/rad, N·m·s/rad, N·m; a later value overrides earlier ones.
+        mounts: Payload mounts, "hand=BODY" or "hand=BODY:x,y,z", m; default: found by name.
         packages: "NAME=FOLDER" of package://NAME.
-        rate: How many commands a second, Hz.
-        keyframe: At which frozen joints stand, and home; "": the first.
-        contacts: Keep geoms that touch, and let them.
+        rate: Rate of commands, Hz.
+        keyframe: Home position, also of fixed joints; default: the first keyframe.
+        contacts: Keep geoms that can collide, and simulate contacts.
     """
 
     joints: tuple[str, ...] = ()
@@ -56,7 +56,13 @@ class RobotOptions:
 
 @dataclass(frozen=True)
 class NewRobot:
-    """A robot folder that was written; the vendor's own model with its pose at home, (nq); what to know about it."""
+    """Result of new_robot.
+
+    Attributes:
+        vendor: The vendor's compiled model.
+        pose: Its home pose, (nq).
+        notes: What was omitted, fixed or corrected.
+    """
 
     robot: RobotSpec
     drives: tuple[Drive, ...]
@@ -65,43 +71,43 @@ class NewRobot:
     notes: list[str] = field(default_factory=list)
 
 
-def new_robot(path: Path, out: Path, wanted: RobotOptions) -> NewRobot:
+def new_robot(path: Path, out: Path, options: RobotOptions) -> NewRobot:
     """Write the robot folder `out` from the MJCF or URDF at `path`.
 
     Raises:
-        RobotError: The model is broken, or a joint of it cannot be what it should be.
-        UsageError: A name or number that does not fit the model, or a gain that neither says.
+        RobotError: The model is damaged, or has no joint to log.
+        UsageError: An option does not fit the model, or a gain is stated nowhere.
     """
-    spec, notes = read_vendor(path, {k: Path(v) for k, v in map(_pair, wanted.packages)})
+    spec, notes = read_vendor(path, {k: Path(v) for k, v in map(_pair, options.packages)})
     model = compile_spec(spec, path)
-    kept = _kept(model, wanted.joints, path)
-    pose, source = _home(model, wanted.keyframe, path)
-    given = {name: getattr(wanted, name) for name in ("kp", "kd", "effort_limit")}
-    found = drives(model, kept, pose, given, path.name)
-    notes += _spoken(spec, model, kept, pose, path)
-    text = _text(spec, model, kept, pose, path, wanted.contacts)
-    robot_toml = _toml(model, found, wanted, path, source)
+    logged = _logged_joints(model, options.joints, path)
+    pose, source = _home(model, options.keyframe, path)
+    given = {name: getattr(options, name) for name in ("kp", "kd", "effort_limit")}
+    joint_drives = drives(model, logged, pose, given, path.name)
+    notes += _notes(spec, model, logged, pose, path)
+    text = _robot_xml(spec, model, logged, pose, path, options.contacts)
+    robot_toml = _robot_toml(model, joint_drives, options, path, source)
     for name in (*_joint_names(model), *(model.body(b).name for b in range(model.nbody))):
-        if "/" in name:  # a name may become a file's
+        if "/" in name:  # a joint name may become a file name
             text, robot_toml = (t.replace(f'"{name}"', f'"{name.replace("/", "_")}"') for t in (text, robot_toml))
     if (out / "robot.toml").exists():
         raise UsageError(f"{out}: holds a robot; choose another --out, or move it away")
     with lock_folder(out, "robot"):
         write_text(out / "robot.xml", text)
         write_text(out / "robot.toml", robot_toml)
-    return NewRobot(load_robot(out), found, model, pose, notes)
+    return NewRobot(load_robot(out), joint_drives, model, pose, notes)
 
 
-def matching(names: Iterable[str], patterns: Iterable[str], what: str) -> list[str]:
-    """Names that match any of the patterns, in the names' order.
+def matching(names: Iterable[str], patterns: Iterable[str], option: str) -> list[str]:
+    """Return the names that match any pattern, in their order.
 
     Raises:
-        UsageError: A pattern matches none.
+        UsageError: A pattern matches no name.
     """
     names = list(names)
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in names):
-            raise UsageError(f"{what} {pattern}: no such joint; there are: {', '.join(names)}")
+            raise UsageError(f"{option} {pattern}: no such joint; there are: {', '.join(names)}")
     return [name for name in names if any(fnmatchcase(name, p) for p in patterns)]
 
 
@@ -112,8 +118,8 @@ def _pair(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _kept(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path) -> list[str]:
-    """Hinges to keep, by name, in the model's order."""
+def _logged_joints(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path) -> list[str]:
+    """Return the names of the hinges to log, in the model's order."""
     kinds = dict(zip(_joint_names(model), map(mujoco.mjtJoint, model.jnt_type), strict=True))
     kinds.pop("", None)
     hinges = [name for name, kind in kinds.items() if kind == mujoco.mjtJoint.mjJNT_HINGE]
@@ -122,8 +128,9 @@ def _kept(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path) -> list[
     for name in set(patterns) & set(kinds) - set(hinges):
         kind = kinds[name].name.removeprefix("mjJNT_").lower()
         raise UsageError(
-            f"--joints {name}: is a {kind} joint, and gaponet knows angles alone (rad, N·m); leave it out and it is "
-            "frozen at home"
+            f"--joints {name}: is a {kind} joint, and gaponet supports angles only (rad, N·m); leave it out, then it "
+            "is "
+            "fixed at home"
         )
     if patterns:
         return matching(hinges, patterns, "--joints")
@@ -136,7 +143,7 @@ def _joint_names(model: mujoco.MjModel) -> list[str]:
 
 
 def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray, str]:
-    """Pose (nq) in which frozen joints stand, inside the joint ranges, and where it is from."""
+    """Return the home pose (nq) within the joint ranges, and its source."""
     keys = [model.key(k).name for k in range(model.nkey)]
     if keyframe and keyframe not in keys:
         raise UsageError(f"--keyframe {keyframe}: {path.name} has {', '.join(keys) or 'none'}")
@@ -150,59 +157,59 @@ def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray,
     return pose, source
 
 
-def _spoken(spec: mujoco.MjSpec, model: mujoco.MjModel, kept: list[str], pose: np.ndarray, path: Path) -> list[str]:
-    """What is frozen and dropped, in words."""
-    said, frozen = [], []
+def _notes(spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path) -> list[str]:
+    """Describe what is fixed and omitted."""
+    notes, fixed = [], []
     for name, kind, at in zip(_joint_names(model), model.jnt_type, model.jnt_qposadr, strict=True):
         unit = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}.get(int(kind))
-        if name not in kept:
-            frozen.append(f"{name or 'unnamed'} {f'at {pose[at]:.3g} {unit}' if unit else f'where {path.name} has it'}")
-    if frozen:
-        said.append(f"frozen: {', '.join(frozen)}")
+        if name not in logged:
+            fixed.append(f"{name or 'unnamed'} {f'at {pose[at]:.3g} {unit}' if unit else f'where {path.name} has it'}")
+    if fixed:
+        notes.append(f"frozen: {', '.join(fixed)}")
     for e in spec.equalities:
-        pair = [name for name in (e.name1, e.name2) if name in kept]
+        pair = [name for name in (e.name1, e.name2) if name in logged]
         if e.type == mujoco.mjtEq.mjEQ_JOINT and len(pair) == 1 and e.name2:
             other = e.name2 if e.name1 in pair else e.name1
-            said.append(
-                f"{other} moves with {pair[0]} and is held still here: kp, friction and armature that are "
-                f"identified of {pair[0]} are those of its own link alone, as much smaller as both are heavier"
+            notes.append(
+                f"{other} moves with {pair[0]} and is fixed here: identified kp, friction and armature of {pair[0]} "
+                f"are those of its own link, smaller in proportion to the mass of both links"
             )
     if (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
-        said.append("the base is held still here: fasten the robot while it is recorded, a base that hangs swings")
+        notes.append("the base is fixed here: fasten the robot while it is recorded, a hanging base swings")
     dropped = {"actuator": model.nu, "keyframe": model.nkey, "sensor": model.nsensor}
     gone = ", ".join(f"{count} {kind}(s)" for kind, count in dropped.items() if count)
     if gone:
-        said.append(f"left out: {gone}; gains and limits stand in robot.toml")
-    if spec.option.integrator not in IMPLICIT:
-        said.append("integrator: implicitfast, which takes servos' kd into account; the model's own does not")
-    return said
+        notes.append(f"left out: {gone}; gains and limits stand in robot.toml")
+    if spec.option.integrator not in IMPLICIT_INTEGRATORS:
+        notes.append("integrator: implicitfast, which takes servos' kd into account; the model's own does not")
+    return notes
 
 
-def _text(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, kept: list[str], pose: np.ndarray, path: Path, contacts: bool
+def _robot_xml(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path, contacts: bool
 ) -> str:
-    """robot.xml: one file without the joints that are frozen and what names them."""
+    """Return robot.xml: one file without fixed joints and the elements that refer to them."""
     values = dict(zip(_joint_names(model), pose[model.jnt_qposadr], strict=True))
-    lost = {name for name in values if name not in kept}
-    tendons = {model.tendon(t).name for t in range(model.ntendon) if _wraps(model, t) & lost}
+    removed = {name for name in values if name not in logged}
+    tendons = {model.tendon(t).name for t in range(model.ntendon) if _wraps(model, t) & removed}
     for kind in (spec.actuators, spec.sensors, spec.keys):
         for element in list(kind):
             spec.delete(element)
-    for equality in [e for e in spec.equalities if {e.name1, e.name2} & (lost | tendons)]:
+    for equality in [e for e in spec.equalities if {e.name1, e.name2} & (removed | tendons)]:
         spec.delete(equality)
     for tendon in [t for t in spec.tendons if t.name in tendons]:
         spec.delete(tendon)
     for joint in [j for j in spec.joints if j.type in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)]:
         spec.delete(joint)
-    if spec.option.integrator not in IMPLICIT:
+    if spec.option.integrator not in IMPLICIT_INTEGRATORS:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     plain = mujoco.MjSpec.from_string(self_contained_text(spec, path))  # explicit inertias, quaternions, no classes
-    for joint in [j for j in plain.joints if j.name not in kept]:
+    for joint in [j for j in plain.joints if j.name not in logged]:
         freeze(plain, joint, values[joint.name])
     for joint in plain.joints:
-        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # effort_limit says it, in one place
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # effort_limit of robot.toml is the limit
     if not contacts:
-        _untouching(plain)
+        _disable_contacts(plain)
     return self_contained_text(plain, path)
 
 
@@ -212,12 +219,12 @@ def _wraps(model: mujoco.MjModel, tendon: int) -> set[str]:
     return {model.joint(j).name for j in model.wrap_objid[part][on_joint]}
 
 
-def _untouching(spec: mujoco.MjSpec) -> None:
-    """Nothing touches; shapes for touching go where there are others to look at."""
+def _disable_contacts(spec: mujoco.MjSpec) -> None:
+    """Disable contacts; delete collision geoms of bodies that also have visual ones."""
     for body in spec.bodies:
-        touch = [g for g in body.geoms if g.contype or g.conaffinity]
-        for geom in touch:
-            if len(touch) < len(body.geoms):
+        colliding = [g for g in body.geoms if g.contype or g.conaffinity]
+        for geom in colliding:
+            if len(colliding) < len(body.geoms):
                 spec.delete(geom)
             else:
                 geom.contype = geom.conaffinity = 0
@@ -225,23 +232,25 @@ def _untouching(spec: mujoco.MjSpec) -> None:
         spec.delete(pair)
 
 
-def _toml(model: mujoco.MjModel, found: tuple[Drive, ...], wanted: RobotOptions, path: Path, source: str) -> str:
-    if not (0 < wanted.rate <= 1000):
-        raise UsageError(f"--rate {wanted.rate}: give the rate of the commands in Hz, up to 1000")
-    names = [d.name for d in found]
-    operated = matching(names, wanted.operated, "--operated") if wanted.operated else names
-    dt = 1 / wanted.rate
+def _robot_toml(
+    model: mujoco.MjModel, joint_drives: tuple[Drive, ...], options: RobotOptions, path: Path, source: str
+) -> str:
+    if not (0 < options.rate <= 1000):
+        raise UsageError(f"--rate {options.rate}: give the rate of the commands in Hz, up to 1000")
+    names = [d.name for d in joint_drives]
+    operated = matching(names, options.operated, "--operated") if options.operated else names
+    dt = 1 / options.rate
     steps = max(1, math.ceil(dt / model.opt.timestep - 1e-6))
     stem = path.resolve().parent.name if path.stem in ("robot", "model", "scene") else path.stem
-    name = wanted.name or "".join(c if c.isalnum() or c in "-_" else "_" for c in stem)
+    name = options.name or "".join(c if c.isalnum() or c in "-_" else "_" for c in stem)
     lines = [
         f"# Made from {path.name} by gaponet robot new; every number may be changed here.",
         f"name = {json.dumps(name)}",
         f"dt = {dt!r}  # control period, s: --rate",
         f"timestep = {dt / steps!r}  # physics step, s; {path.name} has {model.opt.timestep:g}",
-        f"contacts = {str(wanted.contacts).lower()}  # --contacts keeps geoms that touch, and lets them",
+        f"contacts = {str(options.contacts).lower()}  # --contacts keeps geoms that touch, and lets them",
     ]
-    for d in found:
+    for d in joint_drives:
         lines += [
             "", "[[joint]]", f"name = {json.dumps(d.name)}",
             *([f"aliases = [{json.dumps(d.actuator)}]  # its actuator"] if d.actuator not in ("", *names) else []),
@@ -249,22 +258,22 @@ def _toml(model: mujoco.MjModel, found: tuple[Drive, ...], wanted: RobotOptions,
             f"effort_limit = {d.limit!r}  # N·m: {d.limit_source}",
             f"home = {float(d.home)!r}  # rad: {source}", f"operated = {str(d.name in operated).lower()}",
         ]  # fmt: skip
-    for side, body, pos, why in _mounts(model, operated, wanted.mounts):
+    for side, body, pos, why in _mounts(model, operated, options.mounts):
         lines += ["", f"[[payload_mount]]  # {why}", f"side = {json.dumps(side)}",
                   f"body = {json.dumps(body)}", f"pos = {[round(float(x), 6) for x in pos]}"]  # fmt: skip
     return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines) + "\n"
 
 
 def _mounts(
-    model: mujoco.MjModel, operated: list[str], asked: tuple[str, ...]
+    model: mujoco.MjModel, operated: list[str], mounts: tuple[str, ...]
 ) -> list[tuple[str, str, np.ndarray, str]]:
-    """Side, body, place in it (m), and why."""
-    if asked:
-        return [_mount(model, *_pair(word)) for word in asked]
-    ends = tips = _ends(model, operated)
+    """Return payload mounts: side, body, position in it (m), and source."""
+    if mounts:
+        return [_mount(model, *_pair(word)) for word in mounts]
+    ends = tips = _last_bodies(model, operated)
     if len(ends) > 1:
         ends = _palms(model, [e for e in ends if any(_hand(model.body(b).name) for b in _beyond(model, e))])
-    found: list[tuple[str, str, np.ndarray, str]] = []
+    result: list[tuple[str, str, np.ndarray, str]] = []
     for end in ends:
         beyond = _beyond(model, end)
         sites = [s for s in range(model.nsite) if model.site_bodyid[s] in beyond and _hand(model.site(s).name)]
@@ -276,9 +285,9 @@ def _mounts(
         else:
             body, pos, why = end, model.body_ipos[end], "the last link's centre of mass"
         name = model.body(end).name.lower()
-        side = next((word for word in ("left", "right") if word in name), f"hand{len(found) or ''}")
-        found.append((side, model.body(body).name, pos, f"a guess: {why}; --mounts SIDE=BODY:x,y,z says it"))
-    return found
+        side = next((word for word in ("left", "right") if word in name), f"hand{len(result) or ''}")
+        result.append((side, model.body(body).name, pos, f"a guess: {why}; --mounts SIDE=BODY:x,y,z sets it"))
+    return result
 
 
 def _mount(model: mujoco.MjModel, side: str, where: str) -> tuple[str, str, np.ndarray, str]:
@@ -293,42 +302,42 @@ def _mount(model: mujoco.MjModel, side: str, where: str) -> tuple[str, str, np.n
     return side, body, pos, "--mounts"
 
 
-def _ends(model: mujoco.MjModel, operated: list[str]) -> list[int]:
-    """Bodies with an operated joint, beyond which there is none."""
+def _last_bodies(model: mujoco.MjModel, operated: list[str]) -> list[int]:
+    """Return the bodies with an operated joint but none beyond it."""
     moved = {int(model.jnt_bodyid[model.joint(name).id]) for name in operated}
     return [b for b in sorted(moved) if not moved & set(_beyond(model, b)[1:])]
 
 
 def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
-    """Ends of one side, the fingers of a hand, as the body that carries them all; others as they are."""
+    """Replace the fingers of one side by the body that carries them."""
     sides: dict[str, list[int]] = {}
     for end in ends:
         name = model.body(end).name.lower()
         sides.setdefault(next((word for word in ("left", "right") if word in name), ""), []).append(end)
-    found = []
-    for part in sides.values():
-        palm = max(set.intersection(*(set(_chain(model, end)) for end in part)))
-        found += [palm] if model.body_parentid[palm] else part
-    return sorted(found)
+    result = []
+    for side_ends in sides.values():
+        palm = max(set.intersection(*(set(_chain(model, end)) for end in side_ends)))
+        result += [palm] if model.body_parentid[palm] else side_ends
+    return sorted(result)
 
 
 def _chain(model: mujoco.MjModel, body: int) -> list[int]:
-    """A body and all that carry it, the world among them."""
-    found = [body]
-    while found[-1]:
-        found.append(int(model.body_parentid[found[-1]]))
-    return found
+    """Return a body and its ancestors up to the world."""
+    chain = [body]
+    while chain[-1]:
+        chain.append(int(model.body_parentid[chain[-1]]))
+    return chain
 
 
 def _beyond(model: mujoco.MjModel, body: int) -> list[int]:
-    """A body and all that hangs on it."""
-    found = [body]
+    """Return a body and its descendants."""
+    bodies = [body]
     for b in range(body + 1, model.nbody):
-        if model.body_parentid[b] in found:
-            found.append(b)
-    return found
+        if model.body_parentid[b] in bodies:
+            bodies.append(b)
+    return bodies
 
 
 def _hand(name: str) -> bool:
     words = re.split(r"[\W\d_]+", name.lower())
-    return any(word == "ee" or word.startswith(HANDS) for word in words)
+    return any(word == "ee" or word.startswith(HAND_PREFIXES) for word in words)

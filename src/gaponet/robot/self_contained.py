@@ -1,8 +1,8 @@
-"""An MJCF that needs no file beside it: what a run or a dataset keeps of a robot whose MJCF includes or names files.
+"""MJCF in one text without other files, for runs and datasets that store a robot.
 
-MuJoCo writes the structure, with six digits; the figures of bodies, joints, geoms and sites are then those that it
-compiled, with all their digits. Inertias are explicit. A mesh that touches is written out; one that is only looked at
-becomes its bounding box.
+MuJoCo writes the structure, but numbers with six digits only. The numbers of bodies, joints, geoms and sites are
+therefore copied from the compiled model in full precision. Inertias are explicit. A mesh that can collide is written
+out; a visual mesh becomes its bounding box.
 """
 
 from __future__ import annotations
@@ -19,53 +19,53 @@ from gaponet.base.errors import RobotError
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.mjcf import compile_spec, read_mjcf
 
-Places = dict[str, Iterator[int]]  # tag → number of the next one in the model
+Counters = dict[str, Iterator[int]]  # tag → index of the next element in the model
 
-DROPPED = ("actuator", "sensor", "keyframe", "asset", "visual", "statistic", "custom", "size")
-COMPILER = {"angle": "radian", "autolimits": "true", "inertiafromgeom": "auto"}
-LOOKS = ("class", "childclass", "material", "mesh", "density", "shellinertia", "fitscale", "fromto")
-DYNAMICS = ("armature", "frictionloss", "margin")
+DROPPED_SECTIONS = ("actuator", "sensor", "keyframe", "asset", "visual", "statistic", "custom", "size")
+COMPILER_ATTRIBUTES = {"angle": "radian", "autolimits": "true", "inertiafromgeom": "auto"}
+DROPPED_GEOM_ATTRIBUTES = ("class", "childclass", "material", "mesh", "density", "shellinertia", "fitscale", "fromto")
+JOINT_ATTRIBUTES = ("armature", "frictionloss", "margin")
 
 
 def self_contained_mjcf(path: Path) -> str:
-    """The MJCF at path in one text; its actuators are left out, since robot.toml has them.
+    """Return the MJCF at `path` in one text, without actuators: robot.toml holds their numbers.
 
     Raises:
-        RobotError: It does not compile, or has what such a text cannot hold (tendons with odd figures, plugins).
+        RobotError: It does not compile, or such a text cannot hold it (plugins, tendons with more than six digits).
     """
     return self_contained_text(read_mjcf(path), path)
 
 
 def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
-    """The same of a specification that was read from `path`."""
+    """Return a specification, read from `path`, in one text; errors as for `self_contained_mjcf`."""
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
     model = compile_spec(spec, path)
     root = ET.fromstring(spec.to_xml())
-    for child in [c for c in root if c.tag in (*DROPPED, "compiler")]:
+    for child in [c for c in root if c.tag in (*DROPPED_SECTIONS, "compiler")]:
         root.remove(child)
-    for element in root.iter("geom"):  # a class may name what was dropped
+    for element in root.iter("geom"):  # a default class may name a material that was dropped
         element.attrib.pop("material", None)
-    root.insert(0, ET.Element("compiler", COMPILER))
+    root.insert(0, ET.Element("compiler", COMPILER_ATTRIBUTES))
     asset, world = ET.SubElement(root, "asset"), root.find("worldbody")
     assert world is not None
     _fill(world, 0, model, asset, {tag: count() for tag in ("joint", "geom", "site")}, count(1))
     ET.indent(root)
     text = ET.tostring(root, encoding="unicode") + "\n"
-    if _moves(model) != _moves(compile_spec(mujoco.MjSpec.from_string(text), path)):
+    if _fingerprint(model) != _fingerprint(compile_spec(mujoco.MjSpec.from_string(text), path)):
         raise RobotError(
             f"{path}: does not fit into one file that moves the same; write it without <include> and files"
         )
     return text
 
 
-def _moves(model: mujoco.MjModel) -> list[str]:
+def _fingerprint(model: mujoco.MjModel) -> list[str]:
     return [line for line in model_fingerprint(model) if not line.startswith("actuator ")]
 
 
 def _fill(
-    element: ET.Element, body: int, model: mujoco.MjModel, asset: ET.Element, next_: Places, bodies: Iterator[int]
+    element: ET.Element, body: int, model: mujoco.MjModel, asset: ET.Element, counters: Counters, bodies: Iterator[int]
 ) -> None:
-    """Give a body and all below it the model's figures, depth first, which is the model's order."""
+    """Copy the model's numbers into a body and its descendants, depth first, which is the model's order."""
     _unwrap(element)
     for child in [c for c in element if c.tag not in ("joint", "geom", "site", "body")]:
         element.remove(child)
@@ -78,19 +78,19 @@ def _fill(
             element.insert(0, inertial)
     for child in element:
         if child.tag == "joint":
-            _joint(child, model, next(next_["joint"]))
+            _joint(child, model, next(counters["joint"]))
         elif child.tag == "geom":
-            _geom(child, model, next(next_["geom"]), asset)
+            _geom(child, model, next(counters["geom"]), asset)
         elif child.tag == "site":
-            s = next(next_["site"])
+            s = next(counters["site"])
             child.attrib.pop("material", None)
             set_attributes(child, pos=model.site_pos[s], quat=model.site_quat[s])
     for child in [c for c in element if c.tag == "body"]:
-        _fill(child, next(bodies), model, asset, next_, bodies)
+        _fill(child, next(bodies), model, asset, counters, bodies)
 
 
 def _unwrap(element: ET.Element) -> None:
-    """The children of frames in their place: the model's figures are from the body."""
+    """Replace frames by their children: the model states positions relative to the body."""
     while any(c.tag == "frame" for c in element):
         children = [inner for c in element for inner in (list(c) if c.tag == "frame" else [c])]
         element[:] = children
@@ -102,34 +102,35 @@ def _joint(element: ET.Element, model: mujoco.MjModel, j: int) -> None:
         element, pos=model.jnt_pos[j], axis=model.jnt_axis[j], ref=model.qpos0[at], springref=model.qpos_spring[at]
     )
     set_attributes(
-        element, **{name: getattr(model, f"{'jnt' if name == 'margin' else 'dof'}_{name}")[dof] for name in DYNAMICS}
+        element,
+        **{name: getattr(model, f"{'jnt' if name == 'margin' else 'dof'}_{name}")[dof] for name in JOINT_ATTRIBUTES},
     )
     for name, kind, i in (("stiffness", "jnt", j), ("damping", "dof", dof)):
         higher = getattr(model, f"{kind}_{name}poly", np.zeros((model.nv, 0)))[i]
         first = getattr(model, f"{kind}_{name}")[i]
         set_attributes(element, **{name: [first, *higher] if np.any(higher) else first})
-    element.attrib.pop("springdamper", None)  # stiffness and damping were made of it
-    for ours, theirs in (("", ""), ("actfrc", "actuatorfrc")):
-        limited = bool(getattr(model, f"jnt_{ours}limited")[j])
-        element.set(f"{theirs}limited", str(limited).lower())
+    element.attrib.pop("springdamper", None)  # the compiler derived stiffness and damping from it
+    for field, attribute in (("", ""), ("actfrc", "actuatorfrc")):
+        limited = bool(getattr(model, f"jnt_{field}limited")[j])
+        element.set(f"{attribute}limited", str(limited).lower())
         if limited:
-            set_attributes(element, **{f"{theirs}range": getattr(model, f"jnt_{ours}range")[j]})
+            set_attributes(element, **{f"{attribute}range": getattr(model, f"jnt_{field}range")[j]})
 
 
 def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element) -> None:
-    """Without mass: inertias are explicit."""
-    for name in LOOKS:
+    """Copy a geom without its mass, since inertias are explicit."""
+    for name in DROPPED_GEOM_ATTRIBUTES:
         element.attrib.pop(name, None)
-    pos, size, turn = model.geom_pos[g], model.geom_size[g], np.zeros(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[g])
+    pos, size, rotation = model.geom_pos[g], model.geom_size[g], np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[g])
     kind = mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower()
     if kind in ("mesh", "sdf", "hfield"):
-        meets = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
-        if meets and (model.geom_contype[g] or model.geom_conaffinity[g]):
+        collides = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+        if collides and (model.geom_contype[g] or model.geom_conaffinity[g]):
             element.set("mesh", _mesh(model, int(model.geom_dataid[g]), asset))
             kind = "mesh"
         else:
-            kind, pos = "box", pos + turn.reshape(3, 3) @ model.geom_aabb[g, :3]
+            kind, pos = "box", pos + rotation.reshape(3, 3) @ model.geom_aabb[g, :3]
             size = np.maximum(model.geom_aabb[g, 3:], 1e-4)
     element.set("type", kind)
     rgba = model.geom_rgba[g] if model.geom_matid[g] < 0 else model.mat_rgba[model.geom_matid[g]]
@@ -146,7 +147,7 @@ def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element)
 
 
 def _mesh(model: mujoco.MjModel, mesh: int, asset: ET.Element) -> str:
-    """Write a mesh out as it was compiled, once; returns its name."""
+    """Add a compiled mesh to the assets, once, and return its name."""
     name = f"mesh{mesh}"
     if all(child.get("name") != name for child in asset):
         vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
@@ -157,7 +158,7 @@ def _mesh(model: mujoco.MjModel, mesh: int, asset: ET.Element) -> str:
     return name
 
 
-def set_attributes(element: ET.Element, **figures: object) -> None:
-    """Attributes with all digits."""
-    for name, values in figures.items():
+def set_attributes(element: ET.Element, **numbers: object) -> None:
+    """Set attributes of an element in full precision."""
+    for name, values in numbers.items():
         element.set(name, " ".join(repr(float(x)) for x in np.ravel(np.asarray(values, float))))

@@ -1,8 +1,8 @@
-"""A robot: joint names, gains, limits, control period and payload mounts, read from one folder.
+"""Robot description: joint names, gains, limits, control period and payload mounts, read from a robot folder.
 
-A folder holds `robot.toml` (what a log and a controller need to know) and `robot.xml` (MJCF: kinematics, inertia, joint
-friction; its actuators, if any, are replaced by position actuators with the gains of `robot.toml`). A user adds a robot
-by writing such a folder; no code is needed.
+A folder holds `robot.toml` (what logs and controllers need) and `robot.xml` (MJCF: kinematics, inertia, friction).
+Position actuators with the gains of `robot.toml` replace the actuators of the MJCF. A new robot is a new folder; it
+needs no code.
 """
 
 from __future__ import annotations
@@ -33,49 +33,49 @@ STOP_FIELDS = ("stop_low", "stop_high")
 MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOP_FIELDS)  # NaN where the MJCF's value stands
 SERVO_TERMS = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
 IDENTIFIED_FIELDS = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *SERVO_TERMS)
-MAX_SUGGESTIONS = 3  # similar joints that an error lists
-GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
+MAX_SUGGESTIONS = 3  # similar joint names in an error
+GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are equal
 SERVO_FIELDS = ("kp", "kd", "effort_limit", *IDENTIFIED_FIELDS)  # what identification may change
 SIGNED = ("qpos_home", "offset", "zero", *STOP_FIELDS)
 
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """What is known about a robot without stepping it. n joints, always in the order of `joint_names`.
+    """Description of a robot, without simulation. Arrays have n joints in the order of `joint_names`.
 
     Attributes:
         name: Folder name, e.g. "so101".
         mjcf: Path of the MJCF.
-        folder: Where robot.toml is.
+        folder: Folder of robot.toml.
         joint_names: All actuated joints, (n).
         operated: The subset that the operator corrects, in the same order.
         kp, kd: PD gains, (n), N·m/rad and N·m·s/rad.
         effort_limit: Torque limit, (n), N·m.
         qpos_home: Rest position, (n), rad.
-        log_units: Unit in which public logs hold each joint, (n): rad, deg, or fraction (0..1 of the MJCF range).
+        log_units: Unit of each joint in public logs, (n): rad, deg, or fraction (0..1 of the MJCF range).
         aliases: Other names of a joint in logs → its name here.
-        payload_mounts: Where payloads go.
+        payload_mounts: Places where payloads are attached.
         dt: Control period, s.
         timestep: Physics step at that control period, s; dt / timestep is an exact integer.
         damping, armature, frictionloss: Identified values that replace the MJCF's, (n), N·m·s/rad, kg·m², N·m; NaN
-            where the MJCF's stands.
+            keeps the MJCF's value.
         delay: Time from command to servo, (n), s.
-        offset: Offset of the servo's zero, (n), rad: it aims at command + offset.
-        zero: The encoder's: the MJCF's angle is reading + zero, (n), rad.
-        target_speed: Speed of the ramp that the servo's own generator makes of targets, (n), rad/s; 0 if it makes none.
-        stop_low, stop_high: Joint stops that narrow the MJCF's range, (n), rad; NaN where the MJCF's stands.
-        stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at which a third of it
-            is left, rad/s.
+        offset: Offset of the servo's zero, (n), rad: its goal is command + offset.
+        zero: Offset of the encoder, (n), rad: the MJCF's angle is reading + zero.
+        target_speed: Speed of the servo's own trajectory generator, (n), rad/s; 0 without one.
+        stop_low, stop_high: Joint stops that narrow the MJCF's range, (n), rad; NaN keeps the MJCF's limit.
+        stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at which it has
+            decreased to 1/e, rad/s.
         friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's, (n).
-        min_torque: Least torque of a motor that turns at all, (n), N·m.
-        encoder_step: Steps in which the servo sees its angle, (n), rad; 0 if fine.
-        servos: Type of each joint's servo, (n); None where robot.toml does not say.
-        tips, table: What may touch a table, and the table; with one nothing else touches.
-        carries_payload: Whether the simulator has the payload that the robot has.
-        gain_scale: kp and kd of operated joints over those of [[joint]]; they are in kp and kd.
-        contacts: Whether links touch as the MJCF says. Off, nothing touches but tips a table: links welded to the world
-            collide for ever with their neighbours, which shows as a gap.
-        nominal: The robot before identification, where parameters were identified (sysid/identify.py).
+        min_torque: Smallest torque that turns the motor, (n), N·m.
+        encoder_step: Resolution of the servo's angle, (n), rad; 0 if it has no effect.
+        servos: Servo type of each joint, (n); None if robot.toml states none.
+        tips, table: Tips that can touch a table, and the table; all other contacts are then off.
+        carries_payload: True if the simulated robot carries the payload of the recordings.
+        gain_scale: Factor on kp and kd of operated joints in [[joint]]; kp and kd include it.
+        contacts: True if links collide as the MJCF states. It is off by default, because links welded to the world
+            collide permanently with their neighbours, which looks like a gap.
+        nominal: The robot before identification; None if no parameter was identified (sysid/identify.py).
     """
 
     name: str
@@ -143,7 +143,7 @@ class RobotSpec:
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """The robot with its files: another process may be on a machine that has not this folder."""
+        """Include the files: another process may run on a machine without this folder."""
         files = [self.mjcf, *self.folder.glob("*.toml")]
         return vars(self) | {"files": {file.name: file.read_bytes() for file in files if file.is_file()}}
 
@@ -160,21 +160,21 @@ class RobotSpec:
         return self.steps_per(self.dt)
 
     def steps_per(self, dt: float) -> int:
-        """Physics steps per control period of another length, s: as many as keep a step close to `timestep`."""
+        """Return the physics steps per control period of length dt, s, with steps close to `timestep`."""
         return max(1, round(dt / self.timestep))
 
     @property
     def has_servo_model(self) -> bool:
-        """Whether a servo does more than MuJoCo's position actuator (sim/servo.py)."""
+        """True if a servo has terms beyond MuJoCo's position actuator (sim/servo.py)."""
         return any(getattr(self, name).any() for name in SERVO_TERMS)
 
     @property
     def before_identification(self) -> RobotSpec:
-        """The nominal robot: this one, or what it was identified from."""
+        """The nominal robot: this one, or the one before identification."""
         return self.nominal or self
 
     def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
-        """The same robot with identified values: joint → any of SERVO. A damping below zero is taken from kd."""
+        """Return the robot with identified values: joint → any of SERVO_FIELDS. Negative damping reduces kd instead."""
         changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO_FIELDS}
         for joint, values in servos.items():
             i = self.index([joint])[0]
@@ -186,21 +186,21 @@ class RobotSpec:
         return dataclasses.replace(self, **changed, nominal=self.nominal or self)
 
     def with_gains(self, kp: tuple[float, ...] | None, kd: tuple[float, ...] | None) -> RobotSpec:
-        """The same robot with its servos set to other gains, (n) N·m/rad and N·m·s/rad; None leaves them as they are.
+        """Return the robot with other nominal gains, (n) N·m/rad and N·m·s/rad; None keeps the present ones.
 
-        The nominal robot has these gains; what identification found is kept as a ratio to the nominal kp and kd.
+        Identified gains keep their ratio to the nominal ones.
         """
         if kp is None and kd is None:
             return self
         nominal = self.nominal or self
-        known = np.array(nominal.kp if kp is None else kp), np.array(nominal.kd if kd is None else kd)
-        if np.allclose(known, (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):
+        new_kp, new_kd = np.array(nominal.kp if kp is None else kp), np.array(nominal.kd if kd is None else kd)
+        if np.allclose((new_kp, new_kd), (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):
             return self
-        stiffer = np.divide(known[0], nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
-        found = np.divide(self.kd, nominal.kd, out=np.ones_like(nominal.kd), where=nominal.kd > 0)
-        nominal = dataclasses.replace(nominal, kp=known[0], kd=known[1])
+        kp_ratio = np.divide(new_kp, nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
+        kd_ratio = np.divide(self.kd, nominal.kd, out=np.ones_like(nominal.kd), where=nominal.kd > 0)
+        nominal = dataclasses.replace(nominal, kp=new_kp, kd=new_kd)
         own = self.nominal and nominal
-        return dataclasses.replace(self, kp=self.kp * stiffer, kd=known[1] * found, nominal=own)
+        return dataclasses.replace(self, kp=self.kp * kp_ratio, kd=new_kd * kd_ratio, nominal=own)
 
     def with_gain_scale(self, scale: float) -> RobotSpec:
         """Return the same robot with the operated joints set to `scale` times the kp and kd of [[joint]]."""
@@ -223,7 +223,7 @@ class RobotSpec:
         return self.stopped(np.where(limited, [j.range for j in joints], [-np.inf, np.inf]))
 
     def stopped(self, ranges: Array) -> Array:
-        """Joint ranges (n, 2) of the MJCF, rad, narrowed by identified stops; these never widen a range."""
+        """Narrow joint ranges (n, 2) of the MJCF, rad, by identified stops."""
         return np.stack([np.fmax(ranges[:, 0], self.stop_low), np.fmin(ranges[:, 1], self.stop_high)], axis=1)
 
     @property
@@ -232,48 +232,51 @@ class RobotSpec:
         return self.index(self.operated)
 
     def index(self, names: tuple[str, ...] | list[str]) -> Array:
-        """Positions of `names` in `joint_names`; raises with the nearest names on a stranger."""
+        """Return the positions of `names` in `joint_names`; an unknown name raises JointMismatchError."""
         for name in names:
             if name not in self.joint_names:
                 raise JointMismatchError(self._unknown(name, "a request")[0])
         return np.array([self.joint_names.index(name) for name in names], int)
 
     def resolve(self, name: str, where: str, extra: dict[str, str] | None = None) -> str:
-        """The robot's own name of a joint called `name` in a log.
+        """Return the robot's name of a joint in a log.
 
         Args:
-            name: Name in the log; of left/waist the robot has left_waist, or else the last part. kLeftElbow and
-                left_elbow are left_elbow_joint.
+            name: Name in the log. left/waist matches left_waist or else waist; kLeftElbow and left_elbow match
+                left_elbow_joint.
             where: File, for the error.
-            extra: The user's --map, tried first.
+            extra: The user's --map, which has priority.
+
+        Raises:
+            JointMismatchError: No joint or several joints match.
         """
         full, short = name.strip(), name.strip().split("/")[-1]
         for table in (extra or {}, self.aliases):
             mapped = table.get(full, table.get(short))
             if mapped is not None:
                 full = short = mapped
-        found = next((n for n in (full.replace("/", "_"), short) if n in self.joint_names), None)
-        same = [found] if found else [joint for joint in self.joint_names if _letters(joint) == _letters(short)]
-        if len(same) != 1:
-            told, near = self._unknown(short, where)
-            raise JointMismatchError(f"{told}. Map it with --map {short}={near}")
-        return same[0]
+        exact = next((n for n in (full.replace("/", "_"), short) if n in self.joint_names), None)
+        matches = [exact] if exact else [joint for joint in self.joint_names if _letters(joint) == _letters(short)]
+        if len(matches) != 1:
+            message, nearest = self._unknown(short, where)
+            raise JointMismatchError(f"{message}. Map it with --map {short}={nearest}")
+        return matches[0]
 
     def _unknown(self, name: str, where: str) -> tuple[str, str]:
         """Return the error text for an unknown joint name, and the most similar joint."""
         near = difflib.get_close_matches(name, self.joint_names, n=MAX_SUGGESTIONS, cutoff=0.0)
-        said = f"{where} names joint '{name}', which robot '{self.name}' does not have; nearest: {', '.join(near)}"
-        return said, near[0]
+        message = f"{where} names joint '{name}', which robot '{self.name}' does not have; nearest: {', '.join(near)}"
+        return message, near[0]
 
 
 def _letters(joint: str) -> str:
-    """What names of one joint have in common in the styles of C, of ROS and of Python."""
+    """Return the letters that a joint name shares between the styles of C, ROS and Python."""
     return re.sub(r"[^a-z0-9]|joint", "", re.sub(r"^k(?=[A-Z])", "", joint).lower())
 
 
 @functools.cache
 def _unpacked(files: tuple[tuple[str, bytes], ...]) -> Path:
-    """A folder with these files until this process ends."""
+    """Write the files into a temporary folder that lives as long as this process."""
     folder = Path(tempfile.mkdtemp(prefix="gaponet-robot-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for name, content in files:
@@ -282,18 +285,18 @@ def _unpacked(files: tuple[tuple[str, bytes], ...]) -> Path:
 
 
 def packaged_robots() -> list[str]:
-    """Names of the robots in the package."""
+    """Return the names of the robots in the package."""
     return sorted(p.parent.name for p in PACKAGE_FOLDER.glob("*/robot.toml"))
 
 
 def load_robot(name_or_path: str | Path) -> RobotSpec:
     """Read a robot from the package by name, or from a folder by path.
 
-    A text without a slash is a name and never a folder of that name in the current directory; a Path, or a text with
-    a slash such as "./g1", is a folder.
+    A string without a slash is a name, never a folder of the current directory. A Path, or a string with a slash such
+    as "./g1", is a folder.
 
     Raises:
-        RobotError: With the folder, the field and what to write there.
+        RobotError: It names the folder, the field and what to write there.
     """
     folder = _folder(name_or_path)
     toml = folder / "robot.toml"
@@ -310,12 +313,12 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
 
 
 def robot_argument(folder: Path) -> str:
-    """What to write after --robot for a robot folder: with a slash, as a text without one is a name."""
+    """Return the value of --robot for a robot folder: with a slash, because a string without one is a name."""
     return f"./{folder}" if folder.name == str(folder) else str(folder)
 
 
 def _folder(name_or_path: str | Path) -> Path:
-    """Where a robot is; refuses a name that could mean two."""
+    """Return the folder of a robot; refuses an ambiguous name."""
     text, folder = str(name_or_path), Path(name_or_path)
     if isinstance(name_or_path, Path) or folder.name != text or text == "..":
         return folder
@@ -329,13 +332,13 @@ def _folder(name_or_path: str | Path) -> Path:
 
 
 def _servo_types(table: RobotTable) -> tuple[ServoType | None, ...]:
-    """One number of each joint."""
-    known: dict[str, ServoType | None] = {"": None} | {servo.name: servo for servo in table.servo}
+    """Return the servo type of each joint."""
+    types: dict[str, ServoType | None] = {"": None} | {servo.name: servo for servo in table.servo}
     for joint in table.joint:
-        if joint.servo not in known:
-            there = ", ".join(s.name for s in table.servo) or "none"
-            raise RobotError(f"joint '{joint.name}': servo '{joint.servo}' is no [[servo]]; there are: {there}")
-    return tuple(known[joint.servo] for joint in table.joint)
+        if joint.servo not in types:
+            names = ", ".join(s.name for s in table.servo) or "none"
+            raise RobotError(f"joint '{joint.name}': servo '{joint.servo}' is no [[servo]]; there are: {names}")
+    return tuple(types[joint.servo] for joint in table.joint)
 
 
 def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
@@ -344,7 +347,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         name=table.name,
         description=table.description or table.name,
         mjcf=mjcf,
-        folder=folder.absolute(),  # told to other processes
+        folder=folder.absolute(),  # other processes may have another current folder
         joint_names=tuple(j.name for j in joints),
         operated=tuple(j.name for j in joints if j.operated),
         kp=np.array([j.kp for j in joints]),
@@ -362,9 +365,9 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         contacts=table.contacts,
         carries_payload=table.carries_payload,
     ).with_gain_scale(table.gain_scale)
-    found = table.identified_table
-    if (robot.table or found) and not robot.tips:
-        raise RobotError("[table] is touched by nothing; name what may touch it in a [[tip]] with body, pos and radius")
+    identified_table = table.identified_table
+    if (robot.table or identified_table) and not robot.tips:
+        raise RobotError("[table]: no [[tip]] can touch it; add a [[tip]] with body, pos and radius")
     for joint in table.identified:
         if joint not in robot.joint_names:
             raise RobotError(f"[identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}")
@@ -373,8 +376,8 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         for joint, servo in table.identified.items()
     }
     identified = robot.with_servos(servos) if servos else robot
-    if found is not None:
-        identified = dataclasses.replace(identified, table=found, nominal=robot)
+    if identified_table is not None:
+        identified = dataclasses.replace(identified, table=identified_table, nominal=robot)
     sides = [mount.side for mount in robot.payload_mounts]
     for side in table.identified_mount:
         if side not in sides:

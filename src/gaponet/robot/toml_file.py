@@ -1,4 +1,4 @@
-"""The fields of a robot.toml, with their ranges."""
+"""Fields of robot.toml with their ranges."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class _Joint:
 
 @dataclass(frozen=True)
 class ServoType:
-    """One [[servo]]: a type that joints name, and what others measured of it, with the source."""
+    """[[servo]]: servo type that joints refer to, with published measurements and their source."""
 
     name: Name
     source: str = ""
@@ -37,19 +37,21 @@ class ServoType:
     armature: Gain | None = None  # kg·m²
     frictionloss: Gain | None = None  # N·m
     gain: Gain | None = None  # N·m/rad for a firmware kp of 1
-    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = None  # … at this supply, which it goes with
+    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = (
+        None  # V, supply of that measurement; gain is proportional to it
+    )
 
     @property
     def published(self) -> dict[str, float]:
-        """Field → value, where there is one."""
-        found = {"damping": self.damping, "armature": self.armature, "frictionloss": self.frictionloss}
-        return {name: value for name, value in found.items() if value is not None}
+        """Published values by field."""
+        values = {"damping": self.damping, "armature": self.armature, "frictionloss": self.frictionloss}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)
 class PayloadMount:
-    """One [[payload_mount]], where a payload is attached: its centre at `pos` (m) in the frame of MJCF body `body`;
-    `mass` (kg) hangs there always, as a hand that the MJCF lacks."""
+    """[[payload_mount]]: a payload's centre is at `pos` (m) in the frame of MJCF body `body`. `mass` (kg) is always
+    there, such as a hand that the MJCF lacks."""
 
     side: Name
     body: str
@@ -59,7 +61,7 @@ class PayloadMount:
 
 @dataclass(frozen=True)
 class _Mount:
-    """One [identified_mount.SIDE]."""
+    """[identified_mount.SIDE]."""
 
     pos: tuple[Metres, Metres, Metres]
     mass: Annotated[float, Interval(ge=0, le=100)]
@@ -67,7 +69,7 @@ class _Mount:
 
 @dataclass(frozen=True)
 class _Servo:
-    """One [identified.JOINT]: values that replace the MJCF's and the nominal gain."""
+    """[identified.JOINT]: values that replace those of the MJCF and the nominal gains."""
 
     kp: Gain | None = None
     kd: Gain | None = None
@@ -91,7 +93,7 @@ class _Servo:
 
 @dataclass(frozen=True)
 class Tip:
-    """One [[tip]], a sphere of `radius` (m) that may touch the table, at `pos` (m) in the frame of MJCF body `body`."""
+    """[[tip]]: sphere of `radius` (m) that can touch the table, at `pos` (m) in the frame of MJCF body `body`."""
 
     body: str
     pos: tuple[Metres, Metres, Metres]
@@ -100,7 +102,7 @@ class Tip:
 
 @dataclass(frozen=True)
 class Table:
-    """[table], a level plane at `height` (m, MJCF world); its friction coefficient, its stiffness under a tip, N/m."""
+    """[table]: level plane at `height` (m, MJCF world), with friction coefficient and stiffness under a tip (N/m)."""
 
     height: Metres
     friction: Annotated[float, Interval(ge=0, le=10)] = 0.3
@@ -117,9 +119,9 @@ class RobotTable:
     payload_mount: Annotated[tuple[PayloadMount, ...], Len(0, 20)] = ()
     tip: Annotated[tuple[Tip, ...], Len(0, 20)] = ()
     table: Table | None = None
-    contacts: bool = False  # links touch as the MJCF says; without it nothing touches but tips a table
-    carries_payload: bool = True  # false: the robot's payload is not in the simulator
-    gain_scale: Annotated[float, Interval(gt=0, le=1000)] = 1.0  # kp and kd of operated joints over those of [[joint]]
+    contacts: bool = False  # links collide as the MJCF states; else only tips and table collide
+    carries_payload: bool = True  # false: the simulator omits the payload
+    gain_scale: Annotated[float, Interval(gt=0, le=1000)] = 1.0  # factor on kp and kd of operated joints in [[joint]]
     identified: dict[str, _Servo] = field(default_factory=dict)
     identified_table: Table | None = None
     identified_mount: dict[str, _Mount] = field(default_factory=dict)

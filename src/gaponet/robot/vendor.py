@@ -1,4 +1,4 @@
-"""A vendor's model, MJCF or URDF, as it lies in its repository: with what it names, and without what is not there."""
+"""Reading of vendors' models, MJCF or URDF, with the meshes that exist and without those that do not."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from gaponet.base.sandbox import sandboxed
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, mujoco_errors, read_mjcf, require_simulable
 
-MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
-KEEP = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
+MESHES = (".stl", ".obj", ".msh")  # formats that MuJoCo reads
+URDF_COMPILER = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
         "boundmass": "1e-6", "boundinertia": "1e-9", "autolimits": "true"}  # fmt: skip
-DENSITY = 1000.0  # kg/m³, of links whose inertia is impossible
+BALL_DENSITY = 1000.0  # kg/m³, of the ball that replaces an impossible inertia
 
 
 def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
-    """A model file as a specification, and what was left out of it.
+    """Read a model file as a specification, with notes on what was omitted or corrected.
 
     Args:
         path: .xml (MJCF) or .urdf.
-        packages: Folders of package://NAME; one that is not named is looked for around the file.
+        packages: Folders of package://NAME; others are searched for around the file.
 
     Raises:
-        RobotError: Neither MJCF nor URDF, or broken.
+        RobotError: The file is neither MJCF nor URDF, or is damaged.
     """
     if path.is_dir():
         models = sorted(p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}"))
@@ -61,7 +61,7 @@ def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
         spec.delete(geom)
     for mesh in missing.values():
         spec.delete(mesh)
-    return spec, _left_out(sorted(missing), f"are not in {place}") + _unreadable(spec)
+    return spec, _left_out(sorted(missing), f"are not in {place}") + _drop_unreadable_meshes(spec)
 
 
 def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
@@ -81,25 +81,25 @@ def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujo
                 link.remove(shape)
             else:
                 mesh.set("filename", str(file.resolve()))
-    mended = _inertias(root)
+    corrected = _correct_inertias(root)
     own = root.find("mujoco")
     own = ET.SubElement(root, "mujoco") if own is None else own
     for compiler in own.findall("compiler"):
         own.remove(compiler)
-    ET.SubElement(own, "compiler", KEEP)
+    ET.SubElement(own, "compiler", URDF_COMPILER)
     with mujoco_errors(path, "not valid URDF"):
         spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
     hint = "were not found; --packages NAME=FOLDER says where package://NAME is"
     notes = _left_out(missing, hint) + _left_out(unread, f"are none of {', '.join(MESHES)}")
-    return spec, notes + _unreadable(spec) + mended
+    return spec, notes + _drop_unreadable_meshes(spec) + corrected
 
 
 def _left_out(names: list[str], why: str) -> list[str]:
     return [f"{len(names)} mesh(es) {why}; left out: {abbreviate(names)}"] if names else []
 
 
-def _inertias(root: ET.Element) -> list[str]:
-    """Give links with mass whose inertia no body can have (URDFs often hold zeros) that of a ball; says which."""
+def _correct_inertias(root: ET.Element) -> list[str]:
+    """Replace impossible inertias, such as zeros, by those of a ball of the link's mass; return notes."""
     impossible, light = [], []
     for link in root.iter("link"):
         inertial = link.find("inertial")
@@ -114,7 +114,7 @@ def _inertias(root: ET.Element) -> list[str]:
         matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         if inertia is None or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] > 0:
             continue
-        ball = 0.4 * m * (3 * m / (4 * np.pi * DENSITY)) ** (2 / 3)
+        ball = 0.4 * m * (3 * m / (4 * np.pi * BALL_DENSITY)) ** (2 / 3)
         for axes in ("xx", "yy", "zz", "xy", "xz", "yz"):
             inertia.set(f"i{axes}", repr(float(ball)) if axes[0] == axes[1] else "0")
         impossible.append(link.get("name", ""))
@@ -136,8 +136,8 @@ def _number(element: ET.Element | None, name: str) -> float:
         return float("nan")
 
 
-def _unreadable(spec: mujoco.MjSpec) -> list[str]:
-    """Leave out meshes that MuJoCo cannot read, for all but their looks are in the links' own inertias; says which."""
+def _drop_unreadable_meshes(spec: mujoco.MjSpec) -> list[str]:
+    """Delete meshes that MuJoCo cannot read, since links state their own inertias; return notes."""
     omitted = []
     for mesh in spec.meshes:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open ones have no volume
@@ -158,7 +158,7 @@ def _unreadable(spec: mujoco.MjSpec) -> list[str]:
 
 
 def _resolve(name: str, path: Path, packages: dict[str, Path]) -> Path | None:
-    """Where a mesh is, or None."""
+    """Return the path of a mesh, or None."""
     kind, _, rest = name.rpartition("://")
     if kind not in ("package", "model"):
         places = [path.parent / rest]

@@ -1,8 +1,8 @@
-"""Robots that nobody tuned on, drawn by seed: a vendor's file that is wrong, servos of a random law, logs with dirt.
+"""Random robots for benchmarks: a vendor's file with errors, servos with random effects, and logs with noise.
 
-A body is a public model of ../shared/robots/public where that folder is present (or GAPONET_DATA/../robots/public), or
-else an arm, legs or a hand of random kinematics. What is logged comes from plain MuJoCo and the few lines of
-`Stranger.play`: nothing of gaponet is imported here. All of it is VIRTUAL.
+A body is a public model of ../shared/robots/public (or GAPONET_DATA/../robots/public) if that folder exists, else an
+arm, legs or a hand with random kinematics. Logs come from plain MuJoCo and `RandomRobot.play`; this module imports
+nothing of gaponet. All of these robots are VIRTUAL.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PUBLIC = {  # model → joints that are welded where it stands: slides, wheels, 
 }  # fmt: skip
 PACKAGED = Path(__file__).parents[1] / "src" / "gaponet" / "robot" / "robots"  # more names
 RATES = (25, 30, 50, 60, 100, 125, 200, 240, 250, 500, 1000)  # Hz
-LAWS = (
+EFFECTS = (
     "stribeck",
     "load",
     "backlash",
@@ -37,14 +37,14 @@ LAWS = (
 NUMBERS = 3e6  # of a log in all: at most so much is recorded
 MOTIONS, SECONDS = 12, (120.0, 300.0)
 SMALL, SLOW = 4, 60.0
-STILL, SPOILS = 3, ("as drawn", "units", "damping", "armature", "still")
+STILL, FILE_ERRORS = 3, ("as drawn", "units", "damping", "armature", "still")
 ARM = """<mujoco><compiler angle="radian" autolimits="true"/><option integrator="implicitfast"/>
 <worldbody>{}</worldbody></mujoco>"""
 
 
 @dataclass(frozen=True)
-class Law:
-    """What the servos really do, (n) each: N·m/rad, N·m·s/rad, N·m, kg·m², rad, s; what is NaN or 0 is not there."""
+class Servo:
+    """True servo parameters, (n) each: N·m/rad, N·m·s/rad, N·m, kg·m², rad, s; an effect with NaN or 0 is absent."""
 
     kp: Array
     kd: Array
@@ -65,8 +65,8 @@ class Law:
 
 
 @dataclass(frozen=True)
-class Dirt:
-    """Of the logs: noise and encoder step, rad; share of dropped samples; jitter of the sampling, of a period."""
+class LogNoise:
+    """Errors of the logs: noise and encoder step, rad; fraction of dropped samples; sampling jitter, periods."""
 
     noise: float
     step: float
@@ -78,7 +78,7 @@ class Dirt:
 
 @dataclass(frozen=True)
 class Recording:
-    """One log: time (k,) s; ctrl, qpos, qvel, tau (k, n); kg in the hand."""
+    """One log: time (k,) s; ctrl, qpos, qvel, tau (k, n); payload, kg."""
 
     motion: str
     payload: float
@@ -89,12 +89,12 @@ class Recording:
     tau: Array | None
 
     def rows(self, keep: Array | slice) -> Recording:
-        """Only some rows."""
+        """Select rows."""
         columns = ("time", "ctrl", "qpos", "qvel", "tau")
         return replace(self, **{c: v[keep] for c in columns if (v := getattr(self, c)) is not None})
 
     def columns(self, joints: tuple[str, ...]) -> dict[str, Array]:
-        """As a table."""
+        """Return the log as columns of a table."""
         found = {"time": self.time}
         for name in ("ctrl", "qpos", "qvel", "tau"):
             if (values := getattr(self, name)) is not None:
@@ -103,8 +103,8 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Stranger:
-    """A robot: its body, its servos, what its file says instead, how it is logged."""
+class RandomRobot:
+    """Robot: body, true servos, the values of its file (`said`), rate and errors of its logs."""
 
     seed: int
     body: str
@@ -113,23 +113,18 @@ class Stranger:
     home: Array
     low: Array
     high: Array
-    law: Law
+    servo: Servo
     said: dict[str, Array]
-    laws: tuple[str, ...]
+    effects: tuple[str, ...]
     rate: float
-    dirt: Dirt
+    log_noise: LogNoise
     payload: float
-    pace: float  # Hz, of the slowest loop: what the motions may ask
+    pace: float  # Hz, bandwidth of the slowest servo, which limits the motions
     bodies: tuple[str, ...] = field(default=())
 
-    @property
-    def in_form(self) -> bool:
-        """Whether kp, damping, Coulomb friction, armature, offset and delay are all there is."""
-        return not self.laws
-
     def model(self, payload: float = 0.0) -> mujoco.MjModel:
-        """The real robot, in steps of 1 ms or a little less."""
-        spec, law = self.spec.copy(), self.law
+        """Compile the true robot with steps of 1 ms or a little less."""
+        spec, servo = self.spec.copy(), self.servo
         period = 1 / self.rate
         spec.option.timestep = period / np.ceil(period / 1e-3)
         if payload:
@@ -137,26 +132,26 @@ class Stranger:
             hand.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], mass=payload, contype=0, conaffinity=0)
         for j, name in enumerate(self.joints):
             joint = spec.joint(name)
-            joint.damping, joint.armature = _of(joint.damping, law.damping[j]), law.armature[j]
-            joint.frictionloss = law.friction[j]
+            joint.damping, joint.armature = _like(joint.damping, servo.damping[j]), servo.armature[j]
+            joint.frictionloss = servo.friction[j]
             joint.solref_friction = [2.5 * spec.option.timestep, 1.0]
-            if not law.creeps:  # MuJoCo's own joints creep by milliradians a second where real ones stick
+            if not servo.creeps:  # MuJoCo's own joints creep by milliradians a second where real ones stick
                 joint.solimp_friction = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-            _servo(spec, name, law.kp[j], law.kd[j], law.limit[j])
+            _servo(spec, name, servo.kp[j], servo.kd[j], servo.limit[j])
         return spec.compile()
 
     def file(self) -> str:
-        """The vendor's MJCF, with other gains than the robot has."""
+        """Return the vendor's MJCF, whose gains differ from the true ones."""
         spec = self.spec.copy()
         for j, name in enumerate(self.joints):
             joint = spec.joint(name)
-            joint.damping, joint.armature = _of(joint.damping, self.said["damping"][j]), self.said["armature"][j]
-            _servo(spec, name, self.said["kp"][j], self.said["kd"][j], self.law.limit[j])
+            joint.damping, joint.armature = _like(joint.damping, self.said["damping"][j]), self.said["armature"][j]
+            _servo(spec, name, self.said["kp"][j], self.said["kd"][j], self.servo.limit[j])
         spec.compile()
         return spec.to_xml()
 
     def commands(self, number: int, seconds: float) -> Array:
-        """Targets of one motion, (T, n) rad: sines of several paces, ways from rest to rest, or steps."""
+        """Draw the commands of one motion, (T, n) rad: sines, moves between rests, steps, or a mixture."""
         rng, n = np.random.default_rng([self.seed, number, 1]), len(self.joints)
         t = np.arange(round(seconds * self.rate)) / self.rate
         room = np.minimum((self.high - self.low) / 2, 1.2)
@@ -177,7 +172,7 @@ class Stranger:
         return np.clip(found, self.low, self.high)
 
     def _visits(self, rng: np.random.Generator, clock: np.random.Generator, t: Array, jump: bool) -> Array:
-        """−1 … 1: rests and the ways between them, where to by one generator and when by the other."""
+        """Draw moves between rests in −1 … 1; `rng` draws positions, `clock` times."""
         found, at, now = np.zeros(len(t)), 0.0, 0.0
         while now < t[-1]:
             rest, way = clock.uniform(0.6, 2.5), 0.0 if jump else clock.uniform(0.6, 2.0) * 2 / self.pace
@@ -188,9 +183,9 @@ class Stranger:
         return found
 
     def recordings(self, motions: int = MOTIONS, seconds: float | None = None) -> Iterator[Recording]:
-        """Logs of all motions; where there is a payload, every second motion carries it."""
+        """Yield the logs of all motions; every second one carries the payload, if there is one."""
         rng = np.random.default_rng([self.seed, 2])
-        channels = 2 + self.dirt.velocity + self.dirt.torque
+        channels = 2 + self.log_noise.velocity + self.log_noise.torque
         most = min(NUMBERS / (self.rate * len(self.joints) * channels), rng.uniform(*SECONDS))
         each = max(most / MOTIONS, 5.0) if seconds is None else seconds / motions
         for number in range(motions):
@@ -198,56 +193,68 @@ class Stranger:
             yield self.play(f"m{number:02}", self.commands(number, each), payload, number)
 
     def play(self, motion: str, ctrl: Array, payload: float, number: int) -> Recording:
-        """The robot moves and is logged."""
-        model, law, dirt, n = self.model(payload), self.law, self.dirt, len(self.joints)
+        """Simulate a motion and log it."""
+        model, servo, log_noise, n = self.model(payload), self.servo, self.log_noise, len(self.joints)
         data, h = mujoco.MjData(model), model.opt.timestep
         each = round(1 / self.rate / h)
         target = self._targets(ctrl, h, each)
         dof = np.array([model.joint(j).dofadr[0] for j in self.joints])
         at = np.array([model.joint(j).qposadr[0] for j in self.joints])
         data.qpos[at] = target[0]
-        loses = law.stribeck.any() or law.load.any()
+        loses = servo.stribeck.any() or servo.load.any()
         states = np.zeros((len(target), 3, n), np.float32)
         for k, u in enumerate(target):
             q, v = data.qpos[at], data.qvel[dof]
-            if law.dead_band.any():
+            if servo.dead_band.any():
                 e = u - q
-                u = q + np.sign(e) * np.maximum(np.abs(e) - law.dead_band, 0)
+                u = q + np.sign(e) * np.maximum(np.abs(e) - servo.dead_band, 0)
             if loses:
-                more = law.stribeck * np.exp(-np.abs(v) / law.stribeck_speed) + law.load * np.abs(data.actuator_force)
-                model.dof_frictionloss[dof] = law.friction + more
+                more = servo.stribeck * np.exp(-np.abs(v) / servo.stribeck_speed) + servo.load * np.abs(
+                    data.actuator_force
+                )
+                model.dof_frictionloss[dof] = servo.friction + more
             states[k] = q, v, data.actuator_force
             data.ctrl[:] = u
             mujoco.mj_step(model, data)
         rng = np.random.default_rng([self.seed, number, 3])
         rows = np.arange(len(ctrl))
-        jitter = np.clip(rng.normal(0, dirt.jitter / 2, len(rows)), -dirt.jitter, dirt.jitter) if dirt.jitter else 0.0
+        jitter = (
+            np.clip(rng.normal(0, log_noise.jitter / 2, len(rows)), -log_noise.jitter, log_noise.jitter)
+            if log_noise.jitter
+            else 0.0
+        )
         sampled = np.clip(np.round((rows + jitter) * each).astype(int), 0, len(states) - 1)
         q, v, f = (states[sampled, i].astype(float) for i in range(3))
-        q = q + dirt.noise * rng.standard_normal(q.shape)
-        if dirt.step:
-            q = np.round(q / dirt.step) * dirt.step
-        v = v + 20 * dirt.noise * rng.standard_normal(q.shape)
+        q = q + log_noise.noise * rng.standard_normal(q.shape)
+        if log_noise.step:
+            q = np.round(q / log_noise.step) * log_noise.step
+        v = v + 20 * log_noise.noise * rng.standard_normal(q.shape)
         f = f + 0.01 * np.abs(f).max(axis=0) * rng.standard_normal(q.shape)
-        log = Recording(motion, payload, sampled * h, ctrl, q, v if dirt.velocity else None, f if dirt.torque else None)
-        keep = rng.random(len(rows)) >= dirt.dropped
+        log = Recording(
+            motion, payload, sampled * h, ctrl, q, v if log_noise.velocity else None, f if log_noise.torque else None
+        )
+        keep = rng.random(len(rows)) >= log_noise.dropped
         keep[0] = True
         return log.rows(keep)
 
     def _targets(self, ctrl: Array, h: float, each: int) -> Array:
-        """What the servos aim at in every physics step, (T · each, n)."""
-        law, steps = self.law, np.arange(len(ctrl) * each)
-        late = np.round(law.delay / h).astype(int)
+        """Return the goals of the servos in every physics step, (T · each, n)."""
+        servo, steps = self.servo, np.arange(len(ctrl) * each)
+        late = np.round(servo.delay / h).astype(int)
         rows = np.maximum(steps[:, None] - late, 0) // each
-        target = np.take_along_axis(ctrl, rows, axis=0) + law.offset
-        for limit, moved in ((law.speed * h, _ramp), (law.backlash, _play), (h / np.maximum(law.filter, h), _lag)):
+        target = np.take_along_axis(ctrl, rows, axis=0) + servo.offset
+        for limit, moved in (
+            (servo.speed * h, _ramp),
+            (servo.backlash, _play),
+            (h / np.maximum(servo.filter, h), _lag),
+        ):
             if (limit != (1.0 if moved is _lag else 0.0)).any():
                 target = moved(target, limit)
         return target
 
 
 def _ramp(target: Array, most: Array) -> Array:
-    """A trajectory generator that moves its own target no faster than so much a step."""
+    """Limit the change of a target per step."""
     found, now, most = np.empty_like(target), target[0].copy(), np.where(most > 0, most, np.inf)
     for k, u in enumerate(target):
         now += np.clip(u - now, -most, most)
@@ -256,7 +263,7 @@ def _ramp(target: Array, most: Array) -> Array:
 
 
 def _play(target: Array, gap: Array) -> Array:
-    """Lost motion: the output follows when the gap is taken up."""
+    """Apply backlash: the output follows when the gap is closed."""
     found, now = np.empty_like(target), target[0].copy()
     for k, u in enumerate(target):
         now = np.clip(now, u - gap, u + gap)
@@ -265,7 +272,7 @@ def _play(target: Array, gap: Array) -> Array:
 
 
 def _lag(target: Array, share: Array) -> Array:
-    """A first-order filter of the targets."""
+    """Filter the targets, first order."""
     found, now = np.empty_like(target), target[0].copy()
     for k, u in enumerate(target):
         now = now + share * (u - now)
@@ -273,8 +280,8 @@ def _lag(target: Array, share: Array) -> Array:
     return found
 
 
-def spoiled(robot: Stranger, how: str) -> Stranger:
-    """The same robot, whose file is wrong in one way more (of SPOILS), or that does not move its first joints."""
+def with_file_error(robot: RandomRobot, how: str) -> RandomRobot:
+    """Add one error of FILE_ERRORS to the robot's file; with "still", its first joints do not move."""
     if how == "still":
         low, high = robot.low.copy(), robot.high.copy()
         low[:STILL] = high[:STILL] = robot.home[:STILL]
@@ -284,12 +291,16 @@ def spoiled(robot: Stranger, how: str) -> Stranger:
     return replace(robot, said={f: x * factor.get(f, 1.0) for f, x in robot.said.items()})
 
 
-def draw(seed: int, public: bool | None = None, small: bool = False, named: str = "") -> Stranger:
-    """The robot of a seed. public: of the public models, or (False) of those that are made here; default: by chance.
-    small: the first made here of at most SMALL joints, at no more than SLOW Hz. named: one of PUBLIC, in part, or of
-    gaponet's own robots."""
+def draw_robot(seed: int, public: bool | None = None, small: bool = False, named: str = "") -> RandomRobot:
+    """Draw the robot of a seed.
+
+    Args:
+        public: True for a public model, False for random kinematics; default: by chance.
+        small: Random kinematics with at most SMALL joints, at no more than SLOW Hz.
+        named: Part of the path of a public model, or a robot of gaponet.
+    """
     if small:
-        next(i for i in range(100) if len((found := draw(seed + 10**6 * i, False)).joints) <= SMALL)
+        next(i for i in range(100) if len((found := draw_robot(seed + 10**6 * i, False)).joints) <= SMALL)
         return replace(found, rate=min(found.rate, SLOW))
     rng = np.random.default_rng([seed, 0])
     chance, place = rng.random() < 0.4, rng.integers(len(PUBLIC))
@@ -302,7 +313,7 @@ def draw(seed: int, public: bool | None = None, small: bool = False, named: str 
     if spec is None:
         body = ("arm", "legs", "hand")[rng.integers(3)]
         spec = mujoco.MjSpec.from_string({"arm": _arm, "legs": _legs, "hand": _hand}[body](rng))
-    return _dressed(seed, rng, spec, body)
+    return _complete(seed, rng, spec, body)
 
 
 def _folder() -> Path | None:
@@ -312,7 +323,7 @@ def _folder() -> Path | None:
 
 
 def _public(path: Path, welded: tuple[str, ...]) -> mujoco.MjSpec:
-    """A public model without its meshes, contacts and what is not a hinge; on a stand."""
+    """Read a public model without meshes, contacts and joints other than hinges; its base is fixed."""
     spec = mujoco.MjSpec.from_file(str(path))
     for kind in ("actuators", "sensors", "keys", "equalities", "tendons", "excludes", "pairs"):
         for element in list(getattr(spec, kind)):
@@ -335,7 +346,7 @@ def _plain(spec: mujoco.MjSpec) -> str:
 
 
 def _link(rng: np.random.Generator, name: str, axis: str, length: float, mass: float, inside: str, limit: float) -> str:
-    """A body with a hinge, a rod, and what hangs on its end."""
+    """Return a body with a hinge, a rod, and a child at its end."""
     to = np.roll([length, 0, 0], rng.integers(3)) * rng.choice([-1, 1])
     to = to if abs(to[1]) < 1e-9 else np.array([0, 0, -length])
     low = -limit * rng.uniform(0.6, 1)
@@ -348,7 +359,7 @@ def _link(rng: np.random.Generator, name: str, axis: str, length: float, mass: f
 
 
 def _chain(rng: np.random.Generator, prefix: str, n: int, length: float, mass: float, limit: float) -> str:
-    """n links, each shorter and lighter than the one that carries it."""
+    """Return n links, each shorter and lighter than its parent."""
     text = ""
     for i in reversed(range(n)):
         axis = ("1 0 0", "0 1 0", "0 0 1")[rng.integers(3)] if rng.random() < 0.8 else "0.6 0.8 0"
@@ -379,8 +390,8 @@ def _hand(rng: np.random.Generator) -> str:
     return ARM.format("".join(bodies))
 
 
-def _dressed(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: str) -> Stranger:
-    """A body with servos, a wrong file, a logger."""
+def _complete(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: str) -> RandomRobot:
+    """Draw servos, file errors and log errors for a body."""
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     model = spec.compile()
@@ -406,20 +417,20 @@ def _dressed(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: str
     total = 2 * rng.uniform(0.4, 1.2, n) * np.sqrt(kp * moved)
     share = rng.uniform(0.2, 1.0)
     none = np.zeros(n)
-    laws = () if rng.random() < 0.5 else tuple(map(str, rng.choice(LAWS, rng.integers(1, 4), replace=False)))
-    each = lambda name, least, most: spread(least, most, n) if name in laws else none  # noqa: E731
+    effects = () if rng.random() < 0.5 else tuple(map(str, rng.choice(EFFECTS, rng.integers(1, 4), replace=False)))
+    each = lambda name, least, most: spread(least, most, n) if name in effects else none  # noqa: E731
     limit = 3 * weight + 0.6 * kp
-    law = Law(
+    servo = Servo(
         kp=kp, kd=share * total, damping=(1 - share) * total, friction=kp * spread(1e-3, 2e-2) * spread(0.6, 1.6, n),
         armature=armature, offset=rng.normal(0, 0.01, n) * (rng.random() < 0.7),
         delay=np.full(n, rng.uniform(0, 0.06)) + rng.uniform(0, 0.004, n),
-        limit=np.maximum(1.25 * weight, 0.12 * kp * spread(0.7, 1.5, n)) if "saturation" in laws else limit,
+        limit=np.maximum(1.25 * weight, 0.12 * kp * spread(0.7, 1.5, n)) if "saturation" in effects else limit,
         stribeck=kp * each("stribeck", 2e-3, 1e-2), stribeck_speed=spread(0.02, 0.2, n), load=each("load", 0.03, 0.25),
         backlash=each("backlash", 1e-3, 1e-2), dead_band=each("dead_band", 1e-3, 1e-2),
-        speed=each("speed", 0.4, 2.0), filter=each("filter", 0.01, 0.06), creeps="creep" in laws,
+        speed=each("speed", 0.4, 2.0), filter=each("filter", 0.01, 0.06), creeps="creep" in effects,
     )  # fmt: skip
-    said = {name: getattr(law, name) * _wrong(rng, n, name != "kp") for name in ("kp", "kd", "damping", "armature")}
-    dirt = Dirt(
+    said = {name: getattr(servo, name) * _wrong(rng, n, name != "kp") for name in ("kp", "kd", "damping", "armature")}
+    log_noise = LogNoise(
         noise=float(rng.choice([0.0, spread(1e-5, 1e-3)])),
         step=float(rng.choice([0.0, 2 * np.pi / 4096, 2 * np.pi / 16384, 2 * np.pi / 131072])),
         dropped=float(rng.choice([0.0, rng.uniform(0.001, 0.02)])),
@@ -428,18 +439,18 @@ def _dressed(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: str
     )  # fmt: skip
     heavy = float(model.body_mass.sum()) * rng.uniform(0.05, 0.3) if body == "arm" and rng.random() < 0.5 else 0.0
     bodies = tuple(model.body(b).name for b in range(1, model.nbody))
-    return Stranger(seed, body, spec, joints, np.clip(none, low, high), low, high, law, said, laws,
-                    float(rng.choice(RATES)), dirt, round(heavy, 3), float(pace), bodies)  # fmt: skip
+    return RandomRobot(seed, body, spec, joints, np.clip(none, low, high), low, high, servo, said, effects,
+                    float(rng.choice(RATES)), log_noise, round(heavy, 3), float(pace), bodies)  # fmt: skip
 
 
 def _wrong(rng: np.random.Generator, n: int, may_lack: bool) -> Array:
-    """How a file is wrong: by up to a factor of two, most of it in all joints alike, or 0."""
+    """Draw factors of a file's errors: up to two, mostly common to all joints, or 0."""
     factor = 2.0 ** np.clip(rng.uniform(-1, 1) + rng.uniform(-0.25, 0.25, n), -1, 1)
     return factor * (rng.random() > 0.2 or not may_lack)
 
 
-def _of(like: object, value: float) -> object:
-    """A number, or the first of a polynomial's where the specification holds one."""
+def _like(like: object, value: float) -> object:
+    """Return a number, or coefficients of a polynomial if the specification holds some."""
     return value if np.ndim(like) == 0 else [value, *np.zeros(len(like) - 1)]  # type: ignore[arg-type]
 
 

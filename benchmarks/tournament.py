@@ -1,13 +1,13 @@
-"""The standing tournament: robots that nobody tuned on (strangers.py), as a user would have them, by commands alone.
+"""Tournament of identification on random robots (random_robots.py), by commands only: docs/results/robots.md.
 
-    python benchmarks/robots.py WORK --robots 60 --first 0        # goes on where it was cut short
-    python benchmarks/robots.py WORK --robots 200 --small         # of 2 to 4 joints, up to 60 Hz, a minute of logs
-    python benchmarks/robots.py WORK --robots 1 --named ur5e --spoil units      # one public model
-    python benchmarks/robots.py WORK --robots 0 --page docs/results/robots.md
+    python benchmarks/tournament.py WORK --robots 60 --first 0        # resumes after an interrupt
+    python benchmarks/tournament.py WORK --robots 200 --small         # 2 to 4 joints, up to 60 Hz, a minute of logs
+    python benchmarks/tournament.py WORK --robots 1 --named ur5e --file-error units   # one public model
+    python benchmarks/tournament.py WORK --robots 0                   # the tables
 
-Each seed: a vendor's file that is wrong and logs of a plain simulator; gaponet robot new, import, doctor, identify; and
-benchmarks/plain_fit.py on the same dataset. Both are measured by gaponet gap on FRESH motions that are in no dataset
-that anything was fitted to, as many of each kind. A process for each robot; of a seed the last line counts.
+Each seed draws a vendor's file with errors and logs of a plain simulator. Then run gaponet robot new, import, doctor
+and identify, and benchmarks/plain_fit.py on the same dataset. gaponet gap measures both on FRESH motions, which no fit
+has seen. Each robot has its own process. For a repeated seed, the last line of the journal counts.
 """
 
 from __future__ import annotations
@@ -23,28 +23,23 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from plain_fit import plain_fit
-from strangers import SPOILS, Stranger, draw, spoiled
+from random_robots import FILE_ERRORS, RandomRobot, draw_robot, with_file_error
 
 from gaponet.base.files import write_text
 from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
-from gaponet.report.figures.style import figure, save, styled
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import whole_errors
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 FIELDS = ("kp", "damping", "frictionloss", "armature", "delay", "offset")
 WORSE, WORSE_THAN_PLAIN = 1.01, 1.10
-MARK = "<!-- below by hand -->\n"
 FRESH, LATER = 8, 100  # motions that are measured, and the number of the first
 SMALL = 60.0  # s recorded of a small robot
 Row = dict[str, Any]
@@ -55,7 +50,7 @@ class RefusedError(Exception):
 
 
 class Taken:
-    """Seconds, and those of the processor, since it was made."""
+    """Wall and processor time since the start, s."""
 
     def __init__(self) -> None:
         self.began, self.cpu = time.monotonic(), self._cpu()
@@ -69,7 +64,7 @@ class Taken:
 
 
 def call(*words: object) -> str:
-    """What a command prints."""
+    """Run a command and return what it prints."""
     out, said = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
         code = gaponet(list(map(str, words)))
@@ -79,8 +74,8 @@ def call(*words: object) -> str:
     return out.getvalue()
 
 
-def write(robot: Stranger, folder: Path, logs: Iterable[Any]) -> float:
-    """The logs, a folder for each payload; seconds recorded."""
+def write(robot: RandomRobot, folder: Path, logs: Iterable[Any]) -> float:
+    """Write the logs, one folder per payload; returns the recorded seconds."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -100,14 +95,14 @@ def play(
     seconds: float | None,
     small: bool,
     named: str = "",
-    spoil: str = SPOILS[0],
+    file_error: str = FILE_ERRORS[0],
     rival: bool = True,
 ) -> Row:
-    """One robot of the tournament."""
-    robot = spoiled(draw(seed, small=small, named=named), spoil)
-    row: Row = {"seed": seed, "small": small, "spoil": spoil, "body": robot.body, "joints": len(robot.joints),
-                "rate": robot.rate, "laws": list(robot.laws), "payload": robot.payload,
-                "dirt": vars(robot.dirt)}  # fmt: skip
+    """Run one robot of the tournament."""
+    robot = with_file_error(draw_robot(seed, small=small, named=named), file_error)
+    row: Row = {"seed": seed, "small": small, "file_error": file_error, "body": robot.body, "joints": len(robot.joints),
+                "rate": robot.rate, "effects": list(robot.effects), "payload": robot.payload,
+                "log_noise": vars(robot.log_noise)}  # fmt: skip
     recordings = list(robot.recordings(motions, seconds))
     row["seconds_recorded"] = write(robot, folder / "logs", recordings)
     each, kinds = float(recordings[0].time[-1]), range(LATER, LATER + FRESH)
@@ -152,16 +147,18 @@ def play(
 
 
 def errors_of(whole: list[Sequence], robot: RobotSpec) -> list[float]:
-    """Mean |error| of each motion, rad."""
+    """Return the mean |error| of each motion, rad."""
     return [float(f"{e:.6g}") for e in whole_errors(whole, robot)]
 
 
-def inside(robot: Stranger, folder: Path, std: dict[str, dict[str, float]], undetermined: dict[str, list[str]]) -> Row:
-    """Distance of each parameter called determined from the truth in its standard errors, and in its own size: field →
-    numbers; and how many of each field are called not determined."""
-    spec, law = load_robot(folder), robot.law
-    truth = {"kp": law.kp, "damping": law.kd + law.damping, "frictionloss": law.friction, "armature": law.armature,
-             "delay": law.delay, "offset": law.offset}  # fmt: skip
+def inside(
+    robot: RandomRobot, folder: Path, std: dict[str, dict[str, float]], undetermined: dict[str, list[str]]
+) -> Row:
+    """Compare parameters with the truth: deviation in standard errors and relative, by field; counts of those that
+    identify reports as not determined."""
+    spec, servo = load_robot(folder), robot.servo
+    truth = {"kp": servo.kp, "damping": servo.kd + servo.damping, "frictionloss": servo.friction,
+             "armature": servo.armature, "delay": servo.delay, "offset": servo.offset}  # fmt: skip
     row: Row = {"sigmas": {}, "relative": {}, "undetermined": {}}
     for field in FIELDS:
         for j, joint in enumerate(robot.joints):
@@ -178,23 +175,23 @@ def inside(robot: Stranger, folder: Path, std: dict[str, dict[str, float]], unde
 
 
 def ratios(rows: Iterable[Row], over: str = "nominal") -> np.ndarray:
-    """Error of the identified robot over another's."""
+    """Return the error of the identified robot relative to another one."""
     return np.array([r["identified"] / r[over] for r in rows if over in r])
 
 
 def level(row: Row) -> bool:
-    """Whether a robot is at most as far from its fresh motions as the plain script's: by a hundredth, or by less than
-    the standard error of the difference, motion by motion."""
+    """Return True if the error exceeds that of the plain script by at most 1 %, or by less than the standard error of
+    the paired difference."""
     more = np.subtract(*(row["motions"][k] for k in ("identified", "plain")))
     return bool(more.mean() <= max((WORSE - 1) * row["plain"], standard_error(more)))
 
 
 def tables(rows: list[Row]) -> list[str]:
-    """What is claimed, in Markdown."""
+    """Return the tables in Markdown."""
     kinds: dict[str, Callable[[Row], bool]] = {
         "all": lambda r: True,
-        "servo of the form that is fitted": lambda r: not r["laws"],
-        "of another form": lambda r: bool(r["laws"]),
+        "servo of the form that is fitted": lambda r: not r["effects"],
+        "of another form": lambda r: bool(r["effects"]),
         "public model": lambda r: "/" in r["body"],
     }
     said = ["| robots | how many | never worse | median of nominal | worst | plain's or less | within 1 % | or in ± "
@@ -220,7 +217,7 @@ def tables(rows: list[Row]) -> list[str]:
              "| parameter, servos of the form | within 2 standard errors | median distance from the truth | called not "
              "determined |", "|---|---:|---:|---:|"]  # fmt: skip
     for field in FIELDS:
-        parts = [r for r in rows if not r["laws"] and field in r.get("sigmas", {})]
+        parts = [r for r in rows if not r["effects"] and field in r.get("sigmas", {})]
         sigmas = np.concatenate([[], *(r["sigmas"][field] for r in parts)])
         if len(sigmas):
             far = np.concatenate([[], *(r["relative"].get(field, []) for r in parts)])
@@ -234,56 +231,21 @@ def tables(rows: list[Row]) -> list[str]:
 
 
 def losers(rows: list[Row]) -> list[str]:
-    """Robots that lose to their own file, or to the plain script beyond ± and a hundredth, and those refused."""
-    said = ["| seed | body | joints | Hz | law | nominal, mrad | identified | plain | what |", "|---" * 9 + "|"]
+    """List robots that are worse than their file or the plain script, and refused ones."""
+    said = ["| seed | body | joints | Hz | effects | nominal, mrad | identified | plain | what |", "|---" * 9 + "|"]
     for r in rows:
         worse = r["identified"] > WORSE * r["nominal"] or ("plain" in r and not level(r))
         if worse or "refused" in r or "plain_refused" in r:
             mrad = [f"{1e3 * r[k]:.2f}" if k in r else "–" for k in ("nominal", "identified", "plain")]
             why = r.get("refused", r.get("plain_refused", ""))[:160].replace("|", "/")
-            laws = ", ".join(r["laws"]) or "of the form"
-            said.append(
-                f"| {r['seed']} | {r['body']} | {r['joints']} | {r['rate']:g} | {laws} | {' | '.join(mrad)} | {why} |"
-            )
+            effects = ", ".join(r["effects"]) or "of the form"
+            robot = f"{r['seed']} | {r['body']} | {r['joints']} | {r['rate']:g}"
+            said.append(f"| {robot} | {effects} | {' | '.join(mrad)} | {why} |")
     return said
 
 
-@styled
-def picture(rows: list[Row]) -> Figure:
-    """What identification leaves beside what the plain script leaves, each of the vendor's file."""
-    fig = figure(4.6, 4.2)
-    ax = fig.subplots()
-    for name, colour, kind in (("servo of the form", "#1f77b4", True), ("of another form", "#d95f02", False)):
-        some = [r for r in rows if (not r["laws"]) == kind and "plain" in r]
-        x, y = ([r[k] / r["nominal"] for r in some] for k in ("plain", "identified"))
-        ax.scatter(x, y, 14, colour, label=f"{name}, {len(some)}", alpha=0.8)
-    every = [r[k] / r["nominal"] for r in rows for k in ("plain", "identified") if k in r]
-    ends = [0.7 * min(every), 1.5 * max(every)]
-    ax.plot(ends, ends, color="0.6", lw=0.8)
-    ax.set(xscale="log", yscale="log", xlim=ends, ylim=ends, aspect="equal",
-           xlabel="plain script, share of the file's error", ylabel="gaponet identify")  # fmt: skip
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_major_formatter("{x:g}")
-    ax.legend(loc="upper left")
-    ax.set_title("VIRTUAL robots that nobody tuned on")
-    return fig
-
-
-def publish(page: Path, rows: list[Row], text: str) -> None:
-    """The page and its figure; what stands below the page's mark is kept."""
-    head = (
-        "# Robots that nobody tuned on\n\n"
-        f"`python benchmarks/robots.py WORK --robots N{' --small' * all(r['small'] for r in rows)}`: {len(rows)} "
-        "**virtual** robots drawn by seed (`benchmarks/strangers.py`), their\nlogs made by plain MuJoCo with a servo "
-        "that gaponet's simulator does not know; by commands alone, as a user would.\n\n"
-    )
-    kept = page.read_text().partition(MARK)[2] if page.exists() else ""
-    page.write_text(f"{head}![]({page.stem}.svg)\n\n{text}\n{MARK}{kept}")
-    save(picture(rows), page.with_suffix(".svg"))
-
-
 def known(journal: Path) -> dict[int, Row]:
-    """Seed → its last row, with what was measured first of one played again; a line that was cut short is none."""
+    """Read the journal: seed → its last row, with the first result of a repeated seed. Incomplete lines are skipped."""
     found: dict[int, Row] = {}
     for line in journal.read_text().rpartition("\n")[0].splitlines() if journal.exists() else []:
         row = json.loads(line)
@@ -295,7 +257,7 @@ def known(journal: Path) -> dict[int, Row]:
 
 
 def main() -> None:
-    """Play what is missing, one robot at a time; print the tables."""
+    """Run the missing robots one at a time, then print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--robots", type=int, default=10)
@@ -305,10 +267,11 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="small robots, a minute of logs")
     parser.add_argument("--alone", action="store_true", help="without the plain script")
     parser.add_argument("--named", default="", help="part of a public model's path: every robot is this one")
-    parser.add_argument("--spoil", default=SPOILS[0], choices=SPOILS, help="what its file has wrong beyond that")
+    parser.add_argument(
+        "--file-error", default=FILE_ERRORS[0], choices=FILE_ERRORS, help="what its file has wrong beyond that"
+    )
     parser.add_argument("--seeds", type=int, nargs="*", help="these, instead of a range; measured again")
     parser.add_argument("--keep", action="store_true", help="keep each robot's folder")
-    parser.add_argument("--page", type=Path, help="write the tables here")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     journal = args.work / "robots.jsonl"
@@ -320,13 +283,13 @@ def main() -> None:
             continue
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)
-        how = (seconds, args.small, args.named, args.spoil, not args.alone)
+        how = (seconds, args.small, args.named, args.file_error, not args.alone)
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
             r = process.submit(play, seed, folder, args.motions, *how).result()
         with journal.open("a") as file:
             file.write(json.dumps(r) + "\n")
         print(
-            f"{seed} {r['body']} {r['joints']} joints {r['rate']:g} Hz {','.join(r['laws']) or 'in form'}: "
+            f"{seed} {r['body']} {r['joints']} joints {r['rate']:g} Hz {','.join(r['effects']) or 'in form'}: "
             f"{1e3 * r['nominal']:.2f} → {1e3 * r['identified']:.2f} (plain {1e3 * r.get('plain', np.nan):.2f}) mrad, "
             f"{r.get('cpu', np.nan):.0f} s (plain {r.get('plain_cpu', np.nan):.0f} s) {r.get('refused', '')}",
             flush=True,
@@ -336,8 +299,6 @@ def main() -> None:
     rows = list(known(journal).values())
     text = "\n".join([*tables(rows), "", *losers(rows)]) + "\n"
     print(text)
-    if args.page:
-        publish(args.page, rows, text)
     if (ratios(rows) > WORSE).any() or (ratios(rows, "plain") > WORSE_THAN_PLAIN).any():
         parser.exit(1, "a robot is worse than its file by more than 1 %, or than the plain script by more than 10 %\n")
 
