@@ -1,18 +1,18 @@
-"""Proof that nothing is lost or doubled: commands killed at random moments, on full disks, read-only, and two at once.
+"""Writing commands under adversity: killed at random moments, on full or read-only disks, and started twice.
 
     python benchmarks/kills.py WORK [--kills 20] [--only import,train] [--seed 0]
 
-Records a small VIRTUAL SO-101 set in WORK/input, then carries out each command of CASES once undisturbed, and again
+Records a small VIRTUAL SO-101 set in WORK/input. Each command of `cases` runs once undisturbed, and then
 
-    kills      with kill -9 at random moments, started again each time until so many were killed
+    kills      with kill -9 at random moments, restarted each time until the number of kills is reached
     full       on a tmpfs that is too small, then on the same one made larger (root only)
-    read_only  on a tmpfs mounted read-only (root only)
+    read_only  on a read-only tmpfs (root only)
     races      twice at once into one folder
-    mixed      import and collect at once into one dataset: the second is refused, and still is when it comes later
-    foreign    into a folder that holds a `.git`
+    mixed      import and collect at once into one dataset; the second is refused, then and later
+    foreign    into a folder with a `.git`
 
-What is compared at the end of each is the content of the folder. Prints one JSON object; exits with 1 where a content
-differs, a file is left over, an exit code is not the one meant, or a traceback was printed.
+At the end, the content of the folder must equal that of the undisturbed command. Prints one JSON object; exits with 1
+if a content differs, a file remains, an exit code is wrong, or a traceback was printed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-import gaponet.nn.onnx_export  # what a child needs is there before it is forked
+import gaponet.nn.onnx_export  # imported before children are forked
 import gaponet.nn.training.trainer  # noqa: F401
 from gaponet.base.files import FOLDER_MARKER
 from gaponet.cli.main import main as gaponet_main
@@ -44,59 +44,59 @@ from gaponet.data.store import Dataset
 TRAIN = ["--model.history", "2", "--warm-start.num-envs", "16", "--warm-start.steps", "40", "--warm-start.rounds", "3",
          "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
 LIMIT_S = 600.0
-REFUSALS = ("Folder", "File", "Usage", "Dataset", "Model")  # what an error's line may begin with
+REFUSALS = ("Folder", "File", "Usage", "Dataset", "Model")  # first words of one-line errors
 
 
 @dataclass(frozen=True)
 class Case:
-    """A command: its arguments, what it starts from, and what must be equal in the end."""
+    """Command with its arguments, its initial folder, and the content to compare."""
 
     argv: Callable[[Path], list[str]]
     content: Callable[[Path], Any]
-    begin: Path | None = None  # copied to OUT first
-    done: int = 0  # exit code where all is there already
+    begin: Path | None = None  # initial content of OUT
+    done: int = 0  # exit code of a repeated command
     unwritable: int = 2  # exit code on a disk that is mounted read-only
 
 
 def entries(out: Path) -> Any:
-    """Order and hashes of a dataset, and every file in it; samples are read."""
+    """Return order and hashes of a dataset, and its files; reads all samples."""
     data = Dataset(out)
     data.sequences()
     return [[(e.id, e.hash) for e in data.entries], names(out)]
 
 
 def names(out: Path) -> list[str]:
-    """Files of a folder, marks left out: which of its subfolders have one depends on nothing of the user's."""
+    """Return the files of a folder without markers, which depend on the order of writing."""
     return sorted(str(f.relative_to(out)) for f in out.rglob("*") if f.is_file() and f.name != FOLDER_MARKER)
 
 
 def digests(out: Path) -> dict[str, str]:
-    """Content of every file."""
+    """Return the hash of every file."""
     return {name: hashlib.sha256((out / name).read_bytes()).hexdigest() for name in names(out)}
 
 
 def trained(out: Path) -> Any:
-    """A run without its times."""
+    """Return the content of a run without times."""
     lines = [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
     curve = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
     return [curve, digests(out / "model")["model.onnx"], names(out)]
 
 
 def page(out: Path) -> Any:
-    """A run's report is whole, and its evaluation the same."""
+    """Require a complete report; return the evaluation and the files."""
     assert (out / "report.html").read_text().rstrip().endswith("</html>")
     return [json.loads((out / "metrics.json").read_text())["methods"], names(out)]
 
 
 def result(out: Path) -> Any:
-    """Rows of an experiment."""
+    """Return the rows of an experiment and its files."""
     out = out / "rehearsal"
     record = json.loads((out / "data.json").read_text())
     return [record["tables"][0]["rows"], sorted(p.name for p in (out / "cells").iterdir()), names(out)]
 
 
 def cases(given: Path) -> dict[str, Case]:
-    """Every command that writes; `given`: data, bare (data without twins), logs (LeRobot) and a run."""
+    """Return every command that writes; `given` holds data, bare (data without twins), logs (LeRobot) and a run."""
     robot = ["--robot", "so101"]
     data, log, run = (str(given / name) for name in ("data", "logs", "run"))
     recipe = ["--recipe", str(given / "more.toml")]
@@ -122,7 +122,7 @@ def cases(given: Path) -> dict[str, Case]:
 
 
 def prepare(given: Path) -> None:
-    """The inputs, once."""
+    """Create the inputs."""
     recipe = 'motions = ["steps-*", "tour-all-*"]\npayloads = [{}]\nunits = ["virtual-1"]\nvariants = {}\n'
     given.mkdir(parents=True)
     for name, payloads, variants in (("few", "0.0", 3), ("more", "0.0, 0.2", 6)):
@@ -138,7 +138,7 @@ def prepare(given: Path) -> None:
 
 
 def start(argv: list[str], log: Path) -> int:
-    """The command in a process of its own, which is forked with everything imported; returns its id."""
+    """Start a command in a forked process, with everything imported; returns its id."""
     process = os.fork()
     if process:
         return process
@@ -160,7 +160,7 @@ def start(argv: list[str], log: Path) -> int:
 
 
 def wait(process: int, until: float = LIMIT_S) -> int | None:
-    """Exit code of a process, None if it still runs after so many seconds."""
+    """Return the exit code of a process; None if it still runs after `until` s."""
     deadline = time.monotonic() + until
     while True:
         ended, status = os.waitpid(process, os.WNOHANG)
@@ -172,7 +172,7 @@ def wait(process: int, until: float = LIMIT_S) -> int | None:
 
 
 class Trial:
-    """A command under adversity; collects what went wrong."""
+    """Tests of one command under adversity; collects failures."""
 
     def __init__(self, name: str, case: Case, work: Path, rng: np.random.Generator) -> None:
         self.name, self.case, self.work, self.rng = name, case, work / name, rng
@@ -189,13 +189,13 @@ class Trial:
         self.needed = size(whole) - self.before
 
     def fresh(self, out: Path) -> Path:
-        """OUT as the command finds it the first time."""
+        """Create OUT with its initial content."""
         if self.case.begin is not None:
             shutil.copytree(self.case.begin, out, dirs_exist_ok=True)
         return out
 
     def expect(self, what: str, code: int | None, *meant: int) -> None:
-        """Note an exit code that is not one of those meant, and a traceback."""
+        """Record an exit code that is not expected, and a traceback."""
         self.count[what] += 1
         text = self.log.read_text(errors="replace") if self.log.is_file() else ""
         if code not in meant or "Traceback" in text:
@@ -205,7 +205,7 @@ class Trial:
         self.log.unlink(missing_ok=True)
 
     def same(self, what: str, out: Path) -> None:
-        """Note content that is not what the undisturbed command left."""
+        """Record content that differs from that of the undisturbed command."""
         try:
             equal = self.case.content(out) == self.content
         except Exception as error:
@@ -215,7 +215,7 @@ class Trial:
             self.wrong.append(f"{what}: {out} is not what the undisturbed command leaves")
 
     def kills(self, wanted: int) -> None:
-        """Kill, start again, and compare when one comes to its end."""
+        """Kill and restart the command; compare when it ends."""
         turn = 0
         while self.count["killed"] < wanted:
             out = self.fresh(self.work / f"killed-{turn}")
@@ -236,7 +236,7 @@ class Trial:
             self.same("killed", out)
 
     def full(self) -> None:
-        """A disk that fills up at a third, and again at two thirds, of what is needed; then there is room."""
+        """Run on a disk with a fraction of the needed space, then with enough."""
         for share in (0.02, 0.35, 0.7):
             place = mounted(self.work / f"full-{share:g}", self.before + self.needed * share)
             try:
@@ -251,7 +251,7 @@ class Trial:
                 subprocess.run(["umount", str(place)], check=True)
 
     def read_only(self) -> None:
-        """Nothing can be written."""
+        """Run on a read-only disk."""
         place = mounted(self.work / "read-only", 1 << 30)
         try:
             out = self.fresh(place / "out")
@@ -264,7 +264,7 @@ class Trial:
             subprocess.run(["umount", str(place)], check=True)
 
     def races(self, turns: int = 5) -> None:
-        """Two at once: one does it, the other is refused, or comes late and finds it done."""
+        """Run two commands at once: one succeeds, the other is refused or finds the result."""
         for turn in range(turns):
             out = self.fresh(self.work / f"race-{turn}")
             logs = [self.log.with_name(f"race-{turn}-{i}.txt") for i in range(2)]
@@ -279,7 +279,7 @@ class Trial:
             self.same("race", out)
 
     def foreign(self) -> None:
-        """Somebody else's folder."""
+        """Run into a folder of another program."""
         if self.case.begin is not None:
             return
         out = self.work / "foreign"
@@ -291,8 +291,8 @@ class Trial:
 
 
 def mixed(given: Path, work: Path, turns: int = 6) -> dict[str, Any]:
-    """Import and collect at once into one dataset: the first in it has it; afterwards an import finds in a collected
-    set what it would add, and collect refuses what was not collected."""
+    """Run import and collect at once into one dataset: one succeeds. Then run the other again: an import finds the
+    collected recordings, and collect refuses imported ones."""
     both = [cases(given)[name] for name in ("import", "collect")]
     count: Counter[str] = Counter()
     wrong: list[str] = []
@@ -314,12 +314,12 @@ def mixed(given: Path, work: Path, turns: int = 6) -> dict[str, Any]:
 
 
 def size(folder: Path) -> float:
-    """What a folder takes on a disk, bytes."""
+    """Return the disk space of a folder, bytes."""
     return sum(4096 * (1 + f.stat().st_size // 4096) for f in folder.rglob("*"))
 
 
 def mounted(place: Path, size: float) -> Path:
-    """A tmpfs of that many bytes."""
+    """Mount a tmpfs of this size, bytes."""
     place.mkdir()
     pages = max(int(size) // 4096, 4)
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={pages * 4096}", "tmpfs", str(place)], check=True)
