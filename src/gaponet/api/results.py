@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.finding import Finding
     from gaponet.robot.spec import RobotSpec
-    from gaponet.sysid.drift import Drift
+    from gaponet.sysid.drift import Drift, Moved
     from gaponet.sysid.fit import Identified
     from gaponet.sysid.torque_motors import Driven
 
@@ -337,7 +337,10 @@ class CheckResult:
     def to_dict(self) -> dict[str, Any]:
         """The result as plain data."""
         d = self.drift
-        plain = lambda moved: {**vars(moved), "sigmas": moved.sigmas}  # noqa: E731
+
+        def plain(moved: Moved) -> dict[str, Any]:
+            return {**vars(moved), "sigmas": moved.sigmas}
+
         return {
             "verdict": self.verdict, "advice": self.advice, "recordings": self.recordings, "seconds": d.seconds,
             "moved": [plain(m) for m in d.moved], "largest": {j: plain(m) for j, m in d.largest.items()},

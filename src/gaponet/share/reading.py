@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import logging
 from pathlib import Path
 
 from gaponet.data.store import Dataset
@@ -38,7 +38,7 @@ def open_dataset(
         DatasetError: There is no dataset, it is damaged, or it cannot be reached.
 
     Datasets written before November 2026 have no robot folder. For those the run's robot is used, or else the robot of
-    that name in the package, with a note on stderr.
+    that name in the package, with a warning in the log.
     """
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if robot is not None:
@@ -47,6 +47,7 @@ def open_dataset(
         return data, load_stored_robot(Path(run), data.robot_name)
     spec = load_stored_robot(data.path, data.robot_name)
     if not has_stored_robot(data.path):
-        note = f"{data.path} keeps no robot (written before November 2026): taking the package's {spec.name}"
-        print(note, file=sys.stderr)
+        logging.getLogger("gaponet").warning(
+            "%s holds no robot (written before November 2026): the package's %s is used", data.path, spec.name
+        )
     return data, spec

@@ -17,8 +17,8 @@ its units, periods and metadata itself. Images and videos are left alone.
 
 from __future__ import annotations
 
+import logging
 import re
-import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -72,7 +72,9 @@ def read(
     for part in sets_under(path):
         unit = _unit(part, position_unit)
         if part.absent:
-            print(f"note: {part.path}: {part.absent} episodes that it lists are not there", file=sys.stderr)
+            logging.getLogger("gaponet").warning(
+                "%s: %d episodes that meta/episodes lists are missing", part.path, part.absent
+            )
         tasks = tasks_of(part)
         open_file, table = Path(), None
         for episode in part.episodes:

@@ -1,0 +1,64 @@
+"""Types of every public name, as a user's type checker sees them: `make check` runs mypy on this file.
+
+It is not a test of pytest, and is never executed.
+"""
+
+from pathlib import Path
+from typing import assert_type
+
+import numpy as np
+
+import gaponet as gp
+
+robot = gp.load_robot("so101")
+assert_type(robot, gp.RobotSpec)
+assert_type(gp.__version__, str)
+data = gp.Dataset("data")
+assert_type(gp.open_dataset("s3://bucket/data"), tuple[gp.Dataset, gp.RobotSpec])
+
+with gp.progress_bar("importing") as update:
+    imported = gp.import_logs(Path("logs"), robot="so101", out="data", unit_id="a", payload_mass=0.0, progress=update)
+assert_type(imported, gp.ImportResult)
+assert_type(imported.dataset, gp.Dataset)
+assert_type(gp.doctor(data), gp.DoctorResult)
+assert_type(gp.doctor(data).verdict, str)
+assert_type(gp.pair(data, robot=robot), gp.PairResult)
+assert_type(gp.collect(out="data"), gp.CollectResult)
+assert_type(gp.excite(robot, out="motions", further=True), gp.ExciteResult)
+
+assert_type(gp.gap(data), gp.GapResult)
+assert_type(gp.gap(data).mpjae, dict[str, float])
+assert_type(gp.check("robot", "logs"), gp.CheckResult)
+assert_type(gp.replay("rollouts", robot="robot"), gp.ReplayResult)
+
+identified = gp.identify(data, out="robot", terms=("stribeck",))
+assert_type(identified, gp.IdentifyResult)
+assert_type(identified.robot, gp.RobotSpec)
+assert_type(gp.identify_torque(data, out="robot"), gp.TorqueResult)
+trained = gp.train(data, out="run", config=gp.TrainConfig(model=gp.ModelConfig(history=4)))
+assert_type(trained, gp.TrainResult)
+assert_type(trained.model, gp.GapModel)
+assert_type(gp.evaluate(trained.model, data), gp.EvalResult)
+assert_type(gp.evaluate("run", data).unseen, bool)
+assert_type(gp.adapt_robot(robot, "logs", out="today"), gp.AdaptResult)
+assert_type(gp.adapt_model("run", data, unit="a"), gp.AdaptResult)
+
+assert_type(gp.export_robot("robot", to="mjcf"), gp.ExportResult)
+assert_type(gp.export_network("run", to="onnx").parity, float | None)
+gp.randomization("robot", out="ranges")
+
+sim = gp.AlignedSim(robot)
+compensator = gp.Compensator(robot)
+assert_type(sim, gp.AlignedSim)
+assert_type(compensator, gp.Compensator)
+delta = trained.model.loop().delta(np.zeros(5), np.zeros(5), np.zeros(5), payload_mass=0.0)
+classes = (gp.Controller, gp.RemoteRobot, gp.MujocoAligner)
+
+
+def first_message(error: gp.GAPONetError) -> str:
+    return str(error)
+
+
+absent = gp.no_such_name  # type: ignore[attr-defined]
+gp.gap(data, robot)  # type: ignore[call-arg]
+gp.gap(data, motion="wave")  # type: ignore[call-arg]
