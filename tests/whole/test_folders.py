@@ -19,8 +19,6 @@ COMMANDS = [
     ["train", "nowhere", "--out"],
     ["identify", "nowhere", "--out"],
     ["experiment", "compare", "nowhere", "--out"],
-    ["experiment", "unit", "nowhere", "--out"],
-    ["experiment", "data", "nowhere", "--out"],
     ["experiment", "tracking", "nowhere", "--out"],
     ["experiment", "delivery", "nowhere", "--out"],
     ["run", "--motion", "wave", "--out"],
