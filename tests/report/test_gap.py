@@ -12,7 +12,7 @@ from gaponet.data.repeatability import Repetitions
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.report.candidate import Candidate
-from gaponet.report.figures.gap_figure import waterfall
+from gaponet.report.figures.identified_robot import waterfall
 from gaponet.report.gap import CAUSES, cause_steps, error_floor, gap_by_step, reductions
 from gaponet.report.methods import title
 from gaponet.report.run_files import read_gap
@@ -49,7 +49,7 @@ def test_every_kind_of_model_has_its_bar(kind):
              "virtual": True, "robot": "arm", "sequences": 3, "unseen": True}  # fmt: skip
     ax = waterfall(found).axes[0]
     ticks = [t.get_text() for t in ax.get_yticklabels()]
-    assert ticks == [*map(title, steps), "left"]
+    assert ticks == [*map(title, steps), "remaining"]
     assert ax.patches[4].get_width() == pytest.approx(2.0)  # what the model removes, mrad
 
 

@@ -45,9 +45,9 @@ def replay(
     if out is not None:
         made.save(out)
     if figure:
-        from gaponet.report.figures import replay_figure
+        from gaponet.report.figures.identified_robot import write_rollout
 
-        replay_figure.write(list(made.rollouts), made.robot.operated, figure)
+        write_rollout(list(made.rollouts), made.robot.operated, figure)
     screen.result(made.to_dict())
 
 

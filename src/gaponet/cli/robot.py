@@ -215,7 +215,7 @@ def show(
     Args:
         out: Picture to write, .png or .svg.
     """
-    from gaponet.report.figures.uncertainty import picture
+    from gaponet.report.figures.identified_robot import draw_uncertainty
     from gaponet.sysid.uncertainty import ParameterUncertainty
     from gaponet.sysid.uncertainty_table import FIELD_UNITS, sentences, summarize, table_rows
 
@@ -238,7 +238,7 @@ def show(
         if out.suffix not in (".png", ".svg"):
             raise UsageError(f"--out {out}: a picture is a .png or an .svg")
         with atomic_write(out) as temporary:
-            picture(known, f"{spec.name}: what is known").savefig(temporary, format=out.suffix[1:], dpi=200)
+            draw_uncertainty(known, f"{spec.name}: what is known").savefig(temporary, format=out.suffix[1:], dpi=200)
         screen.say(f"picture: {out}")
     screen.result({
         "robot": spec.name, "sources": known.sources, "held": known.validated,

@@ -153,7 +153,7 @@ def _evaluate(
 def _values(e: _Evaluated) -> dict[str, Any]:
     """Return the values of the template."""
     from gaponet.report.figures import evaluation as draw
-    from gaponet.report.figures.gap_figure import waterfall
+    from gaponet.report.figures.identified_robot import waterfall
 
     methods, name = e.metrics["methods"], title(e.own)
     bars = [

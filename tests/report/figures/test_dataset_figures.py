@@ -9,7 +9,7 @@ from gaponet.base.errors import DatasetError
 from gaponet.data.store import Dataset
 from gaponet.report.evaluate import evenly_spaced
 from gaponet.report.figures import dataset_figures as draw
-from gaponet.report.figures.draw_dataset import PICTURES, draw_all, liveliest, swing
+from gaponet.report.figures.draw_dataset import FIGURES, draw_all, largest_torque_change, swing
 from gaponet.report.figures.style import save
 from gaponet.report.provenance import robot_label
 from gaponet.sim.model import model_hash
@@ -52,20 +52,20 @@ def test_what_has_no_data_is_left_out_with_a_reason(arm, tmp_path):
     assert left_out == {
         "joint_ranges": "no operated joint is commanded to move",
         "torque_temperature": "no torque was recorded",
-        "gap_by_payload": "no motion was played with several payloads",
+        "gap_by_payload": "no motion was recorded with several payloads",
     }
     assert len(written) == 4
 
 
 def test_only_twins_that_a_picture_needs_are_made(dataset, arm):
     dataset.append(recordings(arm, 1, rows=60, unit="b")[0])  # with one payload only
-    for picture in PICTURES.values():
+    for picture in FIGURES.values():
         picture(dataset, arm, lambda *_: None)
     assert [dataset.has_twin(e, model_hash(arm)) for e in dataset.entries] == [True] * 6 + [False]
 
 
 def test_the_motion_whose_torques_change_most_is_shown(dataset, arm):
-    assert {e.meta.motion for e in liveliest(dataset, arm)} == {"m2"}
+    assert {e.meta.motion for e in largest_torque_change(dataset, arm)} == {"m2"}
 
 
 def test_spikes_are_no_swing():

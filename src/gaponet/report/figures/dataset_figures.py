@@ -1,4 +1,4 @@
-"""The pictures of a dataset: one function each, arrays in, Figure out, in the style of a report's figures."""
+"""The figures of a dataset, drawn from arrays."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from gaponet.report.methods import colour
 
 SIDES = {"left": "#3b7dd8", "right": "#d9662b", "": "#4d8f5b"}
 LEVEL_COLOURS = dict(zip(LEVELS, ("#9ecae1", "#4292c6", "#084594"), strict=True))
-RAIN = 250  # points under each cloud
+SINGLE_POINTS = 250  # single rows drawn for each joint
 
 
 def payload_colours(payloads: list[float]) -> dict[float, Any]:
-    """Colours of the payloads from light to heavy, dark enough for paper."""
+    """Return colours of the payloads from light to heavy, dark enough for print."""
     steps = np.linspace(0.85, 0.05, len(payloads)) if len(payloads) > 1 else [0.4]
     return dict(zip(payloads, mpl.colormaps["plasma"](steps), strict=True))
 
 
 @styled
 def joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, float]], title: str) -> Figure:
-    """Raincloud of each joint: density, quartiles with 1 % and 99 %, and single rows; grey: the joint's range.
+    """Draw a raincloud of each joint: density, quartiles with 1 % and 99 %, single rows; grey: the joint's range.
 
     Args:
         positions: {joint: (k,) rad}.
@@ -47,7 +47,7 @@ def joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, flo
         ax.plot([low, high], [y, y], color=tint, lw=1)
         ax.plot([q1, q3], [y, y], color=tint, lw=4, solid_capstyle="butt")
         ax.plot(middle, y, "o", ms=3.2, mfc="white", mec=tint, mew=1)
-        rain = rng.choice(values, min(RAIN, len(values)), replace=False)
+        rain = rng.choice(values, min(SINGLE_POINTS, len(values)), replace=False)
         ax.plot(rain, y - 0.23 + rng.uniform(-0.12, 0.12, len(rain)), ".", ms=1.6, mew=0, color=tint, alpha=0.5)
     ax.set_yticks(-np.arange(len(positions)), [joint_label(j, wrapped=False) for j in positions])
     ax.tick_params(axis="y", length=0)
@@ -68,7 +68,7 @@ def joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, flo
 
 
 def _density(values: Array) -> tuple[Array, Array]:
-    """Kernel density over the values' range, its peak 1."""
+    """Return positions and kernel density over the values' range, scaled to a peak of 1."""
     low, high = values.min(), values.max()
     width = np.clip(0.015 * (high - low), 1e-3, 0.04)  # rad, of the kernel
     x = np.linspace(low - 3 * width, high + 3 * width, 400)
@@ -80,7 +80,7 @@ def _density(values: Array) -> tuple[Array, Array]:
 
 @styled
 def composition(entries: list[Entry], title: str) -> Figure:
-    """Hours by payload, unit and rate, stacked by level; over each bar the number of sequences."""
+    """Draw hours by payload, unit and rate, stacked by level, with the number of sequences over each bar."""
     keys = {
         "payload, kg per hand": lambda e: e.meta.payload_mass,
         "unit": lambda e: e.meta.unit_id,
@@ -118,14 +118,14 @@ def _hours(entries: Any) -> float:
 
 @styled
 def torque_temperature(takes: dict[float, Sequence], joints: list[str], title: str) -> Figure:
-    """Position, torque and warming over time of one motion with several payloads.
+    """Draw position, torque and warming over time of one motion with several payloads.
 
     Args:
         takes: {payload kg: recording}, with torque or temperature or both.
     """
-    some = next(iter(takes.values()))
+    first = next(iter(takes.values()))
     rows = [("qpos", "position, rad"), ("tau", "torque, N·m"), ("temperature", "warming, K")]
-    rows = [(c, label) for c, label in rows if getattr(some, c) is not None]
+    rows = [(c, label) for c, label in rows if getattr(first, c) is not None]
     fig = figure(7.0, 0.9 + 1.45 * len(rows))
     axes = fig.subplots(len(rows), len(joints), sharex=True, squeeze=False)
     _same_scale(axes[1:])
@@ -151,11 +151,11 @@ def torque_temperature(takes: dict[float, Sequence], joints: list[str], title: s
 
 
 @styled
-def overlay(real: Sequence, twin_qpos: Array, joints: list[str], title: str) -> Figure:
-    """Command, recording and simulated twin of a few joints, and the gap between the last two below.
+def overlay(real: Sequence, sim_qpos: Array, joints: list[str], title: str) -> Figure:
+    """Draw command, recording and nominal simulation of some joints, and their difference below.
 
     Args:
-        twin_qpos: (T, n) rad, the nominal simulator's, n as in the recording.
+        sim_qpos: Positions of the nominal simulator, (T, n) rad.
     """
     fig = figure(7.0, 3.7)
     axes = fig.subplots(2, len(joints), sharex=True, squeeze=False, height_ratios=[1.5, 1])
@@ -165,9 +165,9 @@ def overlay(real: Sequence, twin_qpos: Array, joints: list[str], title: str) -> 
         j = real.joint_names.index(joint)
         top, low = axes[:, column]
         top.plot(time, real.ctrl[:, j], color="#d99000", lw=0.8, ls=(0, (3, 1.5)), label="command")
-        top.plot(time, twin_qpos[:, j], color=colour("nominal"), lw=1.4, label="simulated twin")
+        top.plot(time, sim_qpos[:, j], color=colour("nominal"), lw=1.4, label="simulated")
         top.plot(time, real.qpos[:, j], color=colour("recorded"), lw=1.0, label="recorded")
-        gap = (real.qpos[:, j] - twin_qpos[:, j]) * 1e3
+        gap = (real.qpos[:, j] - sim_qpos[:, j]) * 1e3
         low.axhline(0, color="#111111", lw=0.6)
         low.fill_between(time, gap, 0, color=colour("gaponet"), alpha=0.25, lw=0)
         low.plot(time, gap, color=colour("gaponet"), lw=0.9)
@@ -183,7 +183,7 @@ def overlay(real: Sequence, twin_qpos: Array, joints: list[str], title: str) -> 
 
 @styled
 def gap_by_payload(errors: dict[float, Array], joints: list[str], title: str) -> Figure:
-    """Mean |gap| of each joint and of all, by payload: median, quartiles and 5–95 % over sequences.
+    """Draw the mean |gap| of each joint and of all joints by payload: median, quartiles, 5–95 % over sequences.
 
     Args:
         errors: {payload kg: (sequences, n) rad, mean |gap| of a sequence}.
@@ -205,14 +205,14 @@ def gap_by_payload(errors: dict[float, Array], joints: list[str], title: str) ->
     ax.set_xlim(-0.55, len(names) - 0.45)
     ax.set_ylim(bottom=0)
     ax.grid(axis="x", visible=False)
-    ax.set_ylabel("mean |recorded − twin|, mrad")
+    ax.set_ylabel("mean |recorded − simulated|, mrad")
     ax.set_xlabel("white: median over takes, box: quartiles, line: 5–95 %", fontsize=7.5)
     legend(fig, title)
     return fig
 
 
 def _same_scale(rows: Any) -> None:
-    """Give each row of axes one scale: torques and gaps of joints are to be compared, positions are not."""
+    """Give each row of axes one scale, so that joints can be compared."""
     for row in rows:
         for ax in row[1:]:
             ax.sharey(row[0])

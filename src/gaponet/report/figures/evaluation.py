@@ -1,4 +1,4 @@
-"""The figures of a report: one function each, matplotlib in, Figure out."""
+"""The figures of a report."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from gaponet.report.figures.charts import JointTrajectory, against, bars, lines
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 from gaponet.report.methods import colour, title
 
-WINDOW = 20.0  # s of each motion shown: a two-minute plot shows nothing
-CORRECTED = 1e-5  # rad; a network that corrects by less draws noise
+SHOWN_S = 20.0  # of each motion, so that details are visible
+MIN_CORRECTION = 1e-5  # rad; smaller corrections are noise
 
 
 def by_joint(methods: dict[str, Any]) -> Figure:
+    """Draw the MPJAE of each method by joint."""
     return _bars(methods, "by_joint", "MPJAE by joint", joint_label)
 
 
 def by_payload(methods: dict[str, Any]) -> Figure:
+    """Draw the MPJAE of each method by payload."""
     return _bars(methods, "by_payload", "MPJAE by payload", "{} kg".format)
 
 
@@ -38,7 +40,7 @@ def _bars(methods: dict[str, Any], group: str, heading: str, label: Callable[[st
 
 
 def by_horizon(methods: dict[str, Any]) -> Figure:
-    """MPJAE against the time since the common start: does the error grow?"""
+    """Draw the MPJAE of each method against the time since the common start."""
     keys = [k for k in methods["nominal"]["by_horizon"] if k != "whole"]
     x = [float(k) for k in keys]
     ticks = [*((v, f"{v:g} s") for v in x), (4 * x[-1], "whole\nmotion")]
@@ -55,7 +57,7 @@ def by_horizon(methods: dict[str, Any]) -> Figure:
 
 @styled
 def _degrees(fig: Figure) -> Figure:
-    """The same figure with degrees on the right."""
+    """Add an axis in degrees on the right."""
     mrad = 1e3 * np.pi / 180
     ways: Any = (lambda y: y / mrad, lambda y: y * mrad)
     right = fig.axes[0].secondary_yaxis("right", functions=ways)
@@ -65,7 +67,7 @@ def _degrees(fig: Figure) -> Figure:
 
 @styled
 def training_curve(progress: list[dict[str, Any]]) -> Figure:
-    """Held-out error after each validation; stages shaded, the kept model marked."""
+    """Draw the validation error during training; the selected model is circled."""
     fig = figure(5.0, 3.0)
     ax = fig.subplots()
     steps = np.array([p["steps"] for p in progress]) / 1e6
@@ -76,7 +78,7 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
         if at:
             ax.plot(steps[at], value[at], "o", ms=3.5, color=tint, label=label)
     best = int(value.argmin())
-    ax.plot(steps[best], value[best], "o", ms=9, mfc="none", mec="#111111", label="kept")
+    ax.plot(steps[best], value[best], "o", ms=9, mfc="none", mec="#111111", label="selected")
     ax.axhline(progress[0]["nominal_mpjae"] * 1e3, color=colour("nominal"), ls="--", lw=1)
     ax.annotate("nominal", (1, progress[0]["nominal_mpjae"] * 1e3), xycoords=("axes fraction", "data"), ha="right",
                 va="bottom", color=colour("nominal"))  # fmt: skip
@@ -91,46 +93,49 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
 def trajectories(
     arrays: dict[str, Array], shown: list[dict[str, Any]], joints: tuple[str, ...], methods: list[str]
 ) -> dict[int, Figure]:
-    """Command, recorded and simulated positions of a few joints over each motion shown.
+    """Draw commanded, recorded and simulated positions of three joints for each stored motion.
 
     Args:
         arrays: For each row ROW/METHOD, recorded, command, delta/METHOD, (T, n) rad.
 
     Returns:
-        By row, those first in which the robot moved most.
+        Figures by row, the motion with the longest travel first.
     """
     looks = {n: (title(n), colour(n)) for n in (*methods, "recorded", "command")}
     drawn: dict[int, tuple[Array, dict[str, JointTrajectory]]] = {}
     for row, facts in enumerate(shown):
         recorded, dt = arrays[f"{row}/recorded"], facts["dt"]
-        start = busiest(recorded, rows := round(WINDOW / dt))
+        start = busiest(recorded, rows := round(SHOWN_S / dt))
         window = slice(start, min(start + rows, len(recorded)))
-        drawn[row] = np.arange(len(recorded))[window] * dt, _courses(arrays, row, joints, methods, window, dt)
+        drawn[row] = (
+            np.arange(len(recorded))[window] * dt,
+            _joint_trajectories(arrays, row, joints, methods, window, dt),
+        )
     travel = {row: np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in drawn}
     return {row: against(*drawn[row], looks, "recorded") for row in sorted(drawn, key=lambda row: -travel[row])}
 
 
-def _courses(
+def _joint_trajectories(
     arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], window: slice, dt: float
 ) -> dict[str, JointTrajectory]:
-    """The three joints with the largest nominal error, of those that are commanded to move while there are any."""
+    """Return the three joints with the largest nominal error; joints that are commanded to move come first."""
     command, recorded = arrays[f"{row}/command"][window], arrays[f"{row}/recorded"]
     still = np.ptp(command, axis=0) <= MOVED
     errors = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
-    learned = [n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > CORRECTED]
-    courses = {}
+    learned = [n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > MIN_CORRECTION]
+    joint_trajectories = {}
     for j in sorted(np.lexsort((-errors, still))[:3].tolist()):
         name = joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else "")
-        asked = command[:, j]
-        courses[name] = JointTrajectory(
-            {n: arrays[f"{row}/{n}"][window, j] for n in methods}, recorded[window, j], asked,
-            {n: arrays[f"{row}/delta/{n}"][window, j] for n in learned}, _turn(asked, dt),
+        target = command[:, j]
+        joint_trajectories[name] = JointTrajectory(
+            {n: arrays[f"{row}/{n}"][window, j] for n in methods}, recorded[window, j], target,
+            {n: arrays[f"{row}/delta/{n}"][window, j] for n in learned}, _turn(target, dt),
         )  # fmt: skip
-    return courses
+    return joint_trajectories
 
 
 def _turn(command: Array, dt: float, seconds: float = 2.0) -> slice:
-    """The stretch in whose middle the command turns, stops or starts."""
+    """Return the rows around the largest change of the command's speed."""
     half = round(seconds / 2 / dt)
     if len(command) <= 2 * half:
         return slice(0, len(command))

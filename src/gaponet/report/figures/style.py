@@ -1,4 +1,4 @@
-"""How every figure looks, where its legend stands, and how it is written to a file."""
+"""Style, legend and files of all figures."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ STYLE: dict[Any, Any] = {
 }
 DASHED = (0, (4, 1.5))
 DOTTED = (0, (1, 1))
-ENTRY, LETTER = 1.9, 0.09  # inches that a legend's entry takes at most, and a letter of it
-LONGEST, LABEL = 120, 40  # letters of a line, and of one beside an axis or in a legend
+MAX_LEGEND_ENTRY, LETTER = 1.9, 0.09  # inches: widest entry of a legend, width of a letter
+MAX_LINE, MAX_LABEL = 120, 40  # letters of a line, and of a label of an axis or a legend
 
 
 def figure(width: float, height: float) -> Figure:
-    """An empty figure, inches; never touches pyplot's global state."""
-    from matplotlib.figure import Figure  # here and below: imported when something is drawn
+    """Return an empty figure, inches, without pyplot's global state."""
+    from matplotlib.figure import Figure  # here and below: imported for drawing only
 
     return Figure(figsize=(width, height))
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorator: draw under STYLE, whatever names hold."""
+    """Decorator: draw with STYLE, and make all texts printable."""
 
     @wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -60,48 +60,47 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def _printable(fig: Figure) -> Figure:
-    """The same figure with words that can be drawn: controls are escapes, which no font has nor an SVG may hold, and of
-    a line longer than there is room for, the middle is left out."""
+    """Escape control characters, which an SVG may not hold, and shorten long lines in the middle."""
     from matplotlib.legend import Legend
     from matplotlib.text import Text
     from matplotlib.ticker import FixedFormatter, FuncFormatter
 
-    def lines(text: str, most: int) -> str:
+    def lines(text: str, limit: int) -> str:
         every = map(escape, text.split("\n"))
-        return "\n".join(s if len(s) <= most else f"{s[: most // 2]}…{s[-most // 2 :]}" for s in every)
+        return "\n".join(s if len(s) <= limit else f"{s[: limit // 2]}…{s[-limit // 2 :]}" for s in every)
 
     for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
         ticks = axis.get_major_formatter()
         if isinstance(ticks, (FixedFormatter, FuncFormatter)):
-            axis.set_major_formatter(FuncFormatter(lambda at, i, ticks=ticks: lines(ticks(at, i), LABEL)))
+            axis.set_major_formatter(FuncFormatter(lambda at, i, ticks=ticks: lines(ticks(at, i), MAX_LABEL)))
     entries = {text for legend in fig.findobj(Legend) for text in legend.get_texts()}
     for text in fig.findobj(Text):
-        text.set_text(lines(text.get_text(), LABEL if text in entries else LONGEST))
+        text.set_text(lines(text.get_text(), MAX_LABEL if text in entries else MAX_LINE))
     return fig
 
 
 def legend(fig: Figure, title: str = "") -> None:
-    """Each label of all axes once, in as many columns as fit, never over the data; with a title, one for the figure."""
-    found: dict[str, Any] = {}
+    """Add one legend for all axes above the figure, in as many columns as fit; title is that of the figure."""
+    handles: dict[str, Any] = {}
     for ax in fig.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
-    wide = min(ENTRY, 0.5 + LETTER * max(map(len, found), default=0))
+            handles.setdefault(label, handle)
+    width = min(MAX_LEGEND_ENTRY, 0.5 + LETTER * max(map(len, handles), default=0))
     fig.legend(
-        list(found.values()), list(found), loc="outside upper left",
-        ncols=max(1, min(len(found), int(fig.get_figwidth() / wide))), columnspacing=1.1, handlelength=1.4,
+        list(handles.values()), list(handles), loc="outside upper left",
+        ncols=max(1, min(len(handles), int(fig.get_figwidth() / width))), columnspacing=1.1, handlelength=1.4,
         title=title or None, alignment="left", title_fontproperties={"weight": "bold", "size": 9},
     )  # fmt: skip
 
 
 def joint_label(joint: str, wrapped: bool = True) -> str:
-    """left_shoulder_pitch_joint → left shoulder pitch, wrapped: a word a line, since tick labels stand side by side."""
+    """Return left_shoulder_pitch_joint as left shoulder pitch; wrapped: one word per line, for neighbouring ticks."""
     words = joint.removesuffix("_joint").replace("_", " ")
     return words.replace(" ", "\n") if wrapped else words
 
 
 def save(fig: Figure, path: Path) -> list[Path]:
-    """SVG with letters as outlines, so that it looks the same everywhere, and PNG for screens and slides."""
+    """Write an SVG, with letters as outlines so that no font is needed, and a PNG. Return both files."""
     import matplotlib as mpl
 
     files = [path.with_suffix(".svg"), path.with_suffix(".png")]
