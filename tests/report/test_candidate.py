@@ -12,7 +12,7 @@ from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.report.candidate import Candidate, select_entries
 from gaponet.report.verdict import network_gain, next_step, verdict
-from gaponet.report.view.side_by_side import pick, side_by_side
+from gaponet.report.view.side_by_side import select_entry, side_by_side
 from gaponet.robot.folder import PROVENANCE_FILE, save_robot
 
 
@@ -44,7 +44,7 @@ def test_an_identified_folder_is_taken_where_a_run_is(fitted, data, arm, capsys)
     assert list(by_cause["left"]) == ["nominal", "gain", "friction", "creep"]
     assert by_cause["methods"]["identified"]["mpjae"] == pytest.approx(found["methods"]["identified"]["mpjae"])
     assert (fitted / "gap.png").is_file()
-    shown = side_by_side(data, pick(data, (fitted,)), gp.load_robot(fitted))
+    shown = side_by_side(data, select_entry(data, (fitted,)), gp.load_robot(fitted))
     assert [m.method for m in shown.motions] == ["target", "nominal", "identified", "recorded"]
     assert shown.seen is False
     assert main(["eval", str(fitted), str(data.path)]) == 0

@@ -68,15 +68,15 @@ def view(
     _require_screen(render, web)
     from gaponet.report.view.film import Clip
     from gaponet.report.view.scene import Scene, View
-    from gaponet.report.view.side_by_side import pick, side_by_side
+    from gaponet.report.view.side_by_side import select_entry, side_by_side
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
-    entry = pick(data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass)
+    entry = select_entry(data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass)
     with progress_bar("replaying") as update:
         shown = side_by_side(data, entry, spec, model, update)
     shown = shown.only(tuple(n for n in show if n != "aligned" or model or spec.nominal is not None))
-    clip = Clip.of(shown, start, duration, speed, fps)
+    clip = Clip.from_start(shown, start, duration, speed, fps)
     errors = {m.method: m.mpjae for m in shown.motions if m.method != "recorded"}
     _introduce(out, entry.meta, {m.name: m.mpjae for m in shown.motions if m.method in errors}, shown.seen)
     rows = slice(round(clip.start / shown.real.dt), round(clip.stop / shown.real.dt) + 1)
@@ -103,9 +103,9 @@ def _require_screen(render: Path | None, web: bool) -> None:
 
     if render is not None:
         choose_gl()
-        from gaponet.report.view.film import require_kind
+        from gaponet.report.view.film import require_writable
 
-        require_kind(render)
+        require_writable(render)
     elif not web and not has_display():
         raise UsageError("no display here; write a film with --render out.gif, or serve a browser with --web")
 

@@ -1,4 +1,4 @@
-"""What a run folder says about its training and its newest evaluation, read and checked for those who show it."""
+"""Reading and checking of a run folder's files about its training and its newest evaluation."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion")
 
 
 class _Error(TypedDict):
-    """The error of a payload, a horizon or a motion, rad."""
+    """Error of a payload, a horizon or a motion, rad."""
 
     mpjae: Number
 
 
 class _JointError(_Error):
-    """The errors of a joint, rad."""
+    """Errors of a joint, rad."""
 
     static: Number
     dynamic: Number
@@ -34,7 +34,7 @@ class _JointError(_Error):
 
 Joints = Annotated[dict[str, _JointError], Len(1)]
 Groups = Annotated[dict[str, _Error], Len(1)]
-Scores = TypedDict(  # one method's metrics, and those of its parts
+Scores = TypedDict(  # metrics of one method, in total and by group
     "Scores",
     {
         "mpjae": Number, "rmse": Number, "q_dis": Number, "static": Number, "dynamic": Number, "large_0.05": Number,
@@ -45,7 +45,7 @@ Scores = TypedDict(  # one method's metrics, and those of its parts
 
 
 class _Shown(TypedDict):
-    """A sequence whose trajectories are kept."""
+    """A sequence with stored trajectories."""
 
     motion: str
     unit_id: str
@@ -54,14 +54,14 @@ class _Shown(TypedDict):
 
 
 class _Artifact(TypedDict):
-    """A model that was evaluated."""
+    """An evaluated model."""
 
     weights: str
     seed: Json
 
 
 class _Delta(TypedDict):
-    """Size of a model's corrections, rad."""
+    """Largest correction of a model, rad."""
 
     max: Number
 
@@ -77,7 +77,7 @@ class _Metrics(TypedDict):
     robot: str
     simulator_hash: str
     simulators: NotRequired[dict[Method, str]]
-    """In which simulator each method ran."""
+    """Hash of each method's simulator."""
     delta: dict[Method, _Delta]
     artifacts: dict[Method, _Artifact]
     shown: NotRequired[Annotated[list[_Shown], Len(0, 100)]]
@@ -87,7 +87,7 @@ class _Metrics(TypedDict):
 
 
 class _PPO(TypedDict):
-    """What a report says of PPO."""
+    """Settings of PPO in the report."""
 
     num_envs: int
     epochs: int
@@ -98,7 +98,7 @@ FORMER_METHODS = {"calibrated": "adapted"}  # former name in metrics.json → na
 
 
 class _Model(TypedDict):
-    """What a list of runs says of the model."""
+    """Model in a list of runs."""
 
     kind: Method
 
@@ -124,16 +124,16 @@ class _Validation(TypedDict):
 
 
 def read_config(run: Path) -> dict[str, Any]:
-    """config.json of a run.
+    """Read config.json of a run.
 
     Raises:
-        ModelError: Missing or damaged, as of all functions here; with file and field.
+        ModelError: The file is missing or damaged; the message names file and field. All functions here raise it.
     """
     return dict(read_json(_Config, run / "config.json", ModelError, REPAIR_HINT, allow_extra=True))
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
-    """metrics.json of a run: the same groups in every method as in the nominal one; absent numbers are NaN."""
+    """Read metrics.json of a run. Every method has the groups of the nominal one; absent numbers are NaN."""
     file = run / "metrics.json"
     metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, REPAIR_HINT, allow_extra=True)}
     for key in ("methods", "ratio_to_nominal"):
@@ -154,7 +154,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
 
 
 def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[str, Array]:
-    """trajectories.npz of a run: for each sequence shown row/METHOD, recorded and command, (T, joints) rad."""
+    """Read trajectories.npz of a run: ROW/METHOD, ROW/recorded and ROW/command, (T, joints) rad."""
     file = run / "trajectories.npz"
     arrays = read_npz(file, ModelError, REPAIR_HINT)
     for row in range(len(metrics.get("shown", []))):
@@ -171,7 +171,7 @@ def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[s
 
 
 def read_progress(run: Path) -> list[dict[str, Any]]:
-    """The validations of a run so far; a last line cut short by a crash is none."""
+    """Read the validations of a run; an incomplete last line is skipped."""
     file = run / "progress.jsonl"
     if not file.is_file():
         return []
@@ -184,13 +184,13 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
 
 
 class _Floor(TypedDict):
-    """The error that encoder and repeatability hide together, rad."""
+    """Error floor by encoder and repeatability, rad."""
 
     both: Number
 
 
 class _Panel(TypedDict):
-    """What is left of the error after each step, and what no simulator can remove; rad."""
+    """Error after each step, and error floor, rad."""
 
     left: dict[Method, Number]
     floor: _Floor
@@ -205,7 +205,7 @@ class _Gap(_Panel):
 
 
 def read_gap(run: Path) -> dict[str, Any] | None:
-    """gap.json of a run; None where there is none."""
+    """Read gap.json of a run; None if there is none."""
     file, again = run / "gap.json", "make it again with gaponet gap DATASET --run RUN"
     if not file.is_file():
         return None

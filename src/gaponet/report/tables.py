@@ -1,4 +1,4 @@
-"""The errors of methods as tables: the same on a screen and in a report."""
+"""Tables of the errors of methods, for terminal and report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gaponet.report.methods import title
 
 
 def mrad(value: float | None) -> str:
-    """rad → milliradian text; a dash where there is none, as of the standard error over one motion."""
+    """Format an angle in rad as milliradian; a dash if there is none, such as the standard error over one motion."""
     return "–" if value is None or value != value else f"{value * 1e3:.2f}"
 
 
@@ -24,9 +24,12 @@ def mrad_and_degrees(value: float) -> str:
 def totals(
     methods: dict[str, Any], angle: Callable[[float], str] = mrad, simulators: Mapping[str, str] | None = None
 ) -> ResultTable:
-    """A row per method, from its metrics (metrics.summary); angle says how an MPJAE is written.
+    """Return a row per method.
 
-    With the simulators in which they ran, by hash, in a last column.
+    Args:
+        methods: Method → metrics (sim.metrics.summary).
+        angle: Formats the MPJAE.
+        simulators: Method → hash of its simulator, for a last column.
     """
     base = methods["nominal"]["mpjae"]
     columns = ("method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "static, mrad", "dynamic, mrad", "Q_dis, rad·s",
@@ -40,7 +43,7 @@ def totals(
 
 
 def by_group(methods: dict[str, Any], group: str, angle: Callable[[float], str] = mrad) -> ResultTable:
-    """MPJAE by joint, payload, unit, horizon or motion: a row for each, a column per method."""
+    """Return the MPJAE by joint, payload, unit, horizon or motion: a row for each, a column per method."""
     parts = [m[f"by_{group}"] for m in methods.values()]
     rows = tuple((key, *(angle(part[key]["mpjae"]) for part in parts)) for key in parts[0])
     return ResultTable(group, ("MPJAE, mrad", *map(title, methods)), rows)

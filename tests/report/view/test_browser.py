@@ -26,7 +26,7 @@ def web(arm):
     swing = 0.8 * np.sin(np.arange(len(real)) / 20)[:, None] * np.ones(2)
     off = {"nominal": 0.4, "gaponet": 0.1, "recorded": 0.0}
     shown = SideBySide(real, arm, tuple(Copy(m, swing + o, np.full(len(real), o)) for m, o in off.items()), None)
-    served = WebScene(Scene(shown, ghost=False), Clip.of(shown, 0.0, 3.0), port=0)
+    served = WebScene(Scene(shown, ghost=False), Clip.from_start(shown, 0.0, 3.0), port=0)
     served.playing.value = False
     ended = threading.Event()
 

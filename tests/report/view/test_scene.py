@@ -9,9 +9,9 @@ from arm import XML, commands, record, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.report.view.film import Clip, require_kind, write
+from gaponet.report.view.film import Clip, require_writable, write
 from gaponet.report.view.picture import Camera
-from gaponet.report.view.scene import Scene, View, dressed
+from gaponet.report.view.scene import Scene, View, visual_spec
 from gaponet.report.view.side_by_side import Copy, SideBySide
 from gaponet.report.view.watch import LEFT, SPACE, Playback
 from gaponet.robot.spec import Table, load_robot
@@ -109,13 +109,13 @@ def test_the_box_holds_the_robot_in_every_frame(four):
 
 
 def test_a_robot_that_stands_beside_a_table_can_be_dressed(arm):
-    assert dressed(dataclasses.replace(arm, table=Table(-0.05, 0.3, 3000.0)), "#c8102e", 0.0).compile().npair == 0
+    assert visual_spec(dataclasses.replace(arm, table=Table(-0.05, 0.3, 3000.0)), "#c8102e", 0.0).compile().npair == 0
 
 
 @pytest.mark.parametrize("name", ["h1_2", "so101"])
 def test_the_robots_of_the_package_can_be_dressed(name):
     robot = load_robot(name)
-    spec = dressed(robot, "#c8102e", 1.0)
+    spec = visual_spec(robot, "#c8102e", 1.0)
     model = spec.compile()
     assert model.ngeom > build_model(robot).ngeom
     assert model.nu == 0
@@ -167,7 +167,7 @@ def test_virtual_is_written_on_virtual_pictures_only(camera, monkeypatch):
 def test_films_have_the_length_asked_for(camera, tmp_path):
     from PIL import Image
 
-    clip = Clip.of(camera.scene.shown, 0.1, 0.2, speed=0.5, fps=10)
+    clip = Clip.from_start(camera.scene.shown, 0.1, 0.2, speed=0.5, fps=10)
     assert write(camera, clip, tmp_path / "a.gif") == 4  # 0.2 s at half speed, 10 pictures/s
     assert write(camera, clip, tmp_path / "a.png") == 1
     with Image.open(tmp_path / "a.gif") as film:
@@ -178,19 +178,19 @@ def test_films_have_the_length_asked_for(camera, tmp_path):
 
 def test_an_mp4_is_an_mp4(camera, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
-    write(camera, Clip.of(camera.scene.shown, 0.0, 0.2, fps=10), tmp_path / "a.mp4")
+    write(camera, Clip.from_start(camera.scene.shown, 0.0, 0.2, fps=10), tmp_path / "a.mp4")
     assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
 
 
 def test_bad_clips_and_files_are_refused_with_what_to_do(four, tmp_path):
     with pytest.raises(UsageError, match=r"--start is 9 s; the recording lasts 0.8 s"):
-        Clip.of(four, 9.0, 1.0)
+        Clip.from_start(four, 9.0, 1.0)
     with pytest.raises(UsageError, match="--speed is 0"):
-        Clip.of(four, 0.0, 1.0, speed=0.0)
+        Clip.from_start(four, 0.0, 1.0, speed=0.0)
     with pytest.raises(UsageError, match=r"ends in .gif, .mp4, .png"):
-        require_kind(tmp_path / "a.avi")
+        require_writable(tmp_path / "a.avi")
     with pytest.raises(UsageError, match="make it first"):
-        require_kind(tmp_path / "nowhere" / "a.gif")
+        require_writable(tmp_path / "nowhere" / "a.gif")
 
 
 def test_keys_pause_and_jump_round_the_clip():
@@ -210,7 +210,7 @@ def test_the_browser_gets_a_mesh_for_every_body_where_it_is(four):
 
     scene = Scene(four)
     object.__setattr__(four.real.meta, "motion", "![x](https:evil.example)")
-    web = WebScene(scene, Clip.of(four, 0.0, 0.6), port=0)
+    web = WebScene(scene, Clip.from_start(four, 0.0, 0.6), port=0)
     try:
         assert r"!\[x\](https:evil.example)" in web.title.content
         web.playing.value = True

@@ -7,7 +7,7 @@ from runs import untrained
 
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.data.store import Dataset
-from gaponet.report.view.side_by_side import pick, side_by_side
+from gaponet.report.view.side_by_side import select_entry, side_by_side
 from gaponet.sim.metrics import metrics, runs
 from gaponet.sim.replay import replay
 
@@ -56,17 +56,17 @@ def test_a_motion_that_is_not_there_is_named_with_those_that_are(dataset, arm):
     with pytest.raises(UsageError, match=r"--show gaponet: here are target, nominal, recorded"):
         shown.only(("gaponet",))
     with pytest.raises(DatasetError, match=r"no such recording of motion1; there are a with 0.2 kg"):
-        pick(dataset, (), "motion1", payload_mass=1.0)
+        select_entry(dataset, (), "motion1", payload_mass=1.0)
 
 
 def test_a_recording_that_no_run_has_seen_comes_first(dataset, arm, tmp_path):
     run = untrained(tmp_path / "run", arm, dataset, train=("motion0", "motion1"), val=("motion3",), test=("motion2",))
     first = untrained(tmp_path / "first", arm, dataset, train=("motion1",), val=("motion3",), test=("motion0",))
-    assert pick(dataset, (first,)).meta.motion == "motion0"
-    assert pick(dataset, (first, run)).meta.motion == "motion2"
-    assert pick(dataset, (run,)).meta.motion == "motion2"
-    assert pick(dataset, (run,), payload_mass=0.2).meta.motion == "motion1"  # seen, but the only ones with 0.2 kg
-    assert pick(dataset, ()).meta.motion == "motion0"
+    assert select_entry(dataset, (first,)).meta.motion == "motion0"
+    assert select_entry(dataset, (first, run)).meta.motion == "motion2"
+    assert select_entry(dataset, (run,)).meta.motion == "motion2"
+    assert select_entry(dataset, (run,), payload_mass=0.2).meta.motion == "motion1"  # seen
+    assert select_entry(dataset, ()).meta.motion == "motion0"
 
 
 def test_the_busiest_stretch_is_where_the_robot_moves(dataset, arm):

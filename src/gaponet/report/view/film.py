@@ -1,4 +1,4 @@
-"""Writes what a camera sees: GIF and PNG through Pillow, MP4 through imageio-ffmpeg."""
+"""Films and pictures of a scene: GIF and PNG through Pillow, MP4 through imageio-ffmpeg."""
 
 from __future__ import annotations
 
@@ -15,22 +15,25 @@ from gaponet.base.files import atomic_write
 from gaponet.report.view.picture import Camera
 from gaponet.report.view.side_by_side import SideBySide
 
-COLOURS = 200  # of a GIF, shared by all frames
-KINDS = (".gif", ".mp4", ".png")
+GIF_COLOURS = 200  # shared by all frames
+SUFFIXES = (".gif", ".mp4", ".png")
 
 
 @dataclass(frozen=True)
 class Clip:
-    """The times of the recording that are shown, and how fast."""
+    """A part of a recording.
+
+    Attributes:
+        start: s into the recording.
+        duration: s of the recording.
+        speed: Below 1 is slow motion.
+        fps: Pictures per second of the film.
+    """
 
     start: float
-    """s into the recording."""
     duration: float
-    """s of the recording."""
     speed: float = 1.0
-    """Below 1 is slow motion."""
     fps: float = 20.0
-    """Pictures per second of the film."""
 
     def __post_init__(self) -> None:
         for name, low, high in (("duration", 0, 3600), ("speed", 0, 100), ("fps", 0, 120)):
@@ -38,8 +41,10 @@ class Clip:
                 raise UsageError(f"--{name} is {value}; give more than {low} and at most {high}")
 
     @classmethod
-    def of(cls, shown: SideBySide, start: float | None, duration: float, speed: float = 1.0, fps: float = 20.0) -> Clip:
-        """The stretch asked for, or the busiest one, cut at the recording's end."""
+    def from_start(
+        cls, shown: SideBySide, start: float | None, duration: float, speed: float = 1.0, fps: float = 20.0
+    ) -> Clip:
+        """Return the part from start on, or the part with the most motion, cut at the recording's end."""
         recorded_s = (len(shown.real) - 1) * shown.real.dt
         begin = shown.busiest(duration) if start is None else start
         if not 0 <= begin < recorded_s:
@@ -48,19 +53,19 @@ class Clip:
 
     @property
     def stop(self) -> float:
-        """s into the recording."""
+        """End of the clip, s into the recording."""
         return self.start + self.duration
 
     def times(self, period: float) -> np.ndarray:
-        """Times of the recording to show, s, one picture every `period` s."""
+        """Return the times of the recording, s, with a picture every `period` s."""
         count = max(round(self.duration / (period * self.speed)), 1)
         return self.start + np.arange(count) * period * self.speed
 
 
-def require_kind(path: Path) -> None:
-    """Refuse a file name whose ending says no known kind, and MP4 without its library, before any work is done."""
-    if path.suffix.lower() not in KINDS:
-        raise UsageError(f"--render {path}: name a file that ends in {', '.join(KINDS)}")
+def require_writable(path: Path) -> None:
+    """Refuse an unknown file suffix, a missing folder or a missing library before any work is done."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"--render {path}: name a file that ends in {', '.join(SUFFIXES)}")
     if not path.parent.is_dir():
         raise UsageError(f"--render {path}: there is no folder {path.parent}; make it first")
     if importlib.util.find_spec("PIL") is None:
@@ -70,15 +75,15 @@ def require_kind(path: Path) -> None:
 
 
 def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int], None] = lambda i, n: None) -> int:
-    """Render to a file whose ending says the kind; a PNG shows the moment when the first simulated copy is worst.
+    """Render to a file; a PNG shows the moment of the largest error of the first simulated copy.
 
     Returns:
         Number of pictures.
     """
-    require_kind(path)
-    kind = path.suffix.lower()
+    require_writable(path)
+    suffix = path.suffix.lower()
     hundredths = max(round(100 / clip.fps), 2)  # a GIF counts in 1/100 s, and viewers slow down below 2
-    times = clip.times(hundredths / 100 if kind == ".gif" else 1 / clip.fps)
+    times = clip.times(hundredths / 100 if suffix == ".gif" else 1 / clip.fps)
 
     def pictures() -> Any:
         for i, time in enumerate(times):
@@ -86,31 +91,31 @@ def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int],
             progress(i + 1, len(times))
 
     with atomic_write(path) as temporary:
-        if kind == ".gif":
+        if suffix == ".gif":
             _write_gif(list(pictures()), temporary, 10 * hundredths)
-        elif kind == ".mp4":
+        elif suffix == ".mp4":
             _write_mp4(pictures(), temporary, clip.fps, (camera.layout.width, camera.layout.height))
         else:
-            camera.picture(furthest(camera.scene.shown, clip)).save(temporary)
-    return 1 if kind == ".png" else len(times)
+            camera.picture(largest_error_time(camera.scene.shown, clip)).save(temporary)
+    return 1 if suffix == ".png" else len(times)
 
 
-def furthest(shown: SideBySide, clip: Clip) -> float:
-    """The time at which the first simulated copy is worst, s."""
+def largest_error_time(shown: SideBySide, clip: Clip) -> float:
+    """Return the time of the largest error of the first simulated copy, s."""
     first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
     simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(shown.motions)
     return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt
 
 
 def _write_gif(pictures: list[Any], path: Path, milliseconds: int) -> None:
-    """Write with one palette for all frames and no dithering: still pixels stay still, and the file small."""
+    """Write with one palette for all frames and no dithering, which keeps the file small."""
     from PIL import Image
 
     some = pictures[:: max(len(pictures) // 4, 1)]
     sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
     for i, picture in enumerate(some):
         sheet.paste(picture, (0, i * picture.height))
-    palette = sheet.quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
+    palette = sheet.quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
     frames = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True)
 

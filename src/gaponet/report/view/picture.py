@@ -1,4 +1,4 @@
-"""A scene as pictures: rendered off screen by MuJoCo, labelled by Pillow."""
+"""Pictures of a scene: rendered off screen by MuJoCo, labelled by Pillow."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.report.view.gl import CURE
+from gaponet.report.view.gl import INSTALL_HINT
 from gaponet.report.view.scene import Scene
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
 
 INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
-DOT = "  ·  "  # Pillow's own font has this, but no ×
-TALLEST = 0.8  # of the width
+SEPARATOR = "  ·  "  # Pillow's own font has this, but no ×
+MAX_HEIGHT = 0.8  # of the width
 
 
 @dataclass(frozen=True)
-class Tiles:
-    """Pixels: a head line, the robots, their labels, and the course of the error, from top to bottom."""
+class Layout:
+    """Heights of head line, robots, labels and error curve from top to bottom, pixels; scale: pixels per metre."""
 
     width: int
     head: int
     robots: int
     labels: int
     course: int
-    scale: float  # pixels per metre
+    scale: float
 
     @property
     def height(self) -> int:
@@ -39,15 +39,19 @@ class Tiles:
         return self.head + self.robots + self.labels + self.course
 
     @classmethod
-    def of(cls, scene: Scene, width: int, course: bool) -> Tiles:
-        """The height that the robots need at this width."""
+    def for_scene(cls, scene: Scene, width: int, course: bool) -> Layout:
+        """Return the layout that fits the robots at this width.
+
+        Raises:
+            UsageError: The width is out of range.
+        """
         if not 160 <= width <= 3840:
             raise UsageError(f"--width is {width}; give 160 to 3840 pixels")
         tall = scene.box[3] - scene.box[2]
         unit = max(width / 960, 0.5)
         head, labels = round(34 * unit), round(54 * unit)
         strip = round(96 * unit) if course else 0
-        scale = min(width / (scene.spacing * len(scene.base)), (TALLEST * width - head - labels - strip) / tall)
+        scale = min(width / (scene.spacing * len(scene.base)), (MAX_HEIGHT * width - head - labels - strip) / tall)
         robots = round(1.1 * tall * scale)
         robots += (head + robots + labels + strip) % 2  # h264 wants even sizes
         return cls(width, head, robots, labels, strip, scale)
@@ -62,12 +66,12 @@ class Camera:
 
         Args:
             width: Width of the picture, pixels, even; the height follows from the robots.
-            speed, magnify: Said on the picture.
+            speed, magnify: Printed on the picture.
             course: Draw the error against time below.
-            span: Time on that axis, s.
+            span: Range of that time axis, s.
         """
         self.scene, self.speed, self.magnify = scene, speed, magnify
-        self.layout = Tiles.of(scene, width - width % 2, course)
+        self.layout = Layout.for_scene(scene, width - width % 2, course)
         self.span = (span[0], min(span[1], (len(scene.shown.real) - 1) * scene.shown.real.dt))
         self.lens = self._lens()
         self.renderer = renderer(scene.model, self.layout.robots, self.layout.width)
@@ -80,7 +84,7 @@ class Camera:
         self.renderer.close()
 
     def picture(self, time: float) -> Any:
-        """The labelled frame at a time of the recording, s: a PIL image."""
+        """Return the labelled frame at a time of the recording, s: a PIL image."""
         from PIL import Image, ImageDraw
 
         self.scene.pose(time)
@@ -92,10 +96,10 @@ class Camera:
         return image
 
     def _lens(self) -> mujoco.MjvCamera:
-        """Orthographic, so that every copy is seen from the same side."""
+        """Return an orthographic camera, which shows every copy from the same side."""
         scene, layout = self.scene, self.layout
         lens = mujoco.MjvCamera()
-        lens.orthographic = scene.model.vis.global_.orthographic = 1  # MuJoCo 3 looks at the model alone
+        lens.orthographic = scene.model.vis.global_.orthographic = 1  # MuJoCo 3 reads the model only
         lens.azimuth, lens.elevation = scene.view.azimuth, scene.view.elevation
         lens.lookat[:] = scene.middle
         lens.distance = 4 * scene.extent
@@ -119,14 +123,14 @@ class Camera:
             self._course(image, draw, row)
 
     def _head(self, draw: ImageDraw, time: float) -> None:
-        """What is shown, on the left; the time on the right; VIRTUAL first, where it is."""
+        """Write VIRTUAL where it applies, the recording on the left, and the time on the right."""
         shown, pad, font = self.scene.shown, self.layout.head // 3, self.fonts[15]
         meta = shown.real.meta
         facts = [meta.robot, meta.motion, f"unit {meta.unit_id}", _payload(meta.payload_mass, meta.payload_side)]
         facts += [] if shown.seen is None else ["seen in training" if shown.seen else "held out"]
         clock = [f"speed {self.speed:g}x"] if self.speed != 1 else []
         clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
-        left, right = DOT.join(facts), DOT.join([*clock, f"{time:6.2f} s"])
+        left, right = SEPARATOR.join(facts), SEPARATOR.join([*clock, f"{time:6.2f} s"])
         mark = "VIRTUAL ROBOT   " if meta.virtual else ""
         while font.getlength(mark + left + right) > self.layout.width - 4 * pad and font.size > 8:
             font = font.font_variant(size=font.size - 0.5)
@@ -135,7 +139,7 @@ class Camera:
         draw.text((self.layout.width - pad, pad * 0.8), right, INK, font, anchor="ra")
 
     def _course(self, image: Any, draw: ImageDraw, row: int) -> None:
-        """|error| against time of each motion, with a line at the present."""
+        """Draw |error| against time of each motion, with a line at the present."""
         strip, x, (high, low) = self.strip
         top = self.layout.height - self.layout.course
         image.paste(strip, (0, top), strip)
@@ -144,7 +148,7 @@ class Camera:
 
     @cached_property
     def strip(self) -> tuple[Any, Array, tuple[float, float]]:
-        """The curves, the same in every picture; x of each row, and the axis' top and bottom, pixels."""
+        """Error curves of all pictures; x of each row; top and bottom of the axis, pixels."""
         from PIL import Image, ImageDraw
 
         layout, real, small = self.layout, self.scene.shown.real, self.fonts[13]
@@ -180,19 +184,19 @@ def _payload(mass: float, side: str) -> str:
 
 
 def font(size: float) -> Any:
-    """Pillow's own, of a size in pixels."""
+    """Return Pillow's own font in a size in pixels."""
     from PIL import ImageFont
 
     return ImageFont.load_default(max(size, 9))
 
 
 def renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
-    """MuJoCo's, off screen.
+    """Return MuJoCo's off-screen renderer.
 
     Raises:
-        UsageError: With what is missing here.
+        UsageError: Nothing can be rendered here; the message says what to install.
     """
     try:
         return mujoco.Renderer(model, height, width)
-    except Exception as error:  # GL libraries raise whatever they like; all of it means: no picture here
-        raise UsageError(f"cannot render off screen ({type(error).__name__}: {error}). {CURE}") from None
+    except Exception as error:  # GL libraries raise exceptions of any type
+        raise UsageError(f"cannot render off screen ({type(error).__name__}: {error}). {INSTALL_HINT}") from None

@@ -1,4 +1,4 @@
-"""A picture of a robot with the positions that an evaluation kept."""
+"""Picture of a robot with the trajectories of an evaluation, for the report."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from gaponet.robot.spec import RobotSpec
 
 
 def prepare() -> None:
-    """Settle which OpenGL is used, before anything imports mujoco; where there is none, portrait says so."""
+    """Choose the OpenGL backend before anything imports mujoco; without one, portrait raises the error."""
     with suppress(UsageError):
         choose_gl()
 
 
 def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str, Array]) -> bytes:
-    """The copies of a robot side by side when the nominal one is furthest off, as PNG.
+    """Return a PNG of the copies of a robot side by side at the largest nominal error.
 
     Args:
-        robot: Joints that are not operated stand at home.
+        robot: Joints that are not operated are drawn at home.
         dt: Period of the rows, s.
-        qpos: The positions by method, "recorded" among them, (T, n operated) rad.
+        qpos: Positions by method, "recorded" among them, (T, n operated) rad.
 
     Raises:
-        UsageError: Nothing can be rendered here; says what is missing.
+        UsageError: Nothing can be rendered here; the message says what to install.
     """
     choose_gl()
-    from gaponet.report.view.film import Clip, furthest
+    from gaponet.report.view.film import Clip, largest_error_time
     from gaponet.report.view.picture import Camera
     from gaponet.report.view.scene import Scene
     from gaponet.report.view.side_by_side import Copy, SideBySide
@@ -45,8 +45,8 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
     base = whole["recorded"]
     motions = tuple(Copy(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items())
     shown = SideBySide(Sequence(meta, robot.joint_names, dt, base, base, 0 * base), robot, motions, None)
-    clip = Clip.of(shown, None, 8.0)
-    moment = furthest(shown, clip)
+    clip = Clip.from_start(shown, None, 8.0)
+    moment = largest_error_time(shown, clip)
     row = min(round(moment / dt), len(base) - 2)
     scene = Scene(shown, rows=slice(row, row + 2), flat=True, closeup=True)
     with Camera(scene, 840, span=(clip.start, clip.stop)) as camera:

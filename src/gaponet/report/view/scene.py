@@ -1,8 +1,7 @@
-"""Several copies of a robot side by side in one MuJoCo scene, one colour per method, made to be looked at.
+"""Several copies of a robot side by side in one MuJoCo scene, one colour per method.
 
-Nothing is stepped here: joint angles are given, positions follow from them. The robots of the package have no meshes;
-what is added to their lines is what is known of them: housings about the joints, and the shells of look.toml or
-collision.toml.
+Nothing is simulated here: body positions follow from given joint angles. The robots of the package have no meshes.
+Housings about the joints and the shells of look.toml or collision.toml are drawn instead.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_spec
 from gaponet.sysid.motion.posture import carriers
 
-PAYLOAD = (0.93, 0.60, 0.10, 1.0)
-GHOST = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy
-THIN = 0.9  # of a ghost's limbs: where the copy is right, it covers the ghost
-BEHIND = 0.12  # of the robot's height: how far behind its copy a ghost stands on a flat picture
-FLOOR = 0.96  # grey of the ground
-SAMPLES = 60  # frames looked at when the camera is set
+PAYLOAD_RGBA = (0.93, 0.60, 0.10, 1.0)
+GHOST_RGBA = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy
+GHOST_THICKNESS = 0.9  # of the limbs: a copy without error covers its ghost
+GHOST_DISTANCE = 0.12  # of the robot's height, behind its copy on a flat picture
+GROUND_GREY = 0.96
+FITTED_FRAMES = 60  # for the size of the picture
 
 
 @dataclass(frozen=True)
 class View:
-    """Where the camera stands. Robots face +x; the row runs from left to right on the picture."""
+    """Direction of the camera. Robots face +x; their row runs from left to right on the picture."""
 
     azimuth: float = 145.0
     """Degrees: 180 looks at the robot's front, 90 at its right side."""
@@ -48,12 +47,12 @@ class View:
 
 
 class Scene:
-    """The copies of a SideBySide, and where they are.
+    """The copies of a SideBySide in one MuJoCo model.
 
     Attributes:
         model, data: MuJoCo model and data of all copies together; copy i's bodies and joints are called METHOD/NAME.
         spacing: Between neighbours along the picture, m.
-        extent: Half the size of it all, m.
+        extent: Half the size of the scene, m.
         box: Outline of one robot on the picture over all frames, relative to its base: (left, right, bottom, top), m.
         base: Base of each copy, (k, 3), m.
     """
@@ -67,14 +66,13 @@ class Scene:
         flat: bool = False,
         closeup: bool = False,
     ) -> None:
-        """Build and fit.
+        """Build the model and fit the picture.
 
         Args:
             view: The camera's direction decides the direction of the row.
             ghost: Draw the recording, translucent, into each other copy.
             rows: Frames that have to fit.
-            flat: For an orthographic picture, on which a ghost can stand behind its copy and still be in place: what is
-                seen of it is what differs.
+            flat: Put ghosts behind their copies, for an orthographic picture: only the differences are visible.
             closeup: Limbs without an operated joint need not fit.
         """
         self.shown, self.view = shown, view
@@ -85,7 +83,7 @@ class Scene:
         self.base = (np.arange(k) - (k - 1) / 2)[:, None] * self.spacing * view.axes[0]
         self.extent = max(0.5 * k * self.spacing, self.box[3] - self.box[2])
         across, up = view.axes
-        behind = BEHIND * (self.box[3] - self.box[2]) * np.cross(up, across) if flat else np.zeros(3)
+        behind = GHOST_DISTANCE * (self.box[3] - self.box[2]) * np.cross(up, across) if flat else np.zeros(3)
         self.model = self._compose(self.base, behind)
         self.data = mujoco.MjData(self.model)
         self.address = [(i, self._address(m.method)) for i, m in enumerate(shown.motions)]
@@ -96,7 +94,7 @@ class Scene:
             ]
 
     def pose(self, time: float) -> None:
-        """Put every copy where it is at a time of the recording, s; between rows positions are interpolated."""
+        """Set the positions of every copy at a time of the recording, s, interpolated between rows."""
         dt, rows = self.shown.real.dt, len(self.shown.real)
         x = float(np.clip(time / dt, 0, rows - 1))
         i = min(int(x), rows - 2)
@@ -107,7 +105,7 @@ class Scene:
         mujoco.mj_camlight(self.model, self.data)
 
     def row(self, time: float) -> int:
-        """The newest row at a time of the recording, s."""
+        """Return the last row before a time of the recording, s."""
         return int(np.clip(time / self.shown.real.dt + 1e-6, 0, len(self.shown.real) - 1))
 
     @property
@@ -122,9 +120,9 @@ class Scene:
         return np.array([self.model.joint(f"{prefix}/{name}").qposadr[0] for name in names])
 
     def _fit(self, rows: slice, closeup: bool) -> tuple[tuple[float, float, float, float], float]:
-        """Extent of one robot on the picture over all motions, and its lowest point."""
+        """Return the outline of one robot on the picture over all motions, and its lowest point."""
         robot, meta = self.shown.robot, self.shown.real.meta
-        model = dressed(robot, "#808080", meta.payload_mass, meta.payload_side).compile()
+        model = visual_spec(robot, "#808080", meta.payload_mass, meta.payload_side).compile()
         data = mujoco.MjData(model)
         seen = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
         if not len(seen):
@@ -138,7 +136,7 @@ class Scene:
         axes = np.stack(self.view.axes)
         for motion in self.shown.motions:
             part = motion.qpos[rows]
-            for q in part[np.unique(np.linspace(0, len(part) - 1, SAMPLES).astype(int))]:
+            for q in part[np.unique(np.linspace(0, len(part) - 1, FITTED_FRAMES).astype(int))]:
                 data.qpos[address] = q
                 mujoco.mj_kinematics(model, data)
                 points = data.geom_xpos[seen, None] + corners @ data.geom_xmat[seen].reshape(-1, 3, 3).mT
@@ -152,50 +150,50 @@ class Scene:
         scene.compiler.degree = False
         _light(scene, self.floor, self.extent)
         for motion, place in zip(self.shown.motions, base, strict=True):
-            coats = {motion.method: (motion.colour, place)}
+            parts = {motion.method: (motion.colour, place)}
             if self.ghosts and motion.method != "recorded":
-                coats[f"{motion.method}-ghost"] = ("", place + behind)
-            for prefix, (colour, pos) in coats.items():
-                spec = dressed(self.shown.robot, colour, meta.payload_mass, meta.payload_side)
-                scene.nuser_actuator = spec.nuser_actuator  # of the servos' law; one that differs is warned of
+                parts[f"{motion.method}-ghost"] = ("", place + behind)
+            for prefix, (colour, pos) in parts.items():
+                spec = visual_spec(self.shown.robot, colour, meta.payload_mass, meta.payload_side)
+                scene.nuser_actuator = spec.nuser_actuator  # of the servo model; MuJoCo warns of a difference
                 scene.attach(spec, prefix=f"{prefix}/", frame=scene.worldbody.add_frame(pos=pos))
         return scene.compile()
 
 
-def dressed(robot: RobotSpec, colour: str, payload_mass: float, payload_side: str = "both") -> mujoco.MjSpec:
-    """A robot to look at: one colour, housings, shells, payload; "" for a ghost."""
+def visual_spec(robot: RobotSpec, colour: str, payload_mass: float, payload_side: str = "both") -> mujoco.MjSpec:
+    """Return the robot in one colour with housings, shells and payload; colour "" gives a ghost."""
     spec = build_spec(robot, payload_mass, payload_side)
-    spec.option = mujoco.MjSpec().option  # nothing is stepped; all copies must agree
+    spec.option = mujoco.MjSpec().option  # nothing is simulated; all copies must agree
     for part in (*spec.actuators, *spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.pairs, *spec.excludes):
         spec.delete(part)
     for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
-        spec.delete(geom)  # the scene has a ground of its own
+        spec.delete(geom)  # the scene has its own ground
     payload = {f"payload_{m.side}" for m in robot.payload_mounts}
-    rgba = rgb(colour) if colour else GHOST
+    rgba = rgb(colour) if colour else GHOST_RGBA
     dark = (*(0.55 * np.array(rgba[:3])), rgba[3])
     meshes = any(g.type == mujoco.mjtGeom.mjGEOM_MESH for g in spec.geoms)
     for geom in spec.geoms:
         geom.material = ""
-        geom.rgba = (PAYLOAD if colour else GHOST) if geom.parent.name in payload else rgba
+        geom.rgba = (PAYLOAD_RGBA if colour else GHOST_RGBA) if geom.parent.name in payload else rgba
     if not meshes:
         for body in spec.bodies[1:]:  # asked for the world's parent, MuJoCo 3.10 ends the process
             _add_housings(body, dark)
         _add_shells(spec, robot, rgba)
     if not colour:
         for geom in spec.geoms:
-            geom.size = THIN * np.array(geom.size)
+            geom.size = GHOST_THICKNESS * np.array(geom.size)
             _cast_no_shadow(geom)
     return spec
 
 
 def rgb(colour: str) -> tuple[float, float, float, float]:
-    """#rrggbb as rgba; black a little lighter, since a black body shows no shape."""
+    """Return #rrggbb as rgba, a little lighter, since a black body shows no shape."""
     parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     return (*(0.14 + 0.86 * p for p in parts), 1.0)  # type: ignore[return-value]
 
 
 def _add_housings(body: mujoco.MjsBody, rgba: tuple[float, ...]) -> None:
-    """A short cylinder about each joint axis, a third wider than the limb."""
+    """Add a short cylinder about each joint axis, a third wider than the limb."""
     around = [*body.geoms, *body.parent.geoms]
     sizes = [g.size[0] for g in around if g.type == mujoco.mjtGeom.mjGEOM_CAPSULE]
     if not sizes:
@@ -207,7 +205,7 @@ def _add_housings(body: mujoco.MjsBody, rgba: tuple[float, ...]) -> None:
 
 
 def _add_shells(spec: mujoco.MjSpec, robot: RobotSpec, rgba: tuple[float, ...]) -> None:
-    """Capsules and boxes of look.toml, or else the capsules of collision.toml, which are generous."""
+    """Add the shapes of look.toml, or else those of collision.toml, which are larger than the robot."""
     for name, share in (("look.toml", 1.0), ("collision.toml", 0.85)):
         path = robot.folder / name
         if path.is_file():
@@ -230,14 +228,14 @@ def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, ends: list[float], radius: 
 
 
 def _operated_bodies(model: mujoco.MjModel, robot: RobotSpec) -> set[int]:
-    """Bodies that carry operated joints, that these move, and that carry those."""
+    """Return the bodies that operated joints move, and the bodies that carry them."""
     moving = {int(model.jnt_bodyid[model.joint(name).id]) for name in robot.operated}
-    found: set[int] = set()
+    bodies: set[int] = set()
     for body in range(1, model.nbody):
         chain = carriers(model, body)
         if moving & chain:
-            found |= chain
-    return found
+            bodies |= chain
+    return bodies
 
 
 def _cast_no_shadow(geom: mujoco.MjsGeom) -> None:
@@ -246,16 +244,16 @@ def _cast_no_shadow(geom: mujoco.MjsGeom) -> None:
 
 
 def _light(scene: mujoco.MjSpec, floor: float, extent: float) -> None:
-    """White ground, one light that casts shadows and one that fills them."""
+    """Add a light ground, one light that casts shadows and one that fills them."""
     world = scene.worldbody
     ground = world.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), pos=(0, 0, floor), rgba=(FLOOR, FLOOR, FLOOR, 1),
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), pos=(0, 0, floor), rgba=(*[GROUND_GREY] * 3, 1),
         contype=0, conaffinity=0,
     )  # fmt: skip
     _cast_no_shadow(ground)  # onto itself
     scene.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=[FLOOR] * 3, rgb2=[FLOOR] * 3, width=8, height=48,
+        rgb1=[GROUND_GREY] * 3, rgb2=[GROUND_GREY] * 3, width=8, height=48,
     )  # fmt: skip
     sun, fill = np.array([-0.25, 0.15, -1.0]), np.array([-0.6, -0.5, -0.4])
     for direction, bright, shadow in ((sun, 0.5, True), (fill, 0.3, False)):

@@ -1,4 +1,4 @@
-"""One sequence as it was asked for, simulated, corrected and recorded: the joint angles that `gaponet view` shows."""
+"""Targets, simulations and recording of one sequence: the joint angles that `gaponet view` shows."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Copy:
     """One copy of the robot.
 
     Attributes:
-        method: Key of plot.methods.
+        method: Key of report.methods.METHODS.
         qpos: (T, n), rad; row t at t·dt.
         error: Mean |q − q_real| over the operated joints, (T), rad; row 0 is the common start.
     """
@@ -46,7 +46,7 @@ class Copy:
 
     @property
     def mpjae(self) -> float:
-        """Mean error over the whole motion, rad: what eval calls MPJAE."""
+        """Mean error over the whole motion (MPJAE), rad."""
         return float(self.error[1:].mean())
 
 
@@ -55,8 +55,8 @@ class SideBySide:
     """The motions of one recording.
 
     Attributes:
-        motions: Target, nominal, corrected, recorded, in this order.
-        seen: Whether a shown model was trained or chosen on this recording; None without a model.
+        motions: Target, nominal, identified, models and recording, in this order.
+        seen: True if a model was trained or validated on this recording; None without a model.
     """
 
     real: Sequence
@@ -65,7 +65,11 @@ class SideBySide:
     seen: bool | None
 
     def only(self, methods: tuple[str, ...]) -> SideBySide:
-        """Some of the motions, in the order asked for; "aligned" means every model's."""
+        """Return some motions in this order; "aligned" stands for the motions of all models.
+
+        Raises:
+            UsageError: No such motion, or none at all.
+        """
         have = {m.method: m for m in self.motions}
         wanted: list[str] = []
         for name in methods:
@@ -75,39 +79,43 @@ class SideBySide:
             if name not in have:
                 raise UsageError(f"--show {name}: here are {', '.join(have)}; models are given with --model RUN")
         if not wanted:
-            raise UsageError("--show leaves nothing to look at; aligned motion needs --model RUN")
+            raise UsageError("--show: nothing is selected; aligned motion needs --model RUN")
         return replace(self, motions=tuple(have[name] for name in dict.fromkeys(wanted)))
 
     def magnified(self, factor: float) -> SideBySide:
-        """Every difference from the recording times a factor, so that an eye can see it; errors stay as they are."""
+        """Return the motions with their differences from the recording times a factor; errors are unchanged."""
         if not factor > 0:
             raise UsageError(f"--magnify is {factor}; give a positive factor, 1 for the truth")
         grow = lambda m: replace(m, qpos=self.real.qpos + factor * (m.qpos - self.real.qpos))  # noqa: E731
         return replace(self, motions=tuple(grow(m) for m in self.motions))
 
     def busiest(self, seconds: float) -> float:
-        """Start of the stretch of this length with the most motion, s."""
+        """Return the start of the part of this length with the most motion, s."""
         rows = max(round(seconds / self.real.dt), 1)
         return busiest(self.real.qpos[:, self.robot.operated_index], rows) * self.real.dt
 
 
-def pick(
+def select_entry(
     dataset: Dataset, runs: ListOf[Path], motion: str = "", unit: str = "", payload_mass: float | None = None
 ) -> Entry:
-    """The first sequence that fits; among those that no run has seen, where one of them fits."""
+    """Return the first matching recording; recordings that no run was fitted to come first.
+
+    Raises:
+        DatasetError: No recording matches.
+    """
     entries = dataset.select((motion,) if motion else ())
     entries = sorted(entries, key=lambda e: was_used(e, runs))
-    asked = [
+    matching = [
         e for e in entries
         if unit in ("", e.meta.unit_id) and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
     ]  # fmt: skip
-    if not asked:
+    if not matching:
         there = sorted({f"{e.meta.unit_id} with {e.meta.payload_mass:g} kg" for e in entries})
         raise DatasetError(
             f"{dataset.path}: no such recording of {motion or 'any motion'}; there are {', '.join(there)}. "
             "Change --unit or --payload-mass"
         )
-    return asked[0]
+    return matching[0]
 
 
 def side_by_side(
@@ -117,7 +125,7 @@ def side_by_side(
     runs: ListOf[Path] = (),
     progress: Progress = no_progress,
 ) -> SideBySide:
-    """Replay a recording in the nominal simulator, in identified ones, and under each run's shipped model.
+    """Replay a recording in the nominal simulator, in identified ones, and with each run's exported model.
 
     Args:
         robot: Identified, it is shown beside the nominal one.
@@ -129,22 +137,22 @@ def side_by_side(
     if robot.nominal is not None:
         simulators["identified"] = (robot, None)
     for run in runs:
-        one = Candidate.load(run, robot)
-        if one.model is not None:
-            one.model.require(one.robot, real.dt)
-        if one.method in simulators:
-            raise UsageError(f"{run}: a second run of {title(one.method)}; give runs of different methods")
-        simulators[one.method] = (one.robot, one.corrector())
-    target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # a command of row t says where to be at t + 1
+        candidate = Candidate.load(run, robot)
+        if candidate.model is not None:
+            candidate.model.require(candidate.robot, real.dt)
+        if candidate.method in simulators:
+            raise UsageError(f"{run}: a second run of {title(candidate.method)}; give runs of different methods")
+        simulators[candidate.method] = (candidate.robot, candidate.corrector())
+    target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # the command of row t is the target at t + 1
     shown = {"target": target}
     for name, (simulator, corrector) in simulators.items():
-        told = with_note(progress, name)
-        shown[name] = replay([real], simulator, corrector, progress=told, lock_idle=True)[0].qpos
+        report = with_note(progress, name)
+        shown[name] = replay([real], simulator, corrector, progress=report, lock_idle=True)[0].qpos
     shown["recorded"] = real.qpos
     op = robot.operated_index
     motions = tuple(Copy(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
-    known = [*runs, *([robot.folder] if robot.nominal is not None else [])]
-    return SideBySide(real, robot, motions, was_used(entry, known) if known else None)
+    folders = [*runs, *([robot.folder] if robot.nominal is not None else [])]
+    return SideBySide(real, robot, motions, was_used(entry, folders) if folders else None)
 
 
 def was_used(entry: Entry, folders: ListOf[Path]) -> bool:

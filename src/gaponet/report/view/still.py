@@ -1,4 +1,4 @@
-"""Models side by side as one picture: what a robot was made from, and what was made of it."""
+"""MuJoCo models side by side as one picture, such as a vendor's model and the robot folder made from it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ FLOOR = mujoco.mjtGeom.mjGEOM_PLANE
 
 
 def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
-    """A PNG of models (label, model, qpos) in a row, all seen from the same side and scaled as the first.
+    """Return a PNG of models (label, model, qpos) in a row, all with the camera that fits the first.
 
     Raises:
-        UsageError: Nothing can be rendered here; says what is missing.
+        UsageError: Nothing can be rendered here; the message says what to install.
     """
     from PIL import Image, ImageDraw
 
@@ -49,16 +49,16 @@ def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
 
 
 def _box(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array]:
-    """Corners around all geoms but floors, m."""
+    """Return the corners of a box around all geoms except floors, m."""
     shown = model.geom_type != FLOOR
     if not shown.any():
         return data.xpos.min(axis=0), data.xpos.max(axis=0)
-    reach, places = np.linalg.norm(model.geom_aabb[shown, 3:], axis=1)[:, None], data.geom_xpos[shown]
-    return (places - reach).min(axis=0, initial=np.inf), (places + reach).max(axis=0, initial=-np.inf)
+    radius, centres = np.linalg.norm(model.geom_aabb[shown, 3:], axis=1)[:, None], data.geom_xpos[shown]
+    return (centres - radius).min(axis=0, initial=np.inf), (centres + radius).max(axis=0, initial=-np.inf)
 
 
 def _white(picture: mujoco.Renderer) -> Array:
-    """The picture with white where nothing is."""
+    """Return the picture with a white background."""
     pixels = picture.render().copy()
     picture.enable_segmentation_rendering()
     pixels[picture.render()[:, :, 0] < 0] = 255

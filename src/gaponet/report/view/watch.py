@@ -1,4 +1,4 @@
-"""A scene in MuJoCo's own window: the mouse moves the camera, space pauses, the arrow keys go back and forth."""
+"""A scene in MuJoCo's window: the mouse moves the camera, space pauses, arrow keys move in time."""
 
 from __future__ import annotations
 
@@ -13,32 +13,33 @@ from gaponet.report.view.film import Clip
 from gaponet.report.view.scene import Scene
 
 SPACE, RIGHT, LEFT = 32, 262, 263  # GLFW key codes
-JUMP = 1.0  # s of the recording, of an arrow key
-FRAME = 1 / 60  # s
+JUMP_S = 1.0  # of the recording, by an arrow key
+FRAME_S = 1 / 60
 
 
 @dataclass
 class Playback:
-    """Where in the clip we are; ends where it began."""
+    """Position in a clip, which repeats."""
 
     clip: Clip
     time: float
     paused: bool = False
 
     def advance(self, elapsed: float) -> None:
-        """Play for `elapsed` s of the wall clock."""
+        """Advance by `elapsed` s of wall time."""
         if not self.paused:
             self.move(elapsed * self.clip.speed)
 
     def move(self, by: float) -> None:
-        """Go `by` s of the recording on, round and round the clip."""
+        """Move by `by` s of the recording; the clip repeats."""
         self.time = self.clip.start + (self.time + by - self.clip.start) % self.clip.duration
 
     def key(self, code: int) -> None:
+        """Handle a key press."""
         if code == SPACE:
             self.paused = not self.paused
         elif code in (RIGHT, LEFT):
-            self.move(JUMP if code == RIGHT else -JUMP)
+            self.move(JUMP_S if code == RIGHT else -JUMP_S)
 
 
 def watch(scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
@@ -68,11 +69,11 @@ def watch(scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
                 _label(window.user_scn, scene, play.time)
             window.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *_texts(scene, play, magnify)))
             window.sync()
-            time.sleep(max(0.0, FRAME - (time.monotonic() - now)))
+            time.sleep(max(0.0, FRAME_S - (time.monotonic() - now)))
 
 
 def _label(extra: mujoco.MjvScene, scene: Scene, now: float) -> None:
-    """Method and present error above each copy; short, or neighbours overlap."""
+    """Write method and present error above each copy."""
     row = scene.row(now)
     above = scene.view.axes[1] * scene.box[3] + np.array([0, 0, 0.06 * (scene.box[3] - scene.box[2])])
     extra.ngeom = 0
@@ -87,7 +88,7 @@ def _label(extra: mujoco.MjvScene, scene: Scene, now: float) -> None:
 
 
 def _texts(scene: Scene, play: Playback, magnify: float) -> tuple[str, str]:
-    """Two columns for the window's corner."""
+    """Return two columns for the window's corner."""
     meta = scene.shown.real.meta
     rows = [("VIRTUAL ROBOT", "")] if meta.virtual else []
     rows += [

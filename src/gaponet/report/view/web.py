@@ -1,4 +1,4 @@
-"""A scene in a browser, served by viser: orbit with the mouse, play, pause, slide through the clip."""
+"""A scene in a browser, served by viser: orbit with the mouse, play, pause, move through the clip."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gaponet.base.text import escape_markdown
 from gaponet.report.view.film import Clip
 from gaponet.report.view.scene import Scene
 
-FRAME = 1 / 30  # s
-HOST = "127.0.0.1"  # nobody else's business; forward the port to look from elsewhere
+FRAME_S = 1 / 30
+HOST = "127.0.0.1"  # private; forward the port for another machine
 
 
 class WebScene:
@@ -26,7 +26,7 @@ class WebScene:
         """Start a server.
 
         Args:
-            port: On this machine only.
+            port: Port on this machine.
         """
         try:
             import viser
@@ -40,9 +40,9 @@ class WebScene:
         self._aim()
         meta, gui = scene.shown.real.meta, self.server.gui
         gui.main_panel.dock_right()  # beside the robots, not in front of them
-        head = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
-        head += escape_markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
-        self.title = gui.add_markdown(head + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
+        heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
+        heading += escape_markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
+        self.title = gui.add_markdown(heading + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
         self.playing = gui.add_checkbox("play", True)
         self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, scene.shown.real.dt, clip.start)
         self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
@@ -50,7 +50,7 @@ class WebScene:
         self.update()
 
     def update(self) -> None:
-        """Everything where it is at the slider's time."""
+        """Show the scene at the slider's time."""
         scene, now = self.scene, float(self.time.value)
         scene.pose(now)
         with self.server.atomic():
@@ -62,7 +62,7 @@ class WebScene:
         self.table.content = f"| mean error, mrad | now | whole motion |\n| --- | ---: | ---: |\n{rows}"
 
     def advance(self, elapsed: float) -> None:
-        """Play for `elapsed` s of the wall clock, round and round the clip."""
+        """Advance by `elapsed` s of wall time; the clip repeats."""
         if self.playing.value:
             on = self.time.value - self.clip.start + elapsed * self.speed.value
             self.time.value = self.clip.start + on % self.clip.duration
@@ -108,7 +108,7 @@ def serve(scene: Scene, clip: Clip, port: int, magnify: float, say: Callable[[st
     before = time.monotonic()
     try:
         while True:
-            time.sleep(FRAME)
+            time.sleep(FRAME_S)
             now = time.monotonic()
             web.advance(now - before)
             before = now
@@ -117,7 +117,7 @@ def serve(scene: Scene, clip: Clip, port: int, magnify: float, say: Callable[[st
 
 
 def surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
-    """Vertices (k, 3) m in the geom's frame, and triangles (m, 3)."""
+    """Return vertices (k, 3), m in the geom's frame, and triangles (m, 3)."""
     from trimesh import creation
 
     kind, (a, b, c) = model.geom_type[geom], (float(x) for x in model.geom_size[geom])
