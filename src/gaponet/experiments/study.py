@@ -42,7 +42,7 @@ class Options:
     executor: str = LOCAL
     """Where they run: local, ray or ray:ADDRESS (docs/scale.md)."""
     robot: str | None = None
-    """Robot name or folder, if not the one that the dataset keeps; all models correct it."""
+    """Robot name or folder, if not the one that the dataset stores; all models correct it."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object on stdout."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TRAINING

@@ -120,19 +120,19 @@ def select_entries(
     data = [FittedData.of_folder(folder) for folder in folders]
     if None in data:
         return dataset.select(motions, units), False
-    known = [d for d in data if d is not None]
-    mine = dataset.select(units=units)
-    fresh = [e for e in mine if not any(e in d for d in known)]
+    fitted = [d for d in data if d is not None]
+    candidates = dataset.select(units=units)
+    unused = [e for e in candidates if not any(e in d for d in fitted)]
     if motions:
         entries = dataset.select(motions, units)
     else:
-        entries = [e for e in fresh if e.hash in known[0].test] or fresh
-        entries = entries or [e for e in mine if not any(e.hash in s.hashes for s in known)]
+        entries = [e for e in unused if e.hash in fitted[0].test] or unused
+        entries = entries or [e for e in candidates if not any(e.hash in s.hashes for s in fitted)]
     if not entries:
         raise DatasetError(
             f"{dataset.path}: every sequence was used in training; give logs the runs never saw, or --motions"
         )
-    return entries, {e.hash for e in entries} <= {e.hash for e in fresh}
+    return entries, {e.hash for e in entries} <= {e.hash for e in unused}
 
 
 @dataclass(frozen=True)

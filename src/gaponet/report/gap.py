@@ -178,9 +178,9 @@ def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, di
 
 
 def _mean(values: ListOf[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if len(known) == len(values) else None
+    numbers = [v for v in values if v is not None]
+    return float(np.mean(numbers)) if len(numbers) == len(values) else None
 
 
-def _above(left: float, floor: float | None) -> float | None:
-    return None if floor is None else max(left - floor, 0.0)
+def _above(error: float, floor: float | None) -> float | None:
+    return None if floor is None else max(error - floor, 0.0)

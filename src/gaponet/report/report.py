@@ -103,7 +103,7 @@ def write_report(
         dataset: Evaluate on this dataset first. Default: the newest evaluation, or the test motions of the dataset that
             was fitted to.
         also: Further runs to compare, when evaluating.
-        robot: Robot name or folder, if not the one that the run keeps.
+        robot: Robot name or folder, if not the one that the run stores.
         picture: Draws the robot (view.portrait).
 
     Returns:

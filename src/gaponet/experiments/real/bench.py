@@ -80,7 +80,7 @@ class Bench:
     """A run of the benchmark. Datasets, trainings and evaluations below `work` are reused.
 
     Attributes:
-        cards: Data cards; data sets that are not present are left out.
+        cards: Data cards; data sets that are not present are skipped.
         data: Folder of the public recordings.
         work: Folder for datasets, trainings and evaluations.
         methods: Name → title and method.
@@ -145,7 +145,7 @@ class Bench:
                 "seconds": {k: round(v) for k, v in seconds.items()}}  # fmt: skip
 
     def evaluate(self, card: Card, name: str, folds: list[Question]) -> list[Row]:
-        """Evaluate every method on every fold of a question; methods without the data that they need are left out."""
+        """Evaluate every method on every fold of a question; methods without the data that they need are skipped."""
         rows: list[Row] = []
         floors = [f for q in folds if (f := repeatability(q)) == f]
         floor = float(np.mean(floors or [np.nan]))

@@ -19,7 +19,7 @@ from gaponet.sysid.identify import identify
 from gaponet.sysid.refit import refit
 from gaponet.sysid.robot_rollouts import WINDOW
 
-LEFT_OUT = "left out"  # starts the note of a network that validation left out
+LEFT_OUT = "left out"  # starts the note of a network that validation rejected
 ADAPTATION_S = 30.0  # of the test's session
 
 
@@ -105,8 +105,8 @@ def adapted(question: Question) -> FittedSim:
         raise UsageError(f"{question.name}: has no recordings for adaptation")
     start, few = identified(question).robot if question.elsewhere is None else question.elsewhere(), question.few
     seconds = len(few) * WINDOW if few[0].duration < WINDOW else ADAPTATION_S  # all of the short windows
-    found = refit(few, start, seconds, judge=True)
-    return FittedSim(found.robot if found.kept else start)
+    fit = refit(few, start, seconds, judge=True)
+    return FittedSim(fit.robot if fit.kept else start)
 
 
 def elsewhere(question: Question) -> FittedSim:

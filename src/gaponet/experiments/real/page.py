@@ -71,7 +71,7 @@ def joint_tables(rows: list[dict[str, Any]]) -> list[ResultTable]:
 
 
 def _left_out(notes: tuple[str, ...]) -> str:
-    """Say in how many folds validation left the network out."""
+    """Say in how many folds validation rejected the network."""
     count = sum(note.startswith(LEFT_OUT) for note in notes)
     return f" ({LEFT_OUT} in {count} of {len(notes)})" if count else ""
 

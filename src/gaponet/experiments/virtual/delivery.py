@@ -192,21 +192,21 @@ def sentences(errors: ListOf[HoldError]) -> list[str]:
     names, masses = methods(errors), payloads(errors)
     light, heavy = masses[0], masses[-1]
     offset = {(m, p): [mean_offset(errors, m, p, a) for a in range(3)] for m in names for p in masses}
-    said = []
+    texts = []
     for m in names[1:]:
         parts = [
             f"{label} {percent_text(reduction(value, raw))} ({raw * 1e2:.1f} → {value * 1e2:.1f} cm)"
             for label, value, raw in zip(AXES, offset[m, heavy], offset["raw", heavy], strict=True)
         ]
-        said.append(f"At {heavy:g} kg, {title(m)} against raw targets: {', '.join(parts)}.")
+        texts.append(f"At {heavy:g} kg, {title(m)} against raw targets: {', '.join(parts)}.")
     for m in names[1:]:
         worse = [x for x, v, raw in zip(AXES, offset[m, light], offset["raw", light], strict=True) if v > raw]
         if worse:
-            said.append(f"At {light:g} kg, {title(m)} is WORSE than raw targets along {', '.join(worse)}.")
-    if not any("WORSE" in s for s in said):
-        said.append(f"At {light:g} kg nothing is worse than raw targets along any axis.")
+            texts.append(f"At {light:g} kg, {title(m)} is WORSE than raw targets along {', '.join(worse)}.")
+    if not any("WORSE" in s for s in texts):
+        texts.append(f"At {light:g} kg nothing is worse than raw targets along any axis.")
     lengths = {p: {m: float(np.linalg.norm(offset[m, p])) for m in names} for p in masses}
-    return said + [f"{sentence} (length of the mean offsets)." for sentence in compare_with_rivals(lengths, names)]
+    return texts + [f"{sentence} (length of the mean offsets)." for sentence in compare_with_rivals(lengths, names)]
 
 
 @styled

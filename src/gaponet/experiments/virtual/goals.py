@@ -115,7 +115,7 @@ class GoalPlanner:
                 return plans
         raise UsageError(
             f"{self.robot.name}: {len(plans)} of {count} trajectories can be held with {self.limits.max_payload:g} kg; "
-            "ask for a lighter payload"
+            "give a lighter payload"
         )
 
     def _reachable(self, hand: int, front: float) -> Array:

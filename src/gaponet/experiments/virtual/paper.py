@@ -108,8 +108,8 @@ class Paper(UnitExperiment):
         tables += [table_2(outcomes, own, supervised), table_2(outcomes, study)]
         tables += [replace(tracking.by_joint(scores, part, robot), shown=False) for part in parts]
         heading = f"The GAPONet paper's figures and tables ({source})"
-        said = f"The paper's network was trained by {RECIPES[self.recipe]}, {own.budget} control steps."
-        return session.result("paper", heading, tables, figures, [said], **facts)
+        sentence = f"The paper's network was trained by {RECIPES[self.recipe]}, {own.budget} control steps."
+        return session.result("paper", heading, tables, figures, [sentence], **facts)
 
 
 @dataclass(frozen=True)
@@ -131,15 +131,15 @@ def table_2_rows(study: Study) -> list[Table2Row]:
                "control rate": len(control_rates(study.data)) > 1}  # fmt: skip
     own = not study.config.model.payload_input
     kind = PAPER_MODEL if own else "gaponet"
-    found: list[Table2Row] = []
+    allowed_rows: list[Table2Row] = []
     for comparison, rows in TABLE_2.items():
         if not allowed.get(comparison, True) or not (own or comparison in OUR_SETTINGS):
             continue
         for setting, change, printed in rows:
             changes = change if own else OUR_SETTINGS[comparison].get(change, change)
             if changes is not None:
-                found.append(Table2Row(comparison, setting, f"{kind}:{changes}" if changes else kind, printed))
-    return found
+                allowed_rows.append(Table2Row(comparison, setting, f"{kind}:{changes}" if changes else kind, printed))
+    return allowed_rows
 
 
 def card_table(data: Dataset, robot: RobotSpec) -> ResultTable:

@@ -41,7 +41,7 @@ class UnitExperiment:
     """kg in each hand; default those trained on."""
 
     def require(self, data: Dataset) -> None:
-        """Refuse a dataset or options that do not fit, before anything takes time."""
+        """Refuse a dataset or options that do not fit, before any training."""
 
     def study(self, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> Study:
         """Return the study of the trainings where no runs are given; the unit that executes is held out."""

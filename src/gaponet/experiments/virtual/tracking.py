@@ -195,7 +195,7 @@ def sentences(scores: ListOf[Score], part: str, joints: JointSet) -> list[str]:
     """Return the conclusions about one part, for one set of joints."""
     label, columns = joints
     of_part = [s for s in scores if s.part == part]
-    names, masses, said = methods(of_part), payloads(of_part), []
+    names, masses, texts = methods(of_part), payloads(of_part), list[str]()
     for source, of_source in by_source(of_part).items():
         error = {p: {m: q_dis(select(of_source, payload=p), m, columns).mean for m in names} for p in (None, *masses)}
         cuts = []
@@ -204,10 +204,10 @@ def sentences(scores: ListOf[Score], part: str, joints: JointSet) -> list[str]:
                 percent_text(reduction(error[p][m], error[p][BASELINE[part]])) for p in (None, masses[-1])
             )
             cuts.append(f"{title(m)} {overall}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
-        said.append(f"{part}, {SOURCES[source]}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}.")
+        texts.append(f"{part}, {SOURCES[source]}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}.")
         duels = compare_with_rivals({p: error[p] for p in masses}, names)
-        said += [f"{part}, {SOURCES[source]}: {sentence}." for sentence in duels]
-    return said
+        texts += [f"{part}, {SOURCES[source]}: {sentence}." for sentence in duels]
+    return texts
 
 
 def _of_joint(values: dict[str, list[MeanStd]], method: str, joint: int) -> MeanStd:

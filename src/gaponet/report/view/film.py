@@ -111,9 +111,9 @@ def _write_gif(pictures: list[Any], path: Path, milliseconds: int) -> None:
     """Write with one palette for all frames and no dithering, which keeps the file small."""
     from PIL import Image
 
-    some = pictures[:: max(len(pictures) // 4, 1)]
-    sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
-    for i, picture in enumerate(some):
+    sample = pictures[:: max(len(pictures) // 4, 1)]
+    sheet = Image.new("RGB", (sample[0].width, sample[0].height * len(sample)))
+    for i, picture in enumerate(sample):
         sheet.paste(picture, (0, i * picture.height))
     palette = sheet.quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
     frames = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
