@@ -1,4 +1,4 @@
-"""Control tests of `gaponet bench real`: changed recordings, after which an effect must vanish or must stay.
+"""Control tests of `gaponet experiment real`: changed recordings, after which an effect must vanish or must stay.
 
     python benchmarks/real_adversaries.py labels --sets h1_2 --questions "3 kg left out"
 
