@@ -19,9 +19,10 @@ from typing_extensions import TypedDict
 from gaponet import api
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
+from gaponet.base.progress import progress_bar
 from gaponet.base.structure import read_json
 from gaponet.cli.logs import joint_map, show_diagnosis
-from gaponet.cli.main import COMMANDS, main
+from gaponet.cli.main import main
 from gaponet.cli.options import Flag, Json, Logs, Model
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset, dataset_hash
@@ -32,36 +33,36 @@ if TYPE_CHECKING:
     from gaponet.data.log import Log
     from gaponet.robot.new import RobotOptions
 
-RAN = "commands.sh"  # what ran to its end, a line each
-MADE_FROM, ROBOT = "start.json", "the model"
-FEWEST = 3  # recordings, from which some are kept for judging; fewer are cut
-PIECE, SHORTEST = 8.0, 4.0  # s of a piece, and below which it is none
-NEAR = 0.01  # of a rate in whole Hz, from which a clock's rounding is told
+COMMANDS_FILE = "commands.sh"  # the commands that have finished, one per line
+RECORD_FILE, MODEL_INPUT = "start.json", "the model"  # MODEL_INPUT: what the robot's command depends on
+MIN_RECORDINGS = 3  # fewer are cut into pieces, so that some can validate
+PIECE_S, MIN_PIECE_S = 8.0, 4.0
+MAX_RELATIVE_ROUNDING = 0.01  # of the measured rate to a whole number of Hz
 
 
 @dataclass(frozen=True)
-class Understood:
-    """What a model and a folder of logs say of themselves.
+class Inspection:
+    """A model and the first of its logs.
 
     Attributes:
-        robot: The model's robot; a file's with its default joints.
-        packaged: What to write after --robot where nothing is to be made; "" for a model file.
+        robot: The model's robot; of a model file with its default joints.
+        packaged: Argument of --robot for a robot that exists; "" for a model file.
         log: The first recording.
-        recordings: How many there are.
-        described: A logs.toml that was guessed; "" where the logs explain themselves.
+        recordings: Number of recordings.
+        logs_toml: Text of a logs.toml that was guessed; "" where the logs need none.
     """
 
     robot: RobotSpec
     packaged: str
     log: Log
     recordings: int
-    described: str
+    logs_toml: str
 
     @property
     def rate(self) -> float:
-        """The rate of the commands, Hz; whole where it is near that."""
+        """Rate of the commands, Hz, rounded to a whole number that is near."""
         rate = 1 / float(np.median(np.diff(self.log.channels["ctrl"].time)))
-        return float(round(rate)) if abs(rate - round(rate)) < NEAR * rate else rate
+        return float(round(rate)) if abs(rate - round(rate)) < MAX_RELATIVE_ROUNDING * rate else rate
 
 
 def start(
@@ -90,14 +91,14 @@ def start(
 ) -> None:
     """All of it in one command: model file and logs in, report out.
 
-    What ran stands in OUT/commands.sh. The same command again goes on where it was interrupted, or stopped to ask. Logs
-    that were added to the folder are imported, and what follows runs again; other logs need another OUT.
+    OUT/commands.sh lists the commands that ran. The same command again continues after an interruption or a question.
+    Logs that were added to the folder are imported, and later commands run again. Other logs need another OUT.
 
     Args:
         model: MJCF or URDF file; or a robot folder, or a packaged robot's name.
         logs: Folder of logs, in any format that gaponet import reads.
-        out: Folder for all that is made.
-        unit_id: Which of its kind.
+        out: Folder for all results.
+        unit_id: Name of the recorded robot.
         payload_mass: kg in each hand while recording.
         joints: Those of the model's joints that were recorded, by name or pattern; default those that the logs name.
         kp: The gain of the controller while recording, N·m/rad: a number, or PATTERN=NUMBER; default the model's.
@@ -112,9 +113,9 @@ def start(
         skip_bad: Cut bad rows and leave out logs that cannot be read.
         allow_pickle: Open pickled files.
         to: Engine to export to.
-        budget: Time that identification may take, such as 4m; default as long as it takes.
-        dry_run: Say what was understood and which commands would run, and write nothing.
-        anyway: Go on where the doctor found errors in the logs.
+        budget: Time that identification may take, such as 4m; default no limit.
+        dry_run: Print the inspection and the commands, and write nothing.
+        anyway: Continue although the doctor found errors in the logs.
     """
     from gaponet.report.view.portrait import prepare
 
@@ -122,71 +123,62 @@ def start(
     from gaponet.data.reading import UnreadError
     from gaponet.robot.new import RobotOptions
 
-    screen, told = Out(json), out / "logs.toml"
+    screen, logs_toml = Out(json), out / "logs.toml"
     values = {"format": format, "position_unit": position_unit, "time_unit": time_unit, "rate": rate, "cut": cut}
-    stated = ["--unit-id", unit_id, "--payload-mass", f"{payload_mass:g}", *(f"--map={pair}" for pair in map)]
-    stated += [f"--{k.replace('_', '-')}={v}" for k, v in values.items() if v is not None]
-    stated += ["--skip-bad"] * skip_bad + ["--allow-pickle"] * allow_pickle
-    options = {"fmt": format, "joint_map": joint_map(map), "position_unit": position_unit, "time_unit": time_unit,
-               "rate": rate, "skip_bad": skip_bad, "allow_pickle": allow_pickle}  # fmt: skip
-    files = _hashes(logs, out)
-    made = _earlier(out, logs, files)
-    wanted = RobotOptions(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
+    import_options = ["--unit-id", unit_id, "--payload-mass", f"{payload_mass:g}", *(f"--map={pair}" for pair in map)]
+    import_options += [f"--{k.replace('_', '-')}={v}" for k, v in values.items() if v is not None]
+    import_options += ["--skip-bad"] * skip_bad + ["--allow-pickle"] * allow_pickle
+    read_options = {"fmt": format, "joint_map": joint_map(map), "skip_bad": skip_bad, "allow_pickle": allow_pickle}
+    read_options |= {name: values[name] for name in ("position_unit", "time_unit", "rate")}
+    record = StartRecord.load(out, logs)
+    robot_options = RobotOptions(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
         try:
-            found = understand(model, logs, told, wanted, options, keep=not dry_run)
+            inspection = inspect_inputs(model, logs, logs_toml, robot_options, read_options, write_guess=not dry_run)
         except UnreadError as unread:
             for line in unread.text.splitlines():
                 screen.say(f"  {line}")
-            raise UsageError(f"{unread}. The lines above are what these logs show of themselves; without "
-                             f"--dry-run they are written to {told}, to be looked over") from None  # fmt: skip
-        _tell(screen, found, model, logs, unit_id, payload_mass)
-        todo = plan(found, model, logs, out, wanted, stated, cut is None)
-        for words in todo:
+            raise UsageError(f"{unread}. The lines above are a guess from these logs; without --dry-run they are "
+                             f"written to {logs_toml} for you to check") from None  # fmt: skip
+        _print_inspection(screen, inspection, model, logs, unit_id, payload_mass)
+        commands = make_commands(inspection, model, logs, out, robot_options, import_options, cut is None)
+        for words in commands:
             words += ["--to", to] if words[0] == "export" else []
             words += ["--budget", budget] if words[0] == "identify" and budget else []
-        lines = [shlex.join(["gaponet", *words]) for words in todo]
-        said = shlex.join(next(words for words in todo if words[0] == "import")[2:])
-        if made["options"] not in ("", said):
-            data = out / "data"
-            raise UsageError(
-                f"{data} was imported with {made['options']}, not with {said}. Give another --out, or the same options "
-                f"again; or delete {data}, and it is made anew"
-            )
+        lines = [shlex.join(["gaponet", *words]) for words in commands]
+        record.require_options(shlex.join(next(words for words in commands if words[0] == "import")[2:]))
         if dry_run:
             for line in lines:
                 screen.say(line, "  ")
         else:
             with lock_folder(out, "started"):
-                if found.described:
-                    write_text(told, found.described)
-                    files[f"{out.name}/logs.toml"] = _sha256(told)
-                now = made | {"logs": str(logs.resolve()), "files": files, "options": said}
-                if not (out / "data").exists():  # an import that is interrupted leaves data of these
-                    write_json(out / MADE_FROM, now)
-                _run(screen, todo, lines, out, anyway, now)
-            screen.say(f"what ran, command by command: {out / RAN}")
+                if inspection.logs_toml:
+                    write_text(logs_toml, inspection.logs_toml)
+                record.begin(logs)
+                _run(screen, commands, lines, record, anyway)
+            screen.say(f"commands that ran: {out / COMMANDS_FILE}")
     screen.result({
-        "robot": found.robot.name, "joints": found.log.joint_names, "recordings": found.recordings,
-        "rate_hz": found.rate, "logs_toml": found.described, "commands": lines, "ran": not dry_run,
+        "robot": inspection.robot.name, "joints": inspection.log.joint_names, "recordings": inspection.recordings,
+        "rate_hz": inspection.rate, "logs_toml": inspection.logs_toml, "commands": lines, "ran": not dry_run,
     })  # fmt: skip
 
 
-def understand(
-    model: Path, logs: Path, told: Path, wanted: RobotOptions, options: dict[str, Any], keep: bool = True
-) -> Understood:
-    """Compile the model, and read the first recording as it lies there, or by a logs.toml that is guessed from it.
+def inspect_inputs(
+    model: Path, logs: Path, logs_toml: Path, robot_options: RobotOptions, read_options: dict[str, Any],
+    write_guess: bool = True,
+) -> Inspection:  # fmt: skip
+    """Compile the model and read the first recording, with a guessed logs.toml where one is needed.
 
     Args:
         model: File, robot folder, or name of a packaged robot.
         logs: Folder.
-        told: Where a guess goes, is corrected by the user, and is read from the next time.
-        wanted: What the user says about a robot that is made from a file.
-        options: What the user says about the logs, as read_first takes it.
-        keep: Write a guess there that these logs cannot be read by, or that a person has to look at.
+        logs_toml: File for the guess. The user corrects it, and the next call reads it.
+        robot_options: Options for a robot that is made from a file.
+        read_options: Options for the logs, as read_first takes them.
+        write_guess: Write the guess if a person has to check it.
 
     Raises:
-        UnreadError: Without `keep`, what a person has to look at.
+        UnreadError: Without `write_guess`: a person has to check the guess.
         RobotError, UsageError, LogError: The model is broken, or the logs cannot be read; the message says what to do.
     """
     from gaponet.data.reading import UnreadError, read_first
@@ -198,73 +190,79 @@ def understand(
         elif not model.exists() and str(model) in packaged_robots():
             robot = load_robot(packaged := str(model))
         else:
-            robot, packaged = new_robot(model, Path(place) / "robot", wanted).robot, ""
+            robot, packaged = new_robot(model, Path(place) / "robot", robot_options).robot, ""
         try:
-            by = told if told.is_file() else None
-            return Understood(robot, packaged, *read_first(logs, robot, by, not keep, **options))
+            existing = logs_toml if logs_toml.is_file() else None
+            return Inspection(robot, packaged, *read_first(logs, robot, existing, not write_guess, **read_options))
         except UnreadError as unread:
-            if not keep:
+            if not write_guess:
                 raise
-            told.parent.mkdir(parents=True, exist_ok=True)
-            write_text(told, unread.text)
+            logs_toml.parent.mkdir(parents=True, exist_ok=True)
+            write_text(logs_toml, unread.text)
             raise UsageError(
-                f"{unread}: {told} says what these logs show of themselves; look it over, then the same command again"
+                f"{unread}: {logs_toml} is a guess from these logs; check it, then give the same command again"
             ) from None
 
 
-def plan(
-    found: Understood, model: Path, logs: Path, out: Path, wanted: RobotOptions, stated: list[str], cuts: bool
-) -> list[list[str]]:
-    """The commands of the whole way, as words after `gaponet`.
+def make_commands(
+    inspection: Inspection, model: Path, logs: Path, out: Path, robot_options: RobotOptions,
+    import_options: list[str], cut_few: bool,
+) -> list[list[str]]:  # fmt: skip
+    """Return the commands from model and logs to a report, as words after `gaponet`.
 
     Args:
-        stated: What import is told of the recordings.
-        cuts: Cut the recordings where they are few.
+        import_options: Options of import about the recordings.
+        cut_few: Cut the recordings into pieces if they are fewer than MIN_RECORDINGS.
     """
-    data, known, todo = str(out / "data"), out / "identified", list[list[str]]()
-    if not found.packaged:
-        given = {name: getattr(wanted, name) for name in ("joints", "kp", "kd", "effort_limit")}
-        if not given["joints"] and len(found.log.joint_names) < len(found.robot.joint_names):
-            given["joints"] = found.log.joint_names
-        words = [x for name, said in given.items() if said for x in (f"--{name.replace('_', '-')}", *said)]
-        todo.append(["robot", "new", str(model), "--out", str(out / "robot"), "--rate", f"{found.rate:g}", *words])
-    robot, told = found.packaged or robot_argument(out / "robot"), out / "logs.toml"
-    described = ["--logs", str(told)] if found.described or told.is_file() else []
-    time = found.log.channels["ctrl"].time
-    piece = min(PIECE, float(time[-1] - time[0]) / FEWEST)
-    described += ["--cut", f"{piece:.3g}"] if cuts and found.recordings < FEWEST and piece >= SHORTEST else []
-    todo += [
-        ["import", str(logs), "--robot", robot, *stated, *described, "--out", data],
+    data, identified, commands = str(out / "data"), out / "identified", list[list[str]]()
+    if not inspection.packaged:
+        options = {name: getattr(robot_options, name) for name in ("joints", "kp", "kd", "effort_limit")}
+        if not options["joints"] and len(inspection.log.joint_names) < len(inspection.robot.joint_names):
+            options["joints"] = inspection.log.joint_names
+        words = [x for name, value in options.items() if value for x in (f"--{name.replace('_', '-')}", *value)]
+        rate = f"{inspection.rate:g}"
+        commands.append(["robot", "new", str(model), "--out", str(out / "robot"), "--rate", rate, *words])
+    robot, logs_toml = inspection.packaged or robot_argument(out / "robot"), out / "logs.toml"
+    described = ["--logs", str(logs_toml)] if inspection.logs_toml or logs_toml.is_file() else []
+    time = inspection.log.channels["ctrl"].time
+    piece = min(PIECE_S, float(time[-1] - time[0]) / MIN_RECORDINGS)
+    if cut_few and inspection.recordings < MIN_RECORDINGS and piece >= MIN_PIECE_S:
+        described += ["--cut", f"{piece:.3g}"]
+    return [
+        *commands,
+        ["import", str(logs), "--robot", robot, *import_options, *described, "--out", data],
         ["doctor", data],
         ["gap", data],
-        ["identify", data, "--out", str(known)],
-        ["gap", data, "--robot", robot_argument(known)],
-        ["export", str(known)],
-        ["report", str(known)],
+        ["identify", data, "--out", str(identified)],
+        ["gap", data, "--robot", robot_argument(identified)],
+        ["export", str(identified)],
+        ["report", str(identified)],
     ]
-    return [words for words in todo if words[0] in COMMANDS]
 
 
-def _tell(screen: Out, found: Understood, model: Path, logs: Path, unit_id: str, payload_mass: float) -> None:
-    log, robot = found.log, found.robot
-    time, still = log.channels["ctrl"].time, [j for j in robot.joint_names if j not in log.joint_names]
-    first = f"{time[-1] - time[0]:.1f} s at {found.rate:g} Hz, {', '.join(log.channels)}"
+def _print_inspection(
+    screen: Out, inspection: Inspection, model: Path, logs: Path, unit_id: str, payload_mass: float
+) -> None:
+    log, robot = inspection.log, inspection.robot
+    time, absent = log.channels["ctrl"].time, [j for j in robot.joint_names if j not in log.joint_names]
+    first = f"{time[-1] - time[0]:.1f} s at {inspection.rate:g} Hz, {', '.join(log.channels)}"
+    gains = ", ".join(f"{x:g}" for x in robot.kp)
     rows = {
-        "robot": f"{robot.name}, from {found.packaged or model}; kp {', '.join(f'{x:g}' for x in robot.kp)} N·m/rad",
-        "logs": f"{found.recordings} recording(s) below {logs}; the first: {first}",
+        "robot": f"{robot.name}, from {inspection.packaged or model}; kp {gains} N·m/rad",
+        "logs": f"{inspection.recordings} recording(s) below {logs}; the first: {first}",
         "joints recorded": ", ".join(log.joint_names),
-        "frozen" if not found.packaged else "taken to stand at home": ", ".join(still),
+        "frozen" if not inspection.packaged else "assumed to stand at home": ", ".join(absent),
         "taken as given": f"unit {unit_id}, {payload_mass:g} kg in each hand (--unit-id, --payload-mass)",
     }
-    for what, said in rows.items():
-        if said:
-            screen.say(f": {said}", what)
-    for line in found.described.splitlines():
+    for label, text in rows.items():
+        if text:
+            screen.say(f": {text}", label)
+    for line in inspection.logs_toml.splitlines():
         screen.say(f"  {line}", "logs.toml, guessed" if line.startswith("# Lines") else "", "yellow")
 
 
-class _MadeFrom(TypedDict):
-    """start.json: logs is their path, files their hashes, options import's, done a command that ran → on what."""
+class _RecordFields(TypedDict):
+    """start.json: path of the logs, their hashes, options of import, finished command → hash of its inputs."""
 
     logs: str
     options: str
@@ -272,11 +270,79 @@ class _MadeFrom(TypedDict):
     done: dict[str, str]
 
 
-def _hashes(logs: Path, out: Path) -> dict[str, str]:
-    """File → SHA-256, of all logs and of the logs.toml in OUT, which may lie among the logs."""
-    below, root = (logs.rglob("*"), logs) if logs.is_dir() else ([logs], logs.parent)
+class StartRecord:
+    """Logs, options and finished commands of a folder that `gaponet start` fills, in start.json."""
+
+    def __init__(self, out: Path, files: dict[str, str], fields: _RecordFields) -> None:
+        self.out, self.files, self.fields = out, files, fields
+        self.options = fields["options"]
+
+    @classmethod
+    def load(cls, out: Path, logs: Path) -> StartRecord:
+        """Read the record of a folder, or start one.
+
+        Raises:
+            UsageError: The folder holds data of other logs.
+        """
+        files, data, path = hash_logs(logs, out), out / "data", out / RECORD_FILE
+        fields, source = _RecordFields(logs="", files={}, options="", done={}), "logs that no file names"
+        if path.is_file():
+            fields = read_json(_RecordFields, path, UsageError, f"delete it and {data}")
+            source = f"{fields['logs']}"
+        if not data.exists():  # only the robot is there
+            done = {line: inputs for line, inputs in fields["done"].items() if inputs == MODEL_INPUT}
+            return cls(out, files, _RecordFields(logs="", files={}, options="", done=done))
+        other = [name for name, digest in fields["files"].items() if files.get(name) != digest]
+        if fields["logs"] and not other:
+            return cls(out, files, fields)
+        if other:
+            source += f", of which {abbreviate(other)} {'is' if len(other) == 1 else 'are'} missing or changed"
+            source += f" in {logs}" * (str(logs.resolve()) != fields["logs"])
+        raise UsageError(
+            f"{data} was made from {source}. Give another --out for these logs, or the same logs again; or delete "
+            f"{data}, and it is made anew"
+        )
+
+    def require_options(self, options: str) -> None:
+        """Refuse other options of import than those of the data that are there."""
+        if self.options not in ("", options):
+            data = self.out / "data"
+            raise UsageError(
+                f"{data} was imported with {self.options}, not with {options}. Give another --out, or the same options "
+                f"again; or delete {data}, and it is made anew"
+            )
+        self.options = options
+
+    def begin(self, logs: Path) -> None:
+        """Take the present logs and options as those of this run."""
+        logs_toml = self.out / "logs.toml"
+        if logs_toml.is_file():
+            self.files[f"{self.out.name}/logs.toml"] = _sha256(logs_toml)
+        done = self.fields["done"]
+        self.fields = _RecordFields(logs=str(logs.resolve()), files=self.files, options=self.options, done=done)
+        if not (self.out / "data").exists():  # an interrupted import leaves data of these logs
+            write_json(self.out / RECORD_FILE, self.fields)
+
+    def inputs(self, command: str) -> str:
+        """Return what a command depends on: the model, the logs, or the recordings in the dataset."""
+        if command == "robot":
+            return MODEL_INPUT
+        if command == "import":
+            return hashlib.sha256(str(sorted(self.files.items())).encode()).hexdigest()
+        return dataset_hash(Dataset(self.out / "data").entries)
+
+    def finish(self, line: str, inputs: str) -> None:
+        """Record a finished command."""
+        self.fields["done"][line] = inputs
+        write_json(self.out / RECORD_FILE, self.fields)
+        write_text(self.out / COMMANDS_FILE, "\n".join(self.fields["done"]) + "\n")
+
+
+def hash_logs(logs: Path, out: Path) -> dict[str, str]:
+    """Return file → SHA-256 of all logs, and of the logs.toml in `out`, which may lie among the logs."""
+    paths, root = (logs.rglob("*"), logs) if logs.is_dir() else ([logs], logs.parent)
     files = {}
-    for file in below:
+    for file in paths:
         name = file.relative_to(root)
         if out.resolve() not in file.resolve().parents and not any(part.startswith(".") for part in name.parts):
             files[name.as_posix()] = file
@@ -289,54 +355,26 @@ def _sha256(file: Path) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
-def _earlier(out: Path, logs: Path, files: dict[str, str]) -> _MadeFrom:
-    """What start.json says of OUT, without data there only how its robot was made; refuses data of other logs."""
-    data, made, where = (
-        out / "data",
-        _MadeFrom(logs="", files={}, options="", done={}),
-        "logs that no file names",
-    )
-    if (out / MADE_FROM).is_file():
-        made = read_json(_MadeFrom, out / MADE_FROM, UsageError, f"delete it and {data}")
-        where = f"{made['logs']}"
-    if not data.exists():
-        return _MadeFrom(
-            logs="", files={}, options="", done={line: on for line, on in made["done"].items() if on == ROBOT}
-        )
-    other = [name for name, digest in made["files"].items() if files.get(name) != digest]
-    if made["logs"] and not other:
-        return made
-    if other:
-        where += f", of which {abbreviate(other)} {'is' if len(other) == 1 else 'are'} missing or changed"
-        where += f" in {logs}" * (str(logs.resolve()) != made["logs"])
-    raise UsageError(
-        f"{data} was made from {where}. Give another --out for these logs, or the same logs again; or delete {data}, "
-        "and it is made anew"
-    )
-
-
-def _run(screen: Out, todo: list[list[str]], lines: list[str], out: Path, anyway: bool, made: _MadeFrom) -> None:
-    """Run what has not run to its end yet, on these logs or on these data."""
-    done, logs = made["done"], hashlib.sha256(str(sorted(made["files"].items())).encode()).hexdigest()
-    for words, line in zip(todo, lines, strict=True):
-        on = {"robot": ROBOT, "import": logs}.get(words[0]) or dataset_hash(Dataset(out / "data").entries)
-        if done.get(line) == on:
+def _run(screen: Out, commands: list[list[str]], lines: list[str], record: StartRecord, anyway: bool) -> None:
+    """Run the commands that have not finished on the present inputs."""
+    for words, line in zip(commands, lines, strict=True):
+        inputs = record.inputs(words[0])
+        if record.fields["done"].get(line) == inputs:
             screen.say(line, "done before: ", "green")
             continue
         screen.say(line, "$ ", "bold cyan")
         if words[0] == "doctor":
-            diagnosis = api.doctor(words[1])
+            with progress_bar("examining") as update:
+                diagnosis = api.doctor(words[1], progress=update)
             show_diagnosis(screen, diagnosis)
             if diagnosis.count("error") and not anyway:
                 raise UsageError(
-                    "stopped: what the doctor calls an error is one of the logs, and no fit mends it. "
-                    f"Mend the logs or {out / 'logs.toml'} (gaponet doctor {words[1]} --fix proposes lines), delete "
-                    f"{words[1]}, and start again; or --anyway"
+                    "stopped: an error that the doctor finds is in the logs, and no fit repairs it. "
+                    f"Repair the logs or {record.out / 'logs.toml'} (gaponet doctor {words[1]} --fix proposes lines), "
+                    f"delete {words[1]}, and start again; or --anyway"
                 )
         elif code := main(words):
             if code == 128 + signal.SIGINT:
                 raise KeyboardInterrupt
-            raise UsageError(f"stopped at: {line}; what to do is said above; then give the same start command again")
-        done[line] = on
-        write_json(out / MADE_FROM, made)
-        write_text(out / RAN, "\n".join(done) + "\n")
+            raise UsageError(f"stopped at: {line}; the message above says what to do; then give the same command again")
+        record.finish(line, inputs)
