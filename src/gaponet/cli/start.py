@@ -128,7 +128,9 @@ def start(
     import_options = ["--unit-id", unit_id, "--payload-mass", f"{payload_mass:g}", *(f"--map={pair}" for pair in map)]
     import_options += [f"--{k.replace('_', '-')}={v}" for k, v in values.items() if v is not None]
     import_options += ["--skip-bad"] * skip_bad + ["--allow-pickle"] * allow_pickle
-    read_options = {"fmt": format, "joint_map": joint_map(map), "skip_bad": skip_bad, "allow_pickle": allow_pickle}
+    read_options: dict[str, Any] = {
+        "fmt": format, "joint_map": joint_map(map), "skip_bad": skip_bad, "allow_pickle": allow_pickle
+    }  # fmt: skip
     read_options |= {name: values[name] for name in ("position_unit", "time_unit", "rate")}
     record = StartRecord.load(out, logs)
     robot_options = RobotOptions(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
