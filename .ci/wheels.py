@@ -21,7 +21,7 @@ rates = [50]
 repetitions = 1
 variants = 3
 """
-SMALL = "--warm-start.rounds 2 --warm-start.num-envs 16 --warm-start.steps 60 --warm-start.sensor-states 64"
+SMALL = "--pretraining.rounds 2 --pretraining.num-envs 16 --pretraining.steps 60 --pretraining.sensor-states 64"
 GYM = """
 import gaponet as gp, numpy as np
 from gaponet.deploy.gym import TrackingEnv

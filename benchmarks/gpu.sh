@@ -22,7 +22,7 @@ train() {
     [ ! -f "$OUT/$1/model/card.json" ] || return 0
     [ -f "$OUT/$1/checkpoint.pt" ] && resume=--resume || resume=
     $PYTHON -m gaponet train "$OUT/data" --out "$OUT/$1" --device "$1" --budget "$2" $resume \
-        --warm-start.num-envs "$ENVS" --ppo.num-envs "$ENVS"
+        --pretraining.num-envs "$ENVS" --ppo.num-envs "$ENVS"
 }
 train cpu "$STEPS"
 train "$DEVICE" "$DEVICE_STEPS"

@@ -41,8 +41,9 @@ from gaponet.base.files import FOLDER_MARKER
 from gaponet.cli.main import main as gaponet_main
 from gaponet.data.store import Dataset
 
-TRAIN = ["--model.history", "2", "--warm-start.num-envs", "16", "--warm-start.steps", "40", "--warm-start.rounds", "3",
-         "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
+TRAIN = ["--model.history", "2", "--pretraining.num-envs", "16", "--pretraining.steps", "40",
+         "--pretraining.rounds", "3", "--ppo.num-envs", "16", "--ppo.num-steps", "16",
+         "--validate-every", "2"]  # fmt: skip
 LIMIT_S = 600.0
 REFUSALS = ("Folder", "File", "Usage", "Dataset", "Model")  # first words of one-line errors
 

@@ -8,7 +8,7 @@ trained on and of one that was not:
     as it is          gaponet train --model paper --recipe paper
     sensors are noise S is a sample of N(0, 1) in training and its mean, 0, in evaluation
     payload permuted  the payload of each training and validation recording is that of another one, drawn at random
-    no PPO            gaponet train --recipe labels that ends before PPO: the supervised start
+    no PPO            gaponet train --recipe labels that ends before PPO: supervised pre-training
     ours              gaponet train as it comes, with the payloads as they are and permuted
 
 A folder in WORK that is complete is not trained again.
@@ -35,7 +35,7 @@ from gaponet.sim.metrics import metrics, runs
 from gaponet.sim.replay import Corrector, replay
 
 PAPER = ("--model", "paper", "--recipe", "paper")
-START_STEPS = 3 * 256 * 400  # control steps of the three rounds of the supervised start
+START_STEPS = 3 * 256 * 400  # control steps of the three rounds of supervised pre-training
 ROWS = {  # row → options of gaponet train
     "as it is": PAPER, "sensors are noise": PAPER, "payload permuted": PAPER,
     "no PPO": ("--model", "paper", "--budget", START_STEPS), "ours": (), "ours, payload permuted": (),

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from kills import prepare, trained
 
-TINY = ["--model.history", "2", "--model.sensors", "off", "--warm-start.num-envs", "16", "--warm-start.steps", "40",
-        "--warm-start.rounds", "3", "--warm-start.gradient-steps", "40", "--warm-start.batch-size", "128",
+TINY = ["--model.history", "2", "--model.sensors", "off", "--pretraining.num-envs", "16", "--pretraining.steps", "40",
+        "--pretraining.rounds", "3", "--pretraining.gradient-steps", "40", "--pretraining.batch-size", "128",
         "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m"]
 MINUTE = 60.0

@@ -30,7 +30,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.layers import size
+from gaponet.nn.layers import num_parameters
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import trained_network
 from gaponet.nn.training.config import RewardConfig, TrainConfig
@@ -115,7 +115,7 @@ def bench_train(robot: RobotSpec, config: TrainConfig, num_envs: int, rounds: in
         "speeds": speeds,
         "expected": expected,
         "share_of_expected": speeds["PPO"]["control_steps_per_s"] / expected,
-        "parameters": size(net),
+        "parameters": num_parameters(net),
         "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
 
@@ -240,7 +240,7 @@ def _inference(learner: PPO, steps: int) -> None:
     """Features, sensors, actor and critic, nothing stored."""
     with torch.no_grad():
         for _ in range(steps):
-            learner.look()
+            learner.observe()
 
 
 def _correction(model: GapModel, states: Array) -> Turn:

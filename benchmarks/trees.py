@@ -20,7 +20,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.experiments.real.methods import LEFT_OUT, FittedSim, identified
 from gaponet.experiments.real.questions import Question, train_val
 from gaponet.nn.training.labels import trajectory_labels
-from gaponet.nn.training.validation import added
+from gaponet.nn.training.validation import error_reduction
 from gaponet.report.verdict import NetworkGain
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
@@ -85,7 +85,7 @@ def on_identified(question: Question) -> FittedSim:
     labels = trajectory_labels(train, start.robot, LIMIT)
     answer = replace(start, corrector=Trees.trained(train, start.robot, labels, 0))
     before, after = (np.array(one.errors(val)) for one in (start, answer))
-    less, error = added(val, before, after)
+    less, error = error_reduction(val, before, after)
     gain = NetworkGain("identification", less, error, float(before.mean()))
     told = f"{100 * gain.reduction / gain.base_error:.0f} % less on validation"
     return replace(answer, note=told) if gain.helps else replace(start, note=f"{LEFT_OUT}: {told}")

@@ -12,7 +12,7 @@ from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
-from gaponet.nn.onnx_export import drawn_states, export
+from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
 
@@ -40,7 +40,7 @@ def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
     torch.nn.init.zeros_(net.trunk[-1].weight)
     torch.nn.init.zeros_(net.trunk[-1].bias)
     torch.nn.init.constant_(net.bias, delta)
-    export(net, folder / "model", make_card(config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2]), drawn_states(net))
+    export(net, folder / "model", make_card(config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2]), sample_inputs(net))
     save_robot(robot, folder / "robot")
     return GapModel.load(folder)
 
@@ -70,5 +70,5 @@ def small_model(robot: RobotSpec, folder: Path) -> GapModel:
     torch.manual_seed(0)
     net = build_network(SMALL, len(robot.operated))
     torch.nn.init.normal_(net.trunk[-1].weight, std=0.03)
-    export(net, folder, make_card(SMALL, robot, dt=[robot.dt]), drawn_states(net))
+    export(net, folder, make_card(SMALL, robot, dt=[robot.dt]), sample_inputs(net))
     return GapModel.load(folder)

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "gaponet"
 FOLDERS = sorted(p.name for p in SOURCE.iterdir() if p.is_dir() and any(p.glob("*.py")))
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-MODEL, TRAIN, START = ModelConfig(), TrainConfig(), TRAINING.warm_start
+MODEL, TRAIN, START = ModelConfig(), TrainConfig(), TRAINING.pretraining
 ONLINE = ("https://github.com/gaponet/gaponet/blob/main/", "https://raw.githubusercontent.com/gaponet/gaponet/main/")
 
 
@@ -39,7 +39,7 @@ def widths(layers: tuple[int, ...]) -> str:
         ("algorithm.md", f"±{MODEL.probe_small} rad (reads gains and friction) and ±{MODEL.probe_large} rad"),
         ("algorithm.md", f"Δ_max = {MODEL.delta_max} rad"),
         ("algorithm.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
-        ("algorithm.md", f"Oracle answers at {TRAIN.warm_start.sensor_states} states"),
+        ("algorithm.md", f"Oracle answers at {TRAIN.pretraining.sensor_states} states"),
         ("algorithm.md", f"{PRIOR} rad per unit of scale"),
         ("experiments.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
     ],

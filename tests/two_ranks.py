@@ -22,7 +22,7 @@ from gaponet.nn.training.trainer import Trainer
 
 CONFIG = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-    warm_start=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
+    pretraining=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
     ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
     episode_s=0.5,
     validate_every=2,
@@ -56,9 +56,9 @@ def together(rank: int) -> dict:
     whole, part = Standardise(3), Standardise(3)
     whole.fit(samples)
     part.fit(samples[rank::2] * 1.0)
-    ranks.pool(part)
+    ranks.pool_statistics(part)
     net = torch.nn.Linear(3, 3)
-    ranks.spread(net)
+    ranks.broadcast(net)
     ranks.require_equal(net.state_dict())
     try:
         with torch.no_grad():

@@ -8,8 +8,8 @@ from arm import recordings, write_arm
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 
-TRAIN = """--seeds 1 --budget 640 --warm-start.rounds 1 --warm-start.num-envs 16 --warm-start.steps 40
---warm-start.gradient-steps 20""".split()  # noqa: SIM905
+TRAIN = """--seeds 1 --budget 640 --pretraining.rounds 1 --pretraining.num-envs 16 --pretraining.steps 40
+--pretraining.gradient-steps 20""".split()  # noqa: SIM905
 
 
 @pytest.fixture(scope="module")

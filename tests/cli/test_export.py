@@ -14,7 +14,7 @@ from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
-from gaponet.nn.onnx_export import drawn_states, export
+from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 
@@ -28,7 +28,7 @@ def run(tmp_path):
     torch.manual_seed(0)
     net = build_network(CONFIG, 2)
     torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
-    export(net, tmp_path / "run" / "model", make_card(CONFIG, robot, dt=[0.02]), drawn_states(net))
+    export(net, tmp_path / "run" / "model", make_card(CONFIG, robot, dt=[0.02]), sample_inputs(net))
     torch.save({"best_state": net.state_dict()}, tmp_path / "run" / "checkpoint.pt")
     return tmp_path / "run"
 

@@ -18,7 +18,7 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 
 SMALL = TrainConfig(
-    warm_start=PretrainingConfig(rounds=1, num_envs=16, steps=40, gradient_steps=40, batch_size=128),
+    pretraining=PretrainingConfig(rounds=1, num_envs=16, steps=40, gradient_steps=40, batch_size=128),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1),
 )
 

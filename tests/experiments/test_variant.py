@@ -6,13 +6,13 @@ from gaponet.base.errors import UsageError
 from gaponet.experiments.variant import KINDS, _read, parse_variant
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 
-BASE = TrainConfig(warm_start=PretrainingConfig(rounds=7))
+BASE = TrainConfig(pretraining=PretrainingConfig(rounds=7))
 
 
 def test_what_the_word_does_not_say_is_as_in_the_base():
     variant = parse_variant("mlp", BASE)
     assert variant.kind == "mlp"
-    assert variant.config.warm_start.rounds == 7
+    assert variant.config.pretraining.rounds == 7
     assert not variant.identified
 
 

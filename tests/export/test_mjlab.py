@@ -103,13 +103,13 @@ def test_a_trained_model_moves_mjlab_as_it_moves_alignedsim(python, tmp_path):
     recipe = ["--robot", "h1_2", "--fleet", "easy", "--recipe", "demo", "--units", "virtual-1", "--nproc", "1"]
     assert main(["collect", "--out", data, *recipe]) == 0
     start = [
-        "--warm-start.num-envs",
+        "--pretraining.num-envs",
         "64",
-        "--warm-start.steps",
+        "--pretraining.steps",
         "100",
-        "--warm-start.rounds",
+        "--pretraining.rounds",
         "4",
-        "--warm-start.rows",
+        "--pretraining.rows",
         "4000",
     ]
     assert main(["train", data, "--out", run, "--budget", "25600", *start]) == 0

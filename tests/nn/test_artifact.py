@@ -45,7 +45,7 @@ def test_onnx_equals_torch(artifact):
 
 def test_export_refuses_to_write_what_differs(artifact, robot, tmp_path, monkeypatch):
     _, net, samples, _ = artifact
-    monkeypatch.setattr("gaponet.nn.onnx_export.PARITY", -1.0)
+    monkeypatch.setattr("gaponet.nn.onnx_export.MAX_DIFFERENCE_RAD", -1.0)
     with pytest.raises(ModelError, match="ONNX and torch differ by"):
         export(net, tmp_path / "out", {}, samples)
     assert not (tmp_path / "out").exists()

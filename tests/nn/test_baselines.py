@@ -7,7 +7,7 @@ import torch
 
 from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.layers import size
+from gaponet.nn.layers import num_parameters
 from gaponet.nn.networks import build_network
 
 KINDS = ("mlp", "shared_mlp")
@@ -35,16 +35,16 @@ def test_every_number_of_the_observation_and_the_action_is_seen(kind):
 
 
 def test_a_matched_mlp_has_the_operators_parameters_within_one_percent():
-    operator = size(build_network(ModelConfig(), 10))
+    operator = num_parameters(build_network(ModelConfig(), 10))
     matched = build_network(ModelConfig(kind="mlp", mlp_match=True), 10)
-    assert abs(size(matched) / operator - 1) < 0.01
+    assert abs(num_parameters(matched) / operator - 1) < 0.01
 
 
 @pytest.mark.parametrize("n", [2, 10])
 def test_the_shared_mlp_has_the_weights_of_branch_and_trunk_and_of_other_joints_no_past(n):
     config = ModelConfig()
     operator, shared = (build_network(replace(config, kind=kind), n) for kind in ("gaponet", "shared_mlp"))
-    assert abs(size(shared) / size(operator) - 1) < 0.02
+    assert abs(num_parameters(shared) / num_parameters(operator) - 1) < 0.02
     torch.nn.init.normal_(shared.net[-1].weight)
     data = x(shared.config, n, batch=1).requires_grad_(True)
     shared(data)[0, 0].backward()

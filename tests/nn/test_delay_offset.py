@@ -26,4 +26,4 @@ def test_pieces_cover_long_sequences(tmp_path):
     robot = write_arm(tmp_path)
     sequence = record(robot, commands(2500, 0), "m")
     assert sum(map(len, DelayOffset.pieces([sequence], seconds=20.0))) == 2500
-    assert sum(map(len, DelayOffset.pieces([sequence] * 40, seconds=20.0, frames=10_000))) < 20_000
+    assert sum(map(len, DelayOffset.pieces([sequence] * 40, seconds=20.0, max_rows=10_000))) < 20_000

@@ -74,7 +74,7 @@ def looped(config, limits, num_envs, tensors):
     weights = np.random.default_rng(0).normal(0, 0.1, (config.input_dim(2), 2)).astype(np.float32)
     if not tensors:
         return DeltaLoop(config, limits, num_envs, lambda x: x @ weights)
-    return DeltaLoop(config, limits, num_envs, lambda x: x @ torch.from_numpy(weights), of=torch.zeros(0))
+    return DeltaLoop(config, limits, num_envs, lambda x: x @ torch.from_numpy(weights), like=torch.zeros(0))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -50,7 +50,7 @@ def test_noise_on_the_inputs_changes_the_answer_and_none_does_not():
     torch.nn.init.normal_(net.trunk[-1].weight)
     data = x(config, 2)
     assert torch.equal(net(data), net(data))
-    net.features.noise = 0.4
+    net.features.noise_std = 0.4
     assert not torch.equal(net(data), net(data))
 
 

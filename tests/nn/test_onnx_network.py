@@ -13,7 +13,7 @@ from gaponet.export.program import export_program
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
-from gaponet.nn.onnx_export import drawn_states, export, onnx_content
+from gaponet.nn.onnx_export import export, onnx_content, sample_inputs
 from gaponet.nn.onnx_network import OnnxNetwork
 
 SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
@@ -41,7 +41,7 @@ def robot(tmp_path_factory):
 def artifact(robot, tmp_path_factory):
     net = trained(stride=2)
     folder = tmp_path_factory.mktemp("run") / "model"
-    export(net, folder, make_card(net.config, robot, dt=[0.02]), drawn_states(net))
+    export(net, folder, make_card(net.config, robot, dt=[0.02]), sample_inputs(net))
     return folder
 
 
@@ -56,7 +56,7 @@ def artifact(robot, tmp_path_factory):
 )  # fmt: skip
 def test_what_ships_answers_as_the_network_does(how):
     net = trained(n=3, **how)
-    x = drawn_states(net, 20)
+    x = sample_inputs(net, 20)
     with torch.inference_mode():
         expected = net(torch.from_numpy(x)).numpy()
     np.testing.assert_allclose(OnnxNetwork(onnx_content(net))(x), expected, atol=1e-6)
@@ -65,7 +65,7 @@ def test_what_ships_answers_as_the_network_does(how):
 
 def test_drawn_states_have_the_statistics_trained_on():
     net = trained()
-    z = net.features.standardise(net.features.relative(torch.from_numpy(drawn_states(net, 4000))))
+    z = net.features.standardise(net.features.relative(torch.from_numpy(sample_inputs(net, 4000))))
     assert abs(float(z.mean())) < 0.05
     assert abs(float(z.std()) - 1) < 0.05
 

@@ -16,7 +16,7 @@ from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.networks import build_network
-from gaponet.nn.onnx_export import drawn_states, export
+from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.nn.paper import released_inputs, released_network
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.budget import Budget
@@ -117,7 +117,7 @@ def test_the_limit_changes_no_correction_within_it():
 def test_the_artifact_answers_as_the_network(tmp_path, how):
     config, robot = replace(PAPER, **how), write_arm(tmp_path / "arm")
     net = network(config)
-    assert export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), drawn_states(net)) <= 1e-5
+    assert export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), sample_inputs(net)) <= 1e-5
     model = GapModel.load(tmp_path / "run")
     assert model.config == config
     x = torch.randn(7, config.input_dim(2))
@@ -172,7 +172,7 @@ def test_answers_of_the_simulator_are_what_the_branch_sees_and_no_control_loop_h
     x = torch.randn(5, config.input_dim(2))
     assert torch.equal(net.prepare(x)[:, -16:], x[:, -16:])
     assert net.predictor is None
-    export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), drawn_states(net))
+    export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), sample_inputs(net))
     model = GapModel.load(tmp_path / "run")
     with pytest.raises(ModelError, match="for gaponet eval alone"):
         model.loop()
@@ -184,7 +184,7 @@ def test_learned_probes_start_at_the_fixed_ones_and_gradients_reach_them_alone()
     config = replace(PAPER, sensor_source="learned")
     net, x = network(config).train(), torch.randn(9, config.input_dim(2))
     start = (config.probe_limit * net.probes.tanh()).detach()
-    np.testing.assert_allclose(start, ProbeOracle.offsets_of(config, 2), atol=1e-6)
+    np.testing.assert_allclose(start, ProbeOracle.probe_offsets(config, 2), atol=1e-6)
     net.predictor.requires_grad_(False)
     prepared = net.prepare(x)
     assert not prepared.requires_grad
@@ -202,7 +202,7 @@ def test_learned_sensors_are_the_predictor_s_answers_to_each_probe():
 
 
 def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp_path, monkeypatch):
-    monkeypatch.setattr("gaponet.nn.training.sensor_fit.STEPS", 200)
+    monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
     config, robot = replace(PAPER, sensor_source="learned"), write_arm(tmp_path)
     env = DeltaEnv(recordings(robot, 2, rows=60, kp=0.5), robot, config, 64, 1000, RewardConfig(), nthread=1)
     net = network(config)
@@ -219,7 +219,7 @@ def test_the_branch_sees_the_observation_and_the_trunk_the_lag_where_switches_sa
     x = torch.randn(5, net.config.input_dim(2))
     relative = net.features(x)
     assert torch.equal(net.prepare(x)[:, :3], relative[:, -3:])  # payload and A − q
-    assert torch.equal(net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)], relative[:, : net.seen.stop])
+    assert torch.equal(net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)], relative[:, : net.observation.stop])
     assert net.branch[0].in_features == net.config.observation_dim(2) + 16
 
 
@@ -277,7 +277,7 @@ def test_other_networks_refuse_the_paper_s_switches():
 
 TRAINING = TrainConfig(
     PAPER,
-    warm_start=PretrainingConfig(rounds=1, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64),
+    pretraining=PretrainingConfig(rounds=1, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64),
     ppo=PPOConfig(num_envs=8, num_steps=8, mini_batches=2, epochs=1, critic_warmup=0, explained=-1e9, refit_sensors=2,
                   critic_hidden=(16,)),
     episode_s=0.5, validate_every=2, threads=1,
@@ -286,7 +286,7 @@ TRAINING = TrainConfig(
 
 @pytest.fixture(autouse=True)
 def few_gradient_steps(monkeypatch):
-    monkeypatch.setattr("gaponet.nn.training.sensor_fit.STEPS", 20)
+    monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 20)
 
 
 @pytest.fixture(scope="module")
@@ -309,11 +309,11 @@ def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stoppe
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
     update = 8 * 8 * config.model.delta_hold
     run = tmp_path / "whole"
-    model = Trainer(*world, run, config, Budget(steps=4 * update)).run()
-    assert GapModel.how_trained(model.card) == "4 updates of PPO from the untrained network, no supervised start"
+    model = Trainer.prepare(*world, run, config, Budget(steps=4 * update)).run()
+    assert GapModel.how_trained(model.card) == "4 updates of PPO from the untrained network, no supervised pre-training"
     assert model.card["steps"] == 4 * update
-    Trainer(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
-    Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
+    Trainer.prepare(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
+    Trainer.prepare(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
     whole, parts = (torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts"))
     assert all(torch.equal(x, parts[name]) for name, x in whole.items())
     untrained = build_network(config.model, 2)
@@ -322,13 +322,13 @@ def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stoppe
 
 def test_it_trains_by_labels_too_and_eval_says_how_many_corrections_are_at_the_limit(world, tmp_path, capsys):
     run = tmp_path / "run"
-    card = Trainer(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
-    assert GapModel.how_trained(card) == "supervised start (1 rounds), 2 updates of PPO"
+    card = Trainer.prepare(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
+    assert GapModel.how_trained(card) == "supervised pre-training (1 rounds), 2 updates of PPO"
     result = evaluate([run], *world).result
     assert list(result["methods"]) == ["nominal", "delay_offset", "paper"]
     assert result["delta"]["paper"]["at_limit"] == 0
     net = network(replace(PAPER, delta_max=1e-3))
-    export(net, run / "model", card | {"model": asdict(net.config)}, drawn_states(net))
+    export(net, run / "model", card | {"model": asdict(net.config)}, sample_inputs(net))
     assert evaluate([run], *world).result["delta"]["paper"]["at_limit"] > 0.5
     assert main(["eval", str(run), str(world[0].path)]) == 0
     assert "of the corrections are at the limit (--model.delta-max)" in capsys.readouterr().out
@@ -338,8 +338,8 @@ def test_a_refitted_predictor_keeps_the_units_that_the_branch_has_learned(world,
     fitted = []
     for every in (0, 2):
         config = replace(TRAINING, ppo=replace(TRAINING.ppo, refit_sensors=every))
-        config = replace(config, warm_start=replace(config.warm_start, rounds=0))
-        trainer = Trainer(*world, tmp_path / f"run{every}", config, Budget(steps=2 * 64))
+        config = replace(config, pretraining=replace(config.pretraining, rounds=0))
+        trainer = Trainer.prepare(*world, tmp_path / f"run{every}", config, Budget(steps=2 * 64))
         trainer.run()
         fitted.append(trainer.net.predictor.state_dict())
     once, again = fitted

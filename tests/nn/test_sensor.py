@@ -10,7 +10,7 @@ from gaponet.sim.model import build_model
 
 
 def test_every_joint_is_probed_both_ways_and_with_both_amplitudes():
-    offsets = ProbeOracle.offsets_of(ModelConfig(num_probes=20), 5)
+    offsets = ProbeOracle.probe_offsets(ModelConfig(num_probes=20), 5)
     assert offsets.shape == (20, 5)
     assert ((offsets != 0).sum(axis=1) == 1).all()
     for joint in range(5):
@@ -23,7 +23,7 @@ def test_the_oracle_is_one_control_period_of_the_simulator(tmp_path):
     answer = ProbeOracle(robot, config, [(0.3, "both", 0.02)])(q, v)
     assert answer.shape == (1, 4, 4)
     model = build_model(robot, 0.3)
-    for k, offset in enumerate(ProbeOracle.offsets_of(config, 2)):
+    for k, offset in enumerate(ProbeOracle.probe_offsets(config, 2)):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:], data.ctrl[:] = q[0], v[0], q[0] + offset
         mujoco.mj_step(model, data, robot.decimation)

@@ -44,7 +44,7 @@ def test_the_page_is_one_offline_file_that_names_the_method_everywhere(evaluated
     page = write_report(evaluated).read_text()  # the figures are SVG with their words in it
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page)
     for text in (
-        "Undertrained: the budget ended after 3 of 10 rounds", "3 of 10 rounds of the supervised start, no PPO",
+        "Undertrained: the budget ended after 3 of 10 rounds", "supervised pre-training (3 of 10 rounds), no PPO",
         "none: stands still", "elbow</td>", "°)", "Pearson", "median error", "gaponet train data --out run",
         f"gaponet eval {evaluated} {evaluated.parent / 'data'}",
         json.loads((evaluated / "metrics.json").read_text())["date"], "prefers-color-scheme: dark",
@@ -71,7 +71,7 @@ def test_a_trained_run_is_not_called_undertrained(run):
     card = GapModel.load(run).card
     said = warnings(card, "identified+gaponet", json.loads((run / "metrics.json").read_text()))
     assert not any("Undertrained" in text for text in said)
-    assert GapModel.how_trained(card) == "supervised start (10 rounds), 40 updates of PPO"
+    assert GapModel.how_trained(card) == "supervised pre-training (10 rounds), 40 updates of PPO"
 
 
 def test_the_robot_is_drawn_or_the_page_says_why_not(evaluated):

@@ -1,4 +1,4 @@
-"""The inverse of a simulator is the target that was given to it, and the label of the warm start."""
+"""The inverse of a simulator is the target that was given to it, and the label of pre-training."""
 
 import numpy as np
 import pytest

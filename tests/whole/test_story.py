@@ -11,8 +11,8 @@ from arm import recordings, write_arm
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 
-TRAIN = """--budget 3500 --warm-start.rounds 2 --warm-start.num-envs 16 --warm-start.steps 60
---warm-start.gradient-steps 60 --ppo.num-envs 16 --ppo.num-steps 16 --ppo.epochs 1""".split()  # noqa: SIM905
+TRAIN = """--budget 3500 --pretraining.rounds 2 --pretraining.num-envs 16 --pretraining.steps 60
+--pretraining.gradient-steps 60 --ppo.num-envs 16 --ppo.num-steps 16 --ppo.epochs 1""".split()  # noqa: SIM905
 
 
 @pytest.fixture(scope="module")

@@ -129,14 +129,14 @@ def _exported(made: Exported, folder: Path, to: str, robot: str) -> ExportResult
 
 def _export_onnx(run: Path, out: Path | None) -> ExportResult:
     from gaponet.nn.artifact import CARD, GapModel
-    from gaponet.nn.onnx_export import drawn_states, trained_network
     from gaponet.nn.onnx_export import export as write
+    from gaponet.nn.onnx_export import sample_inputs, trained_network
     from gaponet.robot.folder import load_stored_robot, save_robot
 
     path = out or run / "model"
     card, config = GapModel.read_card(run / "model" / CARD)
     net = trained_network(run, config, len(card["joint_names"]))
-    parity = write(net, path, card, drawn_states(net))
+    parity = write(net, path, card, sample_inputs(net))
     if path != run / "model" and has_stored_robot(run):
         save_robot(load_stored_robot(run, card["robot"]), path / STORED_ROBOT)  # commands can then be transferred
     return _network(path, "onnx", card["robot"], parity)

@@ -232,7 +232,10 @@ def train(
         data, spec = as_dataset(dataset, robot)
         require_commands(data)
         show = lambda status: progress(status.fraction, 1.0, status.note)  # noqa: E731
-        trainer = Trainer(data, spec, Path(out), config, Budget.parse(budget), resume, holdout_units, show, log)
+        trainer = Trainer.prepare(
+            data, spec, Path(out), config, Budget.parse(budget),
+            resume=resume, holdout_units=holdout_units, show=show, log=log,
+        )  # fmt: skip
         trained = trainer.run()
     return TrainResult(model=trained, card=trained.card)
 

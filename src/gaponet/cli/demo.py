@@ -65,7 +65,7 @@ def demo(
             f": does a network find more?  (gaponet train {dataset} --robot {robot_argument(known)} --out {run})",
             "3 Use",
         )
-        resume, config = (run / "checkpoint.pt").is_file(), TrainConfig(warm_start=QUICK)
+        resume, config = (run / "checkpoint.pt").is_file(), TrainConfig(pretraining=QUICK)
         try:
             with progress_bar("training gaponet") as update:
                 api.train(

@@ -42,7 +42,7 @@ def train(
     Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model.
 
     Args:
-        recipe: labels: a supervised start, then PPO. paper: PPO from an untrained network, with settings for that;
+        recipe: labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with settings for that;
             PPO options that are given keep their values.
         fast: PPO with one pass over each batch and a smaller critic, whatever the fields below say.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.

@@ -29,7 +29,7 @@ from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.payload import PayloadEstimate
 from gaponet.nn.adaptation import Adaptation
-from gaponet.nn.artifact import RECORDED_TOLERANCE, GapModel
+from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
@@ -165,7 +165,7 @@ class Compensator:
         for joint, i in zip(known.operated, known.operated_index, strict=True):
             for name, gains in (("kp", kp), ("kd", kd)):
                 was, now = float(getattr(known, name)[i]), float(gains[joint_names.index(joint)])
-                if abs(now - was) > RECORDED_TOLERANCE * max(was, now):
+                if abs(now - was) > GAIN_TOLERANCE * max(was, now):
                     raise RobotError(
                         f"{known.folder}: {name} of {joint} is {was:g} there, the servo has {now:.4g}; set the servo, "
                         "or robot.toml and identify on logs made with it, or extrapolate (--extrapolate)"

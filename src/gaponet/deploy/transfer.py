@@ -21,7 +21,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.data.sequence import Sequence
-from gaponet.nn.artifact import DT_TOLERANCE, GapModel
+from gaponet.nn.artifact import RATE_TOLERANCE, GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import ClosedForm, Period, Probed
@@ -197,7 +197,7 @@ def periods_of(model: GapModel, dt: float) -> int:
     """
     for trained in model.card.get("dt") or [dt]:
         times = max(1, round(trained / dt))
-        if abs(dt * times / trained - 1) <= DT_TOLERANCE:
+        if abs(dt * times / trained - 1) <= RATE_TOLERANCE:
             return times
     rates = ", ".join(f"{1 / trained:.1f}" for trained in model.card["dt"])
     raise ModelError(

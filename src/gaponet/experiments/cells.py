@@ -26,7 +26,7 @@ from gaponet.base.structure import read_json
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.experiments.variant import Variant
 from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import TrainConfig
+from gaponet.nn.training.config import RENAMED_FIELDS, TrainConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import model_hash
 
@@ -129,6 +129,7 @@ def _require_same_setup(cell: Cell, dataset: Dataset) -> None:
 
 def _with_defaults(config: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
     """Add the defaults of the fields that did not exist when the config was written."""
+    config = {RENAMED_FIELDS.get(name, name): value for name, value in config.items()}
     nested = {k: _with_defaults(config[k], v) for k, v in defaults.items() if isinstance(v, dict) and k in config}
     return defaults | config | nested
 

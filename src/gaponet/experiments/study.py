@@ -22,7 +22,7 @@ from gaponet.robot.spec import RobotSpec
 
 # Small rounds, fitted until the labels are fitted (progress.jsonl: label_rmse). With 200 gradient steps a product
 # network has the advantage.
-TRAINING = TrainConfig(warm_start=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
+TRAINING = TrainConfig(pretraining=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
 DEFAULT_MODELS = ("gaponet", "shared_mlp", "mlp:mlp_match=on")
 DEFAULT_BUDGET, DEFAULT_SEEDS = "76800", 3  # control steps of two rounds
 # Measured on one core with the virtual H1-2: s per training whatever its budget, and s per control step.

@@ -1,6 +1,6 @@
 """A model with some settings changed, as one word: mlp, mlp:mlp_hidden=256,128, identified+gaponet:sensors=predicted.
 
-[identified+]KIND[:FIELD=VALUE]…        a field of ModelConfig or TrainConfig; warm_start.rounds for one inside another
+[identified+]KIND[:FIELD=VALUE]…        a field of ModelConfig or TrainConfig; pretraining.rounds for one inside another
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.config import TrainConfig
+from gaponet.nn.training.config import RENAMED_FIELDS, TrainConfig
 from gaponet.report.methods import IDENTIFIED
 
 KINDS: tuple[str, ...] = get_args(get_type_hints(ModelConfig)["kind"])
@@ -62,6 +62,8 @@ def parse_variant(text: str, base: TrainConfig) -> Variant:
 
 def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
     field, equals, value = setting.partition("=")
+    part, dot, name = field.partition(".")
+    field = RENAMED_FIELDS.get(part, part) + dot + name
     places = dict(_places(config))
     if not equals or field not in places:
         near = get_close_matches(field, places, 5, 0.4)

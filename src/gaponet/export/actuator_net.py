@@ -35,7 +35,7 @@ from gaponet.sim.replay import Corrector, replay
 
 PAST, HIDDEN, CLAMP = 0.1, (32, 32), 5.0  # s beyond the longest delay, widths, standard deviations
 MOST = 40  # recordings of each part
-ROWS, STEPS, BATCH, RATE, DECAY, NOISE = 60_000, 2000, 512, 2e-3, 1.0, 0.4  # of the fit, as in the supervised start
+ROWS, STEPS, BATCH, RATE, DECAY, NOISE = 60_000, 2000, 512, 2e-3, 1.0, 0.4  # of the fit, as in supervised pre-training
 GAINS = (1.0, 0.5, 0.0)  # how much of kp · Δa: the least error on validation motions
 
 
@@ -163,7 +163,7 @@ def _between(q: np.ndarray, v: np.ndarray, dt: float, count: int, which: int) ->
 
 
 def _fit(net: ActuatorNet, x: Tensor, y: Tensor) -> None:
-    """Regress Δa under noise on the past, as in the supervised start: else a network reads what Δa did before."""
+    """Regress Δa under noise on the past, as in supervised pre-training: else a network reads what Δa did before."""
     net.mean.copy_(x.mean(0))
     net.std.copy_(x.std(0).clamp_min(1e-4))
     z, unit = net.seen(x), float(y.square().mean().sqrt()) or 1.0

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gaponet.base.errors import ModelError
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.onnx_export import PARITY, trained_network
+from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, trained_network
 
 CHECKED = 12  # control periods
 
@@ -81,7 +81,7 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
 def require_parity(module: Any, model: GapModel, what: str, path: Path) -> float:
     """The largest difference between a module and its artifact, rad; refuses one above 1e-5 rad."""
     difference = largest_difference(module, model)
-    if not difference <= PARITY:
+    if not difference <= MAX_DIFFERENCE_RAD:
         raise ModelError(
             f"{path}: {what} and {model.path} differ by {difference:.2e} rad; not written. "
             "Write the artifact again with gaponet export RUN"

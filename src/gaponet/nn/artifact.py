@@ -1,14 +1,11 @@
-"""GapModel: what ships. A folder with model.onnx (normalisers inside) and card.json.
-
-Needs onnxruntime, never torch.
-"""
+"""GapModel: a trained model as a folder with model.onnx (normalisers inside) and card.json. It does not need torch."""
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired
+from typing import Annotated, Any, Literal, NotRequired
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -23,27 +20,24 @@ from gaponet.nn.onnx_network import Network, OnnxNetwork
 from gaponet.robot.folder import has_stored_robot, load_stored_robot, stored_robot_holder
 from gaponet.robot.spec import RobotSpec
 
-if TYPE_CHECKING:
-    pass
-
 WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
-RECORDED_TOLERANCE = 0.02  # relative, of gains
-# Switches of earlier versions that cards still name, and the value that they would have today.
-RETIRED = {
+GAIN_TOLERANCE = 0.02  # relative, between recorded and real gains
+RATE_TOLERANCE = 0.02  # relative: a clock of 49.85 Hz counts as 50 Hz
+# Removed options that cards of earlier versions contain → the value with which such a model still works.
+REMOVED_OPTIONS = {
     "payload_predictor": True, "context": "none", "branch": "unstacked", "branch_history": True, "fno_width": 32,
     "fno_layers": 3, "fno_modes": 4, "coupling": "posture", "transformer_width": 64, "transformer_layers": 2,
     "transformer_heads": 4,
 }  # fmt: skip
-DT_TOLERANCE = 0.02  # a clock of 49.85 Hz is the 50 Hz it was meant to be
+RENAMED_STAGES = {"warm_start_rounds": "pretraining_rounds", "ppo_anew": "ppo_from_untrained"}  # earlier → today
 
 
 def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, Any]:
-    """The card of a model: how to feed it, what it was trained on, what it must not be used for.
+    """Return the card of a model: its inputs, its training data and its limits.
 
     Args:
-        config: Shape of the model.
-        robot: Robot and nominal simulator.
-        facts: dt [s], payload_seen [kg], dataset_hash, units, virtual, split, versions and whatever else is known.
+        robot: The simulator that the model corrects.
+        facts: Further fields, such as dt [s], payload_seen [kg], dataset_hash, units, virtual and versions.
     """
     from gaponet.sim.model import model_hash
 
@@ -62,22 +56,24 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
 
 
 class _SensorR2(TypedDict):
-    """How well the sensor predictor explains what it was not fitted to."""
+    """R² of the sensor predictor on held-out states."""
 
     mean: Number
     by_joint: dict[str, Number]
 
 
 class _Stages(TypedDict):
-    """What training got to: rounds of the warm start, done and planned; updates of PPO, and whether it began anew."""
+    """Progress of training: completed and planned rounds of pre-training, and PPO updates."""
 
-    warm_start_rounds: tuple[int, int]
     ppo_updates: int
-    ppo_anew: NotRequired[bool]
+    pretraining_rounds: NotRequired[tuple[int, int]]
+    ppo_from_untrained: NotRequired[bool]
+    warm_start_rounds: NotRequired[tuple[int, int]]  # earlier name
+    ppo_anew: NotRequired[bool]  # earlier name
 
 
 class _Card(TypedDict):
-    """The fields of a card.json that something is decided by; others stand beside them."""
+    """Fields of a card.json that are checked. It may have others."""
 
     format: int
     robot: Name
@@ -109,14 +105,14 @@ class _Card(TypedDict):
     sha256: NotRequired[dict[str, Sha256]]
 
 
-def _require_answer(network: Network, width: int, shape: tuple[int, ...], largest: float, file: Path) -> None:
-    """Refuse a network that does not answer (k, width) numbers with (k, *shape) finite ones up to `largest` (rad)."""
+def _require_output(network: Network, inputs: int, outputs: int, largest: float, file: Path) -> None:
+    """Refuse a network whose output for inputs (k, inputs) is not (k, outputs), finite, and at most `largest` rad."""
     try:
-        answers = [network(np.zeros((k, width), np.float32)) for k in (1, 2)]
-        fits = all(a.shape == (k, *shape) for k, a in enumerate(answers, 1))
-        fits = fits and all(np.isfinite(a).all() and np.abs(a).max() <= largest + 1e-3 for a in answers)
-        reason = f"{width} numbers in do not give {shape} finite ones up to {largest:g} rad out"
-    except Exception as error:  # whatever a stranger's network does
+        deltas = [network(np.zeros((k, inputs), np.float32)) for k in (1, 2)]
+        fits = all(delta.shape == (k, outputs) for k, delta in enumerate(deltas, 1))
+        fits = fits and all(np.isfinite(delta).all() and np.abs(delta).max() <= largest + 1e-3 for delta in deltas)
+        reason = f"{inputs} numbers in do not give {outputs} finite ones up to {largest:g} rad out"
+    except Exception as error:  # an unknown network can raise anything
         fits, reason = False, f"it does not run: {' '.join(str(error).split())[:120]}"
     if not fits:
         raise ModelError(f"{file}: does not fit its card ({reason}); copy or train the model again")
@@ -124,10 +120,10 @@ def _require_answer(network: Network, width: int, shape: tuple[int, ...], larges
 
 @dataclass(frozen=True)
 class GapModel:
-    """A delta-action model and its card.
+    """Delta-action model and its card. It has no state and can be shared.
 
-    `loop` serves a control loop, and remembers its past; the model itself remembers nothing and can be shared.
-    deploy.AlignedSim is a simulator with such a loop, `corrector` serves sim.replay.
+    `loop` is for control loops and has a history. `corrector` is for rollouts of sim.replay. deploy.AlignedSim is a
+    simulator with a loop.
     """
 
     path: Path
@@ -137,14 +133,14 @@ class GapModel:
 
     @classmethod
     def load(cls, path: str | Path, threads: int = 1) -> GapModel:
-        """Read an artifact, or the artifact of a run folder.
+        """Load a model, or the model of a run folder.
 
         Args:
             path: Folder.
-            threads: How many onnxruntime uses; 0 for all cores, which pays for hundreds of robots at once.
+            threads: Threads of onnxruntime; 0 for all cores, which is faster for hundreds of robots at once.
 
         Raises:
-            ModelError: Missing or damaged file, or one written by a newer version.
+            ModelError: A file is missing, damaged, or from a newer version.
         """
         folder = Path(path)
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
@@ -154,27 +150,27 @@ class GapModel:
         card, config = GapModel.read_card(folder / CARD)
         file = folder / WEIGHTS
         network = OnnxNetwork.read(file, threads)
-        width, n = config.input_dim(len(card["joint_names"])), len(card["joint_names"])
-        _require_answer(network, width, (n,), config.delta_max, file)
+        n = len(card["joint_names"])
+        _require_output(network, config.input_dim(n), n, config.delta_max, file)
         if card.get("sha256", {}).get(WEIGHTS, digest := sha256(file)) != digest:
             raise ModelError(f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN again")
         return cls(folder, card, config, network)
 
     @property
     def qpos_range(self) -> Array:
-        """Limits of the operated joints, (n, 2) rad; ±inf where there is none (or the card is an old one)."""
+        """Limits of the operated joints, (n, 2) rad; ±inf where there is none, or the card does not have them."""
         limits = self.card.get("qpos_range", [[None, None]] * len(self.card["joint_names"]))
         return np.array([[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits])
 
     def loop(self, num_envs: int = 1) -> DeltaLoop:
-        """The corrections of num_envs robots, with a past of their own: loop.delta(qpos, qvel, ctrl, payload_mass).
+        """Return the control loop of num_envs robots: loop.delta(qpos, qvel, ctrl, payload_mass).
 
         Joints are those of the card (joint_names), in that order.
 
         Raises:
-            ModelError: It asks its simulator, which stands in no control loop.
+            ModelError: The model needs its simulator, which a control loop does not have.
         """
-        if self.config.asks_simulator:
+        if self.config.needs_simulator:
             raise ModelError(
                 f"{self.path}: its sensor values are the simulator's answers (sensor_source fixed), for gaponet eval "
                 "alone; train with --model.sensor-source predicted"
@@ -182,7 +178,11 @@ class GapModel:
         return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
 
     def corrects(self, robot: RobotSpec) -> bool:
-        """Whether this is the simulator that it was trained in; refuses another robot."""
+        """Return true if this is the simulator of training.
+
+        Raises:
+            ModelError: This is another robot.
+        """
         from gaponet.sim.model import model_hash
 
         card = self.card
@@ -194,13 +194,13 @@ class GapModel:
         return bool(card["simulator"] == model_hash(robot))
 
     def require(self, robot: RobotSpec, dt: float | None = None) -> None:
-        """Refuse a robot, simulator, gains or rate the model was not trained on."""
+        """Refuse another simulator, with other gains or limits, or another control period dt, s, than in training."""
         from gaponet.sim.model import model_hash
 
         if not self.corrects(robot):
-            trained, asked = self.card["simulator"], model_hash(robot)
+            trained, given = self.card["simulator"], model_hash(robot)
             raise ModelError(
-                f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {asked} "
+                f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {given} "
                 "(MJCF, gains or limits differ, or it is of before friction held); use the robot folder that the run "
                 "keeps, or train again"
             )
@@ -208,27 +208,27 @@ class GapModel:
             self.require_rate(dt)
 
     def simulator(self) -> RobotSpec:
-        """The simulator that it corrects, as its run or its export keeps it.
+        """Load the simulator of training from the run or export folder.
 
         Raises:
-            ModelError: The model lies in no run, or in one that keeps another simulator.
+            ModelError: The folder has no simulator, or another one.
         """
         if not has_stored_robot(stored_robot_holder(self.path)):
             raise ModelError(
                 f"{self.path}: trained in simulator {self.card['simulator']}, which does not lie beside it; "
                 "commands cannot be transferred to another simulator or rate; give the run folder, or an export (--out)"
             )
-        kept = load_stored_robot(stored_robot_holder(self.path), self.card["robot"])
-        self.require(kept)
-        return kept
+        robot = load_stored_robot(stored_robot_holder(self.path), self.card["robot"])
+        self.require(robot)
+        return robot
 
     @property
     def heaviest(self) -> float:
-        """Largest payload in its training data, kg; where an old card does not say, the largest it can be told."""
+        """Largest payload in the training data, kg; the largest possible input if the card does not have it."""
         return float(max(self.card.get("payload_seen", [self.config.payload_max])))
 
     def require_payload(self, payload_mass: Array | float, extrapolate: bool = False) -> None:
-        """Refuse payloads (kg) that are none, or lie beyond those trained on unless `extrapolate`."""
+        """Refuse payloads, kg, that are not physical, and, unless `extrapolate`, those outside the training data."""
         mass = np.asarray(payload_mass, float)
         if not (np.isfinite(mass) & (mass >= 0)).all():
             raise UsageError(f"payload_mass is {payload_mass}; give kg, 0 when empty")
@@ -241,12 +241,12 @@ class GapModel:
             )
 
     def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:
-        """Refuse a real robot whose servos have other gains (n) than those the training data were recorded with."""
+        """Refuse a real robot whose servo gains, (n,), differ from those of the training recordings."""
         for name, gains in (("kp", kp), ("kd", kd)):
             recorded = self.card.get("recorded", {}).get(name)
             for joint, was in zip(self.card["joint_names"], recorded or (), strict=False):
                 now = float(gains[joint_names.index(joint)])
-                if abs(now - was) > RECORDED_TOLERANCE * max(was, now):
+                if abs(now - was) > GAIN_TOLERANCE * max(was, now):
                     raise ModelError(
                         f"{self.path}: its data were recorded with {name} {was:g} of {joint}, the servo has {now:.4g}; "
                         "set the servos as they were, train on recordings with these gains (import with --kp and --kd "
@@ -254,9 +254,9 @@ class GapModel:
                     )
 
     def require_rate(self, dt: float) -> None:
-        """Refuse a control period, s, that the model was not trained on."""
+        """Refuse a control period, s, that is not in the training data."""
         rates = self.card.get("dt", [])
-        if rates and min(abs(dt / r - 1) for r in rates) > DT_TOLERANCE:
+        if rates and min(abs(dt / r - 1) for r in rates) > RATE_TOLERANCE:
             seen = ", ".join(f"{1 / r:.1f}" for r in rates)
             raise ModelError(
                 f"{self.path}: trained at {seen} Hz, asked to run at {1 / dt:.1f} Hz; run the loop at a trained rate, "
@@ -264,33 +264,34 @@ class GapModel:
             )
 
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
-        """The corrections for sim.replay and AlignedSim; refuses a robot the model was not trained on."""
+        """Return the corrections for rollouts of sim.replay in the simulator of training; refuse another one."""
         self.require(robot)
         return DeltaCorrector(self.infer, self.config, robot)
 
     def weights_hash(self) -> str:
-        """First 12 hex digits of the SHA-256 of model.onnx."""
+        """Return the first 12 hex digits of the SHA-256 of model.onnx."""
         return sha256(self.path / WEIGHTS)[:12]
 
     @staticmethod
     def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
-        """A card as it stands in the file, every field of a sensible type and size, and the shape of its model.
+        """Read and check a card; return it and the options of its model.
 
         Raises:
-            ModelError: Damaged, or written by a newer version.
+            ModelError: The file is damaged or from a newer version, or the model has a removed option.
         """
         mend = "restore it or train again"
         read_format(_Card, file, FORMAT, ModelError, mend)
         card = read_json(dict[str, Any], file, ModelError, mend)
-        for field, value in RETIRED.items():
-            if (had := card["model"].pop(field, value)) != value:
-                raise ModelError(f"{file}: trained with {field} {had}, which is no more; train again without it")
-        if card.pop("family", None):
-            raise ModelError(f"{file}: trained in a family of simulators, which is no more; see gaponet.Transfer")
+        for field, value in REMOVED_OPTIONS.items():
+            if (given := card["model"].pop(field, value)) != value:
+                raise ModelError(f"{file}: trained with {field} {given}, which is no more; train again without it")
+        if stages := card.get("stages"):
+            card["stages"] = {RENAMED_STAGES.get(name, name): value for name, value in stages.items()}
         config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
         n = len(card["joint_names"])
         lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
-        for name, values in (lists | {f"recorded.{k}": v for k, v in card.get("recorded", {}).items()}).items():
+        lists |= {f"recorded.{name}": values for name, values in card.get("recorded", {}).items()}
+        for name, values in lists.items():
             if values is not None and len(values) != n:
                 raise ModelError(f"{file}: {name}: should have one entry for each of {n} joints; {mend}")
         for low, high in card.get("qpos_range", []):
@@ -300,22 +301,20 @@ class GapModel:
 
     @staticmethod
     def how_trained(card: dict[str, Any]) -> str:
-        """What the budget bought, in words; a model that saw no update of PPO is called a supervised start."""
+        """Describe the completed training stages in words."""
         if "stages" not in card:
-            return "by an older gaponet, which did not keep what training got to"
-        (done, planned), updates = card["stages"]["warm_start_rounds"], card["stages"]["ppo_updates"]
-        warm = (
-            f"{done} of {planned} rounds of the supervised start"
-            if done < planned
-            else f"supervised start ({done} rounds)"
-        )
+            return "by an older gaponet, which did not store the training stages"
+        stages = card["stages"]
+        (done, planned), updates = stages.get("pretraining_rounds", (0, 0)), stages["ppo_updates"]
         if not planned and updates:
-            return f"{updates} updates of PPO from the untrained network, no supervised start"
-        if card["stages"].get("ppo_anew"):
-            return f"{warm}, worse than no correction; {updates} updates of PPO from the untrained network"
-        return f"{warm}, {updates} updates of PPO" if updates else f"{warm}, no PPO"
+            return f"{updates} updates of PPO from the untrained network, no supervised pre-training"
+        rounds = f"{done} rounds" if done >= planned else f"{done} of {planned} rounds"
+        pretraining = f"supervised pre-training ({rounds})"
+        if stages.get("ppo_from_untrained"):
+            return f"{pretraining}, worse than no correction; {updates} updates of PPO from the untrained network"
+        return f"{pretraining}, {updates} updates of PPO" if updates else f"{pretraining}, no PPO"
 
 
 def sha256(file: Path) -> str:
-    """SHA-256 of a file's content, 64 hex digits."""
+    """Return the SHA-256 of a file, 64 hex digits."""
     return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -1,11 +1,11 @@
-"""Delay and offset per joint: the cheapest honest correction. u_j(t) = a_j(t − d_j) + o_j."""
+"""Baseline: a delay and an offset per joint, u_j(t) = a_j(t − d_j) + o_j."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
@@ -17,55 +17,54 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import Progress, replay
 
-MAX_DELAY = 0.16  # s, in steps of the control period
-PIECE = 20.0  # s, free run per fitting piece
-FRAMES = 10_000  # frames fitted on at most
+MAX_DELAY_S = 0.16
+PIECE_S = 20.0  # duration of a rollout in the fit
+MAX_FIT_ROWS = 10_000
 
 
 @dataclass(frozen=True)
 class DelayOffset:
-    """Fitted values by operated joint: delay s, offset rad."""
+    """Fitted values per operated joint: delay s, offset rad."""
 
     delay: dict[str, Annotated[float, Interval(ge=0, le=1)]]
     offset: dict[str, Angle]
 
     @classmethod
     def read(cls, run: Path) -> DelayOffset:
-        """Read the one kept in a run folder, in delay_offset.json.
+        """Read delay_offset.json of a run folder.
 
         Raises:
-            ModelError: Missing or damaged.
+            ModelError: The file is missing or damaged.
         """
         hint = "give a complete run folder of gaponet train"
         return read_json(cls, run / "delay_offset.json", ModelError, hint)
 
-    def corrector(self, robot: RobotSpec) -> _DelayOffsetCorrector:
-        return _DelayOffsetCorrector(self, robot)
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
+    def corrector(self, robot: RobotSpec) -> DelayOffsetCorrector:
+        """Return the corrections for rollouts of sim.replay."""
+        return DelayOffsetCorrector(self, robot)
 
     @classmethod
     def fit(
         cls, sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, progress: Progress | None = None
     ) -> DelayOffset:
-        """Try every whole-step delay on all joints at once; keep each joint's with the least error after its offset.
+        """Fit delay and offset of each joint by rollouts with all delays in whole control periods.
 
-        Joints are fitted as if alone; their coupling is small beside delay and sag.
+        All joints have the same delay in a rollout. Each joint takes the delay with the least error after its offset:
+        the coupling between joints is small compared with delay and sag.
         """
-        part = DelayOffset.pieces(sequences)
+        pieces = DelayOffset.pieces(sequences)
         op, names = robot.operated_index, robot.operated
-        dt = float(np.median([s.dt for s in part]))
-        delays = dt * np.arange(int(MAX_DELAY / dt) + 1)
+        dt = float(np.median([s.dt for s in pieces]))
+        delays = dt * np.arange(int(MAX_DELAY_S / dt) + 1)
         error, offset = np.empty((len(delays), len(op))), np.empty((len(delays), len(op)))
         zero = dict.fromkeys(names, 0.0)
         for i, delay in enumerate(delays):
             candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
-            twins = replay(part, robot, candidate.corrector(robot), nthread, lock_idle=True)
+            rollouts = replay(pieces, robot, candidate.corrector(robot), nthread, lock_idle=True)
             for k, (j, name) in enumerate(zip(op, names, strict=True)):
-                both = zip(part, twins, strict=True)
-                mine = [(s.qpos - t.qpos)[1:, j] for s, t in both if name not in s.meta.unrecorded]
-                e = np.concatenate(mine or [np.zeros(1)])
+                pairs = zip(pieces, rollouts, strict=True)
+                errors = [(s.qpos - r.qpos)[1:, j] for s, r in pairs if name not in s.meta.unrecorded]
+                e = np.concatenate(errors or [np.zeros(1)])
                 offset[i, k] = np.median(e)
                 error[i, k] = np.abs(e - offset[i, k]).mean()
             if progress:
@@ -77,41 +76,43 @@ class DelayOffset:
         )
 
     @staticmethod
-    def pieces(sequences: ListOf[Sequence], seconds: float = PIECE, frames: int = FRAMES) -> list[Sequence]:
-        """Cut sequences into pieces that run side by side; evenly thinned to at most `frames` rows."""
-        cut = []
+    def pieces(sequences: ListOf[Sequence], seconds: float = PIECE_S, max_rows: int = MAX_FIT_ROWS) -> list[Sequence]:
+        """Cut sequences into pieces, and take an even subset with about max_rows rows."""
+        pieces = []
         for s in sequences:
             rows = round(seconds / s.dt)
             for start in range(0, max(len(s) - rows // 2, 0) + 1, rows):
-                cut.append(s.rows(slice(start, start + rows)))
-        return cut[:: max(1, round(sum(map(len, cut)) / frames))]
+                pieces.append(s.rows(slice(start, start + rows)))
+        return pieces[:: max(1, round(sum(map(len, pieces)) / max_rows))]
 
 
-class _DelayOffsetCorrector:
-    """Delays targets and adds the offset; before the first command, the first command."""
+class DelayOffsetCorrector:
+    """Delays targets and adds the offset. Before the first target, the first target holds."""
 
     def __init__(self, values: DelayOffset, robot: RobotSpec) -> None:
-        self.op = robot.operated_index
-        self.range = robot.qpos_range[self.op]
+        self.operated = robot.operated_index
+        self.range = robot.qpos_range[self.operated]
         for joint in robot.operated:
             if joint not in values.delay or joint not in values.offset:
                 raise ModelError(f"delay and offset of joint '{joint}' are not known (delay_offset.json); train again")
         self.delay = np.array([values.delay[j] for j in robot.operated])
         self.offset = np.array([values.offset[j] for j in robot.operated])
+        self.periods = np.zeros((0, len(self.delay)), int)  # delay in control periods, (k, n)
+        self.past: list[Array] = []  # targets, (k, n) rad, newest last
 
     def reset(self, start: ListOf[Sequence]) -> None:
-        """Begin with one simulation per sequence."""
-        self.steps = np.round(self.delay[None, :] / np.array([s.dt for s in start])[:, None]).astype(int)  # (k, n)
-        self.past: list[Array] = []
+        """Start one simulation per sequence."""
+        self.periods = np.round(self.delay[None, :] / np.array([s.dt for s in start])[:, None]).astype(int)
+        self.past = []
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
-        """Targets of delay steps ago plus offset, (k, n_all) rad."""
-        self.past.append(np.array(target[:, self.op]))
-        if len(self.past) > self.steps.max() + 1:
+        """Return delayed targets plus offset, (k, n_all) rad."""
+        self.past.append(np.array(target[:, self.operated]))
+        if len(self.past) > self.periods.max() + 1:
             self.past.pop(0)
-        past = np.stack(self.past)  # (depth, k, n), newest last
-        index = np.maximum(len(past) - 1 - self.steps, 0)
+        past = np.stack(self.past)  # (depth, k, n)
+        index = np.maximum(len(past) - 1 - self.periods, 0)
         delayed = np.take_along_axis(past, index[None], axis=0)[0]
-        out = np.array(target, float)
-        out[:, self.op] = np.clip(delayed + self.offset, self.range[:, 0], self.range[:, 1])
-        return out
+        corrected = np.array(target, float)
+        corrected[:, self.operated] = np.clip(delayed + self.offset, self.range[:, 0], self.range[:, 1])
+        return corrected

@@ -1,4 +1,4 @@
-"""Networks: branch, trunk and their inner product; and the one place that builds any network."""
+"""Networks: the operator (branch and trunk), its baselines, and `build_network` for any configuration."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from torch.nn.functional import pad
 
 from gaponet.base.arrays import Array
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.layers import DeltaNet, dense, size
+from gaponet.nn.layers import DeltaNet, dense, num_parameters
 from gaponet.nn.observation import Layout
 from gaponet.nn.paper import PaperNet, SensorPredictor
 
 
 class OperatorNet(DeltaNet):
-    """Δa = bounded(⟨branch(o [, sensors]), trunk(a, P)⟩ + c), a DeepONet.
+    """DeepONet: Δa_j = bounded(⟨branch(inputs of joint j), trunk(a_j − q_j, P)⟩ + c_j).
 
-    One branch and one trunk, shared by all joints, take what belongs to a joint and its name; the branch is told q, q̇
-    and a − q of all joints as well.
+    All joints share one branch and one trunk net. The branch input of joint j is its one-hot index, its sensor values,
+    its state and history, the payload P, and q, q̇ and a − q of all joints. The trunk input is the one-hot index,
+    a_j − q_j and the payload.
     """
 
     columns: Tensor
@@ -31,31 +32,35 @@ class OperatorNet(DeltaNet):
         if config.sensors == "predicted":
             inputs = config.observation_dim(n)
             self.predictor = SensorPredictor(inputs, config.sensor_hidden, config.sensor_dim(n))
-        see, ask = self.joint_columns(config, n)
-        self.register_buffer("columns", torch.from_numpy(np.hstack([see, ask]).ravel()), persistent=False)
-        self.branch_inputs, self.trunk_inputs = see.shape[1], ask.shape[1]
+        branch, trunk = self.joint_columns(config, n)
+        self.register_buffer("columns", torch.from_numpy(np.hstack([branch, trunk]).ravel()), persistent=False)
+        self.branch_inputs, self.trunk_inputs = branch.shape[1], trunk.shape[1]
         self.branch = dense(self.branch_inputs, config.branch_hidden, config.num_basis)
-        self.trunk = dense(self.trunk_inputs, config.trunk_hidden, config.num_basis, zero=True)
+        self.trunk = dense(self.trunk_inputs, config.trunk_hidden, config.num_basis, zero_output=True)
         self.bias = nn.Parameter(torch.zeros(n))
 
     @staticmethod
     def joint_columns(config: ModelConfig, n: int) -> tuple[Array, Array]:
-        """Columns of [features | sensors | 0 | 1] that branch and trunk see of each joint, (n, inputs) each."""
-        at, sensors = Layout(config, n), config.sensor_dim(n) * (config.sensors != "off")
-        x = np.arange(at.query.stop + sensors)
-        onehot = len(x) + np.eye(n, dtype=int)
+        """Return the inputs of branch and trunk as columns of [features | sensors | 0 | 1], (n, inputs) each."""
+        layout, sensors = Layout(config, n), config.sensor_dim(n) * (config.sensors != "off")
+        columns = np.arange(layout.query.stop + sensors)
+        joint_onehot = len(columns) + np.eye(n, dtype=int)
 
-        def own(part: slice) -> Array:
-            return x[part].reshape(-1, n).T
+        def per_joint(part: slice) -> Array:
+            return columns[part].reshape(-1, n).T
 
-        def shared(part: slice) -> Array:
-            return np.tile(x[part], (n, 1))
+        def all_joints(part: slice) -> Array:
+            return np.tile(columns[part], (n, 1))
 
-        see = own(slice(at.query.stop, None)), own(slice(at.past.stop)), *map(shared, (at.payload, at.state, at.action))
-        return np.hstack([onehot, *see]), np.hstack([onehot, own(at.action), shared(at.payload)])
+        branch = [
+            joint_onehot, per_joint(slice(layout.query.stop, None)), per_joint(slice(layout.past.stop)),
+            all_joints(layout.payload), all_joints(layout.state), all_joints(layout.action),
+        ]  # fmt: skip
+        trunk = [joint_onehot, per_joint(layout.action), all_joints(layout.payload)]
+        return np.hstack(branch), np.hstack(trunk)
 
     def arrange(self, z: Tensor) -> Tensor:
-        """Features of [o_t | a_t] → [what the branch sees | what the trunk is asked], (B, n, both)."""
+        """Features of [o_t | a_t] → [branch inputs | trunk inputs] of each joint, (B, n, both)."""
         if self.config.sensors != "off":
             z = torch.cat([z, self.sensors(z)], dim=1)
         z = pad(pad(z, (0, 1)), (0, 1), value=1.0)
@@ -63,24 +68,24 @@ class OperatorNet(DeltaNet):
 
     def correct(self, prepared: Tensor) -> Tensor:
         """⟨branch, trunk⟩ + c → Δa, (B, n) rad."""
-        rows = prepared.flatten(0, -2)  # two-dimensional, so that linear layers need no copy of a part
-        see, ask = rows[:, : self.branch_inputs], rows[:, self.branch_inputs :]
+        rows = prepared.flatten(0, -2)  # two-dimensional, so that linear layers copy nothing
+        branch_rows, trunk_rows = rows[:, : self.branch_inputs], rows[:, self.branch_inputs :]
         shape = (-1, self.n, self.config.num_basis)
-        branch, trunk = self.branch(see).reshape(shape), self.trunk(ask).reshape(shape)
+        branch, trunk = self.branch(branch_rows).reshape(shape), self.trunk(trunk_rows).reshape(shape)
         return self.bounded((branch * trunk).sum(-1) + self.bias)
 
     def sensors(self, z: Tensor) -> Tensor:
-        """Sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities; z = features(x)."""
+        """Features → predicted sensor values, standardised, (B, 2nm): n positions and n velocities per probe."""
         return self.predictor.mean(z[:, self.features.layout.observation])
 
 
 class DeltaMLP(DeltaNet):
-    """x → Δa through dense layers."""
+    """Baseline: a plain network on all features, the form of ASAP."""
 
     def __init__(self, config: ModelConfig, n: int, hidden: Sequence[int] | None = None) -> None:
-        """hidden: Widths, if not those of the config."""
+        """hidden: Widths of the hidden layers; default config.mlp_hidden."""
         super().__init__(config, n)
-        self.net = dense(self.features.dim, config.mlp_hidden if hidden is None else hidden, n, zero=True)
+        self.net = dense(self.features.dim, config.mlp_hidden if hidden is None else hidden, n, zero_output=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
         return self.bounded(self.net(prepared))
@@ -89,47 +94,49 @@ class DeltaMLP(DeltaNet):
     def matched_hidden(
         hidden: Sequence[int], parameters: int, build: Callable[[tuple[int, ...]], nn.Module]
     ) -> tuple[int, ...]:
-        """The widths scaled so that what `build` makes of them has as near to `parameters` parameters as they allow."""
+        """Scale widths so that the network of `build` has nearly this number of parameters."""
         largest = max(hidden)
 
         def scaled(width: int) -> tuple[int, ...]:
             return tuple(max(1, round(w * width / largest)) for w in hidden)
 
-        def miss(width: int) -> int:
+        def excess(width: int) -> int:
             with torch.device("meta"):  # shapes only
-                return size(build(scaled(width))) - parameters
+                return num_parameters(build(scaled(width))) - parameters
 
         low, high = 1, 1
-        while miss(high) < 0:
+        while excess(high) < 0:
             low, high = high, 2 * high
         while high - low > 1:
             middle = (low + high) // 2
-            low, high = (middle, high) if miss(middle) < 0 else (low, middle)
-        return scaled(min((low, high), key=lambda width: abs(miss(width))))
+            low, high = (middle, high) if excess(middle) < 0 else (low, middle)
+        return scaled(min((low, high), key=lambda width: abs(excess(width))))
 
 
 class SharedMLP(OperatorNet):
-    """Baseline: what branch and trunk are given, side by side into one plain network, shared by the joints.
+    """Baseline: one plain network with the inputs and sensors of the operator, shared by the joints.
 
-    It has the operator's sensors and as many weights as branch and trunk: only their product is missing.
+    It has as many weights as branch and trunk together. The only difference to the operator is the missing product.
     """
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
         inputs = self.branch_inputs + self.trunk_inputs
-        weights = size(self.branch) + size(self.trunk) + n
+        weights = num_parameters(self.branch) + num_parameters(self.trunk) + n
         del self.branch, self.trunk, self.bias
-        width = lambda widths: dense(inputs, widths, 1)  # noqa: E731
-        hidden = DeltaMLP.matched_hidden(config.mlp_hidden, weights, width)
-        self.net = dense(inputs, hidden, 1, zero=True)
+        hidden = DeltaMLP.matched_hidden(config.mlp_hidden, weights, lambda widths: dense(inputs, widths, 1))
+        self.net = dense(inputs, hidden, 1, zero_output=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
-        """What `prepare` made of each joint → Δa, (B, n) rad."""
         return self.bounded(self.net(prepared).squeeze(-1))
 
 
 def build_network(config: ModelConfig, n: int) -> DeltaNet:
-    """The network a config describes, for n operated joints."""
+    """Return an untrained network for n operated joints.
+
+    Raises:
+        UsageError: An option belongs to another kind of network.
+    """
     config.require_kind()
     if config.kind == "gaponet":
         return OperatorNet(config, n)
@@ -139,12 +146,7 @@ def build_network(config: ModelConfig, n: int) -> DeltaNet:
         return SharedMLP(config, n)
     if not config.mlp_match:
         return DeltaMLP(config, n)
-    weights = _operator_size(config, n)
-    hidden = DeltaMLP.matched_hidden(config.mlp_hidden, weights, lambda widths: DeltaMLP(config, n, widths))
-    return DeltaMLP(config, n, hidden)
-
-
-def _operator_size(config: ModelConfig, n: int) -> int:
-    """Parameters that the operator with these fields has, sensor predictor included."""
     with torch.device("meta"):  # shapes only
-        return size(OperatorNet(replace(config, kind="gaponet"), n))
+        parameters = num_parameters(OperatorNet(replace(config, kind="gaponet"), n))
+    hidden = DeltaMLP.matched_hidden(config.mlp_hidden, parameters, lambda widths: DeltaMLP(config, n, widths))
+    return DeltaMLP(config, n, hidden)

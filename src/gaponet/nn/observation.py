@@ -1,10 +1,10 @@
-"""THE observation: the one definition used by training, the aligned simulator and the robot.
+"""Observation of the networks: the same code for training, aligned simulators and robots.
 
 o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the target applied over
 [s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
 
-x = [ o_t | a_t ] is what a network is given. The paper's network (nn/paper.py) can have more: with fixed probes S_t,
-then with real_state [ q_real − q | q̇_real − q̇ | known ], known 1 or, with all else zero, 0.
+x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more columns: with fixed probes
+S_t, then with real_state [ q_real − q | q̇_real − q̇ | 1 ], which are all zero where the recorded state is hidden.
 """
 
 from __future__ import annotations
@@ -19,20 +19,25 @@ from gaponet.nn.config import ModelConfig
 
 
 class Layout:
-    """Where in x things are, as slices of its columns; a network's features have the same places."""
+    """Columns of x as slices. Features of a network have the same columns.
+
+    Attributes:
+        q, v, past, payload, action, sensors, real: The parts of x in their order.
+        state, observation, query: [q | q̇], o_t and [o_t | a_t].
+    """
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         self.n, self.history = n, config.history
         o = config.observation_dim(n)
-        answers, real = config.sensor_dim(n) * config.asks_simulator, (2 * n + 1) * config.real_state
+        answers, real = config.sensor_dim(n) * config.needs_simulator, (2 * n + 1) * config.real_state
         sizes = (n, n, 3 * n * config.history, int(config.payload_input), n, answers, real)
-        places = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
-        self.q, self.v, self.past, self.payload, self.action, self.sensors, self.real = places
+        parts = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
+        self.q, self.v, self.past, self.payload, self.action, self.sensors, self.real = parts
         self.state, self.observation, self.query = slice(0, 2 * n), slice(0, o), slice(0, o + n)
         self.dim = config.input_dim(n)
 
     def shifted(self, shift: Array) -> Array:
-        """What moving every position and target of [o_t | a_t] by shift (k, n) rad adds to x, (k, dim)."""
+        """Return the change of x, (k, dim), when positions and targets of [o_t | a_t] change by shift, (k, n) rad."""
         k, n = shift.shape
         out = np.zeros((k, self.dim))
         out[:, self.q] = out[:, self.action] = shift
@@ -41,30 +46,36 @@ class Layout:
 
 
 class History:
-    """The past frames of num_envs robots, written into x; numpy and torch arrays alike."""
+    """Past frames of num_envs robots in the columns `past` of x, a numpy array or a torch tensor.
+
+    Without a stride or held sensors, the frames are stored in x itself, and `write` does nothing.
+
+    Attributes:
+        depth: Number of stored frames.
+        frames: [q | q̇ | u] of each, newest first, (num_envs, depth, 3n).
+    """
 
     def __init__(self, config: ModelConfig, n: int, x: Any) -> None:
-        """
-        Args:
-            x: The network's input, (num_envs, dim). Without a stride or held sensors the frames are kept there and
-                nothing is copied.
-        """
+        """x: Input of the network, (num_envs, dim)."""
         layout = Layout(config, n)
         self.n = n
         self.depth = (config.history - 1) * config.stride + 1
-        self.picked = slice(0, self.depth, config.stride)  # newest first
-        self.place, self.present = x[:, layout.past], x[:, layout.state]
-        self.inside = config.stride == config.sensor_hold == 1
-        held = self.place if self.inside else zeros_like(x, len(x), 3 * n * self.depth)
-        self.frames = held.reshape(len(x), self.depth, 3 * n)  # a view, of a slice of columns too
-        self.state, self.target = held[:, : 2 * n], held[:, 2 * n : 3 * n]  # of the newest
-        self.older, self.younger, self.host = held[:, 3 * n :], held[:, : -3 * n], isinstance(x, np.ndarray)
+        self._observed = slice(0, self.depth, config.stride)
+        self._past = x[:, layout.past]
+        self._in_x = config.stride == config.sensor_hold == 1
+        memory = self._past if self._in_x else zeros_like(x, len(x), 3 * n * self.depth)
+        self.frames = memory.reshape(len(x), self.depth, 3 * n)  # a view
+        self._numpy = isinstance(x, np.ndarray)
+        # Internal arrays of one robot have one dimension: numpy needs half the time.
+        memory, self._present = (a[0] if len(x) == 1 else a for a in (memory, x[:, layout.state]))
+        self._q, self._v, self._u = memory[..., :n], memory[..., n : 2 * n], memory[..., 2 * n : 3 * n]
+        self._state, self._newer, self._older = memory[..., : 2 * n], memory[..., : -3 * n], memory[..., 3 * n :]
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, u: Any) -> None:
-        """Fill histories from real frames before the start, never with zeros.
+        """Fill histories with frames from before the start, never with zeros.
 
         Args:
-            ids: Environments: indices, a slice or a mask that picks k.
+            ids: k environments: indices, a slice or a mask.
             qpos, qvel, u: Frames, (k, depth, n), newest first, or (k, 1, n), repeated.
         """
         n = self.n
@@ -73,22 +84,22 @@ class History:
         self.frames[ids, :, 2 * n :] = u
 
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
-        """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each; None,
-        None is the state that x shows."""
-        self.older[...] = self.younger if self.host else copy_array(self.younger)  # torch would overwrite what it reads
+        """Append a frame: state at t and target applied over [t, t+1), (num_envs, n) each. None is the state in x."""
+        # numpy copies overlapping memory correctly, torch does not.
+        self._older[...] = self._newer if self._numpy else copy_array(self._newer)
         if qpos is None:
-            self.state[...] = self.present
+            self._state[...] = self._present
         else:
-            self.state[:, : self.n], self.state[:, self.n :] = qpos, qvel
-        self.target[...] = u
+            self._q[...], self._v[...] = qpos, qvel
+        self._u[...] = u
 
     def write(self, ids: Any = slice(None)) -> None:
-        """Bring x up to date, for environments `ids`."""
-        if not self.inside:
-            frames = self.frames[ids][:, self.picked]
-            self.place[ids] = frames.reshape(len(frames), self.place.shape[1])
+        """Write the observed frames of environments `ids` into x."""
+        if not self._in_x:
+            frames = self.frames[ids][:, self._observed]
+            self._past[ids] = frames.reshape(len(frames), self._past.shape[1])
 
     @staticmethod
     def rows_before(t: Array, depth: int) -> Array:
-        """Row indices of the `depth` frames before rows t, newest first, the first row repeated; (k,) → (k, depth)."""
+        """Return rows of the `depth` frames before rows t, newest first, not below 0: (k,) → (k, depth)."""
         return np.maximum(np.asarray(t)[:, None] - 1 - np.arange(depth), 0)

@@ -1,4 +1,4 @@
-"""Network → artifact folder. Refuses to write one that does not answer as the network does."""
+"""Export of a network to an artifact folder, checked against torch."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.nn.artifact import CARD, WEIGHTS
-from gaponet.nn.layers import CLAMP, DeltaNet
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.layers import MAX_FEATURE, DeltaNet
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_network import TRUSTED, OnnxNetwork
 
-PARITY = 1e-5  # rad
+MAX_DIFFERENCE_RAD = 1e-5  # between ONNX and torch
 
 
 def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) -> float:
@@ -30,13 +31,13 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
 
     Args:
         net: Trained network, normalisers inside.
-        samples: Observations [o_t | a_t] to compare on, (k, dim) float32, of states really visited.
+        samples: Inputs x of visited states, (k, dim) float32, for the comparison.
 
     Returns:
         Largest |ONNX − torch| over the samples, rad.
 
     Raises:
-        ModelError: The difference is above 1e-5 rad; nothing is written.
+        ModelError: The difference is larger than MAX_DIFFERENCE_RAD; nothing is written.
     """
     with lock_folder(folder, "model"):
         frozen = copy.deepcopy(net).eval()
@@ -44,13 +45,12 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
         with torch.inference_mode():
             expected = frozen(torch.from_numpy(samples)).numpy()
         difference = float(np.abs(expected - OnnxNetwork(content)(samples)).max())
-        if not difference <= PARITY:
+        if not difference <= MAX_DIFFERENCE_RAD:
             raise ModelError(
-                f"{folder}: ONNX and torch differ by {difference:.2e} rad (limit {PARITY:.0e}); not written"
+                f"{folder}: ONNX and torch differ by {difference:.2e} rad (limit {MAX_DIFFERENCE_RAD:.0e}); not written"
             )
         with atomic_write(folder / WEIGHTS) as onnx:
             onnx.write_bytes(content)
-        (folder / "weights.npz").unlink(missing_ok=True)  # an earlier version's copy of the weights
         digest = hashlib.sha256(content).hexdigest()
         TRUSTED.add(digest)
         facts = {"parity_rad": difference, "sha256": {WEIGHTS: digest}}
@@ -58,8 +58,8 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
         return difference
 
 
-class _Linear(nn.Module):
-    """A network whose features are one linear layer: onnxruntime needs a quarter less time."""
+class _FusedFeatures(nn.Module):
+    """Network with its features as one linear layer, with which onnxruntime needs a quarter less time."""
 
     weight: Tensor
     bias: Tensor
@@ -74,7 +74,7 @@ class _Linear(nn.Module):
         self.register_buffer("bias", bias.flatten())
 
     def forward(self, x: Tensor) -> Tensor:
-        z = nn.functional.linear(x, self.weight, self.bias).clamp(-CLAMP, CLAMP)
+        z = nn.functional.linear(x, self.weight, self.bias).clamp(-MAX_FEATURE, MAX_FEATURE)
         return self.net.correct(z.reshape(-1, *self.shape))
 
 
@@ -86,14 +86,18 @@ def onnx_content(net: DeltaNet) -> bytes:
         warnings.simplefilter("ignore")
         # dynamo=True writes the same function in 2 to 16 s instead of 0.1, and needs onnxscript; torch 2.14 has both.
         torch.onnx.export(
-            _Linear(net) if linear else net, (x,), content, input_names=["x"], output_names=["delta"],  # type: ignore[arg-type]
+            _FusedFeatures(net) if linear else net, (x,), content, input_names=["x"], output_names=["delta"],  # type: ignore[arg-type]
             dynamo=False, dynamic_axes={name: {0: "batch"} for name in ("x", "delta")},
         )  # fmt: skip
     return content.getvalue()
 
 
-def trained_network(run: Path, config: Any, n: int) -> DeltaNet:
-    """The network that a run kept, from its checkpoint."""
+def trained_network(run: Path, config: ModelConfig, n: int) -> DeltaNet:
+    """Load the best network of a run from its checkpoint.
+
+    Raises:
+        ModelError: There is no checkpoint, or it is damaged or has another network.
+    """
     path = run / "checkpoint.pt"
     if not path.is_file():
         raise ModelError(f"{run}: no checkpoint.pt; give a run folder of gaponet train, not the artifact alone")
@@ -105,12 +109,12 @@ def trained_network(run: Path, config: Any, n: int) -> DeltaNet:
     return net.eval()
 
 
-def drawn_states(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
-    """Inputs x spread as those trained on, (count, dim) float32, where no recording is at hand; sensor values are 0."""
+def sample_inputs(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
+    """Return inputs x with the statistics of the training data, (count, dim) float32; sensor values are 0."""
     features = net.features
     generator = torch.Generator().manual_seed(seed)
     z = torch.randn(count, features.dim, generator=generator)
     relative = features.standardise.mean + features.standardise.std * z
-    # relative(x) is linear and the identity but for differences to q_t: its inverse is solved for, not written down.
+    # relative(x) is linear in x.
     x = torch.linalg.solve(features.relative(torch.eye(features.dim)).T.double(), relative.double().T).T
     return torch.nn.functional.pad(x.float(), (0, net.config.input_dim(net.n) - features.dim)).contiguous().numpy()

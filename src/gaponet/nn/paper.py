@@ -6,23 +6,22 @@
     Δa_j = Σ_i b_ij y_ij,  i = 1 … p = 16              (4)  no bias
 
 S holds the answers of the simulator to m = 20 probe targets (nn/sensor.py): positions and velocities of all n joints
-after one control period, (m, 2n). The branch sees these values alone, so all that it knows of the state comes through
-them. Targets A, positions Q, and velocities V are the present state and the H frames of the observation: 20 + 30 H
-numbers for n = 10, one more with the payload P. The joint index J is the place in the output: one pass serves all
-joints.
+after one control period, (m, 2n). S is the only input of the branch, so it carries all information about the state.
+Targets A, positions Q, and velocities V are the present state and the H frames of the observation: 20 + 30 H numbers
+for n = 10, one more with the payload P. The joint index J is the place in the output: one pass serves all joints.
 
-The paper also names the recorded state, Q_real and V_real, in (1). The critic of PPO sees both (nn/training/env.py).
-The predictor does not: the simulator's answers do not depend on them. With `real_state` the branch sees them beside S.
+The paper also has the recorded state, Q_real and V_real, in (1). The critic of PPO observes both (nn/training/env.py).
+The predictor does not: the simulator's answers do not depend on them. With `real_state` they are inputs of the branch.
 
 The probe targets are q + e_k, k = 1 … m. `sensor_source` is one of:
 
     predicted   e_k are fixed; one predictor gives the answers to all
-    fixed       e_k are fixed; the simulator itself gives S: what a perfect predictor would be worth
+    fixed       e_k are fixed; the simulator itself gives S, which is the limit of a perfect predictor
     learned     e_k are parameters that PPO trains, within ±probe_limit. The predictor takes one e_k beside the state
                 and gives its 2n answers. It is fitted to random e_k, then frozen; gradients pass through it.
 
-The literal form lacks two inputs of the default network. With `branch_observation` the branch also sees the
-observation, and thus its history, relative to q. With `relative_action` the trunk sees A − q instead of A.
+The literal form lacks two inputs of the default network. `branch_observation` adds the observation with its history,
+relative to q, to the branch. `relative_action` gives A − q instead of A to the trunk.
 
 S is sampled in training and is the mean in evaluation and export. Δ_max is a safety limit: exact clipping, in
 evaluation and export; training reports the share of corrections at the limit.
@@ -41,9 +40,11 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import DeltaNet, Standardise, dense
 from gaponet.nn.sensor import ProbeOracle
 
-PREDICTOR, BRANCH, TRUNK = (128, 128), (256, 256, 256), (128, 128, 128)  # widths of hidden layers
-REAL_UNITS = (0.05, 0.3)  # rad, rad/s: differences of recorded and simulated state that count as 1
-RELEASED_EPSILON = 0.01  # of the published network's normaliser, (x − mean) / (std + ε)
+PREDICTOR_HIDDEN, BRANCH_HIDDEN, TRUNK_HIDDEN = (128, 128), (256, 256, 256), (128, 128, 128)
+REAL_STATE_SCALES = (0.05, 0.3)  # rad, rad/s, of differences between recorded and simulated state
+RELEASED_EPSILON = 0.01  # in the published network's normaliser, (x − mean) / (std + ε)
+# Modules in checkpoints before 26 November 2026 → modules of today.
+RENAMED = {"observed": "observation_scale", "asked": "query_scale", "answers": "sensor_scale"}
 
 
 class SensorPredictor(nn.Module):
@@ -72,55 +73,64 @@ class SensorPredictor(nn.Module):
 
 
 class PaperNet(DeltaNet):
-    """Equations (1) to (4). Inputs are standardised and otherwise as they are: absolute positions and targets.
+    """Equations (1) to (4), on standardised absolute positions and targets.
 
-    `features` (relative to q, standardised) serve the critic of PPO, branch_observation and relative_action.
+    `features` (relative to q) are for the critic of PPO, branch_observation and relative_action.
 
     Attributes:
+        observation, query: Columns of x for equation (1), and for the trunk: {P, A} or A.
         probes: atanh(e_k / probe_limit) of learned probes, (m, n); else None.
+        extra_inputs: Number of branch inputs besides S.
     """
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
-        at, sensors, outputs = self.features.layout, config.sensor_dim(n), config.num_basis * n
-        self.seen = at.observation
-        # {P, A}: in x the payload, where it is observed, stands before the action.
-        self.query = slice(at.payload.start if config.payload_trunk else at.action.start, at.action.stop)
-        asked = self.query.stop - self.query.start
-        self.observed, self.asked = Standardise(self.seen.stop), Standardise(asked)
+        layout, sensors, outputs = self.features.layout, config.sensor_dim(n), config.num_basis * n
+        self.observation = layout.observation
+        self.query = slice(layout.payload.start if config.payload_trunk else layout.action.start, layout.action.stop)
+        queries = self.query.stop - self.query.start
+        self.observation_scale, self.query_scale = Standardise(self.observation.stop), Standardise(queries)
         self.probes: nn.Parameter | None = None
-        if config.asks_simulator:
-            self.answers = Standardise(sensors)
+        if config.needs_simulator:
+            self.sensor_scale = Standardise(sensors)
         elif config.sensor_source == "learned":
-            start = torch.from_numpy(ProbeOracle.offsets_of(config, n)).float() / config.probe_limit
+            start = torch.from_numpy(ProbeOracle.probe_offsets(config, n)).float() / config.probe_limit
             self.probes = nn.Parameter(start.atanh())
-            self.predictor = SensorPredictor(self.seen.stop + n, PREDICTOR, 2 * n)
+            self.predictor = SensorPredictor(self.observation.stop + n, PREDICTOR_HIDDEN, 2 * n)
         else:
-            self.predictor = SensorPredictor(self.seen.stop, PREDICTOR, sensors)
-        self.real_units = [*(unit for unit in REAL_UNITS for _ in range(n)), 1.0]
-        self.beside = self.seen.stop * config.branch_observation + len(self.real_units) * config.real_state
-        self.branch = nn.Sequential(*dense(self.beside + sensors, BRANCH, outputs), nn.ELU())
-        self.trunk = dense(asked, TRUNK, outputs, zero=True)
+            self.predictor = SensorPredictor(self.observation.stop, PREDICTOR_HIDDEN, sensors)
+        self.real_state_scale = [*(scale for scale in REAL_STATE_SCALES for _ in range(n)), 1.0]
+        observations = self.observation.stop * config.branch_observation
+        self.extra_inputs = observations + len(self.real_state_scale) * config.real_state
+        self.branch = nn.Sequential(*dense(self.extra_inputs + sensors, BRANCH_HIDDEN, outputs), nn.ELU())
+        self.trunk = dense(queries, TRUNK_HIDDEN, outputs, zero_output=True)
+
+    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
+        for name in [name for name in state if name.startswith(prefix)]:
+            module, _, field = name.removeprefix(prefix).partition(".")
+            if module in RENAMED:
+                state[f"{prefix}{RENAMED[module]}.{field}"] = state.pop(name)
+        super()._load_from_state_dict(state, prefix, *args)
 
     def fit_inputs(self, x: Tensor) -> None:
         super().fit_inputs(x)
-        self.observed.fit(x[:, self.seen])
-        self.asked.fit(x[:, self.query])
-        if self.config.asks_simulator:
-            self.answers.fit(x[:, self.features.layout.sensors], floor=1e-6)
+        self.observation_scale.fit(x[:, self.observation])
+        self.query_scale.fit(x[:, self.query])
+        if self.config.needs_simulator:
+            self.sensor_scale.fit(x[:, self.features.layout.sensors], min_std=1e-6)
 
     def sensor_inputs(self, x: Tensor) -> Tensor:
-        z = self.observed(x[:, self.seen])
-        return z + self.features.noise * torch.randn_like(z) if self.features.noise else z
+        z = self.observation_scale(x[:, self.observation])
+        return z + self.features.noise_std * torch.randn_like(z) if self.features.noise_std else z
 
     def sensors(self, x: Tensor, z: Tensor) -> Tensor:
-        """Equation (1): S, standardised, (B, 2nm): a sample in training, else the mean; or the simulator's answers.
+        """Equation (1): S, standardised, (B, 2nm): a sample in training, else the mean, or the simulator's answers.
 
-        Probes that are learned change after `prepare`. So this is then the input of `probed`: z = sensor_inputs(x) and,
-        in training, the noise of the sample.
+        PPO changes learned probes after `prepare`. For them, the result is therefore the input of `probed`:
+        z = sensor_inputs(x) and, in training, the noise of the sample.
         """
-        if self.config.asks_simulator:
-            return self.answers(x[:, self.features.layout.sensors])
+        if self.config.needs_simulator:
+            return self.sensor_scale(x[:, self.features.layout.sensors])
         if not self.training:
             return z if self.probes is not None else self.predictor.mean(z)
         noise = torch.randn(len(z), self.config.sensor_dim(self.n), device=z.device)
@@ -129,33 +139,36 @@ class PaperNet(DeltaNet):
         mean, log_var = self.predictor(z)
         return mean + noise * (0.5 * log_var).exp()
 
-    def probed(self, given: Tensor) -> Tensor:
-        """What `sensors` returns for learned probes → S, (B, 2nm)."""
+    def probed(self, inputs: Tensor) -> Tensor:
+        """Result of `sensors` with learned probes → S, (B, 2nm)."""
         assert self.probes is not None
-        seen, first = self.seen.stop, self.predictor.net[0]
-        of_state, of_probe = first.weight.split([seen, self.n], dim=1)
-        state, probes = linear(given[:, :seen], of_state), linear(self.probes.tanh(), of_probe, first.bias)
+        observations, first = self.observation.stop, self.predictor.net[0]
+        state_weight, probe_weight = first.weight.split([observations, self.n], dim=1)
+        state = linear(inputs[:, :observations], state_weight)
+        probes = linear(self.probes.tanh(), probe_weight, first.bias)
         mean, log_var = SensorPredictor.distribution(self.predictor.net[1:](state.unsqueeze(1) + probes))  # (B, m, 2n)
         if not self.training:
             return mean.flatten(1)
-        return torch.addcmul(mean.flatten(1), given[:, seen:], (0.5 * log_var).exp().flatten(1))
+        return torch.addcmul(mean.flatten(1), inputs[:, observations:], (0.5 * log_var).exp().flatten(1))
 
     def prepare(self, x: Tensor) -> Tensor:
-        """x → [query | what the branch sees beside S | S]."""
+        """x → [trunk input | extra branch inputs | S]."""
         z, config = self.sensor_inputs(x), self.config
         relative = self.features(x) if config.branch_observation or config.relative_action else x
-        beside = [relative[:, self.seen]] if config.branch_observation else []
-        beside += [x[:, self.features.layout.real] / x.new_tensor(self.real_units)] if config.real_state else []
-        query = relative[:, self.query] if config.relative_action else self.asked(x[:, self.query])
-        return torch.cat([query, *beside, self.sensors(x, z)], dim=1)
+        extra = [relative[:, self.observation]] if config.branch_observation else []
+        extra += [x[:, self.features.layout.real] / x.new_tensor(self.real_state_scale)] if config.real_state else []
+        query = relative[:, self.query] if config.relative_action else self.query_scale(x[:, self.query])
+        return torch.cat([query, *extra, self.sensors(x, z)], dim=1)
 
     def correct(self, prepared: Tensor) -> Tensor:
-        shape, asked = (-1, self.config.num_basis, self.n), self.query.stop - self.query.start
-        seen = prepared[:, asked:]
+        """Output of `prepare` → Δa, (B, n) rad."""
+        shape, queries = (-1, self.config.num_basis, self.n), self.query.stop - self.query.start
+        sensors = prepared[:, queries:]
         if self.probes is not None:
-            seen = torch.cat([seen[:, : self.beside], self.probed(seen[:, self.beside :])], dim=1)
-        b = self.branch(seen).reshape(shape)  # (2)
-        y = self.trunk(prepared[:, :asked]).reshape(shape)  # (3)
+            extra = sensors[:, : self.extra_inputs]
+            sensors = torch.cat([extra, self.probed(sensors[:, self.extra_inputs :])], dim=1)
+        b = self.branch(sensors).reshape(shape)  # (2)
+        y = self.trunk(prepared[:, :queries]).reshape(shape)  # (3)
         return self.bounded((b * y).sum(1))  # (4)
 
 
@@ -163,15 +176,15 @@ def released_network(weights: dict[str, Array]) -> PaperNet:
     """Return the network that the authors published (isaac-sim2real/sage, feature/add-plug-in), ten joints.
 
     Their observation has no present velocities: these columns get weight zero. Their predictor has no variance. Their
-    normaliser of [S | A] is the identity but for its ε: it divides by 1 + 0.01.
+    normaliser of [S | A] only divides by 1 + ε.
 
     Args:
-        weights: The arrays of their state dict, by its names.
+        weights: Arrays of their state dict.
     """
     net = PaperNet(ModelConfig(kind="paper", payload_input=False, delta_max=10.0), 10).eval()
     state = net.state_dict()
-    theirs = {"predictor.net": "sensor_model", "trunk": "trunk_net.net", "branch": "branch_net.branches.0"}
-    for own, name in theirs.items():
+    published = {"predictor.net": "sensor_model", "trunk": "trunk_net.net", "branch": "branch_net.branches.0"}
+    for own, name in published.items():
         for layer in (0, 2, 4, 6):
             fusion = own == "branch" and layer == 6
             source = "branch_net.fusion.0" if fusion else f"{name}.{layer}"
@@ -184,12 +197,12 @@ def released_network(weights: dict[str, Array]) -> PaperNet:
         mean = state[f"predictor.net.4.{part}"]
         state[f"predictor.net.4.{part}"] = torch.cat([mean, torch.zeros_like(mean)])
     state["branch.0.weight"] = state["branch.0.weight"] / (1 + RELEASED_EPSILON)
-    state["asked.std"] = state["asked.std"] * (1 + RELEASED_EPSILON)
+    state["query_scale.std"] = state["query_scale.std"] * (1 + RELEASED_EPSILON)
     net.load_state_dict(state)
     return net
 
 
 def released_inputs(observation: Array, action: Array) -> Tensor:
-    """Return x = [o_t | a_t] for the published network from its own observation (B, 130) and action (B, 10)."""
+    """Convert the published network's observation (B, 130) and action (B, 10) to x = [o_t | a_t]."""
     o, a = torch.from_numpy(observation), torch.from_numpy(action)
     return torch.cat([o[:, :10], torch.zeros_like(a), o[:, 10:], a], dim=1)

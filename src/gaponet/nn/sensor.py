@@ -1,7 +1,7 @@
-"""Sensors: what the simulator answers to a fixed set of probing targets, from here.
+"""Sensor values: the simulator's answers to m probes, which are targets near the present position.
 
-U_ξ(x) is the simulator advanced one control period from state ξ with target x held. Probes x_k = q + e_k ask it at m
-points; the oracle really steps the simulator, the predictor (nn/networks.py) learns to answer in its place.
+U_ξ(x) is the state of the simulator one control period after state ξ, with the target x. The probes are x_k = q + e_k.
+`ProbeOracle` steps the simulator. The sensor predictor (nn/paper.py) learns its answers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gaponet.sim.batch import BatchSim, Condition
 
 
 class ProbeOracle:
-    """Forks the simulator m times per state. For labels and tests; never used on a robot."""
+    """Steps m copies of the simulator from each state. It is for training and rollouts, not for robots."""
 
     def __init__(
         self,
@@ -27,18 +27,19 @@ class ProbeOracle:
         nthread: int = 0,
         locked: tuple[str, ...] = (),
     ) -> None:
-        """One state slot per entry of `conditions`; states are of the joints that are not locked."""
-        self.offsets = self.offsets_of(config, len(robot.operated))
+        """conditions: Payload, rate and gains of each state. States have the joints that are not in `locked`."""
+        self.offsets = self.probe_offsets(config, len(robot.operated))
         self.dt, self.absolute = np.array([c[2] for c in conditions]), config.sensor_target == "absolute"
         m = len(self.offsets)
-        prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
-        self.sim = sim = BatchSim(prompt, [c for c in conditions for _ in range(m)], nthread, locked)
+        no_delay = np.zeros(len(robot.joint_names))  # a delayed servo would not respond within the control period
+        copies = [c for c in conditions for _ in range(m)]
+        self.sim = sim = BatchSim(replace(robot, delay=no_delay), copies, nthread, locked)
         self.operated = np.array([sim.joint_names.index(name) for name in robot.operated])
         self.target = np.zeros(sim.qpos.shape)
 
     @staticmethod
-    def offsets_of(config: ModelConfig, n: int) -> Array:
-        """e_k, (m, n) rad: one joint at a time, signs and amplitudes alternating so that each joint meets both."""
+    def probe_offsets(config: ModelConfig, n: int) -> Array:
+        """Return e_k, (m, n) rad: one joint per probe, with alternating signs and amplitudes."""
         offsets = np.zeros((config.num_probes, n))
         for k in range(config.num_probes):
             lap, joint = divmod(k, n)
@@ -48,24 +49,24 @@ class ProbeOracle:
         return offsets
 
     def __call__(self, qpos: Array, qvel: Array, offsets: Array | None = None) -> Array:
-        """Sensor values.
+        """Return sensor values.
 
         Args:
-            qpos, qvel: States of the joints, (k, n_free), one per slot.
+            qpos, qvel: States of the joints that are not locked, (k, n_free).
             offsets: e_k of each state, (k, m, n) rad; default: the fixed probes.
 
         Returns:
             (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints, or [q', Δt·q̇'] with an absolute target.
         """
         k, m, op, sim = len(qpos), len(self.offsets), self.operated, self.sim
-        rows, each = np.arange(k * m), np.repeat(np.arange(k), m)
-        q, v = qpos[each], qvel[each]
+        rows, state = np.arange(k * m), np.repeat(np.arange(k), m)
+        q, v = qpos[state], qvel[state]
         target = q.astype(float)
         target[:, op] += np.tile(self.offsets, (k, 1)) if offsets is None else offsets.reshape(k * m, -1)
         sim.reset(rows, q, v, past=target[:, None])
         self.target[rows] = target
         sim.step(self.target, None if len(rows) == sim.num_envs else rows)
         start = 0.0 if self.absolute else 1.0
-        moved = sim.qpos[rows][:, op] - start * q[:, op]
-        sped = (sim.qvel[rows][:, op] - start * v[:, op]) * self.dt[each][:, None]
-        return np.concatenate([moved, sped], axis=1).astype(np.float32).reshape(k, m, 2 * len(op))
+        positions = sim.qpos[rows][:, op] - start * q[:, op]
+        velocities = (sim.qvel[rows][:, op] - start * v[:, op]) * self.dt[state][:, None]
+        return np.concatenate([positions, velocities], axis=1).astype(np.float32).reshape(k, m, 2 * len(op))

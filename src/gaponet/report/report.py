@@ -262,10 +262,11 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
             f"The robot lags the simulator by {card['excess_delay'] * 1e3:.0f} ms, the history spans "
             f"{span * 1e3:.0f} ms: raise --model.history or --model.stride."
         )
-    done, planned = card.get("stages", {}).get("warm_start_rounds", (0, 0))
+    done, planned = card.get("stages", {}).get("pretraining_rounds", (0, 0))
     if done < planned:
         longer = "" if "identified" in methods and not network_gain(methods, own).helps else "; train longer"
-        out.append(f"Undertrained: the budget ended after {done} of {planned} rounds of the supervised start{longer}.")
+        rounds = f"{done} of {planned} rounds of supervised pre-training"
+        out.append(f"Undertrained: the budget ended after {rounds}{longer}.")
     if card.get("interrupted"):
         out.append("Training was interrupted before its budget was out.")
     return out

@@ -95,6 +95,7 @@ class _PPO(TypedDict):
 
 
 FORMER_METHODS = {"calibrated": "adapted"}  # former name in metrics.json → name
+FORMER_STAGES = {"warm start": "pretraining"}  # former name in progress.jsonl → name
 
 
 class _Model(TypedDict):
@@ -176,11 +177,12 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
     if not file.is_file():
         return []
     lines = file.read_bytes().split(b"\n")[:-1]
-    return [
+    progress = [
         {**parse_json(_Validation, line, f"{file}:{number}", ModelError, REPAIR_HINT, allow_extra=True)}
         for number, line in enumerate(lines, 1)
         if line.strip()
     ]
+    return [line | {"stage": FORMER_STAGES.get(str(line["stage"]), line["stage"])} for line in progress]
 
 
 class _Floor(TypedDict):

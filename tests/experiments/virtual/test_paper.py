@@ -64,5 +64,5 @@ def test_the_papers_network_and_ours_share_the_rows_that_ours_has_a_switch_for(m
         "gaponet:history=8",
     ]
     own = Paper().paper_study(study)
-    assert (own.config.ppo.std, own.config.warm_start.rounds) == (0.02, 0)
+    assert (own.config.ppo.std, own.config.pretraining.rounds) == (0.02, 0)
     assert {row.word for row in table_2_rows(own)} >= {"paper", "paper:payload_input=on", "paper:sensor_hold=5"}

@@ -18,7 +18,7 @@ from gaponet.nn.training.trainer import Trainer
 
 TINY = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-    warm_start=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
+    pretraining=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
     ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
     episode_s=0.5,
     validate_every=2,
@@ -35,7 +35,7 @@ def world(tmp_path_factory):
     for sequence in recordings(robot, 8, rows=60, kp=0.5):
         data.append(sequence)
     late = robot.with_servos({j: {"delay": 0.03} for j in robot.operated})
-    Trainer(data, late, place / "whole", TINY, STEPS).run()
+    Trainer.prepare(data, late, place / "whole", TINY, STEPS).run()
     return data, late, memory(place / "whole")
 
 
@@ -67,14 +67,14 @@ def stop(stage, at):
     return show
 
 
-@pytest.mark.parametrize(("stage", "at"), [("warm start", 5), ("warm start", 15), ("ppo", 1), ("ppo", 6)])
+@pytest.mark.parametrize(("stage", "at"), [("pretraining", 5), ("pretraining", 15), ("ppo", 1), ("ppo", 6)])
 def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage, at):
     data, robot, whole = world
-    begun = not (stage == "warm start" and at < 10)
+    begun = not (stage == "pretraining" and at < 10)
     with nullcontext() if begun else pytest.raises(ModelError, match="before the first step of training"):
-        Trainer(data, robot, tmp_path / "run", TINY, STEPS, show=stop(stage, at)).run()
+        Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS, show=stop(stage, at)).run()
     assert memory(tmp_path / "run")["steps"] < whole["steps"]
-    Trainer(data, robot, tmp_path / "run", TINY, STEPS, resume=True).run()
+    Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS, resume=True).run()
     again = memory(tmp_path / "run")
     assert differences(whole, again) == []
     assert [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").open()] == again["progress"]
@@ -82,33 +82,33 @@ def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage,
 
 def test_a_run_killed_before_its_first_checkpoint_is_begun_again(world, tmp_path):
     data, robot, whole = world
-    Trainer(data, robot, tmp_path / "run", replace(TINY, seed=1), STEPS)
+    Trainer.prepare(data, robot, tmp_path / "run", replace(TINY, seed=1), STEPS)
     assert (tmp_path / "run" / "config.json").is_file()
-    Trainer(data, robot, tmp_path / "run", TINY, STEPS).run()
+    Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS).run()
     assert differences(whole, memory(tmp_path / "run")) == []
 
 
 def test_a_run_is_not_resumed_on_other_recordings(world, tmp_path):
     data, robot, _ = world
-    Trainer(data, robot, tmp_path / "run", TINY, Budget(steps=0)).run()
+    Trainer.prepare(data, robot, tmp_path / "run", TINY, Budget(steps=0)).run()
     other = Dataset.create(tmp_path / "other", robot)
     for sequence in recordings(robot, 8, rows=50, kp=0.5):
         other.append(sequence)
     with pytest.raises(UsageError, match=r"run: was trained on other recordings than this dataset holds; train anew"):
-        Trainer(other, robot, tmp_path / "run", TINY, STEPS, resume=True)
+        Trainer.prepare(other, robot, tmp_path / "run", TINY, STEPS, resume=True)
 
 
 def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monkeypatch):
     data, robot, _ = world
 
-    def halve(net, error, whole):
+    def halve(net, error, full_error):
         net.bounded.gain.fill_(0.5)
         return 0.5
 
     monkeypatch.setattr("gaponet.nn.training.trainer.choose_gain", halve)
-    monkeypatch.setattr("gaponet.nn.training.trainer.Trainer.validate", better_each_time())
-    warm = replace(TINY, warm_start=replace(TINY.warm_start, rounds=4))
-    card = Trainer(data, robot, tmp_path / "run", warm, Budget(steps=WARM)).run().card
+    monkeypatch.setattr("gaponet.nn.training.validation.Validator.errors", better_each_time())
+    warm = replace(TINY, pretraining=replace(TINY.pretraining, rounds=4))
+    card = Trainer.prepare(data, robot, tmp_path / "run", warm, Budget(steps=WARM)).run().card
     assert card["gain"] == 0.5
     gains = []
 
@@ -116,7 +116,9 @@ def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monk
         if status.stage == "ppo":
             gains.append(trainer.net.bounded.gain.item())
 
-    trainer = Trainer(data, robot, tmp_path / "run", warm, Budget(steps=4 * WARM + UPDATE), True, show=watch)
+    trainer = Trainer.prepare(
+        data, robot, tmp_path / "run", warm, Budget(steps=4 * WARM + UPDATE), resume=True, show=watch
+    )
     assert trainer.net.bounded.gain == 1.0
     trainer.run()
     assert set(gains) == {1.0}
@@ -124,7 +126,7 @@ def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monk
 
 def better_each_time():
     error = iter(1.0 / k for k in range(1, 1000))
-    return lambda self, net, robot=None: np.full(len(self.val_set), next(error))
+    return lambda self, net, robot=None: np.full(len(self.sequences), next(error))
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"\x80\x05cos\nsystem\n(S'true'\ntR."])
@@ -134,4 +136,4 @@ def test_a_checkpoint_that_is_none_is_refused_in_one_line(world, tmp_path, conte
     (tmp_path / "run" / "split.json").write_text("{}")
     (tmp_path / "run" / "checkpoint.pt").write_bytes(content)
     with pytest.raises(ModelError, match=r"checkpoint\.pt: does not fit this model or is damaged"):
-        Trainer(dataset, robot, tmp_path / "run", TINY, STEPS, resume=True)
+        Trainer.prepare(dataset, robot, tmp_path / "run", TINY, STEPS, resume=True)

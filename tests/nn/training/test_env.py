@@ -11,7 +11,7 @@ from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
 from gaponet.nn.training.config import PretrainingConfig, RewardConfig
-from gaponet.nn.training.env import AHEAD, DeltaEnv
+from gaponet.nn.training.env import CRITIC_PREVIEW, DeltaEnv
 from gaponet.nn.training.pretraining import Pretraining
 from gaponet.sim.batch import Condition
 from gaponet.sim.replay import replay
@@ -32,14 +32,14 @@ def test_without_correction_the_environment_is_the_replay(robot):
     sequences = recordings(robot, 2, rows=60, kp=0.6)
     env = make(robot, sequences)
     for i in range(env.num_envs):  # put everyone at a motion's first row
-        env.row[i] = env.here[i] = env.first[i]
+        env.row[i] = env.row_on_device[i] = env.first[i]
     env.sim.reset(slice(None), env.qpos[env.row], env.qvel[env.row])
     first = env.first.copy()
     for _ in range(59):
         env.advance(np.zeros((env.num_envs, 2)))
     twins = replay(sequences, robot)
     for i in range(env.num_envs):
-        twin = twins[int(np.flatnonzero(env.seq_first == first[i])[0])]
+        twin = twins[int(np.flatnonzero(env.rows.first == first[i])[0])]
         np.testing.assert_array_equal(env.sim.qpos[i].astype(np.float32), twin.qpos[59])
 
 
@@ -60,17 +60,21 @@ def test_a_joint_of_which_nothing_was_recorded_stands_and_counts_nowhere(robot):
     stands = lambda x, at: np.where(np.isnan(still), x, at)  # noqa: E731
     one = replace(one, meta=said, ctrl=stands(one.ctrl, 0.3), qpos=stands(one.qpos, 0.3), qvel=stands(one.qvel, 0.0))
     env = make(robot, [one, other])
-    warm = Pretraining(build_network(env.config, 2), env, np.ones((120, 2), np.float32), PretrainingConfig(steps=3), 0)
-    warm.collect(follow_labels=True)
-    unknown = env.first == env.seq_first[0]
+    pretraining = Pretraining(
+        build_network(env.config, 2), env, np.ones((120, 2), np.float32), PretrainingConfig(steps=3), 0
+    )
+    _, labels = pretraining.rollout(follow_labels=True)
+    unknown = env.first == env.rows.first[0]
     assert 0 < unknown.sum() < len(unknown)
-    assert np.isnan(warm.pool_y[0].numpy().reshape(3, -1, 2)[0][unknown, 1]).all()
+    assert np.isnan(labels.numpy().reshape(3, -1, 2)[0][unknown, 1]).all()
     np.testing.assert_allclose(env.sim.qpos[unknown, 1], 0.3, atol=1e-4)  # whatever it carries
     reward, _ = env.step(np.zeros((env.num_envs, 2), np.float32))
     assert (reward[unknown, 1] == 0).all()
     assert (reward[:, 0] < 0).all()
     assert (reward[~unknown, 1] < 0).all()
-    fit = Pretraining(warm.net, env, warm.labels, PretrainingConfig(steps=3, gradient_steps=2), 0).round(lambda: 0.0)
+    fit = Pretraining(pretraining.net, env, pretraining.labels, PretrainingConfig(steps=3, gradient_steps=2), 0).round(
+        lambda: 0.0
+    )
     assert np.isfinite(fit["label_rmse"])
 
 
@@ -83,8 +87,8 @@ def test_a_robot_without_a_gap_earns_no_penalty(robot):
 
 def test_the_critic_looks_ahead_of_the_simulation(robot):
     env = make(robot, recordings(robot, 2, rows=60, kp=0.6))
-    seen, n, many = env.get_observations()["critic"].numpy(), 2, len(AHEAD)
-    q, rows = env.sim.qpos, np.minimum(env.row[:, None] + AHEAD, env.last[:, None])
+    seen, n, many = env.get_observations()["critic"].numpy(), 2, len(CRITIC_PREVIEW)
+    q, rows = env.sim.qpos, np.minimum(env.row[:, None] + CRITIC_PREVIEW, env.last[:, None])
     np.testing.assert_allclose(seen[:, :n], env.qpos[env.row] - q, atol=1e-6)
     ahead = seen[:, 2 * n : 2 * n + many * n].reshape(-1, many, n)
     np.testing.assert_allclose(ahead, env.qpos[rows] - q[:, None], atol=1e-6)
@@ -95,11 +99,11 @@ def test_the_critic_looks_ahead_of_the_simulation(robot):
 def test_payload_of_the_log_is_the_payload_of_the_simulation(robot):
     sequences = recordings(robot, 4, rows=60)
     env = make(robot, sequences)
-    masses = {env.conditions[g][0] for g in env.group}
+    masses = {env.rows.conditions[g][0] for g in env.rows.group}
     assert masses == {0.0, 0.2}
     for i in range(env.num_envs):
-        member = np.flatnonzero(env.seq_first == env.first[i])[0]
-        assert env.conditions[env.group[i]] == Condition.of(sequences[member], robot)
+        member = np.flatnonzero(env.rows.first == env.first[i])[0]
+        assert env.rows.conditions[env.rows.group[i]] == Condition.of(sequences[member], robot)
 
 
 def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(robot):
@@ -108,10 +112,10 @@ def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(r
     env.rng = np.random.default_rng(5)
     env.reset()
     length, drawn = np.array([len(s) for s in sequences]), []
-    for g, condition in enumerate(env.conditions):
+    for g, condition in enumerate(env.rows.conditions):
         mine = np.flatnonzero([Condition.of(s, robot) == condition for s in sequences])
-        drawn += rng.choice(mine, size=(env.group == g).sum(), p=length[mine] / length[mine].sum()).tolist()
-    np.testing.assert_array_equal(env.first, env.seq_first[drawn])
+        drawn += rng.choice(mine, size=(env.rows.group == g).sum(), p=length[mine] / length[mine].sum()).tolist()
+    np.testing.assert_array_equal(env.first, env.rows.first[drawn])
 
 
 def test_a_motions_end_is_a_time_out(robot):
@@ -127,7 +131,7 @@ def test_the_actor_never_sees_the_recorded_state(robot):
     env = make(robot, sequences)
     before = env.get_observations()
     env.track[:, :4] += 1.0  # recorded q, q̇
-    env.now[:, :4] += 1.0
+    env.recorded[:, :4] += 1.0
     after = env.get_observations()
     assert torch.equal(before["actor"], after["actor"])
     assert not torch.equal(before["critic"], after["critic"])

@@ -83,8 +83,8 @@ def test_nothing_goes_to_the_host_in_a_step(tmp_path, servo):
             _, done = env.step(delta)
         assert crossings.seen == []
         np.testing.assert_array_equal(env.elapsed, np.where(done, 0, before + 1))
-        np.testing.assert_array_equal(env.here, env.row)
-        np.testing.assert_array_equal(env.until, env.last)
+        np.testing.assert_array_equal(env.row_on_device, env.row)
+        np.testing.assert_array_equal(env.last_on_device, env.last)
         resets += int(done.sum())
     assert resets
 
@@ -96,15 +96,15 @@ def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
         dataset.append(sequence)
     small = TrainConfig(
         ModelConfig(history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-        warm_start=PretrainingConfig(
+        pretraining=PretrainingConfig(
             rounds=2, num_envs=16, steps=40, gradient_steps=80, batch_size=256, sensor_states=64
         ),
         ppo=PPOConfig(num_envs=16, num_steps=8, epochs=1, critic_warmup=0, explained=-1e9),
         device="warp-cpu",
     )
     steps = 2 * 16 * 40 + 2 * 16 * 8
-    Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps)).run()
-    model = Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps + 256), resume=True).run()
+    Trainer.prepare(dataset, robot, tmp_path / "run", small, Budget(steps=steps)).run()
+    model = Trainer.prepare(dataset, robot, tmp_path / "run", small, Budget(steps=steps + 256), resume=True).run()
     assert model.card["stages"]["ppo_updates"] >= 4
     assert model.card["val_mpjae"]["model"] < 0.9 * model.card["val_mpjae"]["nominal"]
 

@@ -13,23 +13,23 @@ from gaponet.nn.training.config import PAPER_PPO, PPOConfig, PretrainingConfig, 
 
 CHANGED = TrainConfig(
     ModelConfig(kind="mlp", history=8, payload_input=False, mlp_hidden=(64, 32)),
-    warm_start=PretrainingConfig(noise=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
+    pretraining=PretrainingConfig(noise=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
     rates=(50.0, 100.0),
 )  # fmt: skip
 
 
 def test_the_paper_s_recipe_has_no_supervised_start_and_keeps_what_was_changed():
     config = TrainConfig(ModelConfig(kind="paper"), ppo=PPOConfig(std=0.03), seed=4).paper_recipe()
-    assert config.warm_start.rounds == 0
+    assert config.pretraining.rounds == 0
     assert config.ppo == replace(PAPER_PPO, std=0.03)
     assert (config.model.kind, config.seed) == ("paper", 4)
 
 
 def test_a_gpu_has_simulations_of_its_own_number_unless_told():
     cuda = TrainConfig(ppo=PPOConfig(num_envs=256), device="cuda")
-    assert (TrainConfig().sized().warm_start.num_envs, TrainConfig().sized().ppo.num_envs) == (256, 256)
-    assert (cuda.sized().warm_start.num_envs, cuda.sized().ppo.num_envs) == (4096, 256)
-    assert cuda.options() == cuda.sized().options() == ["--warm-start.num-envs", "4096", "--device", "cuda"]
+    assert (TrainConfig().sized().pretraining.num_envs, TrainConfig().sized().ppo.num_envs) == (256, 256)
+    assert (cuda.sized().pretraining.num_envs, cuda.sized().ppo.num_envs) == (4096, 256)
+    assert cuda.options() == cuda.sized().options() == ["--pretraining.num-envs", "4096", "--device", "cuda"]
     assert TrainConfig().options() == TrainConfig().sized().options() == []
 
 

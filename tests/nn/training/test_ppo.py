@@ -9,7 +9,7 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
 from gaponet.nn.training.config import PPOConfig, RewardConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.ppo import PPO
+from gaponet.nn.training.ppo import PPO, advantages
 from gaponet.nn.training.sensor_fit import fit_inputs
 
 MODEL = ModelConfig(history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,))
@@ -27,7 +27,7 @@ def env(tmp_path):
 def test_advantages_by_hand():
     reward, value = torch.tensor([1.0, 2.0, 4.0]).reshape(3, 1, 1), torch.tensor([0.5, 1.0, 2.0]).reshape(3, 1, 1)
     done = torch.tensor([0.0, 1.0, 0.0]).reshape(3, 1, 1)  # a motion ends after the second step
-    found = PPO.advantages(reward, value, torch.full((1, 1), 8.0), done, gamma=0.5, lam=0.5).flatten()
+    found = advantages(reward, value, torch.full((1, 1), 8.0), done, gamma=0.5, lam=0.5).flatten()
     # δ = 1 + 0.5·1 − 0.5 = 1;  2 − 1 = 1;  4 + 0.5·8 − 2 = 6;  the first adds 0.25 of the second's, which adds nothing.
     assert found.tolist() == [1.25, 1.0, 6.0]
 
@@ -52,11 +52,11 @@ def test_joints_that_do_not_explore_teach_nothing(env):
     torch.manual_seed(0)
     learner = PPO(env, build_network(MODEL, 2), SETTINGS)
     batch = learner.collect()
-    still = batch.explored == 0
+    still = batch.exploration_mask == 0
     assert 0.2 < still.float().mean() < 0.8
-    assert torch.equal(batch.sampled[still], batch.mean[still])
-    moved = batch.sampled - batch.mean
-    assert moved[~still].std().item() == pytest.approx(learner.spread, rel=0.2)
+    assert torch.equal(batch.actions[still], batch.mean[still])
+    moved = batch.actions - batch.mean
+    assert moved[~still].std().item() == pytest.approx(learner.innovation_std, rel=0.2)
 
 
 def test_exploration_stays_correlated_and_as_wide_as_it_is_asked_to_be(env):

@@ -1,4 +1,4 @@
-"""The supervised start: the baseline's recipe, the sensor predictor's features."""
+"""Supervised pre-training: the baseline's recipe, the sensor predictor's features."""
 
 from dataclasses import replace
 
@@ -11,13 +11,13 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
 from gaponet.nn.training.config import PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.pretraining import Pretraining, recipe
+from gaponet.nn.training.pretraining import Pretraining, pretraining_config
 
 
 def test_the_label_baseline_is_one_round():
     warm = PretrainingConfig(rounds=4, gradient_steps=50)
-    assert recipe(TrainConfig(warm_start=warm)) == warm
-    once = recipe(TrainConfig(ModelConfig(kind="inverse"), warm_start=warm))
+    assert pretraining_config(TrainConfig(pretraining=warm)) == warm
+    once = pretraining_config(TrainConfig(ModelConfig(kind="inverse"), pretraining=warm))
     assert (once.rounds, once.gradient_steps) == (1, 200)
 
 
@@ -30,7 +30,7 @@ def fitted(tmp_path_factory):
     net = build_network(config, 2)
     settings = PretrainingConfig(num_envs=32, steps=64, gradient_steps=2)
     warm = Pretraining(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)
-    warm.begin()
+    warm.fit_inputs()
     return warm
 
 
@@ -46,12 +46,11 @@ def test_of_too_many_states_the_pool_keeps_a_part_of_every_environment(fitted, m
     env, rows = fitted.env, []
     fitted.config = replace(fitted.config, rounds=2, steps=6)
     for most in (10**6, 2 * 6 * 32 // 3):
-        monkeypatch.setattr("gaponet.nn.training.pretraining.MOST", most)
-        fitted.pool_x.clear(), fitted.pool_y.clear()
+        monkeypatch.setattr("gaponet.nn.training.pretraining.MAX_POOL_STATES", most)
         env.rng = np.random.default_rng(0)
-        fitted.collect(follow_labels=True)
-        rows.append(fitted.pool_x[0].numpy())
-        assert len(fitted.pool_y[0]) == len(rows[-1])
+        x, labels = fitted.rollout(follow_labels=True)
+        rows.append(x.numpy())
+        assert len(labels) == len(x)
     every, some = rows
     assert len(every) == 6 * 32
     kept = np.arange(6 * 32).reshape(6, 32)

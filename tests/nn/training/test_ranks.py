@@ -75,9 +75,9 @@ def test_ranks_have_simulations_and_noise_of_their_own(place):
     first = memory(place / "run-whole")
     (second,) = first["others"]
     assert not torch.equal(first["env"]["arrays"]["row"], second["env"]["arrays"]["row"])
-    assert not torch.equal(first["learner"]["noise"], second["learner"]["noise"])
-    assert len(first["learner"]["noise"]) == CONFIG.ppo.num_envs // 2
-    assert "critic" not in second["learner"]
+    assert not torch.equal(first["ppo"]["noise"], second["ppo"]["noise"])
+    assert len(first["ppo"]["noise"]) == CONFIG.ppo.num_envs // 2
+    assert "critic" not in second["ppo"]
 
 
 def test_one_rank_that_is_interrupted_ends_both_and_they_go_on_to_the_bit(place, saw):
@@ -102,10 +102,10 @@ def equal(a, b):
 def test_a_run_is_resumed_by_as_many_processes(place):
     data, robot = Dataset(place / "data"), write_arm(place / "arm")
     with pytest.raises(UsageError, match="was trained by 2 processes; resume with torchrun --nproc-per-node 2"):
-        Trainer(data, robot, place / "run-whole", CONFIG, Budget(steps=STEPS), resume=True)
+        Trainer.prepare(data, robot, place / "run-whole", CONFIG, Budget(steps=STEPS), resume=True)
 
 
 def test_what_ranks_cannot_share_evenly_is_refused(monkeypatch):
     monkeypatch.setattr(ranks, "world", lambda: 3)
-    with pytest.raises(UsageError, match=r"--warm-start\.num-envs 8: 3 ranks cannot share them evenly"):
+    with pytest.raises(UsageError, match=r"--pretraining\.num-envs 8: 3 ranks cannot share them evenly"):
         ranks.share(CONFIG)

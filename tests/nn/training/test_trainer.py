@@ -17,13 +17,14 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.budget import Budget
 from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
+from gaponet.nn.training.validation import Validator
 from gaponet.report.evaluate import ORDER, evaluate
 from gaponet.report.methods import METHODS
 from gaponet.report.verdict import LEARNED
 
 SMALL = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
-    warm_start=PretrainingConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
+    pretraining=PretrainingConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1, explained=-1e9),
     validate_every=4,
 )
@@ -46,7 +47,7 @@ def robot(tmp_path_factory):
 def trained(robot, tmp_path_factory):
     place = tmp_path_factory.mktemp("trained")
     data = dataset(place / "data", robot, kp=0.5, delay=2)
-    return data, place / "run", Trainer(data, robot, place / "run", SMALL, STEPS).run()
+    return data, place / "run", Trainer.prepare(data, robot, place / "run", SMALL, STEPS).run()
 
 
 def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(trained, robot):
@@ -60,10 +61,10 @@ def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(traine
 def test_a_run_whose_budget_buys_no_step_fails_and_can_be_resumed(trained, robot, tmp_path):
     data, _, _ = trained
     with pytest.raises(ModelError, match=r"the budget ended .* before the first step of training: nothing was learned"):
-        Trainer(data, robot, tmp_path / "run", SMALL, Budget(seconds=1e-6)).run()
+        Trainer.prepare(data, robot, tmp_path / "run", SMALL, Budget(seconds=1e-6)).run()
     assert not (tmp_path / "run/model").exists()
-    card = Trainer(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
-    assert GapModel.how_trained(card) == "1 of 3 rounds of the supervised start, no PPO"
+    card = Trainer.prepare(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
+    assert GapModel.how_trained(card) == "supervised pre-training (1 of 3 rounds), no PPO"
 
 
 def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
@@ -72,22 +73,22 @@ def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
     other = {"train": parts["train"], "val": parts["test"], "test": parts["val"]}
     path = write_split(data, other, "motion", ("swapped",))
     config = replace(SMALL, split=str(path))
-    assert Trainer(data, robot, tmp_path / "run", config, STEPS).parts == other
+    assert Trainer.prepare(data, robot, tmp_path / "run", config, STEPS).data.splits == other
     with pytest.raises(UsageError, match="leave out --holdout-units, --holdout-payloads, --rates and --train-share"):
-        Trainer(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
+        Trainer.prepare(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
 
 
 @pytest.mark.parametrize("kind", ["mlp", "shared_mlp", "inverse"])
 def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tmp_path):
     data, run, _ = trained
     config = replace(SMALL, model=replace(SMALL.model, kind=kind, mlp_hidden=(64,)))
-    model = Trainer(data, robot, tmp_path / "run", config, STEPS).run()
+    model = Trainer.prepare(data, robot, tmp_path / "run", config, STEPS).run()
     lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
     if kind == "inverse":  # one regression, no roll-outs of its own, no PPO
-        assert [line["stage"] for line in lines][:2] == ["start", "warm start"]
+        assert [line["stage"] for line in lines][:2] == ["start", "pretraining"]
         assert {line["steps"] for line in lines} == {0, 16 * 60}
     else:
-        assert {line["stage"] for line in lines} - {"gain"} == {"start", "warm start", "ppo"}
+        assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
         assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
     result = evaluate([run, tmp_path / "run"], data, robot).result
     assert [m for m in result["methods"] if m in LEARNED] == [kind, "gaponet"]
@@ -106,12 +107,12 @@ def test_the_card_says_what_the_model_is(trained):
 def test_the_kept_model_is_the_best_on_validation(trained):
     lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
     assert trained[2].card["val_mpjae"]["model"] == min(line["val_mpjae"] for line in lines)
-    assert {line["stage"] for line in lines} - {"gain"} == {"start", "warm start", "ppo"}
+    assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
 
 
 def test_progress_says_how_far_labels_are_fitted(trained):
     lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
-    fitted = [line for line in lines if line["stage"] == "warm start"]
+    fitted = [line for line in lines if line["stage"] == "pretraining"]
     assert all(0 < line["label_rmse"] < 0.1 and line["label_rmse_before"] > 0 for line in fitted)
     assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
 
@@ -130,7 +131,7 @@ def test_one_recording_under_two_names_in_two_parts_is_refused(robot):
 
 def test_a_robot_without_a_gap_is_left_alone(robot, tmp_path):
     data = dataset(tmp_path / "data", robot)
-    Trainer(data, robot, tmp_path / "run", SMALL, STEPS).run()
+    Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS).run()
     assert evaluate([tmp_path / "run"], data, robot).result["delta"]["gaponet"]["max"] < 0.005
 
 
@@ -140,16 +141,16 @@ def test_ctrl_c_leaves_a_usable_run_that_resumes(robot, tmp_path):
 
     def interrupt(status):
         nonlocal calls
-        calls += status.stage == "warm start"
-        if status.stage == "warm start" and calls == 150:
+        calls += status.stage == "pretraining"
+        if status.stage == "pretraining" and calls == 150:
             raise KeyboardInterrupt
 
-    model = Trainer(data, robot, tmp_path / "run", SMALL, STEPS, show=interrupt).run()
+    model = Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS, show=interrupt).run()
     assert model.card["interrupted"]
     assert np.isfinite(evaluate([tmp_path / "run"], data, robot).result["methods"]["gaponet"]["mpjae"])
     with pytest.raises(UsageError, match="--resume"):
-        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
-    again = Trainer(data, robot, tmp_path / "run", SMALL, STEPS, resume=True).run()
+        Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS)
+    again = Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS, resume=True).run()
     assert not again.card["interrupted"]
     assert again.card["steps"] > model.card["steps"]
     assert again.card["val_mpjae"]["model"] <= model.card["val_mpjae"]["model"]
@@ -164,7 +165,7 @@ def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
 
     monkeypatch.setattr(gaponet.sim.batch, "Batch", note)
     data = dataset(tmp_path / "data", robot, rows=40)
-    Trainer(data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)).run()
+    Trainer.prepare(data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)).run()
     assert asked == {1}
 
 
@@ -195,8 +196,10 @@ def test_a_held_out_payload_is_never_trained_on(robot, tmp_path):
 @pytest.mark.parametrize("sensors", ["predicted", "off"])
 def test_ppo_alone_has_statistics_of_its_inputs_and_sensors_that_answer(sensors, robot, tmp_path):
     data = dataset(tmp_path / "data", robot, kp=0.5)
-    config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=0), model=replace(SMALL.model, sensors=sensors))
-    trainer = Trainer(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
+    config = replace(
+        SMALL, pretraining=replace(SMALL.pretraining, rounds=0), model=replace(SMALL.model, sensors=sensors)
+    )
+    trainer = Trainer.prepare(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
     model = trainer.run()
     assert trainer.net.features.standardise.std.min() < 0.9
     assert (trainer.state.sensor_r2 is None) == (sensors == "off")
@@ -220,7 +223,7 @@ def test_a_budget_that_makes_no_sense_is_refused(text):
 def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(trained, robot, tmp_path):
     data = trained[0]
     fitted = robot.with_servos({j: {"kp": 11.0, "delay": 0.03} for j in robot.operated})
-    Trainer(data, fitted, tmp_path / "run", SMALL, Budget(steps=2 * 16 * 60)).run()
+    Trainer.prepare(data, fitted, tmp_path / "run", SMALL, Budget(steps=2 * 16 * 60)).run()
     result = evaluate([tmp_path / "run"], data, robot).result
     assert list(result["methods"]) == ["nominal", "delay_offset", "identified", "identified+gaponet"]
     assert result["methods"]["nominal"] == evaluate([trained[1]], data, robot).result["methods"]["nominal"]
@@ -229,35 +232,36 @@ def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(tr
 
 
 def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot, trained, monkeypatch):
-    def error(trainer, net, robot=None):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
+    def error(validator, net, robot=None):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
         fitted = net is not None and bool(net.trunk[-1].weight.any())
         mean = 0.4 + 0.4 * abs(net.bounded.gain.item() - 0.5) if fitted else 0.5
-        return np.full(len(trainer.val_set), mean)
+        return np.full(len(validator.sequences), mean)
 
-    monkeypatch.setattr(Trainer, "validate", error)
-    model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
+    monkeypatch.setattr(Validator, "errors", error)
+    model = Trainer.prepare(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
     assert model.card["gain"] == 0.5
     assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)
 
 
-def test_ppo_begins_anew_where_the_warm_start_is_worse_than_nothing(tmp_path, robot, trained, monkeypatch):
+def test_ppo_starts_untrained_if_pretraining_increases_the_error(tmp_path, robot, trained, monkeypatch):
     seen = []
 
-    def error(trainer, net, robot=None):
+    def error(validator, net, robot=None):
         seen.append((trainer.stage, net is not None and bool(net.trunk[-1].weight.any())))
-        return np.full(len(trainer.val_set), 0.6 if trainer.stage == "warm start" else 0.5)
+        return np.full(len(validator.sequences), 0.6 if trainer.stage == "pretraining" else 0.5)
 
-    monkeypatch.setattr(Trainer, "validate", error)
-    config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=2), validate_every=1,
+    monkeypatch.setattr(Validator, "errors", error)
+    config = replace(SMALL, pretraining=replace(SMALL.pretraining, rounds=2), validate_every=1,
                      ppo=replace(SMALL.ppo, critic_warmup=3))  # fmt: skip
-    model = Trainer(trained[0], robot, tmp_path / "run", config, STEPS).run()
-    rounds, updates = [s for s in seen if s[0] == "warm start"], [s for s in seen if s[0] == "ppo"]
-    assert rounds == [("warm start", True)] * 2
+    trainer = Trainer.prepare(trained[0], robot, tmp_path / "run", config, STEPS)
+    model = trainer.run()
+    rounds, updates = [s for s in seen if s[0] == "pretraining"], [s for s in seen if s[0] == "ppo"]
+    assert rounds == [("pretraining", True)] * 2
     assert updates[:3] == [("ppo", False)] * 3  # the critic alone, beside a network that corrects nothing
     assert updates[4:-1] == [("ppo", True)] * len(updates[4:-1])
     assert GapModel.how_trained(model.card) == (
-        f"supervised start (2 rounds), worse than no correction; {len(updates) - 1} updates of PPO from the untrained "
-        "network"
+        f"supervised pre-training (2 rounds), worse than no correction; {len(updates) - 1} updates of PPO from the "
+        "untrained network"
     )
 
 
@@ -266,8 +270,8 @@ def test_recordings_with_two_stiffnesses_are_mixed_only_when_told(robot, tmp_pat
     for i, sequence in enumerate(recordings(robot, 8)):
         data.append(replace(sequence, meta=replace(sequence.meta, kp=(5.0 + i % 2, 5.0), kd=(0.1, 0.1))))
     with pytest.raises(UsageError, match="--mixed-gains"):
-        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
-    Trainer(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)
+        Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS)
+    Trainer.prepare(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)
 
 
 def test_gains_other_than_the_robots_are_named(robot, tmp_path):
@@ -275,4 +279,4 @@ def test_gains_other_than_the_robots_are_named(robot, tmp_path):
     for sequence in recordings(robot, 8):
         data.append(replace(sequence, meta=replace(sequence.meta, kp=(5.0, 5.0), kd=(0.1, 0.1))))
     with pytest.raises(UsageError, match=r"kp \(5.0, 5.0\) .*robot.toml says others"):
-        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
+        Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS)

@@ -23,7 +23,7 @@ from gaponet.report.verdict import NetworkGain
 BASES = {"": nominal, "identification + ": identified}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
 FULL_RECIPE_STEPS = 600_000  # control steps from which the recipe is that of gaponet train
-# Fewer steps are one round of the supervised start.
+# Fewer steps are one round of supervised pre-training.
 ONE_ROUND = PretrainingConfig(rounds=1, num_envs=256, gradient_steps=200, sensor_states=512)
 
 
@@ -40,7 +40,7 @@ def _recipe(steps: int) -> TrainConfig:
     warm = PretrainingConfig()
     if steps < FULL_RECIPE_STEPS:
         warm = replace(ONE_ROUND, steps=max(steps // ONE_ROUND.num_envs, 1), rows=steps)
-    return TrainConfig(warm_start=warm, mixed_gains=True)
+    return TrainConfig(pretraining=warm, mixed_gains=True)
 
 
 def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
@@ -60,7 +60,7 @@ def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
         write_text(split, json.dumps({"parts": parts}))
         config = replace(_recipe(steps), model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
         resume = (training / "checkpoint.pt").is_file()
-        trainer = Trainer(dataset, start.robot, training, config, Budget(steps=steps), resume)
+        trainer = Trainer.prepare(dataset, start.robot, training, config, Budget(steps=steps), resume=resume)
         trainer.baseline = fit_delay_offset(question)
         trainer.run()
     model = GapModel.load(training)

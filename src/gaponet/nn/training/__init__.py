@@ -1,7 +1,7 @@
-"""Training: environment, sensor fit, warm start, PPO. Nothing that may run on a robot imports it."""
+"""Training: environment, sensor fit, supervised pre-training, PPO. Nothing that may run on a robot imports it."""
 
 import os
 
-# torch's threads and the simulator's take turns on the same cores: one that waits must not spin (a factor of five).
-# torch reads this when it is first imported.
+# The threads of torch and of the simulator use the same cores in turn. Waiting threads must not spin, which makes
+# training five times slower. torch reads this variable at its first import.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

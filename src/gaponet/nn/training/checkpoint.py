@@ -1,4 +1,4 @@
-"""What a run must remember to go on as if it had never stopped, bit for bit: tensors, numbers, text, no code."""
+"""Checkpoint for exact resume: tensors, numbers and text, no code."""
 
 from __future__ import annotations
 
@@ -14,102 +14,125 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.files import atomic_write, write_text
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.training import ranks
-from gaponet.nn.training.sensor_fit import Report
+from gaponet.nn.training.sensor_fit import SensorReport
 
 StateDict = dict[str, Any]
 
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
 SHARED = ("net", "optimiser", "critic", "critic_optimiser")  # equal on all ranks
+# Fields of checkpoints before 26 November 2026 → fields of today.
+RENAMED = {
+    "best": "best_error", "trained": "best_trained_error", "trained_state": "best_trained_state", "val": "val_error",
+    "rounds_done": "pretraining_rounds", "updates": "ppo_updates", "anew": "ppo_from_untrained", "learner": "ppo",
+    "warm": "pretraining", "dataset": "dataset_hash",
+}  # fmt: skip
 
 
 @dataclass
 class Checkpoint:
-    """The best networks so far, what was done, and where the stages stand."""
+    """State of a training run: best networks, counters and the state of the stage that runs.
+
+    Attributes:
+        best_state: Weights of the network with the least validation error.
+        best_trained_state: The same among trained networks with gain 1: the start of PPO.
+        best_error, best_trained_error: Their validation errors, rad.
+        val_error: Validation error of the newest network, rad.
+        steps: Control steps of all ranks.
+        seconds: Training time up to this checkpoint.
+        pretraining_rounds, ppo_updates: How many are done.
+        ppo_from_untrained: PPO started from untrained weights because pre-training increased the error.
+        sensor_r2: R² of the sensor predictor.
+        ppo, env, pretraining: States of PPO, of its environments, and of pre-training; None outside these stages.
+        progress: Lines of progress.jsonl.
+        dataset_hash: Hash of the recordings.
+    """
 
     best_state: StateDict
-    trained_state: StateDict
-    best: float = float("inf")
-    trained: float = float("inf")
-    """Validation error of the best network that was fitted, with gain 1."""
-    val: float = float("nan")
+    best_trained_state: StateDict
+    best_error: float = float("inf")
+    best_trained_error: float = float("inf")
+    val_error: float = float("nan")
     steps: int = 0
     seconds: float = 0.0
-    """Trained up to the last checkpoint."""
-    rounds_done: int = 0
-    updates: int = 0
-    anew: bool = False
-    """Whether PPO began from the untrained network, the warm start having been worse than no correction."""
-    sensor_r2: Report | None = None
-    learner: StateDict | None = None
-    """The state of PPO: its critic and optimisers."""
+    pretraining_rounds: int = 0
+    ppo_updates: int = 0
+    ppo_from_untrained: bool = False
+    sensor_r2: SensorReport | None = None
+    ppo: StateDict | None = None
     env: StateDict | None = None
-    """State of PPO's environments."""
-    warm: StateDict | None = None
+    pretraining: StateDict | None = None
     progress: list[dict[str, Any]] = field(default_factory=list)
-    """Lines of progress.jsonl."""
-    dataset: str = ""
-    """Hash of its recordings."""
+    dataset_hash: str = ""
+
+    @property
+    def untrained_error(self) -> float:
+        """Validation error of the simulator without a network, rad."""
+        return float(self.progress[0]["val_mpjae"])
 
     def write(self, out: Path, net: DeltaNet) -> None:
-        """Write the checkpoint, and progress.jsonl beside it; of all ranks, whose networks must be equal, the first."""
-        ranks.require_equal(net.state_dict(), self.learner["critic"] if self.learner else {})
+        """Write checkpoint.pt and progress.jsonl. The first rank writes, after all ranks compared their networks."""
+        ranks.require_equal(net.state_dict(), self.ppo["critic"] if self.ppo else {})
         state = vars(self) | {"net": net.state_dict(), "rng": torch.get_rng_state()}
-        others = ranks.gathered(_own({name: state[name] for name in ("rng", "env", "learner", "warm")}))[1:]
+        others = ranks.gathered(_rank_state({name: state[name] for name in ("rng", "env", "ppo", "pretraining")}))[1:]
         if not ranks.rank():
-            content = io.BytesIO()  # torch does not say which error it met on a disk
+            content = io.BytesIO()  # torch does not report the error of a full disk
             torch.save(state | {"others": others}, content)
             with atomic_write(out / CHECKPOINT) as temporary:
                 temporary.write_bytes(content.getbuffer())
             self.write_progress(out)
 
     def write_progress(self, out: Path) -> None:
-        """Write progress.jsonl anew."""
+        """Write progress.jsonl."""
         write_text(out / PROGRESS, "".join(json.dumps(line) + "\n" for line in self.progress))
 
     @classmethod
-    def read(cls, out: Path, net: DeltaNet, dataset: str) -> tuple[Checkpoint, torch.Tensor]:
-        """Read a checkpoint: into the network, into torch's random numbers, and the rest.
+    def read(cls, out: Path, net: DeltaNet, dataset_hash: str) -> Checkpoint:
+        """Load checkpoint.pt, and set the network and torch's random numbers to their states in it.
 
         Args:
-            dataset: Hash of the recordings to go on with.
+            dataset_hash: Hash of the recordings to train on.
 
         Raises:
-            ModelError: Damaged, or of another network.
-            UsageError: Trained on other recordings, or by another number of ranks.
+            ModelError: The file is damaged or belongs to another network.
+            UsageError: The run has other recordings or another number of ranks.
         """
         try:
-            state = torch.load(out / CHECKPOINT, weights_only=True, map_location="cpu")
+            state = _renamed(torch.load(out / CHECKPOINT, weights_only=True, map_location="cpu"))
             net.load_state_dict(state.pop("net"))
-            others = state.pop("others", [])
+            others = [_renamed(other) for other in state.pop("others", [])]
             if 0 < ranks.rank() <= len(others):
-                state = _with_own(state, others[ranks.rank() - 1])
-            rng = state.pop("rng")
-            kept = cls(**state)
-            torch.set_rng_state(rng)
-        except Exception as error:  # torch and its unpickler raise of every kind
+                state = _with_rank_state(state, others[ranks.rank() - 1])
+            torch.set_rng_state(state.pop("rng"))
+            checkpoint = cls(**state)
+        except Exception as error:  # torch and its unpickler have no common base of errors
             reason = next(iter(str(error).splitlines()), type(error).__name__)
             raise ModelError(f"{out / CHECKPOINT}: does not fit this model or is damaged ({reason})") from None
         if len(others) + 1 != ranks.world():
             n = len(others) + 1
             raise UsageError(f"{out}: was trained by {n} processes; resume with torchrun --nproc-per-node {n}")
-        if kept.dataset not in ("", dataset):
+        if checkpoint.dataset_hash not in ("", dataset_hash):
             raise UsageError(f"{out}: was trained on other recordings than this dataset holds; train anew")
-        return kept, rng
+        return checkpoint
 
 
-def _own(state: Any) -> Any:
-    """What of a state is a rank's own, on the CPU: all but networks and their optimisers."""
+def _renamed(state: StateDict) -> StateDict:
+    """Translate field names of earlier versions."""
+    return {RENAMED.get(name, name): value for name, value in state.items()}
+
+
+def _rank_state(state: Any) -> Any:
+    """Select what differs between ranks, on the CPU: everything except networks and their optimisers."""
     if isinstance(state, dict):
-        return {name: _own(x) for name, x in state.items() if name not in SHARED}
+        return {name: _rank_state(x) for name, x in state.items() if name not in SHARED}
     if isinstance(state, list):
-        return [_own(x) for x in state]
+        return [_rank_state(x) for x in state]
     return state.cpu() if isinstance(state, torch.Tensor) else state
 
 
-def _with_own(state: Any, mine: Any) -> Any:
-    """The first rank's state with another one's `_own` in the place of its own."""
-    if isinstance(mine, dict):
-        return (state or {}) | {name: _with_own((state or {}).get(name), x) for name, x in mine.items()}
-    if isinstance(mine, list):
-        return [_with_own(x, y) for x, y in zip(state, mine, strict=True)]
-    return mine
+def _with_rank_state(state: Any, rank_state: Any) -> Any:
+    """Replace the first rank's `_rank_state` by another rank's."""
+    if isinstance(rank_state, dict):
+        return (state or {}) | {name: _with_rank_state((state or {}).get(name), x) for name, x in rank_state.items()}
+    if isinstance(rank_state, list):
+        return [_with_rank_state(x, y) for x, y in zip(state, rank_state, strict=True)]
+    return rank_state

@@ -1,7 +1,4 @@
-"""Training curves for those who watch them elsewhere: the numbers of progress.jsonl to TensorBoard or Weights & Biases.
-
-Both packages are extras and are imported when asked for.
-"""
+"""Training curves for TensorBoard or Weights & Biases: the numbers of progress.jsonl. Both packages are extras."""
 
 from __future__ import annotations
 
@@ -12,13 +9,22 @@ from typing import Any
 from gaponet.base.errors import UsageError
 
 KINDS = ("tensorboard", "wandb")
+Writer = tuple[Callable[[dict[str, float], int], None], Callable[[], None]]  # write(numbers, steps), close()
 
 
 class Loggers:
-    """Writes a line of progress to each of them; numbers only, NaN left out, over control steps."""
+    """Writes the finite numbers of each progress line over control steps."""
 
     def __init__(self, kinds: tuple[str, ...], out: Path, config: dict[str, Any]) -> None:
-        """kinds: any of KINDS. out: Run folder; TensorBoard's files go to out/tensorboard. config: Shown beside."""
+        """
+        Args:
+            kinds: Any of KINDS.
+            out: Run folder. TensorBoard's files go to out/tensorboard.
+            config: Configuration of the run, for Weights & Biases.
+
+        Raises:
+            UsageError: A package is not installed.
+        """
         self.writers = [{"tensorboard": _tensorboard, "wandb": _wandb}[kind](out, config) for kind in kinds]
 
     def write(self, line: dict[str, Any]) -> None:
@@ -28,11 +34,9 @@ class Loggers:
             write(numbers, line["steps"])
 
     def close(self) -> None:
+        """Close all files and connections."""
         for _, close in self.writers:
             close()
-
-
-Writer = tuple[Callable[[dict[str, float], int], None], Callable[[], None]]
 
 
 def _tensorboard(out: Path, config: dict[str, Any]) -> Writer:

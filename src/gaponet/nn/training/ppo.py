@@ -1,9 +1,9 @@
-"""PPO in which every joint has its own reward, value, advantage and ratio.
+"""PPO in which each joint has its own reward, value, advantage and probability ratio.
 
-What a joint's correction does shows in that joint's error. Summed over the robot, the others' errors are noise in its
-advantage, and one ratio for all joints is clipped as soon as any of them moves. So the robot is n learners that share
-a network. The critic learns alone until it explains the returns (Andrychowicz et al. 2021 on why it has its own
-optimiser); exploration is correlated in time, since a servo filters white noise away (Korenkevych et al. 2019).
+The correction of a joint acts on the error of that joint. In a sum over the robot, the errors of other joints would be
+noise in its advantage, and a common ratio would be clipped when any joint moves. So the robot is n agents that share
+one network. The critic is trained alone until it explains the returns, by its own optimiser (Andrychowicz et al.
+2021). Exploration noise is correlated in time, because a servo filters white noise (Korenkevych et al. 2019).
 """
 
 from __future__ import annotations
@@ -15,45 +15,63 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gaponet.nn.layers import DeltaNet, Standardise, dense
+from gaponet.nn.layers import MAX_FEATURE, DeltaNet, Standardise, dense
 from gaponet.nn.training import ranks
 from gaponet.nn.training.config import PPOConfig
 from gaponet.nn.training.env import DeltaEnv
 
-LOWEST, HIGHEST, FACTOR = 1e-6, 1e-3, 1.5  # bounds of the actor's step size, and its change when KL asks for one
+LEARNING_RATE_BOUNDS = (1e-6, 1e-3)  # of the actor
+LEARNING_RATE_FACTOR = 1.5  # of each adaptation to desired_kl
+MAX_GRADIENT_NORM = 1.0
 
 
-class _Critic(nn.Module):
-    """Value of each joint, (B, n), from the network's features and what only training knows."""
+class Critic(nn.Module):
+    """Value of each joint, (B, n), from the actor's features and the observations of the critic."""
 
-    def __init__(self, features: int, seen: int, hidden: tuple[int, ...], n: int) -> None:
+    def __init__(self, features: int, observations: int, hidden: tuple[int, ...], n: int) -> None:
         super().__init__()
-        self.standardise, self.net = Standardise(seen), dense(features + seen, hidden, n)
+        self.standardise, self.net = Standardise(observations), dense(features + observations, hidden, n)
 
-    def forward(self, features: Tensor, seen: Tensor) -> Tensor:
-        return self.net(torch.cat([features, self.standardise(seen).clamp(-5.0, 5.0)], dim=1))
+    def forward(self, features: Tensor, observations: Tensor) -> Tensor:
+        standardised = self.standardise(observations).clamp(-MAX_FEATURE, MAX_FEATURE)
+        return self.net(torch.cat([features, standardised], dim=1))
 
 
 @dataclass
-class _Batch:
-    """What was collected, one row per decision: targets, values and advantages are (B, n), of each joint."""
+class Batch:
+    """Decisions of all environments; B rows.
+
+    Attributes:
+        prepared: Actor inputs, as `DeltaNet.prepare` returns them.
+        features: Features of the actor inputs.
+        critic_observations: Observations of the critic.
+        mean: Corrections without exploration, (B, n) rad.
+        actions: Corrections with the new part of the exploration noise, (B, n) rad.
+        exploration_mask: 1 where a joint explores, (B, n). Other joints do not contribute to the gradient.
+        advantage, returns: Of each joint, (B, n).
+    """
 
     prepared: Tensor
     features: Tensor
-    seen: Tensor
+    critic_observations: Tensor
     mean: Tensor
-    sampled: Tensor
-    """The correction less the part of its noise that was known before."""
-    explored: Tensor
-    """1 where the joint was disturbed; elsewhere nothing can be learned about its correction."""
+    actions: Tensor
+    exploration_mask: Tensor
     advantage: Tensor
     returns: Tensor
 
 
 @dataclass
 class Update:
-    """What an update found. Attributes: share of the returns' variance that the critic explains; KL of the actor's
-    step, per joint; step sizes; mean |Δa|, rad; share of corrections at or beyond Δ_max; mean reward."""
+    """Metrics of one update.
+
+    Attributes:
+        explained_variance: Share of the variance of the returns that the critic explains.
+        kl: KL divergence of the actor's step, per joint.
+        mean_delta: Mean |Δa|, rad.
+        at_limit: Share of corrections at or beyond Δ_max.
+        reward: Mean reward of a joint and control period.
+    """
 
     explained_variance: float = float("nan")
     kl: float = float("nan")
@@ -65,118 +83,121 @@ class Update:
 
 
 class PPO:
-    """A network, the environment it acts in, and a critic; `update` is one iteration."""
+    """Actor, critic and environment. `update` collects decisions and learns from them."""
 
     def __init__(self, env: DeltaEnv, net: DeltaNet, config: PPOConfig) -> None:
-        """net: Trained in place, its sensor predictor excepted."""
+        """net: The actor; it is trained in place, except its sensor predictor."""
         self.env, self.net, self.config = env, net.train(), config
         if net.predictor is not None:
             net.predictor.requires_grad_(False)
-        self.trained = [p for p in net.parameters() if p.requires_grad]
-        observed = env.get_observations()
-        seen = observed["critic"]
-        self.critic = _Critic(net.features.dim, seen.shape[1], config.critic_hidden, env.num_actions).to(seen.device)
-        ranks.spread(self.critic)
-        self.optimiser = torch.optim.Adam(self.trained, lr=config.learning_rate)
+        observations = env.get_observations()["critic"]
+        device = observations.device
+        width = observations.shape[1]
+        self.critic = Critic(net.features.dim, width, config.critic_hidden, env.num_actions).to(device)
+        ranks.broadcast(self.critic)
+        self.optimiser = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], lr=config.learning_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
-        step = env.robot.dt * env.config.delta_hold
-        self.noise_correlation = math.exp(-step / config.noise_time) if config.noise_time else 0.0
-        self.noise = torch.zeros(env.num_envs, env.num_actions, device=seen.device)
-        self.updates, self.ready, self.found = 0, False, Update()
+        decision_s = env.robot.dt * env.config.delta_hold
+        self.noise_correlation = math.exp(-decision_s / config.noise_time) if config.noise_time else 0.0
+        self.noise = torch.zeros(env.num_envs, env.num_actions, device=device)
+        self.updates, self.actor_enabled, self.metrics = 0, False, Update()
 
     @property
-    def spread(self) -> float:
-        """Standard deviation of what is new in the exploration of a decision, rad."""
+    def innovation_std(self) -> float:
+        """Standard deviation of the new part of the exploration noise in each decision, rad."""
         config = self.config
         halvings = self.updates / config.std_half_life if config.std_half_life else 0.0
         std = max(config.std * 0.5**halvings, min(config.std, config.std_end))
         return std * math.sqrt(1 - self.noise_correlation**2)
 
     def update(self) -> Update:
-        """Run num_steps decisions in every environment, then learn from them."""
+        """Collect num_steps decisions of each environment and learn from them."""
         batch = self.collect()
         self.learn(batch)
         self.updates += 1
-        return self.found
+        return self.metrics
 
-    def collect(self) -> _Batch:
-        """Roll out with the present network; returns what was seen and what came of it."""
+    def observe(self) -> dict[str, Tensor]:
+        """Return inputs, mean correction and value of the present states."""
+        observed = self.env.get_observations()
+        x, observations = observed["actor"], observed["critic"]
+        if not self.updates and not self.critic.standardise.mean.any():
+            self.critic.standardise.fit(observations)
+            ranks.pool_statistics(self.critic)
+        prepared, features = self.net.prepare(x), self.net.features(x)
+        return {
+            "prepared": prepared, "features": features, "critic_observations": observations,
+            "mean": self.net.correct(prepared), "value": self.critic(features, observations),
+        }  # fmt: skip
+
+    def collect(self) -> Batch:
+        """Simulate with the present network; return the decisions and their advantages."""
         env, config = self.env, self.config
-        explored = (torch.rand_like(self.noise) < config.noise_share).float()
-        self.noise *= explored
+        mask = (torch.rand_like(self.noise) < config.noise_share).float()
+        self.noise *= mask
         rows: list[dict[str, Tensor]] = []
-        gamma = config.gamma**env.config.delta_hold  # a step is a decision
+        gamma = config.gamma**env.config.delta_hold  # per decision
         with torch.no_grad():
             for _ in range(config.num_steps):
-                row = self.look()
-                known = self.noise_correlation * self.noise
-                self.noise = known + self.spread * explored * torch.randn_like(known)
+                row = self.observe()
+                correlated = self.noise_correlation * self.noise
+                self.noise = correlated + self.innovation_std * mask * torch.randn_like(correlated)
                 delta = row["mean"] + self.noise
                 reward, done = (torch.as_tensor(x) for x in env.step(delta))
-                row |= {"sampled": delta - known, "explored": explored, "done": done.float()[:, None]}
-                # The end of a motion is a time-out: what would have come is worth what the critic says of now.
+                row |= {"actions": delta - correlated, "exploration_mask": mask, "done": done.float()[:, None]}
+                # The end of a recording is a time-out: the value of the last state stands for the rewards to come.
                 row["reward"] = (1 - gamma) * reward + gamma * row["value"] * row["done"]
                 rows.append(row)
-            seen = {name: torch.stack([r[name] for r in rows]) for name in rows[0]}
-            last = self.look()["value"]
-            seen["advantage"] = PPO.advantages(seen["reward"], seen["value"], last, seen["done"], gamma, config.lam)
-            seen["returns"] = seen["advantage"] + seen["value"]
-            self._measure(seen)
-        fields = _Batch.__dataclass_fields__
-        return _Batch(**{name: x.flatten(0, 1).clone() for name, x in seen.items() if name in fields})
+            steps = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+            last = self.observe()["value"]
+            steps["advantage"] = advantages(steps["reward"], steps["value"], last, steps["done"], gamma, config.lam)
+            steps["returns"] = steps["advantage"] + steps["value"]
+            self._measure(steps)
+        return Batch(**{name: steps[name].flatten(0, 1).clone() for name in Batch.__dataclass_fields__})
 
-    def look(self) -> dict[str, Tensor]:
-        """What the network and the critic make of the present state."""
-        observed = self.env.get_observations()
-        x, seen = observed["actor"], observed["critic"]
-        if not self.updates and not self.critic.standardise.mean.any():
-            self.critic.standardise.fit(seen)
-            ranks.pool(self.critic)
-        prepared, features = self.net.prepare(x), self.net.features(x)
-        return {"prepared": prepared, "features": features, "seen": seen, "mean": self.net.correct(prepared),
-                "value": self.critic(features, seen)}  # fmt: skip
-
-    def _measure(self, seen: dict[str, Tensor]) -> None:
-        left = (seen["returns"] - seen["value"]).flatten(0, 1).var(0) / seen["returns"].flatten(0, 1).var(0)
-        size = seen["mean"].abs()
+    def _measure(self, steps: dict[str, Tensor]) -> None:
+        residual = (steps["returns"] - steps["value"]).flatten(0, 1).var(0)
+        unexplained = residual / steps["returns"].flatten(0, 1).var(0)
+        size = steps["mean"].abs()
         at_limit = (size >= self.env.config.delta_max).float().mean()
         explained, delta, limited, reward = ranks.mean(
-            1 - float(left.mean()), float(size.mean()), float(at_limit), self.env.mean_reward()
+            1 - float(unexplained.mean()), float(size.mean()), float(at_limit), self.env.mean_reward()
         )
-        found = self.found = Update(explained_variance=explained, mean_delta=delta, at_limit=limited, reward=reward)
-        self.ready |= self.updates >= self.config.critic_warmup and found.explained_variance >= self.config.explained
+        self.metrics = Update(explained_variance=explained, mean_delta=delta, at_limit=limited, reward=reward)
+        self.actor_enabled |= self.updates >= self.config.critic_warmup and explained >= self.config.explained
 
-    def learn(self, batch: _Batch) -> None:
-        """Fit the critic and, once it explains the returns, move the actor."""
-        config, explored = self.config, batch.explored
-        count = explored.sum(0).clamp_min(1.0)  # few environments may leave a joint without any
-        own = batch.advantage - (explored * batch.advantage).sum(0) / count
-        batch.advantage = own / ((explored * own**2).sum(0) / count).sqrt().clamp_min(1e-8)
-        distances = []
+    def learn(self, batch: Batch) -> None:
+        """Fit the critic, and the actor once the critic explains the returns."""
+        config, mask = self.config, batch.exploration_mask
+        count = mask.sum(0).clamp_min(1.0)  # with few environments, no one may explore with a joint
+        centred = batch.advantage - (mask * batch.advantage).sum(0) / count
+        batch.advantage = centred / ((mask * centred**2).sum(0) / count).sqrt().clamp_min(1e-8)
+        divergences = []
         for _ in range(config.epochs):
-            for rows in torch.randperm(len(own), device=own.device).chunk(config.mini_batches):
-                value = self.critic(batch.features[rows], batch.seen[rows])
+            for rows in torch.randperm(len(centred), device=centred.device).chunk(config.mini_batches):
+                value = self.critic(batch.features[rows], batch.critic_observations[rows])
                 self._descend(self.critic_optimiser, (value - batch.returns[rows]).square().mean())
-                if self.ready:
-                    distances.append(self._move(batch, rows))
-        self.found.kl = sum(distances) / max(len(distances), 1)
-        self.found.learning_rate = self.optimiser.param_groups[0]["lr"] if self.ready else 0.0
-        self.found.critic_learning_rate = self.config.critic_learning_rate
+                if self.actor_enabled:
+                    divergences.append(self._actor_step(batch, rows))
+        self.metrics.kl = sum(divergences) / max(len(divergences), 1)
+        self.metrics.learning_rate = self.optimiser.param_groups[0]["lr"] if self.actor_enabled else 0.0
+        self.metrics.critic_learning_rate = self.config.critic_learning_rate
 
-    def _move(self, batch: _Batch, rows: Tensor) -> float:
-        """One step of the actor; returns its KL from the network that collected, per joint that explored."""
-        mean, old, sampled = self.net.correct(batch.prepared[rows]), batch.mean[rows], batch.sampled[rows]
-        weight = batch.explored[rows] / batch.explored[rows].sum().clamp_min(1.0)
-        ratio = (((sampled - old) ** 2 - (sampled - mean) ** 2) / (2 * self.spread**2)).exp()
+    def _actor_step(self, batch: Batch, rows: Tensor) -> float:
+        """Take one gradient step; return the KL divergence from the collecting network, per exploring joint."""
+        mean, old, actions = self.net.correct(batch.prepared[rows]), batch.mean[rows], batch.actions[rows]
+        weight = batch.exploration_mask[rows] / batch.exploration_mask[rows].sum().clamp_min(1.0)
+        ratio = (((actions - old) ** 2 - (actions - mean) ** 2) / (2 * self.innovation_std**2)).exp()
         clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
         advantage = batch.advantage[rows]
         self._descend(self.optimiser, -(weight * torch.minimum(ratio * advantage, clipped * advantage)).sum())
-        kl = ranks.mean(float((weight * (mean.detach() - old) ** 2).sum()) / (2 * self.spread**2))[0]
+        kl = ranks.mean(float((weight * (mean.detach() - old) ** 2).sum()) / (2 * self.innovation_std**2))[0]
+        lowest, highest = LEARNING_RATE_BOUNDS
         for group in self.optimiser.param_groups:
             if kl > 2 * self.config.desired_kl:
-                group["lr"] = max(LOWEST, group["lr"] / FACTOR)
+                group["lr"] = max(lowest, group["lr"] / LEARNING_RATE_FACTOR)
             elif kl < self.config.desired_kl / 2:
-                group["lr"] = min(HIGHEST, group["lr"] * FACTOR)
+                group["lr"] = min(highest, group["lr"] * LEARNING_RATE_FACTOR)
         return kl
 
     @staticmethod
@@ -185,41 +206,41 @@ class PPO:
         loss.backward()
         parameters = [p for group in optimiser.param_groups for p in group["params"]]
         ranks.average(*(p.grad for p in parameters if p.grad is not None))
-        nn.utils.clip_grad_norm_(parameters, 1.0)
+        nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
         optimiser.step()
 
-    def state(self) -> dict[str, Any]:
-        """All but the network and the environment, for a checkpoint."""
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state without network and environment, for a checkpoint."""
         return {
             "critic": self.critic.state_dict(), "optimiser": self.optimiser.state_dict(),
             "critic_optimiser": self.critic_optimiser.state_dict(), "noise": self.noise,
-            "updates": self.updates, "ready": self.ready,
+            "updates": self.updates, "ready": self.actor_enabled,
         }  # fmt: skip
 
-    def load(self, state: dict[str, Any]) -> None:
-        """Undo `state`."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state."""
         self.critic.load_state_dict(state["critic"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.critic_optimiser.load_state_dict(state["critic_optimiser"])
         self.noise.copy_(state["noise"])
-        self.updates, self.ready = state["updates"], state["ready"]
+        self.updates, self.actor_enabled = state["updates"], state["ready"]
 
-    @staticmethod
-    def advantages(reward: Tensor, value: Tensor, last: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-        """Generalised advantage estimates (Schulman et al. 2016).
 
-        Args:
-            reward: (T, N, n), of a motion's last step with what is worth what would have come.
-            value: (T, N, n), of the state before each step.
-            last: (N, n), of the state after the last.
-            done: (T, N, 1), 1 where a motion ended.
-            gamma: Discount per step.
-            lam: λ.
-        """
-        found, ahead = torch.empty_like(reward), torch.zeros_like(last)
-        for t in reversed(range(len(reward))):
-            goes_on = 1 - done[t]
-            surprise = reward[t] + gamma * goes_on * last - value[t]
-            ahead = surprise + gamma * lam * goes_on * ahead
-            found[t], last = ahead, value[t]
-        return found
+def advantages(reward: Tensor, value: Tensor, last: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
+    """Return generalised advantage estimates (Schulman et al. 2016), (T, N, n).
+
+    Args:
+        reward: (T, N, n). The reward of a recording's last step includes the discounted value of that step.
+        value: (T, N, n), before each step.
+        last: Value after the last step, (N, n).
+        done: 1 where a recording ended, (T, N, 1).
+        gamma: Discount per step.
+        lam: λ.
+    """
+    estimates, following = torch.empty_like(reward), torch.zeros_like(last)
+    for t in reversed(range(len(reward))):
+        continues = 1 - done[t]
+        temporal_difference = reward[t] + gamma * continues * last - value[t]
+        following = temporal_difference + gamma * lam * continues * following
+        estimates[t], last = following, value[t]
+    return estimates

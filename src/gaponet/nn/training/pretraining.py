@@ -1,10 +1,11 @@
-"""Supervised start: regress the labels on states that they and the policy itself lead to (DAgger, Ross et al. 2011).
+"""Supervised pre-training: regression of labels on visited states (DAgger, Ross et al. 2011).
 
-The first round is led by the labels; each later one rolls the present policy out. Every visited state gets the label of
-its row (nn/training/labels.py: the plant is stable about it, so it holds where the state has drifted), joins the pool,
-and the whole pool is fitted under noise on the inputs. What the labels did shows in the states that they led to: a
-network that is shown them exactly reads the answer there, and is worse than none when it leads itself
-(docs/results/unnamed.md).
+In the first round, rollouts apply the label corrections. In later rounds they apply the present network. Each visited
+state gets the label of its recorded row (nn/training/labels.py). The servos are stable, so that label also holds for a
+state that has drifted. Each round adds the visited states to a pool and fits the network to the whole pool.
+
+Inputs are noisy during the fit. Past corrections are visible in the states that followed. Without noise, a network
+reads the label from them, and its own rollouts are worse than without correction (docs/results/unnamed.md).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from gaponet.base.arrays import Array, array_module
@@ -23,152 +25,164 @@ from gaponet.nn.layers import DeltaNet
 from gaponet.nn.training import ranks
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.sensor_fit import Report, fit_inputs
+from gaponet.nn.training.sensor_fit import SensorReport, fit_inputs
 
-HUBER = 0.5  # of what labels usually are: beyond it a label counts as its distance, not its square
-MOST = 2_000_000  # states in the pool; where more are visited, some environments' are kept of each period, in turn
+HUBER_DELTA = 0.5  # in units of the RMS of the labels
+MAX_POOL_STATES = 2_000_000  # if more are visited, the pool takes a part of the environments of each period, in turn
 
 
-def recipe(config: TrainConfig) -> PretrainingConfig:
-    """The warm start of a kind of model.
+def pretraining_config(config: TrainConfig) -> PretrainingConfig:
+    """Return the pre-training of a run.
 
-    The label baseline has one round, on recorded motions that the labels lead along, with the gradient steps of all
-    rounds together.
+    Kind "inverse" has one round, in which the labels lead, with the gradient steps of all rounds.
     """
-    warm = config.warm_start
-    if config.model.kind != "inverse" or not warm.rounds:
-        return warm
-    return replace(warm, rounds=1, gradient_steps=warm.rounds * warm.gradient_steps)
+    pretraining = config.pretraining
+    if config.model.kind != "inverse" or not pretraining.rounds:
+        return pretraining
+    return replace(pretraining, rounds=1, gradient_steps=pretraining.rounds * pretraining.gradient_steps)
 
 
 class Pretraining:
-    """The pool of visited states and the optimiser; `round` collects and fits once."""
-
-    report: Report | None = None
-    """How well the sensor predictor explains the simulator, where there is one."""
+    """Pool of visited states, and the optimiser. `round` extends the pool and fits the network to it."""
 
     def __init__(
-        self,
-        net: DeltaNet,
-        env: DeltaEnv,
-        labels: Array,
-        config: PretrainingConfig,
-        seed: int,
-        nthread: int = 0,
+        self, net: DeltaNet, env: DeltaEnv, labels: Array, config: PretrainingConfig, seed: int, nthread: int = 0
     ) -> None:
-        """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
-        self.net, self.env, self.config = net, env, config
-        labels = _held(labels, env.config.delta_hold)
+        """labels: Δa* of each row of the environment's recordings, (rows, n) rad."""
+        self.net, self.env, self.config, self.seed, self.nthread = net, env, config, seed, nthread
+        labels = _mean_over_hold(labels, env.config.delta_hold)
         self.labels: Any = env.sim.array(labels)
-        self.unit = float(np.sqrt(np.nanmean(np.square(labels)))) or 1.0
-        self.seed, self.nthread = seed, nthread
+        self.label_rms = float(np.sqrt(np.nanmean(np.square(labels)))) or 1.0
         self.generator = torch.Generator().manual_seed(seed)
-        self.pool_x: list[torch.Tensor] = []
-        self.pool_y: list[torch.Tensor] = []
-        self.trained = [p for name, p in net.named_parameters() if not name.startswith(("predictor", "probes"))]
-        self.optimiser = torch.optim.AdamW(self.trained, lr=config.learning_rate, weight_decay=config.weight_decay)
-        self.done = 0
-        self.rounds: list[dict[str, Any]] = []  # what the roll-outs of each round so far followed from
+        self.pool_x: list[Tensor] = []
+        self.pool_labels: list[Tensor] = []
+        self.parameters = [p for name, p in net.named_parameters() if not name.startswith(("predictor", "probes"))]
+        self.optimiser = torch.optim.AdamW(self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+        self.rollout_states: list[dict[str, Any]] = []  # network and random numbers before the rollouts of each round
 
-    def begin(self) -> None:
-        """Before the first round: statistics of inputs, and on them the sensor predictor, where labels lead along."""
-        self.collect(follow_labels=True)
-        self.pool_y.clear()
-        self.net.bounded.unit.fill_(self.unit)
-        states = self.config.sensor_states
-        self.report = fit_inputs(self.net, self.env, self.pool_x.pop(), states, self.seed, self.nthread)
+    @property
+    def rounds_done(self) -> int:
+        """Number of completed rounds."""
+        return len(self.rollout_states)
 
-    def collect(self, follow_labels: bool) -> None:
-        """Roll out for config.steps, motions restarting where they end."""
+    def fit_inputs(self) -> SensorReport | None:
+        """Fit input statistics and the sensor predictor on a rollout with label corrections. Call before round 1."""
+        x, _ = self.rollout(follow_labels=True)
+        self.net.bounded.scale.fill_(self.label_rms)
+        return fit_inputs(self.net, self.env, x, self.config.sensor_states, self.seed, self.nthread)
+
+    def rollout(self, follow_labels: bool) -> tuple[Tensor, Tensor]:
+        """Simulate config.steps control periods; environments restart where their recording ends.
+
+        Args:
+            follow_labels: Apply the labels instead of the network's corrections.
+
+        Returns:
+            Visited inputs, (states, dim), and their labels, (states, n) rad; NaN where there is none.
+        """
         env, net, hold = self.env, self.net, self.env.config.delta_hold
         steps = max(self.config.steps // hold, 1)
         env.reset()
         net.eval()
-        xs, ys, every = [], [], math.ceil(self.config.rounds * steps * env.num_envs / MOST) or 1
+        xs: list[Tensor] = []
+        ys: list[Tensor] = []
+        every = math.ceil(self.config.rounds * steps * env.num_envs / MAX_POOL_STATES) or 1
         for t in range(steps):
-            some = slice(t % every, None, every)
+            subset = slice(t % every, None, every)
             x = env.get_observations()["actor"]
-            y = self.labels[env.here] + env.unsaid
-            xs.append(x[some].contiguous())
-            ys.append(torch.as_tensor(y[some], device=x.device))
+            labels = self.labels[env.row_on_device] + env.nan_where_unobserved
+            xs.append(x[subset].contiguous())
+            ys.append(torch.as_tensor(labels[subset], device=x.device))
             if follow_labels:
-                delta = array_module(y).nan_to_num(y)
+                delta = array_module(labels).nan_to_num(labels)
             else:
                 with torch.inference_mode():
                     delta = net(x)
             for _ in range(hold):
                 env.advance(delta)
             env.restart()
-        self.pool_x.append(torch.cat(xs))
-        self.pool_y.append(torch.cat(ys))
+        return torch.cat(xs), torch.cat(ys)
 
     def round(self, tick: Callable[[], object]) -> dict[str, float]:
-        """Collect with the present policy, fit on the pool.
+        """Extend the pool by rollouts, and fit the network to the pool.
+
+        Args:
+            tick: Called after each gradient step.
 
         Returns:
-            RMSE of the labels, rad, over the last quarter of the gradient steps and over the quarter before it: a fit
-            that is done has both alike.
-
-        tick is called after every gradient step.
+            RMSE of the labels, rad, in the last quarter of the gradient steps and in the quarter before. The fit has
+            converged if both are equal.
         """
         before = {"net": {k: x.clone() for k, x in self.net.state_dict().items()}, "rng": self.env.rng_state}
-        self.collect(follow_labels=self.done == 0)
-        self.pool_x, self.pool_y = [torch.cat(self.pool_x)], [torch.cat(self.pool_y)]  # once in memory
-        x, y, config, net = self.pool_x[0], self.pool_y[0], self.config, self.net
-        fits = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)  # read when all are done
-        net.train()
-        net.features.noise = config.noise
-        for step in range(config.gradient_steps):
-            done = step / config.gradient_steps
-            for group in self.optimiser.param_groups:
-                group["lr"] = config.learning_rate * (0.01 + 0.99 * (0.5 + 0.5 * math.cos(math.pi * done)))
-            batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator)
-            batch = batch.to(x.device, non_blocking=True)
-            missed = torch.nan_to_num(net(x[batch]) - y[batch])
-            loss = huber_loss(missed / self.unit, torch.zeros_like(missed), delta=HUBER)
-            self.optimiser.zero_grad()
-            loss.backward()
-            ranks.average(*(p.grad for p in self.trained if p.grad is not None))
-            self.optimiser.step()
-            fits[step] = missed.detach().square().mean()
-            tick()
-        net.features.noise = 0.0
-        net.eval()
-        self.done += 1
-        self.rounds.append(before)
-        losses = fits.cpu().numpy()
-        quarter = max(len(losses) // 4, 1)
-        last, earlier = losses[-quarter:], losses[-2 * quarter : -quarter]
+        self._extend_pool(follow_labels=self.rounds_done == 0)
+        self.rollout_states.append(before)
+        squares = self._fit(tick)
+        quarter = max(len(squares) // 4, 1)
+        last, earlier = squares[-quarter:], squares[-2 * quarter : -quarter]
         return {"label_rmse": _rms(last), "label_rmse_before": _rms(earlier)}
 
-    def state(self) -> dict[str, Any]:
-        """A warm start between rounds. Its pool is hundreds of megabytes and follows from the networks that collected
-        it, so those are kept and roll out again."""
+    def _extend_pool(self, follow_labels: bool) -> None:
+        x, labels = self.rollout(follow_labels)
+        # One tensor each: the pool is in memory once.
+        self.pool_x, self.pool_labels = [torch.cat([*self.pool_x, x])], [torch.cat([*self.pool_labels, labels])]
+
+    def _fit(self, tick: Callable[[], object]) -> Array:
+        """Fit the network to the pool; return the mean squared label error of each gradient step, rad²."""
+        config, net, (x,), (labels,) = self.config, self.net, self.pool_x, self.pool_labels
+        squares = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)  # read after the last step
+        net.train()
+        net.features.noise_std = config.noise
+        for step in range(config.gradient_steps):
+            cosine = 0.5 + 0.5 * math.cos(math.pi * step / config.gradient_steps)
+            for group in self.optimiser.param_groups:
+                group["lr"] = config.learning_rate * (0.01 + 0.99 * cosine)
+            batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator)
+            batch = batch.to(x.device, non_blocking=True)
+            error = torch.nan_to_num(net(x[batch]) - labels[batch])
+            loss = huber_loss(error / self.label_rms, torch.zeros_like(error), delta=HUBER_DELTA)
+            self.optimiser.zero_grad()
+            loss.backward()
+            ranks.average(*(p.grad for p in self.parameters if p.grad is not None))
+            self.optimiser.step()
+            squares[step] = error.detach().square().mean()
+            tick()
+        net.features.noise_std = 0.0
+        net.eval()
+        return squares.cpu().numpy()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state between rounds, for a checkpoint.
+
+        The pool has hundreds of megabytes. It is not stored: the networks of all rounds are, and roll out again.
+        """
         return {
-            "rounds": list(self.rounds),
+            "rounds": list(self.rollout_states),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
             "env_rng": self.env.rng_state,
         }
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Roll the past rounds out again, then undo `state`; the network is left as it is."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state, and the pool by new rollouts. The network stays as it is."""
         present = {name: x.clone() for name, x in self.net.state_dict().items()}
         for i, before in enumerate(state["rounds"]):
             self.net.load_state_dict(before["net"])
             self.env.rng_state = before["rng"]
-            self.collect(follow_labels=i == 0)
+            self._extend_pool(follow_labels=i == 0)
         self.net.load_state_dict(present)
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"])
         self.env.rng_state = state["env_rng"]
-        self.rounds, self.done = list(state["rounds"]), len(state["rounds"])
+        self.rollout_states = list(state["rounds"])
 
 
-def _held(labels: Array, hold: int) -> Array:
-    """Mean of the labels of rows t … t + hold − 1, (N, n) → (N − hold + 1, n); across motions it is never used."""
+def _mean_over_hold(labels: Array, hold: int) -> Array:
+    """Average labels over the control periods that a correction is held: (N, n) → (N − hold + 1, n).
+
+    Averages across the end of a recording are not used.
+    """
     return np.mean([labels[i : len(labels) - hold + 1 + i] for i in range(hold)], axis=0) if hold > 1 else labels
 
 
-def _rms(losses: Array) -> float:
-    return float(np.sqrt(ranks.mean(losses.mean())[0])) if len(losses) else float("nan")
+def _rms(squares: Array) -> float:
+    return float(np.sqrt(ranks.mean(squares.mean())[0])) if len(squares) else float("nan")

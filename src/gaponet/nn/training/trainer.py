@@ -1,19 +1,11 @@
-"""One training run: split, sensors, warm start, PPO, the best model on validation, its gain, export.
+"""One training run: inputs, supervised pre-training, PPO, choice of the gain, export.
 
-RUN/config.json        everything needed to repeat it       RUN/progress.jsonl   training curve, one line per validation
-RUN/split.json         content hashes per part              RUN/checkpoint.pt    newest state, for --resume
-RUN/delay_offset.json  the cheap baseline, same data        RUN/model/           the artifact: model.onnx, card.json
-RUN/robot/             the simulator corrected              RUN/tensorboard/     the same curve, with --log tensorboard
-
-A run that was stopped and resumed equals one that was not, bit for bit, as long as its budget counts steps.
+A run that was stopped and resumed equals an uninterrupted run bit for bit if its budget counts control steps.
 """
 
 from __future__ import annotations
 
 import copy
-import hashlib
-import json
-import os
 import platform
 import time
 from collections.abc import Callable
@@ -25,354 +17,346 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.base.files import lock_folder, write_text
+from gaponet.base.files import lock_folder
 from gaponet.base.structure import validated
-from gaponet.data.pair import require_disjoint
-from gaponet.data.sequence import Sequence, SequenceMeta, require_same_gains
-from gaponet.data.split import parts_of, spread
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.nn import delay_offset
 from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export
 from gaponet.nn.training import ranks
 from gaponet.nn.training.budget import Budget, Status
 from gaponet.nn.training.checkpoint import Checkpoint, StateDict
-from gaponet.nn.training.config import TrainConfig, command
+from gaponet.nn.training.config import TrainConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.labels import trajectory_labels
 from gaponet.nn.training.loggers import Loggers
 from gaponet.nn.training.ppo import PPO, Update
-from gaponet.nn.training.pretraining import Pretraining, recipe
+from gaponet.nn.training.pretraining import Pretraining, pretraining_config
+from gaponet.nn.training.run_folder import RunFolder, TrainingData
 from gaponet.nn.training.sensor_fit import fit_inputs, refit_sensors
-from gaponet.nn.training.validation import added, choose_gain, errors
-from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot, save_robot
+from gaponet.nn.training.validation import Validator, choose_gain
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import Condition
-from gaponet.sim.model import model_hash
 
-VALIDATION_RUNS = 24  # free runs per validation at most, of every payload, unit and rate
+UNLIMITED = 10**9  # control periods of an episode
 
 
 class Trainer:
-    """Holds one run; `run()` does it. Ctrl-C ends training and still exports the best model so far."""
+    """Runs the stages of one training run. Ctrl-C ends training, and the best model so far is exported.
+
+    Attributes:
+        baseline: Delay and offset of the training recordings. If it is not set before `run`, it is fitted.
+    """
 
     def __init__(
         self,
+        data: TrainingData,
+        folder: RunFolder,
+        config: TrainConfig,
+        budget: Budget,
+        net: DeltaNet,
+        checkpoint: Checkpoint,
+        loggers: Loggers,
+        show: Callable[[Status], None],
+    ) -> None:
+        """Use Trainer.prepare to make one. On resume, net and torch's random numbers are those of the checkpoint."""
+        self.data, self.folder, self.config, self.budget = data, folder, config, budget
+        self.robot, self.net, self.state, self.loggers, self.show = folder.robot, net, checkpoint, loggers, show
+        self.rank_config = ranks.share(config)
+        self.baseline: DelayOffset | None = None
+        self.validator = Validator(data.val, self.robot, config.model, self.rank_config.threads)
+        self.rng_state = torch.get_rng_state()
+        self.nominal_error = float("nan")
+        self.update = Update()
+        self.interrupted, self.stage = False, "start"
+        self.started_at = time.monotonic()
+
+    @classmethod
+    def prepare(
+        cls,
         dataset: Dataset,
         robot: RobotSpec,
         out: Path,
         config: TrainConfig,
         budget: Budget,
+        *,
         resume: bool = False,
         holdout_units: tuple[str, ...] = (),
         show: Callable[[Status], None] = lambda status: None,
         log: tuple[str, ...] = (),
-    ) -> None:
-        """Split the dataset and refuse what cannot work, before any time is spent; log: any of loggers.KINDS."""
-        dataset.require_robot(robot)
-        config = validated(TrainConfig, asdict(config), "training options", UsageError).sized()
-        if not resume and any((out / name).exists() for name in ("checkpoint.pt", "model/card.json")):
-            raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
-        if resume and not (out / "checkpoint.pt").is_file():
-            raise UsageError(f"{out}: nothing to resume (no checkpoint.pt); train without --resume")
-        if resume and has_stored_robot(out) and model_hash(load_stored_robot(out, robot.name)) != model_hash(robot):
-            raise UsageError(f"{out}: was trained in another simulator; resume with --robot {out / STORED_ROBOT}")
-        self.dataset, self.robot, self.out, self.config = dataset, robot, out, config
-        self.budget, self.show, self.own = budget, show, ranks.share(config)
-        rule = (holdout_units, config.holdout_payloads, config.rates, config.train_share)
-        self.parts = parts_of(dataset, config.split, *rule)
-        if not config.mixed_gains:
-            together = (e.meta for part in self.parts.values() for e in part)
-            require_same_gains(together, dataset.joint_names, robot.operated)
-        self.train_set = dataset.sequences(self.parts["train"], optional=False)
-        self.val_set = dataset.sequences(spread(self.parts["val"], VALIDATION_RUNS), optional=False)
-        if not config.mixed_gains and (other := next((c for c in self._conditions() if c.kp or c.kd), None)):
-            raise UsageError(
-                f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says others: write there "
-                "what the robot runs with, or add --mixed-gains to train in simulators of the recordings' own gains"
-            )
-        require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
-        self.n = len(robot.operated)
-        torch.manual_seed(config.seed)
-        torch.set_num_threads(self.own.learner_threads)
-        self.net = build_network(config.model, self.n)
-        if ranks.rank():  # the same network, other noise
-            torch.manual_seed(_seed(config.seed))
-        self.untrained = copy.deepcopy(self.net.state_dict())
-        self.state = Checkpoint(self.untrained, self.untrained, dataset=dataset_hash(dataset.entries))
-        self.nominal, self.found, self.measured = float("nan"), Update(), dict[bytes, Array]()
-        self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
-        self.interrupted, self.stage = False, "start"
-        self.began = time.monotonic()
-        with ranks.on_first(lock_folder(out, "run")):
-            if resume:
-                self.state, self.rng = Checkpoint.read(out, self.net, self.state.dataset)
-            if not ranks.rank():
-                self._write_config(holdout_units, resume)
-        self.net.to(config.network_device())
-        self.loggers = Loggers(() if ranks.rank() else log, out, asdict(config))
+    ) -> Trainer:
+        """Read the recordings and write the run's setup. All inputs are checked before training takes time.
 
-    def run(self) -> GapModel:
-        """Train until the budget is out or Ctrl-C; returns the exported best model.
+        Args:
+            robot: The simulator that the network corrects.
+            out: Run folder.
+            resume: Continue the run in out.
+            holdout_units: Units that are only in the test split.
+            show: Called with the state of the run.
+            log: Any of loggers.KINDS.
 
         Raises:
-            FolderError: Another process writes into the run.
+            DatasetError, UsageError: The recordings, the options or the folder do not fit.
+            ModelError: The checkpoint is damaged.
         """
-        with ranks.on_first(lock_folder(self.out, "run")):
-            return self._run()
+        config = validated(TrainConfig, asdict(config), "training options", UsageError).sized()
+        folder = RunFolder(out, robot, resume)
+        data = TrainingData.load(dataset, robot, config, holdout_units)
+        torch.manual_seed(config.seed)
+        torch.set_num_threads(ranks.share(config).learner_threads)
+        net = build_network(config.model, len(robot.operated))
+        if ranks.rank():  # equal networks, different noise
+            torch.manual_seed(_rank_seed(config.seed))
+        weights = copy.deepcopy(net.state_dict())
+        checkpoint = Checkpoint(weights, weights, dataset_hash=dataset_hash(dataset.entries))
+        with ranks.on_first(lock_folder(out, "run")):
+            if resume:
+                checkpoint = Checkpoint.read(out, net, checkpoint.dataset_hash)
+            if not ranks.rank():
+                folder.write_setup(data, config, budget)
+                checkpoint.write_progress(out)
+        net.to(config.network_device())
+        loggers = Loggers(() if ranks.rank() else log, out, asdict(config))
+        return cls(data, folder, config, budget, net, checkpoint, loggers, show)
 
-    def _run(self) -> GapModel:
-        ranks.once(self._fit_baseline)
-        self.nominal = float(self.validate(None, self.robot.nominal).mean())
-        try:
-            if not np.isfinite(self.state.best):  # the untrained network corrects nothing: nothing worse is ever kept
-                self.measured[self._key(self.net)] = self.validate(None)
-                self._consider()
-            if self.state.learner is None and recipe(self.config).rounds > self.state.rounds_done:
-                self._warm_start()
-            elif not recipe(self.config).rounds and self.state.learner is None:
-                self._cold_start()
-            self._ppo()
-            self._shrink()
-        except KeyboardInterrupt:
-            self.interrupted = True
-        if not self.state.steps:
-            why = "interrupted" if self.interrupted else "the budget ended"
-            raise ModelError(
-                f"{self.out}: {why} after {self.seconds():.0f} s, before the first step of training: nothing was "
-                "learned, no model written. Give --budget more than that; gaponet train … --resume goes on here"
-            )
-        return self.finish()
+    def run(self) -> GapModel:
+        """Train until the budget is spent or Ctrl-C, and return the exported best model.
+
+        Raises:
+            FolderError: Another process writes into the run folder.
+            ModelError: The budget ended before the first training step.
+        """
+        with ranks.on_first(lock_folder(self.folder.path, "run")):
+            self.baseline = ranks.once(self._write_baseline)
+            self.nominal_error = float(self.validator.errors(None, self.robot.nominal).mean())
+            try:
+                self._run_stages()
+            except KeyboardInterrupt:
+                self.interrupted = True
+            if not self.state.steps:
+                why = "interrupted" if self.interrupted else "the budget ended"
+                raise ModelError(
+                    f"{self.folder.path}: {why} after {self.seconds():.0f} s, before the first step of training: "
+                    "nothing was learned, no model written. Give --budget more than that; gaponet train … --resume "
+                    "goes on here"
+                )
+            return self._finish()
+
+    def seconds(self) -> float:
+        """Return the training time, including earlier parts of a resumed run."""
+        return self.state.seconds + time.monotonic() - self.started_at
 
     # ---- stages
 
-    def _fit_baseline(self) -> None:
-        if self.baseline is None:
-            robot = self.robot.before_identification
-            self.baseline = delay_offset.DelayOffset.fit(self.train_set, robot, self.own.threads)
-        write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
+    def _run_stages(self) -> None:
+        state, rounds = self.state, pretraining_config(self.config).rounds
+        if not np.isfinite(state.best_error):  # the untrained network corrects nothing: the error to improve on
+            self.validator.set_errors(self.net, self.validator.errors(None))
+            self._save_if_best(self.net, self.validator.errors(None).mean())
+        if state.ppo is None and state.pretraining_rounds < rounds:
+            self._pretrain()
+        elif state.ppo is None and not rounds:
+            self._fit_inputs()
+        self._ppo()
+        self._choose_gain()
 
-    def _warm_start(self) -> None:
-        config = recipe(self.own)
+    def _write_baseline(self) -> DelayOffset:
+        robot = self.robot.before_identification
+        baseline = self.baseline or DelayOffset.fit(self.data.train, robot, self.rank_config.threads)
+        self.folder.write_baseline(baseline)
+        return baseline
+
+    def _pretrain(self) -> None:
+        """Supervised pre-training (nn/training/pretraining.py)."""
+        state, config, threads = self.state, pretraining_config(self.rank_config), self.rank_config.threads
         self.stage = "labels"
-        part = self.parts["train"]
-        some = spread(part, max(1, config.rows * len(part) // sum(e.rows for e in part)))
-        labelled = self.dataset.sequences(some, optional=False)
-        env = self._env(config.num_envs, 10**9, self.config.seed, sequences=labelled)
-        labels = trajectory_labels(
-            labelled, self.robot, 0.99 * self.config.model.delta_max, self.own.threads, self._tick
-        )
-        warm = Pretraining(self.net, env, labels, config, _seed(self.config.seed), self.own.threads)
-        warm.report = self.state.sensor_r2
-        if self.state.rounds_done == 0:
+        sequences = self.data.labelled_subset(config.rows)
+        env = self._env(config.num_envs, UNLIMITED, self.config.seed, sequences=sequences)
+        largest = 0.99 * self.config.model.delta_max
+        labels = trajectory_labels(sequences, self.robot, largest, threads, self._tick)
+        pretraining = Pretraining(self.net, env, labels, config, _rank_seed(self.config.seed), threads)
+        if state.pretraining_rounds == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
             self._tick()
-            warm.begin()
-        self.stage = "warm start"
-        if self.state.warm is not None and self._spent() < 1:
-            warm.set_state(self.state.warm)
-            torch.set_rng_state(self.rng)
-        while warm.done < config.rounds and self._spent() < 1:
-            fit = warm.round(self._tick)
-            self.state.sensor_r2 = warm.report
-            self.state.rounds_done, self.state.warm = warm.done, warm.state()
-            self.state.steps += ranks.world() * config.num_envs * config.steps
-            self._consider(None, **fit)
+            state.sensor_r2 = pretraining.fit_inputs()
+        self.stage = "pretraining"
+        if state.pretraining is not None and self._spent() < 1:
+            pretraining.load_state_dict(state.pretraining)
+            torch.set_rng_state(self.rng_state)
+        while pretraining.rounds_done < config.rounds and self._spent() < 1:
+            fit = pretraining.round(self._tick)
+            state.pretraining_rounds, state.pretraining = pretraining.rounds_done, pretraining.state_dict()
+            state.steps += ranks.world() * config.num_envs * config.steps
+            self._validate_and_save(fit)
 
-    def _cold_start(self) -> None:
-        """PPO alone also needs the statistics of its inputs, and sensors that answer."""
+    def _fit_inputs(self) -> None:
+        """Fit input statistics and the sensor predictor for PPO without pre-training."""
         self.stage = "sensors"
         self._tick()
-        env = self._env(self.own.warm_start.num_envs, 10**9, self.config.seed)
+        env = self._env(self.rank_config.pretraining.num_envs, UNLIMITED, self.config.seed)
         x = env.get_observations()["actor"]
-        self.state.sensor_r2 = fit_inputs(
-            self.net, env, x, self.config.warm_start.sensor_states, self.config.seed, self.own.threads
-        )
-        self.state.trained_state = copy.deepcopy(self.net.state_dict())
+        states, threads = self.config.pretraining.sensor_states, self.rank_config.threads
+        self.state.sensor_r2 = fit_inputs(self.net, env, x, states, self.config.seed, threads)
+        self.state.best_trained_state = copy.deepcopy(self.net.state_dict())
 
     def _ppo(self) -> None:
-        ppo = self.own.ppo
+        config, state = self.rank_config.ppo, self.state
         if self._spent() >= 1 or self.config.model.kind == "inverse":
             return
         self.stage = "ppo"
-        steps = round(self.config.episode_s / self.train_set[0].dt)
-        env = self._env(ppo.num_envs, steps, self.config.seed + 1)
-        if self.state.learner is None:
-            self.net.load_state_dict(self._ppo_start())
-        learner = PPO(env, self.net, ppo)
-        if self.state.learner is not None and self.state.env is not None:
-            learner.load(self.state.learner)
-            env.set_state(self.state.env)
-            torch.set_rng_state(self.rng)
-        self.state.warm = None
+        episode_steps = round(self.config.episode_s / self.data.train[0].dt)
+        env = self._env(config.num_envs, episode_steps, self.config.seed + 1)
+        if state.ppo is None:
+            self.net.load_state_dict(self._initial_ppo_weights())
+        ppo = PPO(env, self.net, config)
+        if state.ppo is not None and state.env is not None:
+            ppo.load_state_dict(state.ppo)
+            env.set_state(state.env)
+            torch.set_rng_state(self.rng_state)
+        state.pretraining = None
         while self._spent() < 1:
-            self.found = learner.update()
-            self.state.updates += 1
-            self.state.steps += ranks.world() * ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
-            if ppo.refit_sensors and self.state.updates % ppo.refit_sensors == 0 and self.net.predictor is not None:
-                seed = self.config.seed + self.state.updates
-                self.state.sensor_r2 = refit_sensors(
-                    self.net, env, self.own.warm_start.sensor_states, seed, self.own.threads
-                )
+            self.update = ppo.update()
+            state.ppo_updates += 1
+            state.steps += ranks.world() * config.num_envs * config.num_steps * self.config.model.delta_hold
+            if (
+                config.refit_sensors
+                and state.ppo_updates % config.refit_sensors == 0
+                and self.net.predictor is not None
+            ):
+                states, seed = self.rank_config.pretraining.sensor_states, self.config.seed + state.ppo_updates
+                state.sensor_r2 = refit_sensors(self.net, env, states, seed, self.rank_config.threads)
             self._tick()
-            if self.state.updates % self.config.validate_every == 0:
-                self.state.learner, self.state.env = learner.state(), env.state()
-                self._consider()
-        self.state.learner, self.state.env = learner.state(), env.state()
-        self._consider()
+            if state.ppo_updates % self.config.validate_every == 0:
+                state.ppo, state.env = ppo.state_dict(), env.state()
+                self._validate_and_save(vars(self.update))
+        state.ppo, state.env = ppo.state_dict(), env.state()
+        self._validate_and_save(vars(self.update))
 
-    def _ppo_start(self) -> StateDict:
-        """The best of the warm start or, where that is worse than no correction, the untrained network beside it."""
-        best = self.state.trained_state
-        self.state.anew = bool(recipe(self.config).rounds) and self._in_vain()
-        if not self.state.anew:
-            return best
-        trained = {name for name, _ in self.net.named_parameters() if not name.startswith("predictor.")}
-        return {k: self.untrained[k] if k in trained else v for k, v in best.items()}
+    def _initial_ppo_weights(self) -> StateDict:
+        """Return the best pre-trained weights, or untrained ones if these have a larger error than no correction."""
+        state = self.state
+        too_large = state.best_trained_error > state.untrained_error
+        state.ppo_from_untrained = bool(pretraining_config(self.config).rounds) and too_large
+        if not state.ppo_from_untrained:
+            return state.best_trained_state
+        with torch.random.fork_rng():
+            torch.manual_seed(self.config.seed)
+            untrained = build_network(self.config.model, self.net.n).state_dict()
+        parameters = {name for name, _ in self.net.named_parameters() if not name.startswith("predictor.")}
+        return {k: untrained[k] if k in parameters else v for k, v in state.best_trained_state.items()}
 
-    def _in_vain(self) -> bool:
-        """Whether nothing that was fitted is better than no correction."""
-        return self.state.trained > self.state.progress[0]["val_mpjae"]
-
-    def _shrink(self) -> None:
-        """Less of the best correction where validation motions say so; a resumed run trains on with all of it."""
-        if not np.isfinite(self.state.trained) or self.config.model.kind == "paper":  # which has no gain
+    def _choose_gain(self) -> None:
+        """Reduce the correction if that reduces the validation error. A resumed run continues with gain 1."""
+        state = self.state
+        if not np.isfinite(state.best_trained_error) or self.config.model.kind == "paper":  # it has no gain
             return
         self.stage = "gain"
         self._tick()
-        with torch.random.fork_rng():
-            net = build_network(self.config.model, self.n)
-        net.load_state_dict(self.state.trained_state)
-        if choose_gain(net, lambda: float(self.validate(net).mean()), self.state.trained) < 1.0:
-            self._consider(net)
+        net = self._network(state.best_trained_state)
+        if choose_gain(net, lambda: float(self.validator.errors(net).mean()), state.best_trained_error) < 1.0:
+            self._save_if_best(net, self.validator.errors(net).mean())
 
-    def finish(self) -> GapModel:
-        """Export the best model and write its card."""
+    def _finish(self) -> GapModel:
         self.stage = "export"
         self._tick()
-        net = build_network(self.config.model, self.n)
-        net.load_state_dict(self.state.best_state)
-        net.eval()
-        adds, error = added(self.val_set, self.validate(None), self.validate(net))
-        ranks.once(lambda: self._export(net, {"added": adds} | ({} if np.isnan(error) else {"error": error})))
-        return GapModel.load(self.out)
+        net = self._network(self.state.best_state).eval()
+        reduction, error = self.validator.improvement(net)
+        improvement = {"added": reduction} | ({} if np.isnan(error) else {"error": error})
+        ranks.once(lambda: self._export(net, improvement))
+        return GapModel.load(self.folder.path)
 
-    def _export(self, net: DeltaNet, worth: dict[str, float]) -> None:
-        env = self._env(max(64, len(self._conditions())), 10, 0, "cpu")
+    def _export(self, net: DeltaNet, improvement: dict[str, float]) -> None:
+        env = self._env(max(64, len(self.data.conditions)), 10, 0, device="cpu")
         self.loggers.close()
-        export(net, self.out / "model", self._card(worth), env.get_observations()["actor"].numpy())
+        samples = env.get_observations()["actor"].numpy()
+        export(net, self.folder.path / "model", self._card(improvement), samples)
+
+    # ---- parts of stages
+
+    def _network(self, weights: StateDict) -> DeltaNet:
+        with torch.random.fork_rng():
+            net = build_network(self.config.model, self.net.n)
+        net.load_state_dict(weights)
+        return net
 
     def _env(
-        self, num_envs: int, episode_steps: int, seed: int, device: str | None = None,
+        self,
+        num_envs: int,
+        episode_steps: int,
+        seed: int,
+        *,
+        device: str | None = None,
         sequences: list[Sequence] | None = None,
-    ) -> DeltaEnv:  # fmt: skip
-        c = self.own
-        how = c.reward, _seed(seed), c.threads, device or c.device
-        return DeltaEnv(sequences or self.train_set, self.robot, c.model, num_envs, episode_steps, *how)
+    ) -> DeltaEnv:
+        config = self.rank_config
+        return DeltaEnv(
+            sequences or self.data.train, self.robot, config.model, num_envs, episode_steps, config.reward,
+            _rank_seed(seed), config.threads, device or config.device,
+        )  # fmt: skip
 
-    # ---- validation, checkpoints, card
+    def _validate_and_save(self, metrics: dict[str, float]) -> None:
+        """Validate the network in training, and save it with these metrics of its stage."""
+        state, error = self.state, float(self.validator.errors(self.net).mean())
+        if error < state.best_trained_error:
+            state.best_trained_error, state.best_trained_state = error, copy.deepcopy(self.net.state_dict())
+        self._save_if_best(self.net, error, metrics)
 
-    def validate(self, net: DeltaNet | None, robot: RobotSpec | None = None) -> Array:
-        """MPJAE of a whole-motion free run of each validation recording, (k,) rad, found once.
-
-        Args:
-            net: Corrects; None for the simulator as it is.
-            robot: The simulator, if not the one that is trained in.
-        """
-        key = self._key(net, robot)
-        if key not in self.measured:
-            what = robot or self.robot, self.config.model, net, self.own.threads
-            self.measured[key] = ranks.each(self.val_set, lambda own: errors(own, *what))
-        return self.measured[key]
-
-    @staticmethod
-    def _key(net: DeltaNet | None, robot: RobotSpec | None = None) -> bytes:
-        weights = [] if net is None else [x.cpu().numpy().tobytes() for x in net.state_dict().values()]
-        return hashlib.sha256(b"".join([repr(robot).encode(), *weights])).digest()
-
-    def _consider(self, shrunk: DeltaNet | None = None, **told: float) -> None:
-        """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
-        net = shrunk or self.net
-        self.state.val = float(self.validate(net).mean())
-        if self.state.val < self.state.best:
-            self.state.best, self.state.best_state = self.state.val, copy.deepcopy(net.state_dict())
-        if self.stage in ("warm start", "ppo") and self.state.val < self.state.trained:
-            self.state.trained, self.state.trained_state = self.state.val, copy.deepcopy(net.state_dict())
+    def _save_if_best(self, net: DeltaNet, error: float, metrics: dict[str, float] | None = None) -> None:
+        """Store a network if it is the best so far; write progress.jsonl and the checkpoint."""
+        state = self.state
+        state.val_error = float(error)
+        if state.val_error < state.best_error:
+            state.best_error, state.best_state = state.val_error, copy.deepcopy(net.state_dict())
         line = {
-            "stage": self.stage, "steps": self.state.steps, "seconds": round(self.seconds(), 1),
-            "val_mpjae": self.state.val, "nominal_mpjae": self.nominal,
-        }  # fmt: skip
-        line |= vars(self.found) if self.stage == "ppo" else told
-        self.state.progress.append({k: v if v == v else None for k, v in line.items()})
+            "stage": self.stage, "steps": state.steps, "seconds": round(self.seconds(), 1),
+            "val_mpjae": state.val_error, "nominal_mpjae": self.nominal_error,
+        } | (metrics or {})  # fmt: skip
+        state.progress.append({k: v if v == v else None for k, v in line.items()})
         self.loggers.write(line)
-        self.state.seconds, self.began = self.seconds(), time.monotonic()
-        self.state.write(self.out, self.net)
+        state.seconds, self.started_at = self.seconds(), time.monotonic()
+        state.write(self.folder.path, self.net)
         self._tick()
-
-    def seconds(self) -> float:
-        """Trained so far, earlier parts of a resumed run included."""
-        return self.state.seconds + time.monotonic() - self.began
 
     def _spent(self) -> float:
         return ranks.decided(self.budget.spent(self.seconds(), self.state.steps))
 
-    def _tick(self) -> float:
-        """Show where the run stands; returns the share of the budget spent."""
-        k, spent = self.state, self._spent()
-        share = min(spent, 1.0)
-        self.show(Status(self.stage, share, k.steps, self.seconds(), self.found.reward, k.val, k.best, self.nominal))
-        return spent
+    def _tick(self) -> None:
+        """Report the state of the run."""
+        state, share = self.state, min(self._spent(), 1.0)
+        errors = state.val_error, state.best_error, self.nominal_error
+        self.show(Status(self.stage, share, state.steps, self.seconds(), self.update.reward, *errors))
 
-    def _write_config(self, holdout_units: tuple[str, ...], resume: bool) -> None:
-        data = self.dataset
-        what = data.address or data.path, self.out, self.budget, self.config, self.robot, holdout_units, ranks.world()
-        config = asdict(self.config) | {
-            "budget": asdict(self.budget), "holdout_units": list(holdout_units), "robot": self.robot.name,
-            "command": command(*what),
-            "dataset": data.address or os.path.relpath(data.path, self.out), "dataset_hash": dataset_hash(data.entries),
-        }  # fmt: skip
-        write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
-        kept = self.out / STORED_ROBOT
-        if self.robot.folder.resolve() != kept.resolve() and not (resume and has_stored_robot(self.out)):
-            save_robot(self.robot, kept)
-        split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
-        write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
-        self.state.write_progress(self.out)
-
-    def _conditions(self) -> set[Condition]:
-        return {Condition.of(s, self.robot) for s in self.train_set}
-
-    def _card(self, worth: dict[str, float]) -> dict[str, Any]:
-        seen = self.train_set
+    def _card(self, improvement: dict[str, float]) -> dict[str, Any]:
+        data, state = self.data, self.state
         assert self.baseline is not None
+        metas = [s.meta for s in data.train]
         return make_card(
             self.config.model,
             self.robot,
-            dt=sorted({s.dt for s in seen}),
-            payload_seen=sorted({s.meta.payload_mass for s in seen}),
-            units=sorted({s.meta.unit_id for s in seen}),
-            recorded=_recorded_gains([s.meta for s in seen], self.robot),
-            virtual=any(s.meta.virtual for s in seen),
-            dataset_hash=dataset_hash(self.dataset.entries),
-            hours=round(sum(s.duration for s in seen) / 3600, 3),
-            motions={part: sorted({e.meta.motion for e in entries}) for part, entries in self.parts.items()},
-            val_mpjae={"model": self.state.best, "nominal": self.nominal, "start": self.state.progress[0]["val_mpjae"]}
-            | worth,
-            sensor_r2=self.state.sensor_r2,
+            dt=sorted({s.dt for s in data.train}),
+            payload_seen=sorted({m.payload_mass for m in metas}),
+            units=sorted({m.unit_id for m in metas}),
+            recorded=_recorded_gains(metas, self.robot),
+            virtual=any(m.virtual for m in metas),
+            dataset_hash=dataset_hash(data.dataset.entries),
+            hours=round(sum(s.duration for s in data.train) / 3600, 3),
+            motions={part: sorted({e.meta.motion for e in entries}) for part, entries in data.splits.items()},
+            val_mpjae={"model": state.best_error, "nominal": self.nominal_error, "start": state.untrained_error}
+            | improvement,
+            sensor_r2=state.sensor_r2,
             seed=self.config.seed,
-            gain=self.state.best_state["bounded.gain"].item(),
+            gain=state.best_state["bounded.gain"].item(),
             excess_delay=max(self.baseline.delay.values()),
-            steps=self.state.steps,
+            steps=state.steps,
             seconds=round(self.seconds(), 1),
             interrupted=self.interrupted,
             stages={
-                "warm_start_rounds": [self.state.rounds_done, recipe(self.config).rounds],
-                "ppo_updates": self.state.updates,
-                "ppo_anew": self.state.anew,
+                "pretraining_rounds": [state.pretraining_rounds, pretraining_config(self.config).rounds],
+                "ppo_updates": state.ppo_updates,
+                "ppo_from_untrained": state.ppo_from_untrained,
             },
             versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch")}
             | {"python": platform.python_version()},
@@ -380,17 +364,17 @@ class Trainer:
 
 
 def _recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, list[float] | None]:
-    """kp, kd of the operated joints while the training data were recorded; None where unknown or not one and the same.
+    """Return kp and kd of the real servos in the training recordings; None where unknown or not the same in all.
 
-    They are the real robot's; "kp" and "kd" of the card are the simulator's.
+    "kp" and "kd" of the card are the simulator's.
     """
-    found: dict[str, list[float] | None] = {}
+    recorded: dict[str, list[float] | None] = {}
     for name in ("kp", "kd"):
         gains = {tuple(round(g[i], 9) for i in robot.operated_index) for m in metas if (g := getattr(m, name))}
-        found[name] = list(gains.pop()) if len(gains) == 1 else None
-    return found
+        recorded[name] = list(gains.pop()) if len(gains) == 1 else None
+    return recorded
 
 
-def _seed(first: int) -> int:
-    """The seed of what shall differ between ranks, from that of the first."""
-    return first + ranks.APART * ranks.rank()
+def _rank_seed(seed: int) -> int:
+    """Return this rank's seed for what differs between ranks."""
+    return seed + ranks.SEED_STEP * ranks.rank()

@@ -1,13 +1,14 @@
-"""How far a network is from the recordings while it is trained, in whole free runs; and how much of it to apply.
+"""Validation error of networks during training, and the choice of the correction gain.
 
-A correction learnt from an hour of one robot is partly noise. Where little is left to correct, as after identification,
-half of it can be better than all of it. One number for all joints: chosen joint by joint it fits the few validation
-motions rather than the robot.
+A correction that was learned from an hour of recordings is partly noise. If the simulator is already close to the
+robot, for example after identification, half of the correction can have a smaller error than all of it. All joints
+share one gain: gains per joint would fit the few validation motions rather than the robot.
 """
 
 from __future__ import annotations
 
 import copy
+import hashlib
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 
@@ -20,44 +21,78 @@ from gaponet.nn.layers import DeltaNet
 from gaponet.nn.loop import DeltaCorrector
 from gaponet.nn.onnx_export import onnx_content
 from gaponet.nn.onnx_network import OnnxNetwork
+from gaponet.nn.training import ranks
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import replay
 
-GAINS = (0.75, 0.5, 0.25)  # beside 1
+GAINS = (0.75, 0.5, 0.25)  # candidates below 1
 
 
-def errors(
-    sequences: ListOf[Sequence], robot: RobotSpec, config: ModelConfig, net: DeltaNet | None, nthread: int
-) -> Array:
-    """MPJAE of each recording, (k,) rad; None for the simulator as it is."""
-    op, corrector = robot.operated_index, None
-    if net is not None:  # as it ships: onnxruntime takes half of torch's time here
-        corrector = DeltaCorrector(OnnxNetwork(onnx_content(copy.deepcopy(net).cpu().eval())), config, robot)
-    twins = replay(sequences, robot, corrector, nthread, lock_idle=True)
-    return np.array([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)], float)
+class Validator:
+    """Rollout errors of networks on the validation recordings. Each network is simulated once."""
+
+    def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec, config: ModelConfig, nthread: int) -> None:
+        """robot: The simulator that the network corrects."""
+        self.sequences, self.robot, self.config, self.nthread = sequences, robot, config, nthread
+        self._cache: dict[bytes, Array] = {}
+
+    def errors(self, net: DeltaNet | None, robot: RobotSpec | None = None) -> Array:
+        """Return the mean position error of a rollout of each recording, (k,) rad.
+
+        Args:
+            net: The network; None for the simulator without correction.
+            robot: Simulator instead of the one that the network corrects.
+        """
+        key = self._key(net, robot)
+        if key not in self._cache:
+            self._cache[key] = ranks.each(self.sequences, lambda own: self._rollout_errors(own, net, robot))
+        return self._cache[key]
+
+    def set_errors(self, net: DeltaNet, errors: Array) -> None:
+        """Set the errors of a network without simulation, because it corrects nothing."""
+        self._cache[self._key(net)] = errors
+
+    def improvement(self, net: DeltaNet) -> tuple[float, float]:
+        """Return the error reduction by a network, rad: mean and standard error over motions."""
+        return error_reduction(self.sequences, self.errors(None), self.errors(net))
+
+    @staticmethod
+    def _key(net: DeltaNet | None, robot: RobotSpec | None = None) -> bytes:
+        weights = [] if net is None else [x.cpu().numpy().tobytes() for x in net.state_dict().values()]
+        return hashlib.sha256(b"".join([repr(robot).encode(), *weights])).digest()
+
+    def _rollout_errors(self, sequences: ListOf[Sequence], net: DeltaNet | None, robot: RobotSpec | None) -> Array:
+        robot, corrector = robot or self.robot, None
+        if net is not None:  # on onnxruntime, as it ships; torch needs twice the time
+            network = OnnxNetwork(onnx_content(copy.deepcopy(net).cpu().eval()))
+            corrector = DeltaCorrector(network, self.config, robot)
+        rollouts = replay(sequences, robot, corrector, self.nthread, lock_idle=True)
+        operated = robot.operated_index
+        pairs = zip(sequences, rollouts, strict=True)
+        return np.array([np.abs(rollout.qpos - s.qpos)[1:, operated].mean() for s, rollout in pairs], float)
 
 
-def added(sequences: ListOf[Sequence], before: Array, after: Array) -> tuple[float, float]:
-    """How much less the error is after than before, (k,) rad each: mean and standard error over motions (paired)."""
+def error_reduction(sequences: ListOf[Sequence], before: Array, after: Array) -> tuple[float, float]:
+    """Return before − after, (k,) rad each, as mean and standard error over motions (paired)."""
     motions = np.array([s.meta.motion for s in sequences])
-    less = np.array([(before - after)[motions == m].mean() for m in sorted(set(motions.tolist()))])
-    return float(less.mean()), standard_error(less)
+    reduction = np.array([(before - after)[motions == m].mean() for m in sorted(set(motions.tolist()))])
+    return float(reduction.mean()), standard_error(reduction)
 
 
-def choose_gain(net: DeltaNet, error: Callable[[], float], whole: float) -> float:
-    """Set the gain with the least error, and return it; less of a correction is tried as long as it does better.
+def choose_gain(net: DeltaNet, error: Callable[[], float], full_error: float) -> float:
+    """Set the gain with the least validation error and return it. The search stops when a smaller gain is worse.
 
     Args:
-        net: Its gain is changed in place.
-        error: That of the network as it is when called.
-        whole: The error with gain 1.
+        net: The network; its gain is changed in place.
+        error: Returns the validation error of the network as it is now.
+        full_error: Validation error with gain 1.
     """
-    best = 1.0
+    best_gain, best_error = 1.0, full_error
     for gain in GAINS:
         net.bounded.gain.fill_(gain)
-        if (found := error()) >= whole:
+        if (candidate := error()) >= best_error:
             break
-        best, whole = gain, found
-    net.bounded.gain.fill_(best)
-    return best
+        best_gain, best_error = gain, candidate
+    net.bounded.gain.fill_(best_gain)
+    return best_gain

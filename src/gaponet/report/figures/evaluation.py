@@ -73,7 +73,7 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
     steps = np.array([p["steps"] for p in progress]) / 1e6
     value = np.array([p["val_mpjae"] for p in progress]) * 1e3
     ax.plot(steps, value, "-", color="#555555", lw=0.8)
-    for stage, tint, label in (("warm start", colour("mlp"), "warm start"), ("ppo", colour("gaponet"), "PPO")):
+    for stage, tint, label in (("pretraining", colour("mlp"), "pre-training"), ("ppo", colour("gaponet"), "PPO")):
         at = [i for i, p in enumerate(progress) if p["stage"] == stage]
         if at:
             ax.plot(steps[at], value[at], "o", ms=3.5, color=tint, label=label)
