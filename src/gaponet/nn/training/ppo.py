@@ -48,7 +48,7 @@ class Batch:
         mean: Corrections without exploration, (B, n) rad.
         actions: Corrections with the new part of the exploration noise, (B, n) rad.
         exploration_mask: 1 where a joint explores, (B, n). Other joints do not contribute to the gradient.
-        advantage, returns: Of each joint, (B, n).
+        advantage, returns: One value per joint, (B, n).
     """
 
     prepared: Tensor
