@@ -6,7 +6,12 @@ there as soon as a request was written. `adversary` may change what a servo says
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import select
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 # address, bytes: from Feetech's memory table
 REGISTERS = {
@@ -108,3 +113,26 @@ class Wire:
 
     def close(self) -> None:
         pass
+
+
+@contextmanager
+def on_port(servos: Servos) -> Iterator[str]:
+    """A pseudo-terminal at which the servos answer, from a thread; yields its name."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    over = threading.Event()
+
+    def serve() -> None:
+        while not over.is_set():
+            if select.select([master], [], [], 0.1)[0]:
+                os.write(master, servos.answer(os.read(master, 4096)))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        over.set()
+        thread.join()
+        os.close(master)
+        os.close(slave)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -63,7 +66,7 @@ def test_a_broken_format_is_one_warning_and_every_other_is_read(installed, tmp_p
 def test_a_built_in_name_is_not_replaced_and_one_line_says_so(installed, caplog):
     installed("[gaponet.formats]\nsage = json\n[gaponet.drivers]\nso101 = json:loads\n")
     assert formats() == formats() == FORMATS
-    with pytest.raises(UsageError, match="no driver 'x'; use one of so101, unitree"):
+    with pytest.raises(UsageError, match="no driver 'x'; use one of unitree, so101"):
         open_driver("x", "so101")
     assert [r.getMessage() for r in caplog.records] == [
         "Warning: rival: 'sage' of gaponet.formats exists already and is not replaced",
@@ -88,6 +91,23 @@ def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, c
     name, method = load_method("half")
     assert (name, method(3)) == ("half", 3)
     assert caplog.records == []
+
+
+def test_run_lists_the_drivers_of_extensions_in_its_help_and_its_error(installed, tmp_path):
+    installed("[gaponet.drivers]\ntoy = HERE_toy:Toy\n", toy="def Toy(robot, port): raise OSError(port)")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+
+    def said(*words: str) -> str:
+        command = [sys.executable, "-P", "-m", "gaponet", "run", *words]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True)
+        return " ".join((run.stdout + run.stderr).split())
+
+    assert "{virtual,unitree,so101,toy}" in said("--help")
+    assert "toy" in said("--driver", "x", "--motion", "a.csv")
+    assert "driver 'toy' is an extension" in said("--driver", "toy", "--motion", "a.csv", "--yes")
+    assert "/dev/arm" in said(
+        "--driver", "toy", "--limits-from", "so101", "--port", "/dev/arm", "--motion", "sweep-wrist_flex", "--yes"
+    )
 
 
 def test_a_broken_driver_is_refused(installed):

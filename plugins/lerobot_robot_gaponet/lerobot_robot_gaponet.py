@@ -286,7 +286,7 @@ class GaponetMotion(Teleoperator):
             motion = read_motion(word, self.spec) if word.endswith(SUFFIXES) else library.make(word)
             plan = planner.plan(motion, parts[-1][-1])
             assert plan.motion
-            parts += [plan.into.rows(dt)[1:], plan.motion.sample(dt)]
+            parts += [plan.approach.rows(dt)[1:], plan.motion.sample(dt)]
         return np.concatenate(parts)
 
     def get_action(self) -> dict[str, float]:
@@ -338,7 +338,7 @@ class GaponetCorrect(ProcessorStep):
         self.spec = load_robot(Path(self.known)) if network is None else network.simulator()
         self.units, self.dt = Units(self.spec), self.spec.dt if network is None else network.card["dt"][0]
         self.compensator = Compensator(self.spec, network, CompensatorConfig(dynamics=self.dynamics), self.dt)
-        self.limits = Limits.of(self.spec, self.spec.joint_names, SafetyConfig())
+        self.limits = Limits.from_robot(self.spec, self.spec.joint_names, SafetyConfig())
         self._bounded = limit_delta
         self.reset()
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import io
 import os
 import select
-import threading
-import tty
 from collections.abc import Iterator
 
 import pytest
-from servos import Servos
+from servos import Servos, on_port
 
 from gaponet.base.errors import UsageError
 from gaponet.cli.main import main
@@ -55,22 +53,9 @@ def person(monkeypatch) -> Iterator[Person]:
 @pytest.fixture
 def bus() -> Iterator[tuple[str, Servos]]:
     """A port, and the servos behind it."""
-    servos, (master, slave) = Servos(), os.openpty()
-    tty.setraw(slave)
-    over = threading.Event()
-
-    def serve() -> None:
-        while not over.is_set():
-            if select.select([master], [], [], 0.1)[0]:
-                os.write(master, servos.answer(os.read(master, 4096)))
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    yield os.ttyname(slave), servos
-    over.set()
-    thread.join()
-    os.close(master)
-    os.close(slave)
+    servos = Servos()
+    with on_port(servos) as port:
+        yield port, servos
 
 
 @pytest.mark.parametrize("answer", ["yes\n", "  YES \n"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from gaponet.cli.out import Out
-from gaponet.hw.drivers.link import measure
+from gaponet.hw.drivers.link import measure_link
 from gaponet.hw.drivers.open import open_driver
 
 
@@ -14,7 +14,7 @@ def listen(out: Out, kind: str, name: str, options: dict[str, Any], seconds: flo
     driver = open_driver(kind, name, **options)
     try:
         driver.connect()
-        found = measure(driver, seconds)
+        found = measure_link(driver, seconds)
         publishers = driver.publishers() if hasattr(driver, "publishers") else {}
     finally:
         driver.close(hold=True)

@@ -17,6 +17,7 @@ from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.hw.control.consent import require_consent, require_terminal
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import SafetyConfig
+from gaponet.hw.drivers.open import driver_names
 from gaponet.hw.targets.live import LiveConfig
 
 if TYPE_CHECKING:
@@ -29,6 +30,15 @@ if TYPE_CHECKING:
     from gaponet.robot.spec import RobotSpec
     from gaponet.sysid.motion.feasible import Feasibility
     from gaponet.sysid.motion.motion import Motion
+
+DRIVERS = ("virtual", *driver_names())
+DriverName = Annotated[
+    str,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar=f"{{{','.join(DRIVERS)}}}", choices=DRIVERS, instance_from_str=lambda words: words[0],
+        is_instance=lambda value: isinstance(value, str), str_from_instance=lambda name: [name],
+    ),
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,14 +72,16 @@ class Connection:
 class ControlArgs:
     """What playing a motion may be told of robot and loop, as data: the docstrings are the command-line help."""
 
-    driver: Literal["virtual", "unitree", "so101"] = "virtual"
-    """virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial)."""
+    driver: DriverName = "virtual"
+    """virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial), or the driver of
+    an installed extension."""
     robot: str | None = None
     """Name or folder, identified ones too; default the one that the model's run keeps; without a model h1_2, or so101
     with so101."""
     limits_from: str | None = None
     """Robot folder whose gains, joint ranges, effort limits and collision shapes are used on hardware instead of the
-    package's robot. Read its values before you name it. Identified values come from --robot or --model."""
+    package's robot; an extension's driver requires it. Read its values before you name it. Identified values come from
+    --robot or --model."""
     payload_side: str = "both"
     """both, or one hand."""
     max_payload: float | None = None
@@ -151,7 +163,7 @@ def run(
     if out:
         screen.say(f"written: {recording.save(out, played.name if played else 'live').with_suffix('.*')}")
     screen.result(recording.summary() | tracking(recording))
-    if recording.fault or (out and recording.rows.trouble):
+    if recording.fault or (out and recording.rows.error):
         sys.exit(3)
 
 
@@ -161,7 +173,7 @@ def perform(
     """Make everything, ask, run, and say how it went; live targets are no motion. The seed is of a virtual robot."""
     from gaponet.hw.control.clock import MonotonicClock, SimulatedClock
     from gaponet.hw.control.controller import Controller
-    from gaponet.hw.control.hardware import for_hardware, known_robot, require_plausible, robot_hash
+    from gaponet.hw.control.hardware import hardware_robot, reference_robot, require_plausible, robot_hash
     from gaponet.hw.control.plan import Planner
     from gaponet.hw.drivers.dry import DryRun
 
@@ -169,7 +181,7 @@ def perform(
         raise UsageError("give either --motion, what to play, or --targets, where targets come from while it moves")
     spec = identified = resolve_robot(args)
     if args.driver != "virtual":
-        spec = for_hardware(identified, known_robot(args.driver, args.limits_from))
+        spec = hardware_robot(identified, reference_robot(args.driver, args.limits_from))
     fast = args.connection.fast and args.driver == "virtual"
     if fast and args.targets:
         raise UsageError("live targets come in real time; leave out --fast")
@@ -256,6 +268,7 @@ def listen(screen: Out, args: RunArgs, robot: RobotSpec, driver: Driver, clock: 
 def resolve_robot(args: RunArgs) -> RobotSpec:
     """The robot that the model's run keeps, which one named must be; without a model the one named, or the driver's."""
     from gaponet.base.errors import ModelError
+    from gaponet.hw.control.hardware import ROBOT_OF_DRIVER
     from gaponet.robot.folder import has_stored_robot, load_stored_robot
     from gaponet.robot.spec import load_robot
     from gaponet.sim.model import require_stored_robot
@@ -265,7 +278,8 @@ def resolve_robot(args: RunArgs) -> RobotSpec:
         return require_stored_robot(place, load_robot(args.robot), ModelError, "leave --robot out")
     if place is not None and has_stored_robot(place):
         return load_stored_robot(place, "")
-    return load_robot(args.robot or ("so101" if args.driver == "so101" else "h1_2"))
+    own = ROBOT_OF_DRIVER | {"virtual": "h1_2"}
+    return load_robot(args.robot or own.get(args.driver) or args.limits_from or "h1_2")
 
 
 def _require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
@@ -320,14 +334,14 @@ def find_motion(name: str | None, args: RunArgs, robot: RobotSpec) -> tuple[Moti
 
 def make_driver(args: RunArgs, robot: RobotSpec, clock: Any, seed: int) -> tuple[Driver, dict[str, Any]]:
     """The driver, and what is known about the unit behind it."""
-    from gaponet.hw.drivers.open import open_driver
+    from gaponet.hw.drivers.open import open_driver, supported_options
 
     connection = args.connection
-    if args.driver == "unitree":
-        options: dict[str, Any] = {n: getattr(connection, n) for n in ("topic", "joints", "domain", "interface")}
-        return open_driver("unitree", robot, silent=args.dry_run, **options), {}
-    if args.driver == "so101":
-        return open_driver("so101", robot, port=connection.port, calibration=connection.calibration), {}
+    if args.driver != "virtual":
+        options = supported_options(args.driver, vars(connection))
+        if args.driver == "unitree":
+            options["silent"] = args.dry_run
+        return open_driver(args.driver, robot, **options), {}
     from gaponet.testing.fleet import load_fleet
     from gaponet.testing.virtual_driver import VirtualDriver
 
@@ -341,7 +355,7 @@ def make_driver(args: RunArgs, robot: RobotSpec, clock: Any, seed: int) -> tuple
 
 def tracking(recording: Recording) -> dict[str, Any]:
     """Mean |measured − asked| by joint over the run, rad: measured one period after the command, as everywhere."""
-    rows = recording.during("run")
+    rows = recording.phase_rows("run")
     if len(rows) < 2:
         return {}
     at = [recording.joint_names.index(name) for name in recording.commanded]
@@ -389,22 +403,22 @@ def _compensator(screen: Out, args: RunArgs, robot: RobotSpec, unit: str) -> tup
 
 def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: float) -> None:
     """From where to where, what moves and what is held, how near it comes to what, and how it ends."""
-    from gaponet.hw.control.plan import STILL
+    from gaponet.hw.control.plan import NO_MOVEMENT
 
     rows = plan.rows
-    moves = [n for n, span in zip(robot.joint_names, np.ptp(rows, axis=0), strict=True) if span > STILL]
+    moves = [n for n, span in zip(robot.joint_names, np.ptp(rows, axis=0), strict=True) if span > NO_MOVEMENT]
     held = [n for n in driver.commanded if n not in moves]
     assert plan.motion
-    title = f"Plan: {plan.motion.name}, {plan.duration:.1f} s, of which {plan.into.duration:.1f} to where it begins"
+    title = f"Plan: {plan.motion.name}, {plan.duration:.1f} s, of which {plan.approach.duration:.1f} to where it begins"
     screen.table(title, ["moves", "found, rad", "begins", "lowest", "highest", "ends"], [
-        [joint, *(f"{x:.2f}" for x in (plan.found[j], plan.motion.ctrl[0, j], rows[:, j].min(), rows[:, j].max(),
+        [joint, *(f"{x:.2f}" for x in (plan.start[j], plan.motion.ctrl[0, j], rows[:, j].min(), rows[:, j].max(),
                                        rows[-1, j]))]
         for joint, j in zip(moves, robot.index(moves), strict=True)
     ])  # fmt: skip
-    around = len(plan.into.points) - 2
+    around = len(plan.approach.points) - 2
     how = {"hand_over": "handed over to the robot's own controller", "hold": "held", "damp": "damped, then let go"}
     load = f"with up to {heaviest:g} kg in each hand" if heaviest else "with nothing in the hands (--payload-mass)"
-    back = "goes back to where it was found and is " if plan.back else "is "
+    back = "goes back to where it was found and is " if plan.retreat else "is "
     for text in (
         f"held where found: {', '.join(held)}" if held else "",
         f"the motion is {plan.changed}, to keep within limits" if plan.changed else "",
@@ -440,9 +454,9 @@ def _report(screen: Out, recording: Recording) -> None:
 
 
 def _report_dry(screen: Out, recording: Recording, controller: Controller) -> None:
-    from gaponet.hw.drivers.dry import would_send
+    from gaponet.hw.drivers.dry import summarize_commands
 
-    sent = would_send(recording, controller.limits)
+    sent = summarize_commands(recording, controller.limits)
     screen.table("Dry run: nothing was sent. These commands would have been, to a robot that follows at once",
                  ["joint", "from, rad", "to, rad", "fastest, rad/s", "torque asked, N·m"], [
         [joint, *(f"{value:.3f}" for value in values.values())] for joint, values in sent.items()

@@ -15,7 +15,7 @@ import tyro
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.cli.out import Out
-from gaponet.hw.control.stop import SIGNALS
+from gaponet.hw.control.stop import STOP_SIGNALS
 from gaponet.testing.unitree_virtual import FaultKind, VirtualH12
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def virtual(
         raise UsageError(f"--heard {heard}: there is no folder {heard.parent}")
     name = f"virtual-{unit}" if unit.isdigit() else unit
     physics = load_fleet(fleet, spec).unit(name)
-    for number in SIGNALS:
+    for number in STOP_SIGNALS:
         if number.name not in ("SIGINT", "SIGTSTP"):  # Ctrl-Z suspends it, as any program
             signal.signal(number, signal.default_int_handler)
     label = f"VIRTUAL {spec.name}, fleet {fleet}, unit {name}, {payload_mass:g} kg"

@@ -15,10 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.hw.control.clock import uncollected
+from gaponet.hw.control.clock import no_garbage_collection
 from gaponet.hw.drivers import feetech as reg
-from gaponet.hw.drivers.so101 import FULL, STALL_CURRENT, STIFFNESS
-from gaponet.hw.drivers.so101_calibration import GRIPPER, SPEAK, STEP, STEPS, TURNS, ArmCalibration, ServoRow
+from gaponet.hw.drivers.so101 import FULL_TORQUE, STALL_CURRENT_STEPS, STIFFNESS_PER_P
+from gaponet.hw.drivers.so101_calibration import (
+    CONTINUOUS_JOINT,
+    GRIPPER,
+    JOINTS,
+    STEP_RAD,
+    STEPS_PER_TURN,
+    ArmCalibration,
+    ServoRow,
+)
 from gaponet.robot.spec import RobotSpec
 from gaponet.robot.toml_file import Table
 from gaponet.testing.physics import Physics
@@ -50,7 +58,7 @@ class VirtualSO101:
         robot = replace(robot, table=robot.table or Table(height=0.0))  # on which it rests while its torque is off
         self.robot, self._frame = robot, None if frame is None else round(frame / PERIOD)
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
-        self._order = robot.index(SPEAK)  # servo number − 1 → joint
+        self._order = robot.index(JOINTS)  # servo number − 1 → joint
         self.calibration = ArmCalibration(_as_calibrated(robot), robot)
         self._master, slave = os.openpty()
         tty.setraw(slave)
@@ -60,22 +68,22 @@ class VirtualSO101:
             if link.is_symlink():
                 link.unlink()
             link.symlink_to(self.port)
-        self.memory = [bytearray(128) for _ in SPEAK]
-        for joint, memory in zip(SPEAK, self.memory, strict=True):
+        self.memory = [bytearray(128) for _ in JOINTS]
+        for joint, memory in zip(JOINTS, self.memory, strict=True):
             row = self.calibration.rows[joint]
             for register, value in (
                 (reg.MODEL, reg.STS3215), (reg.MIN_POSITION, row.range_min), (reg.MAX_POSITION, row.range_max),
-                (reg.HOMING_OFFSET, row.homing_offset), (reg.MAX_TORQUE, FULL), (reg.TORQUE_LIMIT, FULL),
+                (reg.HOMING_OFFSET, row.homing_offset), (reg.MAX_TORQUE, FULL_TORQUE), (reg.TORQUE_LIMIT, FULL_TORQUE),
                 (reg.P, 32), (reg.D, 32), (reg.PROTECTION_CURRENT, 500), (reg.PRESENT_VOLTAGE, 120),
             ):  # fmt: skip
                 _put(memory, register, value)
         self.deaf: set[int] = set()  # servos that do not answer
         self.damaged = False  # replies have a wrong checksum
-        self.status = [0] * len(SPEAK)  # error bits in replies
+        self.status = [0] * len(JOINTS)  # error bits in replies
         self._buffer = self._said = b""
         self._apply()
 
-    @uncollected()
+    @no_garbage_collection()
     def run(self, seconds: float = np.inf) -> None:
         """Live and answer in real time."""
         began = time.monotonic()
@@ -123,7 +131,7 @@ class VirtualSO101:
             self._refresh()
             self._answer(servo, self._bytes(servo, parameters[0], parameters[1]))
         elif instruction == reg.WRITE:
-            for one in range(1, len(SPEAK) + 1) if servo == reg.BROADCAST else (servo,):
+            for one in range(1, len(JOINTS) + 1) if servo == reg.BROADCAST else (servo,):
                 self._store(one, parameters[0], parameters[1:])
             self._answer(servo, b"")
         elif instruction == reg.SYNC_READ:
@@ -140,29 +148,29 @@ class VirtualSO101:
                 self.live.step()
 
     def _answer(self, servo: int, data: bytes) -> None:
-        if not 1 <= servo <= len(SPEAK) or servo in self.deaf:
+        if not 1 <= servo <= len(JOINTS) or servo in self.deaf:
             return
         reply = reg.packet(servo, self.status[servo - 1], data)
         self._said += reply[:-1] + bytes([reply[-1] ^ self.damaged])
 
     def _bytes(self, servo: int, address: int, size: int) -> bytes:
-        return bytes(self.memory[servo - 1][address : address + size]) if 1 <= servo <= len(SPEAK) else b""
+        return bytes(self.memory[servo - 1][address : address + size]) if 1 <= servo <= len(JOINTS) else b""
 
     def _store(self, servo: int, address: int, data: bytes) -> None:
-        if 1 <= servo <= len(SPEAK):
+        if 1 <= servo <= len(JOINTS):
             self.memory[servo - 1][address : address + len(data)] = data
 
     def _refresh(self) -> None:
         """Readings into the registers."""
         order = self._order
         qpos, qvel, tau, temperature = self.live.read()
-        steps = np.rint(qpos / (STEP * self.calibration.sign) + self.calibration.zero)[order]  # beyond the limits, too
+        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[order]  # unlimited
         share = (tau / self.robot.effort_limit)[order]
         values = {
-            reg.PRESENT_POSITION: np.clip(steps, 0, STEPS - 1),
-            reg.PRESENT_VELOCITY: np.rint(qvel[order] / STEP),
+            reg.PRESENT_POSITION: np.clip(steps, 0, STEPS_PER_TURN - 1),
+            reg.PRESENT_VELOCITY: np.rint(qvel[order] / STEP_RAD),
             reg.PRESENT_LOAD: np.clip(np.rint(1000 * share), -1000, 1000),
-            reg.PRESENT_CURRENT: np.rint(share * STALL_CURRENT),
+            reg.PRESENT_CURRENT: np.rint(share * STALL_CURRENT_STEPS),
             reg.PRESENT_TEMPERATURE: np.rint(temperature[order]),
         }
         for register, numbers in values.items():
@@ -174,8 +182,8 @@ class VirtualSO101:
         kp, kd, effort = self.robot.kp.copy(), self.robot.kd.copy(), self.robot.effort_limit.copy()
         goals = self.calibration.steps(self.live.ctrl)
         for joint, memory in zip(self._order, self.memory, strict=True):
-            kp[joint] = STIFFNESS * _get(memory, reg.P)
-            effort[joint] *= min(_get(memory, reg.TORQUE_LIMIT), FULL) / FULL
+            kp[joint] = STIFFNESS_PER_P * _get(memory, reg.P)
+            effort[joint] *= min(_get(memory, reg.TORQUE_LIMIT), FULL_TORQUE) / FULL_TORQUE
             if not _get(memory, reg.TORQUE_ENABLE):
                 kp[joint], kd[joint] = 0.0, FREE_DAMPING
                 continue
@@ -189,10 +197,10 @@ class VirtualSO101:
 def _as_calibrated(robot: RobotSpec) -> dict[str, ServoRow]:
     """What LeRobot's calibration finds on an arm whose joints stop where the MJCF's do."""
     rows = {}
-    for number, joint in enumerate(SPEAK, 1):
+    for number, joint in enumerate(JOINTS, 1):
         low, high = robot.qpos_range[robot.index([joint])[0]]
-        half = (STEPS - 1) / 2 if joint == TURNS else (high - low) / 2 / STEP
-        middle = STEPS / 2 - (0.5 if joint == TURNS else 300 if joint == GRIPPER else 0)
+        half = (STEPS_PER_TURN - 1) / 2 if joint == CONTINUOUS_JOINT else (high - low) / 2 / STEP_RAD
+        middle = STEPS_PER_TURN / 2 - (0.5 if joint == CONTINUOUS_JOINT else 300 if joint == GRIPPER else 0)
         ends = {"range_min": int(np.ceil(middle - half)), "range_max": int(np.floor(middle + half))}
         rows[joint] = ServoRow(id=number, drive_mode=0, homing_offset=17 * number, **ends)
     return rows

@@ -16,7 +16,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.files import atomic_write
-from gaponet.hw.control.clock import MonotonicClock, uncollected
+from gaponet.hw.control.clock import MonotonicClock, no_garbage_collection
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
 from gaponet.robot.spec import RobotSpec
@@ -77,7 +77,7 @@ class VirtualH12:
         from gaponet.hw.drivers import dds
 
         robot = robot.nominal or robot
-        self._dds, bus = dds, dds.Bus(domain, interface)
+        bus = dds.Bus(domain, interface)
         self.robot, self.rate, self.fault, self.fault_at = robot, rate, fault, fault_at
         self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order
         self._writer = bus.writer("rt/lowstate", dds.LowState)
@@ -92,7 +92,7 @@ class VirtualH12:
         self._held: deque[tuple[float, Array]] = deque()
         self._frozen: tuple[Array, ...] | None = None
 
-    @uncollected()
+    @no_garbage_collection()
     def run(self, seconds: float = np.inf) -> None:
         """Live in real time, until interrupted."""
         start, k = self.clock.now(), 0
@@ -107,7 +107,7 @@ class VirtualH12:
 
     def _obey(self, now: float) -> None:
         for topic, reader in self._readers.items():
-            for data in self._dds.receive(reader):
+            for data in reader.receive():
                 if len(data) != hg.LowCmd.wire_size or not hg.LowCmd.intact(data):
                     self.refused += 1
                     continue
@@ -168,7 +168,7 @@ class VirtualH12:
             message.view(data, "crc")[0] ^= 1
         self._held.append((now + (LATE if fault == "late" else 0.0), data.copy()))
         while self._held and self._held[0][0] <= now:
-            self._dds.send(self._writer, self._dds.LowState, self._held.popleft()[1])
+            self._writer.send(self._held.popleft()[1])
 
     def _tell(self, fault: str) -> None:
         """What the robot says about itself, honest or not."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.hw.control.clock import Clock
-from gaponet.hw.control.driver import DriverError, End, State
+from gaponet.hw.control.driver import DriverError, EndAction, State
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
 from gaponet.testing.physics import Physics
@@ -69,7 +69,7 @@ class VirtualDriver:
     virtual = True
     noisy = True
     reads_back = True
-    at_end: End = "hold"
+    at_end: EndAction = "hold"
     at_stop = "damps"
     qpos_range: Array | None = None
 

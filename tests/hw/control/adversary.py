@@ -81,7 +81,7 @@ class Adversary:
         self.joint_names, self.kp, self.kd, self.facts = robot.joint_names, robot.kp, robot.kd, {}
         self.commanded = MOTOR_NAMES[13:]
         self.at = robot.index(self.commanded)
-        self.limits = Limits.of(robot, self.commanded, SAFETY)
+        self.limits = Limits.from_robot(robot, self.commanded, SAFETY)
         n = len(robot.joint_names)
         self.obeys = rng.choice([0.0, 100.0, 300.0])  # 1/s², how the joints are drawn to their commands
         self.goal = np.clip(robot.qpos_home + 0.3 * rng.standard_normal(n), *robot.qpos_range.T)

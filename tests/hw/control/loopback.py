@@ -1,4 +1,7 @@
-"""The Unitree driver and the virtual H1-2 on a bus that is a list, in simulated time: nothing of DDS is needed."""
+"""The Unitree driver and the virtual H1-2 on a bus that is a list, in simulated time, and a judge of what arrives.
+
+Nothing of DDS is needed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from gaponet.hw.control.clock import SimulatedClock
+from gaponet.hw.control.recording import Recording
+from gaponet.hw.control.safety import Limits, SafetyConfig
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import MOTOR_NAMES
 from gaponet.robot.spec import RobotSpec
@@ -18,7 +23,7 @@ RATE = 100.0  # states per second
 
 
 class Loopback:
-    """What drivers.dds offers: messages that are sent are there at once."""
+    """Stands in for drivers.dds: a message that is sent arrives at once."""
 
     LowState, LowCmd = "LowState", "LowCmd"
 
@@ -28,24 +33,16 @@ class Loopback:
     def Bus(self, domain: int, interface: str) -> Loopback:  # noqa: N802
         return self
 
-    def reader(self, topic: str, kind: str) -> deque:
-        self.queues[topic].append(deque(maxlen=64))
-        return self.queues[topic][-1]
+    def reader(self, topic: str, kind: str) -> SimpleNamespace:
+        queue: deque = deque(maxlen=64)
+        self.queues[topic].append(queue)
+        return SimpleNamespace(receive=lambda: [queue.popleft() for _ in range(len(queue))])
 
-    def writer(self, topic: str, kind: str) -> str:
-        return topic
+    def writer(self, topic: str, kind: str) -> SimpleNamespace:
+        return SimpleNamespace(send=lambda data: [queue.append(np.array(data)) for queue in self.queues[topic]])
 
     def publishers(self) -> dict[str, list[str]]:
         return defaultdict(list)
-
-    def send(self, writer: str, kind: str, data: np.ndarray) -> None:
-        for queue in self.queues[writer]:
-            queue.append(np.array(data))
-
-    def receive(self, reader: deque) -> list[np.ndarray]:
-        found = list(reader)
-        reader.clear()
-        return found
 
 
 class Disobedient(VirtualH12):
@@ -117,3 +114,30 @@ def living(
     sleep = lambda seconds: clock.wait_until(clock.now() + max(seconds, 0.005))  # noqa: E731
     monkeypatch.setattr(unitree, "time", SimpleNamespace(monotonic=clock.now, sleep=sleep))
     return clock
+
+
+def judge(recording: Recording, received: dict[str, list], robot: RobotSpec, safety: SafetyConfig) -> None:
+    """Assert that commands stayed within the limits, and that damping was for good; `received` is in motor order.
+
+    Args:
+        received: ctrl, kp, weight: what arrived at the robot.
+    """
+    joints, torso = robot.index(recording.commanded), robot.index(["torso_joint"])[0]
+    ctrl, kp = (np.array(received[name]) for name in ("ctrl", "kp"))
+    limits = Limits.from_robot(robot, recording.commanded, safety)
+    stiff = (kp[:, joints] > 0).all(axis=1)
+    assert (stiff | (kp[:, joints] == 0).all(axis=1)).all()
+    assert (np.diff(stiff.astype(int)) <= 0).all(), "a position command after damping"
+    let_go = recording.fault is not None and recording.fault.kind == "obedience"  # held while the weight goes to 0
+    assert received["weight"][-1] == 0 if let_go else not stiff[-1]
+    sent = ctrl[:, joints][stiff]
+    assert (sent >= limits.low - 1e-6).all()
+    assert (sent <= limits.high + 1e-6).all()
+    assert (np.abs(np.diff(sent, axis=0)) <= limits.speed * recording.dt + 1e-6).all()
+    np.testing.assert_array_equal(kp[:, :12], 0.0)  # legs are never commanded
+    assert (kp[:, torso] == robot.kp[torso]).all(), "the torso is held"
+    assert np.ptp(ctrl[:, torso]) == 0, "where it was found"
+    for row in recording.rows:
+        if row.ctrl is not None:
+            torque = limits.kp * (row.ctrl - row.state.qpos)[joints] - limits.kd * row.state.qvel[joints]
+            assert (np.abs(torque) <= limits.effort + 1e-6).all()

@@ -66,7 +66,7 @@ def plans(robot: RobotSpec, poses: int, seed: int, motions: int | None = None) -
             refused.append(str(error)[:160])
             continue
         seconds.append(time.process_time() - began)
-        count["straight" if len(plan.into.points) == 2 else "around"] += 1
+        count["straight" if len(plan.approach.points) == 2 else "around"] += 1
         depth, pair = judge.along(plan.rows[::5], 0.02)
         direct = judge.along(np.stack([found, plan.motion.ctrl[0]]), 0.02)[0]
         straight.append(direct)

@@ -14,7 +14,7 @@ from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.hw.control.driver import DriverError
-from gaponet.hw.control.hardware import for_hardware, known_robot, robot_hash
+from gaponet.hw.control.hardware import hardware_robot, reference_robot, robot_hash
 from gaponet.hw.control.plan import Planner
 from gaponet.hw.control.safety import Limits, SafetyConfig
 from gaponet.hw.drivers.unitree import UnitreeDriver
@@ -59,7 +59,7 @@ def test_a_folder_that_differs_from_the_known_robot_is_refused_with_the_value(
     sent = load_robot(folder)
     assert robot_hash(sent) != robot_hash(h1_2)
     with pytest.raises(RobotError, match=said):
-        for_hardware(sent, known_robot("unitree", None))
+        hardware_robot(sent, reference_robot("unitree", None))
 
 
 def test_a_run_that_differs_from_the_known_robot_is_refused(h1_2, tmp_path, capsys):
@@ -72,10 +72,10 @@ def test_a_run_that_differs_from_the_known_robot_is_refused(h1_2, tmp_path, caps
 
 def test_a_folder_supplies_identified_values_and_the_known_robot_its_limits(h1_2, tmp_path):
     save_robot(h1_2.with_servos({JOINT: {"kp": 90.0, "stop_low": -0.5, "stop_high": 0.5}}), tmp_path / "identified")
-    robot = for_hardware(load_robot(tmp_path / "identified"), known_robot("unitree", None))
+    robot = hardware_robot(load_robot(tmp_path / "identified"), reference_robot("unitree", None))
     assert robot.folder == h1_2.folder
     assert robot.kp[robot.index([JOINT])] == 90.0
-    limits = Limits.of(robot, (JOINT,), SafetyConfig(margin=0.0))
+    limits = Limits.from_robot(robot, (JOINT,), SafetyConfig(margin=0.0))
     assert (limits.kp, limits.low, limits.high) == (100.0, -0.5, 0.5)
 
 
@@ -84,8 +84,8 @@ def test_all_but_identified_values_is_the_known_robots(h1_2, tmp_path):
     file = tmp_path / "identified" / "robot.toml"
     file.write_text(re.sub(r"home = [-\d.]+", "home = 0.3", file.read_text()))
     sent = load_robot(tmp_path / "identified")
-    known = known_robot("unitree", None)
-    robot = for_hardware(sent, known)
+    known = reference_robot("unitree", None)
+    robot = hardware_robot(sent, known)
     assert not np.array_equal(sent.qpos_home, h1_2.qpos_home)
     np.testing.assert_array_equal(robot.qpos_home, h1_2.qpos_home)
     assert robot.nominal is known
@@ -98,22 +98,31 @@ def test_an_identified_stop_does_not_widen_a_range(h1_2):
 
 @pytest.mark.parametrize(
     ("values", "said"),
-    [({"offset": 0.11}, "offset of .* is 0.11 rad"), ({"offset": -0.6}, "offset"), ({"kp": 0.0}, "kp of .* is 0 N"),
+    [({"offset": 0.11}, "offset of .* is 0.11 rad"), ({"offset": np.nan}, "offset"), ({"kp": 0.0}, "kp of .* is 0 N"),
      ({"kp": 24.0}, "0.25 to 4 times the nominal 100"), ({"kp": 401.0}, "kp")],
 )  # fmt: skip
 def test_identified_values_beyond_what_servos_have_are_refused_on_hardware(h1_2, values, said):
     with pytest.raises(RobotError, match=said):
-        for_hardware(h1_2.with_servos({JOINT: values}), h1_2)
+        hardware_robot(h1_2.with_servos({JOINT: values}), h1_2)
 
 
 def test_limits_may_come_from_a_folder_that_the_user_names_but_not_beyond_the_motors(h1_2, tmp_path):
     folder = tampered(h1_2, tmp_path / "soft", "robot.toml", r"kp = (\d+)\.0", r"kp = 40.0")
-    soft = for_hardware(load_robot(folder), known_robot("unitree", str(folder)))
+    soft = hardware_robot(load_robot(folder), reference_robot("unitree", str(folder)))
     assert UnitreeDriver(soft).kp.tolist() == [40.0] * 27
     with pytest.raises(RobotError, match=r"kp of .* is 1000; the driver of h1_2 takes at most 300"):
         UnitreeDriver(replace(h1_2, kp=np.full(27, 1000.0)))
-    with pytest.raises(RobotError, match=r"effort_limit of .* the driver of h1_2 takes at most"):
-        UnitreeDriver(replace(h1_2, effort_limit=10 * h1_2.effort_limit))
+    with pytest.raises(RobotError, match=r"kd of .* is 11; the driver of h1_2 takes at most 10"):
+        UnitreeDriver(replace(h1_2, kd=np.full(27, 11.0)))
+    for effort in (1.01 * h1_2.effort_limit, np.nan * h1_2.effort_limit):
+        with pytest.raises(RobotError, match=r"effort_limit of .* the driver of h1_2 takes at most"):
+            UnitreeDriver(replace(h1_2, effort_limit=effort))
+
+
+def test_the_robot_of_an_extensions_driver_must_be_named(h1_2):
+    with pytest.raises(UsageError, match=r"driver 'toy' is an extension.*give --limits-from FOLDER"):
+        reference_robot("toy", None)
+    assert reference_robot("toy", str(h1_2.folder)).name == "h1_2"
 
 
 def test_a_driver_writes_no_command_outside_its_robots_range(h1_2):

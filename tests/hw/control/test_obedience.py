@@ -1,4 +1,4 @@
-"""Robots that do not do what they are told: never "handed over", never data. Virtual robots in simulated time."""
+"""Faulty and disobedient robots behind their drivers, in simulated time: held or damped, never data."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import json
 import os
 import random
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hw.control.loopback import living
+from hw.control.loopback import RATE, judge, living
 
 from gaponet.base.errors import LogError
 from gaponet.data.importer import import_logs
@@ -20,11 +21,13 @@ from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.recording import Recording
+from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.drivers import feetech as reg
 from gaponet.hw.drivers.unitree import UnitreeDriver
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.so101_virtual import PERIOD, VirtualSO101
+from gaponet.testing.unitree_virtual import VirtualH12
 
 serial = pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 
@@ -119,9 +122,10 @@ def clock() -> SimulatedClock:
 
 
 @pytest.fixture
-def bus(so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bus]:
+def bus(so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bus]:
     from gaponet.hw.drivers import so101 as driver
 
+    monkeypatch.setattr("gaponet.hw.control.publisher.LOCK_FOLDER", tmp_path)  # other processes may run this test
     arm = VirtualSO101(so101, load_fleet("easy", so101).unit("virtual-1"))
     arm.live.steps = round(clock.now() / PERIOD)
     bus = Bus(arm, clock)
@@ -236,7 +240,7 @@ def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on
     monkeypatch.setattr(
         "gaponet.hw.control.controller.Watchdog",
         lambda *_: SimpleNamespace(
-            trouble=str, fired=bool, beat=lambda weight: True, release=ends.append, wait_ready=lambda: None
+            problem=str, fired=bool, beat=lambda weight: True, release=ends.append, wait_ready=lambda: None
         ),
     )
     bus.way, bus.at = "lost", 1.0
@@ -295,15 +299,29 @@ def test_a_lost_packet_is_no_disobedience(so101, clock, bus):
 
 
 def swing(
-    monkeypatch: pytest.MonkeyPatch, way: str = "", at: float = 0.0, told: float | None = None, **unit: object
-) -> tuple[Recording, list]:
-    """Both elbows go half a radian and then swing by as much, the right one the other way; told a payload."""
+    monkeypatch: pytest.MonkeyPatch,
+    way: str = "",
+    at: float = 0.0,
+    told: float | None = None,
+    fault: str = "none",
+    during: Callable[[int, VirtualH12], None] = lambda k, robot: None,
+    **unit: object,
+) -> tuple[Recording, VirtualH12]:
+    """Both elbows go half a radian and then swing by as much, the right one the other way; told a payload.
+
+    Args:
+        way: How the robot disobeys, `at` s after the first command.
+        fault: What is wrong with it, from then on.
+        during: Called in each period of the run.
+    """
     robot = load_robot("h1_2")
     clock = living(monkeypatch, robot, **unit)  # type: ignore[arg-type]
     clock.robot.way, clock.robot.at = way, at
+    clock.robot.fault, clock.robot.fault_at = fault, at  # type: ignore[assignment]
     left, right = robot.index(["left_elbow_joint", "right_elbow_joint"])
 
     def policy(k: int, state: object) -> np.ndarray | None:
+        during(k, clock.robot)
         target = robot.qpos_home.copy()
         target[left], target[right] = 0.5 + 0.5 * np.sin(0.06 * k), 0.5 - 0.5 * np.sin(0.06 * k)
         return target if k < 150 else None
@@ -311,7 +329,42 @@ def swing(
     config = ControlConfig(blend=1.5, settle=0.1, damp=1.0)
     driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
     recording = Controller(driver, robot, config=config, clock=clock, watchdog=False, payload_mass=told).run(policy)
-    return recording, clock.robot.heard.weight
+    return recording, clock.robot
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "periods"),
+    [
+        ("stop", "stale", 3), ("repeat", "stale", 3), ("late", "stale", 3), ("checksum", "stale", 3),
+        ("freeze", "frozen", 2), ("nan", "nan", 1), ("jump", "jump", 1), ("hot", "temperature", 1),
+        ("encoder", "frozen", 25), ("motor", "robot", 1), ("remote", "stop", 1), ("fall", "tilt", 1),
+        ("machine", "robot", 1),
+    ],
+)  # fmt: skip
+def test_a_fault_of_an_h1_2_ends_in_damp(monkeypatch, fault, kind, periods):
+    recording, robot = swing(monkeypatch, fault=fault, at=4.0)
+    assert recording.fault.kind == kind, recording.fault
+    assert [e.phase for e in recording.events][-3:] == ["run", "damp", "stopped"]
+    damped = next(time for time, kp in zip(robot.heard.time, robot.heard.kp, strict=True) if kp[16] == 0)
+    state_age = 1 / RATE  # a fault is in the next state, which the controller reads in the next period
+    assert 0 < damped - (robot.first_command + 4.0) <= periods * 0.02 + state_age + 1e-6
+    judge(recording, vars(robot.heard), robot.robot, SafetyConfig())
+    silent = fault in ("stop", "repeat", "checksum")
+    text = "could NOT be damped: switch the supply off (nothing was heard" if silent else "damped and let go"
+    assert recording.events[-1].text.startswith(text)
+
+
+def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(monkeypatch):
+    """10 s ahead, and back again: the run goes on. Messages that cease are then seen as ever."""
+
+    def step(k: int, robot: VirtualH12) -> None:
+        if fault := {10: "clock", 30: "none", 50: "clock", 70: "stop"}.get(k):
+            robot.fault, robot.fault_at = fault, 0.0
+
+    recording, robot = swing(monkeypatch, during=step)
+    assert recording.fault.kind == "stale", recording.fault
+    assert 71 <= sum(r.phase == "run" for r in recording.rows) <= 74
+    judge(recording, vars(robot.heard), robot.robot, SafetyConfig())
 
 
 @pytest.mark.parametrize(
@@ -342,11 +395,11 @@ def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_d
 
 
 def test_the_weight_waits_until_a_joint_has_followed(monkeypatch):
-    recording, weight = swing(monkeypatch, "listens midway", 2.5)
-    assert 0.0 < max(weight) <= 0.3 + 1e-6
-    recording, weight = swing(monkeypatch)
+    _, robot = swing(monkeypatch, "listens midway", 2.5)
+    assert 0.0 < max(robot.heard.weight) <= 0.3 + 1e-6
+    recording, robot = swing(monkeypatch)
     assert recording.fault is None
-    assert max(weight) == 1.0
+    assert max(robot.heard.weight) == 1.0
     assert recording.events[-1].text == "handed over"
     assert recording.summary()["obeyed"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gaponet.hw.control.phases import COMMANDING, ENDED, TABLE, TRANSITIONS, Action, Phase, Trigger
+from gaponet.hw.control.phases import COMMANDING, ENDED, TRANSITION_TABLE, TRANSITIONS, Action, Phase, Trigger
 
 PAGE = Path(__file__).parents[3] / "docs" / "deploy-safety.md"
 WAITING = (Phase.CONNECT, Phase.IDLE)
@@ -17,9 +17,9 @@ SENDING = {Action.BLEND_IN, Action.PLAY, Action.GO_BACK, Action.RELEASE, Action.
 def test_every_event_is_defined_once_in_every_phase_and_leads_forward():
     named = [pair for row in TRANSITIONS if row[1] != tuple(Trigger) for pair in product(*row[:2])]
     assert len(named) == len(set(named))
-    assert TABLE.keys() == set(product(Phase, Trigger))
+    assert TRANSITION_TABLE.keys() == set(product(Phase, Trigger))
     order = list(Phase)
-    for (phase, _), (following, action) in TABLE.items():
+    for (phase, _), (following, action) in TRANSITION_TABLE.items():
         if action in (Action.IGNORE, Action.RAISE):
             assert following is phase
         else:
@@ -32,14 +32,14 @@ def test_nothing_moves_without_consent_and_a_robot_that_is_ready(missing):
     reached = {Phase.CONNECT}
     for phase, trigger in product(Phase, Trigger):  # phases are in the order in which they can be reached
         if phase in reached and trigger is not missing:
-            reached.add(TABLE[phase, trigger][0])
+            reached.add(TRANSITION_TABLE[phase, trigger][0])
     assert reached <= {*WAITING, Phase.STOPPED}
 
 
 @pytest.mark.parametrize("phase", Phase)
 @pytest.mark.parametrize("fault", [t for t in Trigger if "FAULT" in t.name or t is Trigger.NOT_FOLLOWING])
 def test_a_stop_in_any_phase_ends_held_or_damped(phase, fault):
-    following, action = TABLE[phase, fault]
+    following, action = TRANSITION_TABLE[phase, fault]
     if phase in ENDED:
         assert action is Action.IGNORE, "it goes on damping, or has ended"
     elif phase in WAITING or fault in (Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG):

@@ -15,7 +15,7 @@ from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.driver import Fault, State
 from gaponet.hw.control.phases import ControlConfig
-from gaponet.hw.control.plan import Fence, Planner
+from gaponet.hw.control.plan import CollisionGuard, Planner
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -104,28 +104,28 @@ def virtual(robot: RobotSpec, found: np.ndarray) -> tuple[Controller, list[np.nd
 def test_live_targets_that_go_for_the_table_are_cut(so101, planner, judge):
     down = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0])
     assert judge.deepest(down)[0] > 0.1
-    fence, at = Fence(planner, so101.qpos_home), []
+    guard, at = CollisionGuard(planner, so101.qpos_home), []
     for k in range(200):
         asked = so101.qpos_home + min(1.0, k / 60) * (down - so101.qpos_home)
-        at.append(fence.step(asked, fence.at, 0.02))
+        at.append(guard.step(asked, guard.qpos, 0.02))
     assert max(judge.deepest(q)[0] for q in at) == 0
-    assert "the plane at 0 m" in fence.near
+    assert "the plane at 0 m" in guard.obstacle
     assert abs(at[-1][0] - down[0]) < 0.05, "what does not lead into it goes on"
     for _ in range(300):
-        at.append(fence.step(so101.qpos_home, fence.at, 0.02))
+        at.append(guard.step(so101.qpos_home, guard.qpos, 0.02))
     np.testing.assert_allclose(at[-1], so101.qpos_home, atol=1e-6)
-    assert not fence.near
+    assert not guard.obstacle
 
 
 def test_of_an_arm_that_sags_the_arm_itself_is_kept_clear(so101, planner):
     down, sag = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0]), np.array([0.0, 0.08, 0.0, 0.0, 0.0, 0.0])
-    fence, least = Fence(planner, so101.qpos_home), np.inf
+    guard, least = CollisionGuard(planner, so101.qpos_home), np.inf
     for k in range(200):
         asked = so101.qpos_home + min(1.0, k / 60) * (down - so101.qpos_home)
-        at = fence.step(asked, fence.at + sag, 0.02)
+        at = guard.step(asked, guard.qpos + sag, 0.02)
         least = min(least, planner.collision.along((at + sag)[None]).min())
     told = planner.collision.along(at[None]).min()
-    assert "the plane at 0 m" in fence.near
+    assert "the plane at 0 m" in guard.obstacle
     assert least > planner.collision.clearance - 0.002
     assert told > planner.collision.clearance + 0.005, "the sag matters here"
 
@@ -176,7 +176,7 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
         fault = None if hears or controller.phase != "blend_out" else Fault("obedience", "it ignores goals")
         return State(driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))), fault=fault)
 
-    driver.read, controller.watch.noisy = read, False
+    driver.read, controller.monitor.noisy = read, False
     assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
     legs = [found, robot.qpos_home, far]
     rows = np.concatenate(

@@ -33,7 +33,7 @@ def as_another_user(address: str) -> str:
 @pytest.mark.parametrize("mask", [0o022, 0o077])
 def test_the_lock_works_for_the_next_user_of_the_computer(mask):
     address = f"test {os.getpid()} {mask}"
-    path = publisher.LOCKS / f"gaponet-{address.replace(' ', '-')}.lock"
+    path = publisher.LOCK_FOLDER / f"gaponet-{address.replace(' ', '-')}.lock"
     before = os.umask(mask)
     try:
         with sole_publisher(address):
@@ -45,7 +45,7 @@ def test_the_lock_works_for_the_next_user_of_the_computer(mask):
 
 
 def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path, monkeypatch):
-    monkeypatch.setattr(publisher, "LOCKS", tmp_path)
+    monkeypatch.setattr(publisher, "LOCK_FOLDER", tmp_path)
     (tmp_path / "gaponet-arm.lock").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(UsageError, match="cannot be opened"), sole_publisher("arm"):
         pass
@@ -53,7 +53,7 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path, monkeypatch):
 
 
 def test_a_pipe_in_place_of_the_lock_is_refused_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(publisher, "LOCKS", tmp_path)
+    monkeypatch.setattr(publisher, "LOCK_FOLDER", tmp_path)
     os.mkfifo(tmp_path / "gaponet-arm.lock")
     with pytest.raises(UsageError, match="not a regular file"), sole_publisher("arm"):
         pass

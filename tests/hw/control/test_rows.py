@@ -16,7 +16,7 @@ from gaponet.base.errors import FolderError, LogError
 from gaponet.hw.control import rows as module
 from gaponet.hw.control.driver import State
 from gaponet.hw.control.recording import Recording
-from gaponet.hw.control.rows import CHUNK, Row, Rows
+from gaponet.hw.control.rows import CHUNK_ROWS, Row, Rows
 
 NAMES = ("elbow", "wrist")
 
@@ -29,18 +29,18 @@ def row(k: int, names: tuple[str, ...] = NAMES) -> Row:
 def recording(count: int, folder=None) -> Recording:
     made = Recording("arm", True, NAMES, NAMES, 0.02)
     if folder:
-        made.grow_in(folder)
+        made.write_to(folder)
     for k in range(count):
         made.rows.append(row(k))
     return made
 
 
-@pytest.mark.parametrize("count", [0, 1, CHUNK, 3 * CHUNK + 5])
+@pytest.mark.parametrize("count", [0, 1, CHUNK_ROWS, 3 * CHUNK_ROWS + 5])
 def test_rows_come_back_as_they_were(count):
     rows = Rows(NAMES)
     for k in range(count):
         rows.append(row(k))
-        if k == CHUNK + 3:
+        if k == CHUNK_ROWS + 3:
             assert len(rows) == k + 1  # looking at it half-way changes nothing
     assert len(rows) == count
     for k, found in enumerate(rows):
@@ -59,7 +59,7 @@ def test_memory_holds_none_of_an_hours_rows():
         for k in range(20_000):
             rows.append(one)
             if k % 1000 == 0:
-                rows._todo.join()  # a busy machine's disk may be behind; what waits for it is in memory
+                rows._pending.join()  # a busy machine's disk may be behind; what waits for it is in memory
         rows.close()
         assert tracemalloc.get_traced_memory()[1] < 10e6  # bytes; all rows are 28 MB
     finally:
@@ -71,14 +71,14 @@ def test_a_killed_process_leaves_its_periods_readable_by_name(tmp_path):
     script = (
         "import os, sys; sys.path.insert(0, 'tests')\n"
         "from pathlib import Path; from hw.control.test_rows import recording\n"
-        "made = recording(300, Path(sys.argv[1])); made.rows._todo.join(); os.kill(os.getpid(), 9)\n"
+        "made = recording(300, Path(sys.argv[1])); made.rows._pending.join(); os.kill(os.getpid(), 9)\n"
     )
     folder = tmp_path / "logs"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     assert subprocess.run([sys.executable, "-c", script, folder], env=environment).returncode == -9
     (left,) = folder.glob("*.cycles.npy")
     found = np.load(left)
-    assert len(found) == 300 // CHUNK * CHUNK
+    assert len(found) == 300 // CHUNK_ROWS * CHUNK_ROWS
     np.testing.assert_allclose(found["qpos.wrist"], 0.001 * np.arange(len(found)))
     recording(10, folder).save(folder, "next")  # which removes nothing
     assert left.exists()
@@ -97,8 +97,8 @@ def test_a_disk_that_is_full_keeps_what_was_written_and_says_so(tmp_path, monkey
     monkeypatch.setattr(module.os, "pwrite", full)
     made = recording(500, folder)
     kept = len(made.rows)
-    assert CHUNK <= kept < 500
-    assert made.rows.trouble.strerror == "No space left on device"
+    assert CHUNK_ROWS <= kept < 500
+    assert made.rows.error.strerror == "No space left on device"
     with pytest.raises(LogError, match="not whole, No space left on device; make room"):
         made.log("sway")
     path = made.save(folder, "sway")

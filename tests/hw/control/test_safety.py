@@ -1,20 +1,70 @@
-"""Limits hold for every state and target; every watchdog says why."""
+"""Limits hold for every state and target, have the promised values, and every check of states gives its reason."""
+
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import State
-from gaponet.hw.control.safety import FAULTS, Limits, SafetyConfig, Watch, damping, limit_command, limit_delta
+from gaponet.hw.control.safety import (
+    DISOBEDIENCE_FAULTS,
+    EXTERNAL_FAULTS,
+    FAULT_KINDS,
+    Limits,
+    SafetyConfig,
+    StateMonitor,
+    damping_gains,
+    limit_command,
+    limit_delta,
+)
 from gaponet.robot.spec import RobotSpec
 
 DT = 0.02
 MILLION = 1_000_000
+DEFAULTS = {  # of docs/deploy-safety.md, which is changed with them
+    "margin": 0.02, "speed": 5.0, "torque_share": 0.95, "acceleration": 50.0, "delta": 0.5, "delta_rate": 2.0,
+    "stale": 2.0, "frozen": 2, "frozen_travel": 0.3, "frozen_joint": 0.1, "joint_speed": 12.0, "jump": 0.05,
+    "temperature": 85.0, "tilt": 0.7, "tracking": 0.6, "tracking_time": 0.25, "following": 0.25, "overrun": 2.0,
+    "refused": 20,
+}  # fmt: skip
+CONSTANTS = {
+    "control.output": {"MAX_BEYOND_RANGE_RAD": 0.05, "MAX_SEND_DELAY_S": 0.001, "MAX_SUSPENDED_S": 0.05},
+    "control.target": {
+        "MIN_GOOD_STATES": 5, "MAX_WAIT_S": 5.0, "SEARCH_SHARE": 0.3, "MAX_UNPROVEN_WEIGHT": 0.3, "FAR_RAD": 0.4,
+    },
+    "control.following": {
+        "STRIDE_RAD": 0.05, "MAX_UNFOLLOWED_RAD": 0.25, "MIN_PUSH_SHARE": 0.5, "MIN_LOAD_SHARE": 0.5,
+    },
+    "control.plan": {
+        "MAX_START_DRIFT_RAD": 0.02, "MAX_APPROACH_M": 0.001, "MAX_START_OVERLAP_M": 0.03, "APPROACH_TIME_S": 0.1,
+        "MAX_SAG_M": 0.05, "COMMAND_CLEARANCE_SHARE": 0.5,
+    },
+    "control.hardware": {
+        "MAX_OFFSET_RAD": 0.1, "KP_RATIO_BOUNDS": (0.25, 4.0), "MAX_KP": 300.0, "MAX_KD": 10.0,
+        "MAX_BEYOND_RANGE_RAD": 0.051,
+    },
+    "control.watchdog": {"MAX_RETRY_S": 600.0},
+    "targets.live": {"MAX_MESSAGE_BYTES": 1 << 14, "MAX_BEYOND_RANGE_RAD": 0.2, "MAX_CATCH_UP_PERIODS": 5},
+}  # fmt: skip
+
+
+def test_limits_have_the_values_that_are_promised():
+    assert vars(SafetyConfig()) == DEFAULTS
+    for module, constants in CONSTANTS.items():
+        found = vars(import_module(f"gaponet.hw.{module}"))
+        assert {name: found[name] for name in constants} == constants
+
+
+def test_faults_of_the_robot_itself_let_go_at_once_and_disobedience_spoils_a_recording():
+    own = {"frozen", "nan", "jump", "temperature", "tracking", "torque", "plan", "robot", "tilt"}
+    assert set(FAULT_KINDS) - set(EXTERNAL_FAULTS) == own
+    assert set(DISOBEDIENCE_FAULTS) == {"obedience", "frozen", "jump", "tracking"}
 
 
 @pytest.fixture
 def limits(arm: RobotSpec) -> Limits:
-    return Limits.of(arm, arm.joint_names, SafetyConfig())
+    return Limits.from_robot(arm, arm.joint_names, SafetyConfig())
 
 
 def drawn(rng: np.random.Generator, scale: float, rows: int) -> np.ndarray:
@@ -26,7 +76,9 @@ def drawn(rng: np.random.Generator, scale: float, rows: int) -> np.ndarray:
 
 def test_no_command_ever_leaves_range_rate_or_torque(arm):
     rng = np.random.default_rng(0)
-    limits = Limits.of(arm, arm.joint_names, SafetyConfig(), gains=(np.array([20.0, 3.0]), np.array([0.0, 1.5])))
+    limits = Limits.from_robot(
+        arm, arm.joint_names, SafetyConfig(), gains=(np.array([20.0, 3.0]), np.array([0.0, 1.5]))
+    )
     for _ in range(4):
         rows = MILLION // 4
         target, previous, qpos, qvel = (drawn(rng, s, rows) for s in (2.0, 1.5, 1.5, 3.0))
@@ -62,7 +114,7 @@ def test_a_command_is_refused_only_where_the_three_intervals_do_not_meet(limits)
 
 def test_identified_gains_are_not_those_of_the_real_servo(arm):
     identified = arm.with_servos({"elbow": {"kp": 3.0}})
-    assert Limits.of(identified, arm.joint_names, SafetyConfig()).kp.tolist() == [20.0, 20.0]
+    assert Limits.from_robot(identified, arm.joint_names, SafetyConfig()).kp.tolist() == [20.0, 20.0]
 
 
 def test_a_harmless_command_passes_unchanged(limits):
@@ -94,7 +146,7 @@ def test_a_correction_is_bounded_in_size_and_rate(limits):
 
 
 def test_damping_never_asks_for_more_than_the_effort_limit():
-    kd = damping(np.full(3, 8.0), np.array([1.0, 100.0, np.nan]), np.full(3, 20.0))
+    kd = damping_gains(np.full(3, 8.0), np.array([1.0, 100.0, np.nan]), np.full(3, 20.0))
     np.testing.assert_allclose(kd, [8.0, 0.2, 8.0])
 
 
@@ -105,13 +157,13 @@ def test_a_share_above_the_effort_limit_is_refused():
 
 def test_a_margin_wider_than_the_range_is_refused(arm):
     with pytest.raises(UsageError, match="leaves nothing of the range of shoulder"):
-        Limits.of(arm, arm.joint_names, SafetyConfig(margin=2.0))
+        Limits.from_robot(arm, arm.joint_names, SafetyConfig(margin=2.0))
 
 
 def watched(change: dict[str, object], noisy: bool = True, periods: int = 40) -> tuple[str, int]:
     """Kind of the first fault and its period, of a state that moves gently until period 10 and is then changed."""
     rng = np.random.default_rng(0)
-    watch = Watch(("shoulder", "elbow"), np.arange(2), DT, SafetyConfig(), noisy)
+    watch = StateMonitor(("shoulder", "elbow"), np.arange(2), DT, SafetyConfig(), noisy)
     good = None
     for k in range(periods):
         now, wrong = k * DT, k >= 10
@@ -126,7 +178,7 @@ def watched(change: dict[str, object], noisy: bool = True, periods: int = 40) ->
             good = fields
         fault = watch.check(now, State(**fields), ctrl, change.get("late", 0.0) if wrong else 0.0)
         if fault:
-            assert fault.kind in FAULTS
+            assert fault.kind in FAULT_KINDS
             return fault.kind, k
     return "none", periods
 
@@ -171,7 +223,9 @@ def test_a_coarse_encoder_may_rest_but_not_while_the_command_moves_on():
 
 
 def test_where_the_real_joints_end_earlier_commands_do(arm):
-    limits = Limits.of(arm, arm.joint_names, SafetyConfig(margin=0.1), qpos_range=np.array([[-0.5, 9.0], [-9.0, 0.4]]))
+    limits = Limits.from_robot(
+        arm, arm.joint_names, SafetyConfig(margin=0.1), qpos_range=np.array([[-0.5, 9.0], [-9.0, 0.4]])
+    )
     mjcf = arm.qpos_range
     np.testing.assert_allclose(limits.low, [-0.4, mjcf[1, 0] + 0.1])
     np.testing.assert_allclose(limits.high, [mjcf[0, 1] - 0.1, 0.3])

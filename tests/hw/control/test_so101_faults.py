@@ -1,17 +1,16 @@
-"""The watchdog on an SO-101's wire: servos and controller in processes of their own."""
+"""The watchdog on an SO-101's port: servos here, the controller in a process of its own."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+from servos import Servos, on_port
 
 pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 
@@ -37,8 +36,8 @@ Controller(driver, robot, config=config, safety=calm).run(policy)
 """
 
 
-def let_go(port: str) -> None:
-    """Wait until the watchdog has damped: it holds the robot's lock as long."""
+def wait_until_damped(port: str) -> None:
+    """Wait for the watchdog's end: it holds the robot's lock as long."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         with contextlib.suppress(UsageError), sole_publisher(port):
@@ -48,26 +47,20 @@ def let_go(port: str) -> None:
 
 @pytest.mark.parametrize(("how", "periods"), [(signal.SIGKILL, 0), (signal.SIGSTOP, 5)], ids=["killed", "stopped"])
 def test_the_watchdog_switches_the_torque_off_when_the_controller_is_no_more(how, periods):
-    file = Path(__file__).parent / "servo_process.py"
-    servos = subprocess.Popen([sys.executable, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
-    port = servos.stdout.readline().decode().strip()
-    controller = subprocess.Popen([sys.executable, "-c", CONTROLLER, port], stdout=subprocess.PIPE)
-
-    def torque() -> list[int]:
-        servos.stdin.write(b"torque\n")
-        return json.loads(servos.stdout.readline())
-
-    try:
-        assert controller.stdout.readline() == b"moving\n"
-        assert torque() == [1] * 6
-        os.kill(controller.pid, how)
-        deadline = time.monotonic() + periods / RATE + 0.3 + 2.0  # the damping, and opening the port
-        while torque() != [0] * 6 and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert torque() == [0] * 6
-    finally:
-        controller.kill()
-        controller.wait()
-        let_go(port)
-        servos.kill()
-        servos.wait()
+    servos = Servos()
+    with on_port(servos) as port:
+        controller = subprocess.Popen([sys.executable, "-c", CONTROLLER, port], stdout=subprocess.PIPE)
+        torque = lambda: [servos.get(number, "torque") for number in range(1, 7)]  # noqa: E731
+        try:
+            assert controller.stdout
+            assert controller.stdout.readline() == b"moving\n"
+            assert torque() == [1] * 6
+            os.kill(controller.pid, how)
+            deadline = time.monotonic() + periods / RATE + 0.3 + 2.0  # the damping, and opening the port
+            while torque() != [0] * 6 and time.monotonic() < deadline:
+                time.sleep(0.05)
+            assert torque() == [0] * 6
+        finally:
+            controller.kill()
+            controller.wait()
+            wait_until_damped(port)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import sys
@@ -15,8 +16,8 @@ import pytest
 
 from gaponet.hw.control import watchdog
 from gaponet.hw.control.driver import DriverError
-from gaponet.hw.control.stop import SIGNALS
-from gaponet.hw.control.watchdog import STEPS, Watchdog
+from gaponet.hw.control.stop import STOP_SIGNALS
+from gaponet.hw.control.watchdog import WEIGHT_STEPS, Watchdog
 
 PATIENT, HANG, DAMP = 20.0, 0.5, 0.1  # s
 
@@ -35,7 +36,8 @@ class Robot:
         print(time.monotonic(), weight, file=self.notes, flush=True)
     def confirm(self):
         return "let go"
-    def close(self, hold=False): ...
+    def close(self, hold=False):
+        print("closed, held" if hold else "# closed", file=self.notes, flush=True)
 
 drivers.open_driver = Robot
 watchdog.main(json.loads(sys.argv[1]))
@@ -52,6 +54,7 @@ def dog(notes: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureReq
     """A watchdog in a process of its own that could damp the robot; its parameter is after how many s it does."""
     monkeypatch.setattr(watchdog.child_process, "module_command", lambda _, text: [sys.executable, "-c", ROBOT, text])
     lock = os.open(notes.with_suffix(".lock"), os.O_CREAT | os.O_RDWR)
+    fcntl.flock(lock, fcntl.LOCK_EX)
     dog = Watchdog({"early": True, "notes": str(notes)}, lock, getattr(request, "param", PATIENT), DAMP)
     os.close(lock)
     dog.wait_ready()
@@ -71,15 +74,15 @@ def damped(notes: Path) -> np.ndarray:
 def beat(dog: Watchdog, weight: float) -> None:
     """Beat, and wait until the watchdog has answered it."""
     assert dog.beat(weight)
-    before = dog._answered
-    while dog._answered == before and not dog.trouble():
+    before = dog._answer_time
+    while dog._answer_time == before and not dog.problem():
         time.sleep(0.001)
 
 
 def test_a_robot_is_damped_with_the_last_weight_that_was_commanded(dog, notes):
     beat(dog, 0.1)
-    dog._in.write(bytes([round(STEPS * weight) for weight in (0.2, 0.8)]))  # two beats that are read at once
-    dog.release(loose=True)
+    dog._in.write(bytes([round(WEIGHT_STEPS * weight) for weight in (0.2, 0.8)]))  # two beats that are read at once
+    dog.release(unconfirmed=True)
     dog._process.wait(20)
     weights = damped(notes)[:, 1]
     assert weights[0] == pytest.approx(0.8, abs=0.02), "what the robot still held goes on holding"
@@ -87,28 +90,42 @@ def test_a_robot_is_damped_with_the_last_weight_that_was_commanded(dog, notes):
     assert (np.diff(weights) <= 0).all()
 
 
+def test_it_holds_the_controllers_lock_until_its_end(dog, notes):
+    with open(notes.with_suffix(".lock")) as file:
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        dog.release()
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def test_a_watchdog_without_any_heartbeat_sends_nothing(dog, notes):
+    dog.release(unconfirmed=True)
+    assert dog._process.wait(20) == 0
+    assert notes.read_text() == "closed, held\n"
+
+
 def test_signals_that_ask_to_stop_end_the_controller_and_not_its_watchdog(dog, notes):
     beat(dog, 1.0)
-    for number in SIGNALS:
+    for number in STOP_SIGNALS:
         os.kill(dog._process.pid, number)
         beat(dog, 1.0)
-        assert dog.trouble() == ""
+        assert dog.problem() == ""
     dog.release()
     assert dog._process.wait(20) == 0
-    assert notes.read_text() == ""
+    assert notes.read_text() == "closed, held\n"
 
 
 @hanging
 def test_a_watchdog_that_hangs_is_in_trouble_and_only_from_the_first_beat_on(dog):
     os.kill(dog._process.pid, signal.SIGSTOP)
     time.sleep(1.2 * HANG)
-    assert dog.trouble() == ""
+    assert dog.problem() == ""
     for _ in range(1000):
         dog.beat(1.0)
-        if dog.trouble():
+        if dog.problem():
             break
         time.sleep(HANG / 20)
-    assert dog.trouble() == "the watchdog does not answer"
+    assert dog.problem() == "the watchdog does not answer"
     os.kill(dog._process.pid, signal.SIGCONT)
 
 
@@ -117,25 +134,82 @@ def test_a_watchdog_that_took_the_controller_for_hanging_says_so(dog, notes):
     beat(dog, 1.0)
     dog._process.wait(20)
     assert dog.fired()
-    assert dog.trouble() == "the watchdog ended"
+    assert dog.problem() == "the watchdog ended"
     assert not dog.beat(1.0)
     assert damped(notes)[0, 1] == 1.0
 
 
+class LooseRobot:
+    """A robot in simulated time of which some calls fail."""
+
+    address = "/dev/loose"
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **fails: object) -> None:
+        """fails: method → numbers of its calls that fail; None: all."""
+        self.now, self.fails, self.calls = 0.0, fails, []
+        clock = SimpleNamespace(monotonic=lambda: self.now, sleep=lambda s: setattr(self, "now", self.now + s))
+        monkeypatch.setattr(watchdog, "time", clock)
+
+    def __getattr__(self, name: str):
+        def call(*values: float, hold: bool = False) -> str:
+            self.calls.append((name, *values))
+            number = sum(made[0] == name for made in self.calls)
+            if name in self.fails and (self.fails[name] is None or number in self.fails[name]):
+                raise (OSError if name == "damp" else DriverError)(f"{name} failed")
+            return "let go"
+
+        return call
+
+    def count(self, name: str) -> int:
+        return sum(made[0] == name for made in self.calls)
+
+
+def test_what_fails_is_tried_again_until_the_robot_is_damped(monkeypatch, capsys):
+    robot = LooseRobot(monkeypatch, connect=(1, 2), damp=(2, 3), confirm=(1, 2))
+    watchdog._damp(robot, 0.1, 0.5, connected=False)
+    assert [robot.count(name) for name in ("connect", "confirm", "close")] == [3, 3, 1]
+    weights = [values[0] for name, *values in robot.calls if name == "damp"]
+    assert weights[0] == 0.5
+    assert weights[-1] == 0.0
+    said = capsys.readouterr().err
+    assert "could NOT be damped: switch the supply off (connect failed); trying again" in said
+    assert "(confirm failed)" in said
+    assert said.endswith("watchdog: /dev/loose let go\n")
+
+
 def test_a_watchdog_gives_up_after_ten_minutes_and_not_before(monkeypatch, capsys):
-    now = [0.0]
-    sleep = lambda seconds: now.__setitem__(0, now[0] + seconds)  # noqa: E731
-    monkeypatch.setattr(watchdog, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
-
-    def silent():
-        raise DriverError("nothing was heard")
-
-    robot = SimpleNamespace(
-        address="a robot", damp=lambda weight, share: None, confirm=silent, close=lambda: None, connect=lambda: None
-    )
+    robot = LooseRobot(monkeypatch, confirm=None)
     watchdog._damp(robot, 2.0, 1.0, connected=True)
-    assert 600 < now[0] < 601
+    assert 600 < robot.now < 601
+    assert robot.count("close") == 1
     assert "gave up after 600 s; switch the supply off" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("words", "damped"), [((b"\x64", b"\xc8"), True), ((b"\x64", b"\xff"), False)])
+def test_a_watchdog_waits_for_the_next_heartbeat_as_long_as_it_is_told_and_then_damps(monkeypatch, words, damped):
+    """Without time: the pipes are lists, and the wait for a heartbeat is what select is given."""
+    robot, waits, said = LooseRobot(monkeypatch), [], []
+    heartbeats = iter(words)
+
+    def wait(reads, _, __, timeout):
+        waits.append(timeout)
+        return (reads if len(waits) <= len(words) else [], [], [])
+
+    monkeypatch.setattr("gaponet.hw.drivers.open.open_driver", lambda **spec: robot)
+    monkeypatch.setattr(watchdog.select, "select", wait)
+    monkeypatch.setattr(watchdog.os, "read", lambda *_: next(heartbeats))
+    monkeypatch.setattr(watchdog.os, "write", lambda _, word: said.append(word))
+    monkeypatch.setattr(watchdog.signal, "signal", lambda *_: None)
+    watchdog.main({"timeout": HANG, "damp": DAMP, "early": True})
+    assert waits == [None, HANG, HANG][: len(waits)], "before the first one it waits for ever"
+    assert said == [watchdog.READY, watchdog.ANSWER, *([watchdog.ANSWER, watchdog.FIRED] if damped else [])]
+    assert [values[0] for name, *values in robot.calls if name == "damp"][:1] == ([1.0] if damped else [])
+
+
+def test_a_watchdog_that_cannot_reach_the_robot_is_an_error(notes, monkeypatch):
+    monkeypatch.setattr(watchdog.child_process, "module_command", lambda *_: [sys.executable, "-c", "raise SystemExit"])
+    with open(os.devnull) as lock, pytest.raises(DriverError, match="could not reach the robot"):
+        Watchdog({}, lock.fileno(), HANG, DAMP).wait_ready()
 
 
 @pytest.mark.faults
@@ -145,7 +219,7 @@ def test_the_time_from_the_last_sign_of_life_to_damping_is_bounded(dog, notes, d
     beat(dog, 1.0)
     last = time.monotonic()
     if dies:
-        dog.release(loose=True)
+        dog.release(unconfirmed=True)
     dog._process.wait(20)
     first = damped(notes)[0, 0] - last
     assert (0.0 if dies else 0.9 * HANG) < first < (0.2 if dies else HANG + 0.2)
@@ -157,7 +231,7 @@ def test_the_time_after_which_a_watchdog_that_hangs_is_noticed_is_bounded(dog):
     beat(dog, 1.0)
     os.kill(dog._process.pid, signal.SIGSTOP)
     stopped = time.monotonic()
-    while not dog.trouble():
+    while not dog.problem():
         dog.beat(1.0)
         time.sleep(HANG / 5)
     assert 0.9 * HANG < time.monotonic() - stopped < 1.2 * HANG + 0.2

@@ -11,10 +11,10 @@ from gaponet.hw.control import publisher
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.phases import ControlConfig
-from gaponet.hw.drivers.dry import DryRun, would_send
-from gaponet.hw.drivers.link import measure
+from gaponet.hw.drivers.dry import DryRun, summarize_commands
+from gaponet.hw.drivers.link import measure_link
 from gaponet.hw.drivers.open import open_driver
-from gaponet.hw.targets.policy import play
+from gaponet.hw.targets.policy import motion_policy
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.motion.motion import Motion
 from gaponet.testing.fleet import load_fleet
@@ -35,20 +35,30 @@ def test_a_dry_run_goes_through_the_motion_and_sends_nothing(arm):
     driver = DryRun(Deaf(arm, load_fleet("easy", arm).unit("virtual-1"), clock))
     config = ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1, damp=0.1)
     controller = Controller(driver, arm, config=config, clock=clock)
-    recording = controller.run(play(MOTION, 0.02))
+    recording = controller.run(motion_policy(MOTION, 0.02))
     assert recording.fault is None
-    sent = would_send(recording, controller.limits)
+    sent = summarize_commands(recording, controller.limits)
     assert sent["shoulder"]["lowest_rad"] <= MOTION.ctrl[:, 0].min() + 1e-9
     assert sent["elbow"]["highest_rad"] >= MOTION.ctrl[:, 1].max() - 1e-9
     assert 0 < sent["elbow"]["torque_nm"] <= controller.limits.effort[1]
 
 
+def test_a_dry_run_that_is_stopped_damps_nothing_and_needs_no_watchdog(arm):
+    inner = Deaf(arm, load_fleet("easy", arm).unit("virtual-1"), SimulatedClock())
+    inner.watchdog = dict
+    driver, play = DryRun(inner), motion_policy(MOTION, 0.02)
+    controller = Controller(driver, arm, config=ControlConfig(blend=0.3, damp=0.1), clock=inner.clock)
+    recording = controller.run(lambda k, state: controller.stop("no more") if k == 9 else play(k, state))
+    assert recording.events[-1].text == "nothing was sent"
+    assert driver.watchdog() is None
+
+
 def test_a_dry_run_beside_a_run_of_the_same_robot_is_refused(arm, tmp_path, monkeypatch):
-    monkeypatch.setattr(publisher, "LOCKS", tmp_path)
+    monkeypatch.setattr(publisher, "LOCK_FOLDER", tmp_path)
     inner = Deaf(arm, load_fleet("easy", arm).unit("virtual-1"), SimulatedClock())
     inner.address = "a port"
     with publisher.sole_publisher("a port"), pytest.raises(UsageError, match="another process commands"):
-        Controller(DryRun(inner), arm, clock=SimulatedClock()).run(play(MOTION, 0.02))
+        Controller(DryRun(inner), arm, clock=SimulatedClock()).run(motion_policy(MOTION, 0.02))
 
 
 def test_a_dry_run_on_the_command_line_says_what_would_be_sent(arm, tmp_path, capsys):
@@ -70,7 +80,7 @@ def test_a_link_that_loses_every_fifth_state_says_so():
             none = np.zeros(1)
             return State(1e-3 * self.k, none, none, none, none)
 
-    found = measure(Lossy(), 0.2)
+    found = measure_link(Lossy(), 0.2)
     assert found["lost"] == pytest.approx(found["states"] / 4, rel=0.1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import termios
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,8 +17,8 @@ from servos import Servos, Wire
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError
 from gaponet.hw.drivers import feetech as reg
-from gaponet.hw.drivers.so101 import FULL, SO101Driver
-from gaponet.hw.drivers.so101_calibration import SPEAK, STEP, read_calibration
+from gaponet.hw.drivers.so101 import FULL_TORQUE, SO101Driver
+from gaponet.hw.drivers.so101_calibration import JOINTS, STEP_RAD, read_calibration
 from gaponet.robot.spec import RobotSpec
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.so101_virtual import PERIOD, VirtualSO101
@@ -54,7 +55,7 @@ def instructions(servos: Servos) -> list[int]:
 def calibration(path: Path, **changes: dict[str, int]) -> Path:
     """The file of the arm that Servos is."""
     row = {"drive_mode": 0, "homing_offset": 0, "range_min": 1000, "range_max": 3000}
-    path.write_text(json.dumps({j: {"id": i + 1} | row | changes.get(j, {}) for i, j in enumerate(SPEAK)}))
+    path.write_text(json.dumps({j: {"id": i + 1} | row | changes.get(j, {}) for i, j in enumerate(JOINTS)}))
     return path
 
 
@@ -135,7 +136,7 @@ def test_a_reply_that_was_lost_is_asked_for_again(driver, servos):
     lost = iter([True, False])
     servos.adversary = lambda servo, reply: b"" if servo == 3 and next(lost, False) else reply
     servos.set(3, "position", 2345)
-    assert driver.read().qpos[2] == pytest.approx(345 * STEP)
+    assert driver.read().qpos[2] == pytest.approx(345 * STEP_RAD)
     whole, again = servos.heard[-2:]
     assert (whole[7:-1], again[7:-1]) == (bytes([1, 2, 3, 4, 5, 6]), bytes([3]))
 
@@ -162,7 +163,7 @@ def shuffled(servo: int, reply: bytes) -> bytes:
 def test_noise_half_packets_and_strangers_between_replies_do_no_harm(driver, servos):
     servos.set(5, "position", 2500)
     servos.adversary = shuffled
-    assert driver.read().qpos[4] == pytest.approx(500 * STEP)
+    assert driver.read().qpos[4] == pytest.approx(500 * STEP_RAD)
 
 
 def test_whatever_single_byte_is_changed_a_state_is_true_or_old(driver, servos):
@@ -180,7 +181,7 @@ def test_whatever_single_byte_is_changed_a_state_is_true_or_old(driver, servos):
         where = np.array([servos.get(servo, "position") for servo in range(1, 7)])
         before, state = driver._state, driver.read()
         if state.time != before.time:
-            true[state.time] = np.array_equal(driver.steps.steps(state.qpos), where)
+            true[state.time] = np.array_equal(driver.arm.steps(state.qpos), where)
         assert np.array_equal(state.qpos, before.qpos) or true.get(state.time)
     assert all(true.values())
     assert len(true) > 10
@@ -205,7 +206,7 @@ def test_answers_that_come_late_are_never_taken_for_those_to_a_later_question(dr
         before, state = driver._state, driver.read()
         assert (state.time != before.time) == own
         if own:
-            np.testing.assert_array_equal(driver.steps.steps(state.qpos), 1100 + 10 * period + np.arange(1, 7))
+            np.testing.assert_array_equal(driver.arm.steps(state.qpos), 1100 + 10 * period + np.arange(1, 7))
 
 
 def test_a_late_reply_is_not_taken_for_the_next_registers(wire, servos):
@@ -262,10 +263,24 @@ def test_torque_comes_on_with_the_first_goal_and_a_hold_leaves_it_on(driver, ser
     target = driver.read().qpos + 0.1
     driver.write(target)
     assert [servos.get(s, "torque") for s in range(1, 7)] == [1] * 6
-    np.testing.assert_allclose(driver.read().qpos, target, atol=STEP)
+    np.testing.assert_allclose(driver.read().qpos, target, atol=STEP_RAD)
+    del servos.heard[:]
+    driver.write(target)
+    assert [request[5] for request in servos.heard] == [reg.GOAL_POSITION.address], "a servo that reset stays off"
     count = len(servos.heard)
     driver.close(hold=True)
     assert len(servos.heard) == count
+
+
+def test_from_the_first_goal_until_the_end_no_other_program_can_open_the_port(driver, wire, monkeypatch):
+    calls: list[int] = []
+    wire.fileno = lambda: 0
+    monkeypatch.setattr("fcntl.ioctl", lambda descriptor, request: calls.append(request))
+    assert calls == []
+    driver.write(driver.read().qpos)
+    assert calls == [termios.TIOCEXCL]
+    driver.close()
+    assert calls == [termios.TIOCEXCL, termios.TIOCNXCL]
 
 
 def test_goals_stay_within_the_calibrated_range(driver, servos):
@@ -273,7 +288,7 @@ def test_goals_stay_within_the_calibrated_range(driver, servos):
     assert [servos.get(s, "goal") for s in range(1, 7)] == [3000] * 6
     driver.write(np.full(6, -9.0))
     assert [servos.get(s, "goal") for s in range(1, 7)] == [1000] * 6
-    np.testing.assert_allclose(driver.qpos_range[:5], [[-1000 * STEP, 1000 * STEP]] * 5)
+    np.testing.assert_allclose(driver.qpos_range[:5], [[-1000 * STEP_RAD, 1000 * STEP_RAD]] * 5)
 
 
 def test_damping_tells_all_servos_at_once_without_asking_any(driver, servos):
@@ -415,7 +430,7 @@ def test_the_virtual_arm_follows_and_its_readings_are_whole_steps(connect, so101
     assert driver.facts["remarks"] == []
     roll = so101.index(["wrist_roll"])[0]
     assert abs(follow(driver, roll, 0.3)) < 0.05
-    steps = driver.read().qpos[roll] / STEP + driver.steps.zero[roll]
+    steps = driver.read().qpos[roll] / STEP_RAD + driver.arm.zero[roll]
     assert abs(steps - round(steps)) < 1e-6
     driver.damp()
     assert all(memory[reg.TORQUE_ENABLE.address] == 0 for memory in arm.memory)
@@ -435,7 +450,7 @@ def test_a_virtual_servo_with_a_torque_limit_does_not_lift(connect, so101, arm):
     lift = so101.index(["shoulder_lift"])[0]
     moved = follow(connect(), lift, 0.5)
     for memory in arm.memory:
-        memory[reg.TORQUE_LIMIT.address : reg.TORQUE_LIMIT.address + 2] = (FULL // 50).to_bytes(2, "little")
+        memory[reg.TORQUE_LIMIT.address : reg.TORQUE_LIMIT.address + 2] = (FULL_TORQUE // 50).to_bytes(2, "little")
     assert abs(follow(connect(), lift, 0.5)) > 3 * abs(moved)
 
 

@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 import time
+from collections import defaultdict
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,9 +15,12 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
 
-from gaponet.hw.control.driver import DriverError
+from hw.control.loopback import Loopback
+
+from gaponet.base.errors import UsageError
+from gaponet.hw.control.driver import DriverError, State
 from gaponet.hw.drivers import hg
-from gaponet.hw.drivers.unitree import MOTOR_NAMES, TickClock, UnitreeDriver
+from gaponet.hw.drivers.unitree import MOTOR_NAMES, WEIGHT_MOTOR, TickClock, UnitreeDriver
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.unitree_virtual import VirtualH12
@@ -58,7 +63,8 @@ def decoded(robot, data):
     driver = UnitreeDriver(robot)
     driver._require_h1_2([data])
     driver._clock = TickClock([0.0], [0])
-    return driver._decode(data, 0.0), driver
+    driver._state = driver._decode(data, driver._clock, 0.0)
+    return driver._state, driver
 
 
 def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(robot):
@@ -73,11 +79,11 @@ def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(rob
 
 
 def test_only_the_stop_keys_of_the_remote_stop(robot):
-    told = decoded(robot, message())[1]._told
+    reported = decoded(robot, message())[1]._reported_fault
     pressed = message()
     for keys, stops in ((0x0008, True), (0x0220, True), (0x0020, False), (0x0200, False), (0x0104, False)):
         hg.LowState.view(pressed, "wireless_remote")[2:4] = keys & 0xFF, keys >> 8
-        assert (told(pressed) is not None and told(pressed).kind == "stop") == stops, hex(keys)
+        assert (reported(pressed) is not None and reported(pressed).kind == "stop") == stops, hex(keys)
 
 
 def test_what_one_of_several_messages_says_stops_for_good(robot):
@@ -87,15 +93,14 @@ def test_what_one_of_several_messages_says_stops_for_good(robot):
         hg.LowState.seal(data)
     _, driver = decoded(robot, message())
     queue = [[pressed, well], [well]]
-    driver._reader, driver._dds = None, SimpleNamespace(receive=lambda reader: queue.pop(0))
+    driver._reader = SimpleNamespace(receive=lambda: queue.pop(0))
     assert [driver.read().fault.kind, driver.read().fault.kind] == ["stop", "stop"]
 
 
 def unplugged(robot: RobotSpec, **how: str) -> tuple[UnitreeDriver, list[np.ndarray]]:
     """A driver without a bus, and the list of what it sends."""
     driver, sent = UnitreeDriver(robot, **how), []
-    driver._bus, driver._dds = object(), type("dds", (), {"LowCmd": None, "send": lambda *a: sent.append(a[-1].copy())})
-    driver._writer = None
+    driver._bus, driver._writer = object(), SimpleNamespace(send=lambda data: sent.append(data.copy()))
     return driver, sent
 
 
@@ -119,6 +124,57 @@ def test_an_identified_robot_is_commanded_with_the_gains_of_its_real_servos(robo
     driver.write(robot.qpos_home)
     at = MOTOR_NAMES.index("left_elbow_joint")
     assert hg.LowCmd.motors(sent[0], "kp")[at] == robot.kp[robot.index(["left_elbow_joint"])[0]] != 60.0
+
+
+def test_damping_gains_are_four_times_the_robots_but_no_more_than_the_effort_limits_allow(robot):
+    driver, sent = unplugged(robot, topic="lowcmd", joints="all")
+    for speed in (0.0, 1.0, 100.0):
+        driver._state = State(0.0, *np.zeros((2, 27)), *np.zeros((2, 27)))
+        driver._state = replace(driver._state, qvel=np.full(27, speed))
+        driver.damp()
+        kp, kd = (hg.LowCmd.motors(sent[-1], name)[:27] for name in ("kp", "kd"))
+        order = robot.index(MOTOR_NAMES)
+        np.testing.assert_array_equal(kp, 0.0)
+        most = np.minimum(4 * robot.kd, robot.effort_limit / max(speed, 1e-6))[order]
+        np.testing.assert_allclose(kd, most, rtol=1e-6)
+
+
+def test_after_damping_the_last_message_gives_the_arms_back_and_a_hold_sends_nothing(robot):
+    driver, sent = unplugged(robot)
+    driver.write(robot.qpos_home, 1.0)
+    driver.damp(0.5)
+    driver.close()
+    weights = [hg.LowCmd.motors(data, "q")[WEIGHT_MOTOR] for data in sent]
+    assert weights == [1.0, 0.5, 0.0]
+    assert hg.LowCmd.motors(sent[-1], "kp")[16] == 0
+    driver, sent = unplugged(robot)
+    driver.write(robot.qpos_home, 1.0)
+    driver.close(hold=True)
+    assert len(sent) == 1
+
+
+def test_a_silent_driver_publishes_nothing(robot):
+    driver, sent = unplugged(robot, silent=True)
+    driver.write(robot.qpos_home)
+    driver.damp()
+    driver.close()
+    assert sent == []
+
+
+def test_another_publisher_of_the_topic_is_refused(robot, monkeypatch):
+    bus = Loopback()
+    monkeypatch.setattr(bus, "publishers", lambda: defaultdict(list, {"rt/arm_sdk": ["a demo (process 7 on robot)"]}))
+    monkeypatch.setattr("gaponet.hw.drivers.dds", bus, raising=False)
+    with pytest.raises(DriverError, match=r"others publish rt/arm_sdk on lo: a demo \(process 7"):
+        UnitreeDriver(robot).connect()
+
+
+def test_legs_are_commanded_only_on_lowcmd_and_another_robot_never(robot, so101):
+    assert not any("hip" in j or "knee" in j or "ankle" in j for j in UnitreeDriver(robot, "lowcmd").commanded)
+    with pytest.raises(UsageError, match="does not take the legs"):
+        UnitreeDriver(robot, "arm_sdk", "all")
+    with pytest.raises(UsageError, match="for the 27 joints of h1_2"):
+        UnitreeDriver(so101)
 
 
 def command(robot: RobotSpec, **columns: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from arm import commands
+from hw.noted_arm import DT, QUICK, NotedArm
 
 from gaponet.base.errors import UsageError
 from gaponet.base.structure import _type_adapter
@@ -15,18 +16,17 @@ from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig
 from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, LiveConfig, LiveTargets, Message, decode, next_step
-from gaponet.hw.targets.policy import play
+from gaponet.hw.targets.policy import motion_policy
 from gaponet.sysid.motion.motion import Motion
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.virtual_driver import VirtualDriver
 
-QUICK = ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1, damp=0.1)
-DT, FAULT, HOLD = 0.02, 1.5, 0.5  # s; from FAULT on a sender goes wrong; HOLD is the default
+FAULT, HOLD = 1.5, 0.5  # s; from FAULT on a sender goes wrong; HOLD is the default
 NAN = float("nan")
 
 
 class Scripted:
-    """A wire on which a sender says `say(t)` at each look, t s after the first."""
+    """A transport on which a sender says `say(t)` at each look, t s after the first."""
 
     address = "nowhere"
 
@@ -42,22 +42,6 @@ class Scripted:
         self.states.append((to, state))
 
 
-class Noted(VirtualDriver):
-    """Notes what it is sent; None for damping."""
-
-    def __init__(self, robot, clock):
-        super().__init__(robot, load_fleet("easy", robot).unit("virtual-1"), clock, period=0.01)
-        self.sent = []
-
-    def write(self, ctrl, weight=1.0):
-        self.sent.append((self.clock.now(), ctrl.copy()))
-        super().write(ctrl, weight)
-
-    def damp(self, weight=1.0, share=0.0):
-        self.sent.append((self.clock.now(), None))
-        super().damp(weight, share)
-
-
 def wave(t):
     return {"shoulder": 0.4 * np.sin(3 * t), "elbow": -0.5 * np.sin(2 * t)}
 
@@ -67,19 +51,19 @@ def good(t, sender="a"):
 
 
 def live(arm, say, seconds=2.6, config=LiveConfig(wait=3.0), **how):  # noqa: B008
-    """Controller, wire and driver after a run; the sender ends after `seconds`."""
+    """Recording, driver, transport and targets after a run; the sender ends after `seconds`."""
     clock = SimulatedClock()
-    driver = Noted(arm, clock)
-    wire = Scripted(clock, lambda t: say(t) if t < seconds else [Message("a", 100.0 + t, end=True)])
+    driver = NotedArm(arm, clock)
+    transport = Scripted(clock, lambda t: say(t) if t < seconds else [Message("a", 100.0 + t, end=True)])
     controller = Controller(driver, arm, config=QUICK, clock=clock, **how)
-    targets = LiveTargets(wire, arm, driver.commanded, clock, DT, SafetyConfig().speed, config)
+    targets = LiveTargets(transport, arm, driver.commanded, clock, DT, SafetyConfig().speed, config)
     controller.run(targets)
-    return controller.recording, driver, wire, targets
+    return controller.recording, driver, transport, targets
 
 
 def judge(arm, recording):
     """Every command that left was within range, rate and torque."""
-    limits = Limits.of(arm, arm.joint_names, SafetyConfig())
+    limits = Limits.from_robot(arm, arm.joint_names, SafetyConfig())
     rows = [r for r in recording.rows if r.ctrl is not None]
     ctrl, qpos, qvel = (np.array(x) for x in zip(*((r.ctrl, r.state.qpos, r.state.qvel) for r in rows), strict=True))
     assert ((ctrl >= limits.low) & (ctrl <= limits.high)).all()
@@ -99,41 +83,43 @@ def test_a_stream_is_played_as_the_same_motion_from_a_file(arm):
             return target + 0.3 * (target - qpos) + 2.0 * (target - before)
 
     rows = 0.5 * commands(60, seed=1)  # slow enough to be followed at once
-    told = {"k": -1}
+    row_of = {"k": -1}
 
     def say(t):
-        if len(wire_driver.sent) and targets_phase() == "run":
-            told["k"] += 1
-        k = max(told["k"], 0)
-        over = told["k"] >= len(rows)
+        if len(live_driver.sent) and targets_phase() == "run":
+            row_of["k"] += 1
+        k = max(row_of["k"], 0)
+        over = row_of["k"] >= len(rows)
         row = rows[min(k, len(rows) - 1)]
         return [Message("a", 100 + t, dict(zip(arm.joint_names, row.tolist(), strict=True)), over)]
 
     clock = SimulatedClock()
-    wire_driver = Noted(arm, clock)
-    controller = Controller(wire_driver, arm, config=QUICK, clock=clock, compensator=Corrects())
+    live_driver = NotedArm(arm, clock)
+    controller = Controller(live_driver, arm, config=QUICK, clock=clock, compensator=Corrects())
 
     def targets_phase():
         return controller.phase.value
 
-    wire = Scripted(clock, say)
-    controller.run(LiveTargets(wire, arm, arm.joint_names, clock, DT, SafetyConfig().speed))
+    transport = Scripted(clock, say)
+    controller.run(LiveTargets(transport, arm, arm.joint_names, clock, DT, SafetyConfig().speed))
     clock = SimulatedClock()
-    driver = Noted(arm, clock)
+    driver = NotedArm(arm, clock)
     motion = Motion("sway", "whole_body", DT, rows)
-    from_file = Controller(driver, arm, config=QUICK, clock=clock, compensator=Corrects()).run(play(motion, DT))
+    from_file = Controller(driver, arm, config=QUICK, clock=clock, compensator=Corrects()).run(
+        motion_policy(motion, DT)
+    )
     sent = [[r.ctrl for r in x.rows if r.phase == "run"] for x in (from_file, controller.recording)]
     assert len(sent[0]) == len(sent[1]) == 60
     np.testing.assert_array_equal(*sent)
 
 
 def test_a_run_that_its_sender_ends_goes_back_and_stops_without_fault(arm):
-    recording, driver, wire, targets = live(arm, lambda t: [good(t)])
+    recording, driver, transport, targets = live(arm, lambda t: [good(t)])
     assert recording.fault is None
     assert [e.phase for e in recording.events][-3:] == ["run", "blend_out", "stopped"]
     assert driver.sent[-1][1] is not None
     assert targets.counts["refused"] == {}
-    to, state = wire.states[-1]
+    to, state = transport.states[-1]
     assert to == "a"
     assert state["commanded"] == arm.joint_names
     assert np.isfinite(state["qpos"] + state["qvel"] + state["tau"]).all()
@@ -160,7 +146,7 @@ WRONG = {  # from FAULT on, every message is of this kind
 @pytest.mark.parametrize("what", WRONG)
 def test_what_cannot_be_taken_is_held_and_then_damped(arm, what):
     wrong, kind = WRONG[what]
-    recording, driver, wire, targets = live(arm, lambda t: [good(t)] if t < FAULT else wrong(t))
+    recording, driver, transport, targets = live(arm, lambda t: [good(t)] if t < FAULT else wrong(t))
     assert recording.fault is not None
     assert recording.fault.kind == "silence"
     assert set(targets.counts["refused"]) == ({kind} if kind else set())
@@ -170,7 +156,7 @@ def test_what_cannot_be_taken_is_held_and_then_damped(arm, what):
     held = [r for r in recording.rows if r.target is not None][-10:]
     np.testing.assert_array_equal(np.ptp([r.target for r in held], axis=0), 0.0)  # the last good one, until then
     longest = HOLD + (3 * DT if what == "too fast" else DT)  # its first one may be where the last good one was
-    assert HOLD - 2 * DT < damped - wire.began - FAULT <= longest
+    assert HOLD - 2 * DT < damped - transport.began - FAULT <= longest
 
 
 @pytest.mark.parametrize("what", sorted(WRONG))
@@ -248,8 +234,8 @@ def test_a_target_is_reached_without_overshoot_and_a_ramp_is_followed_as_near_as
 
 def test_after_its_end_a_sender_moves_the_robot_no_more(arm):
     clock = SimulatedClock()
-    wire = Scripted(clock, lambda t: [Message("a", 100 + t, {"shoulder": 2 * t}, end=t > 0.2)])
-    targets = LiveTargets(wire, arm, arm.joint_names, clock, DT, SafetyConfig().speed)
+    transport = Scripted(clock, lambda t: [Message("a", 100 + t, {"shoulder": 2 * t}, end=t > 0.2)])
+    targets = LiveTargets(transport, arm, arm.joint_names, clock, DT, SafetyConfig().speed)
     state, out = SimpleNamespace(time=0.0, qpos=np.zeros(2), qvel=np.zeros(2), tau=np.zeros(2)), []
     for k in range(100):
         out.append(targets(k if k > 1 else 0, state))
@@ -296,9 +282,9 @@ def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
         def publish(self, to, state):
             self.said = [Message("a", self.clock.now(), dict.fromkeys(so101.joint_names, 0.0))]
 
-    wire = Answering(clock, None)
+    transport = Answering(clock, None)
     config = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
-    targets = LiveTargets(wire, so101, so101.joint_names, clock, DT, 5.0)
+    targets = LiveTargets(transport, so101, so101.joint_names, clock, DT, 5.0)
     driver = VirtualDriver(so101, load_fleet("easy", so101).unit("virtual-1"), clock)
     controller = Controller(driver, so101, config=config, clock=clock)
     begin = controller.readiness.context.planner.begin

@@ -1,4 +1,4 @@
-"""Consent of the person at the terminal, without which no real robot moves."""
+"""Consent of the person at the terminal, without which no real robot moves. All commands ask through this module."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from gaponet.base.text import escape
 
 
 def require_terminal(option: str = "--yes") -> int:
-    """Return the descriptor of the terminal that can be asked.
+    """Return the descriptor of the terminal on which to ask.
 
     Args:
-        option: What replaces the question; named in the error.
+        option: Option that replaces the question; named in the error.
 
     Raises:
         UsageError: Standard input is no terminal.
@@ -26,7 +26,7 @@ def require_terminal(option: str = "--yes") -> int:
 
 
 def require_consent(
-    what: str,
+    statement: str,
     question: str = "Is the space around it free, and a hand on its own emergency stop?",
     word: str = "yes",
     option: str = "--yes",
@@ -36,10 +36,10 @@ def require_consent(
     Call it before the first command to the robot.
 
     Args:
-        what: What will happen, a sentence.
+        statement: What will happen, a sentence.
         question: What the person confirms.
         word: The only answer that consents, in lower case.
-        option: What replaces the question; named where there is no terminal.
+        option: Option that replaces the question; named where there is no terminal.
 
     Raises:
         UsageError: Anything else was typed, standard input ended, or it is no terminal.
@@ -48,7 +48,7 @@ def require_consent(
     import termios  # not on Windows
 
     termios.tcflush(descriptor, termios.TCIFLUSH)  # an answer typed before the question was shown answers nothing
-    sys.stderr.write(f"{escape(what)} {question} Type '{word}' to start; anything else leaves: ")
+    sys.stderr.write(f"{escape(statement)} {question} Type '{word}' to start; anything else leaves: ")
     sys.stderr.flush()
     line = os.read(descriptor, 1024).decode(errors="replace")  # not sys.stdin, which may hold earlier bytes
     if not line.endswith("\n"):  # end of file, also behind a word

@@ -1,7 +1,7 @@
-"""Controller: plays targets on a robot at a fixed rate, within limits, and stops it when something is wrong.
+"""Controller: plays targets on a robot at a fixed rate, within limits, and stops it after a fault.
 
-phases.TRANSITIONS is its state machine. What stops a robot is latched, and a controller that has stopped cannot be
-started again. docs/deploy-safety.md says what this guarantees.
+phases.TRANSITIONS is its state machine. A fault is latched, and a controller that has stopped cannot be started again.
+docs/deploy-safety.md lists the guarantees.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from typing import Any
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.hw.control.clock import Clock, MonotonicClock, uncollected
+from gaponet.hw.control.clock import Clock, MonotonicClock, no_garbage_collection
 from gaponet.hw.control.driver import Driver, DriverError, Fault, State
-from gaponet.hw.control.following import Following
+from gaponet.hw.control.following import FollowingMonitor
 from gaponet.hw.control.output import Context, Output
-from gaponet.hw.control.phases import COMMANDING, ENDED, MOVING, TABLE, Action, ControlConfig, Phase, Trigger
-from gaponet.hw.control.plan import Compensates, Plan, Planner
+from gaponet.hw.control.phases import COMMANDING, ENDED, MOVING, TRANSITION_TABLE, Action, ControlConfig, Phase, Trigger
+from gaponet.hw.control.plan import Plan, Planner, TargetCompensator
 from gaponet.hw.control.publisher import sole_publisher
 from gaponet.hw.control.recording import Event, Recording
 from gaponet.hw.control.rows import Row
-from gaponet.hw.control.safety import ASTRAY, SOFT, Limits, SafetyConfig, Watch
-from gaponet.hw.control.stop import Keys, StopRequest, on_signal
-from gaponet.hw.control.target import Change, Readiness, TargetGenerator
+from gaponet.hw.control.safety import DISOBEDIENCE_FAULTS, EXTERNAL_FAULTS, Limits, SafetyConfig, StateMonitor
+from gaponet.hw.control.stop import StopKeys, StopRequest, stop_on_signals
+from gaponet.hw.control.target import PhaseChange, Readiness, TargetGenerator
 from gaponet.hw.control.watchdog import Watchdog
-from gaponet.hw.targets.policy import Policy, play
+from gaponet.hw.targets.policy import Policy, motion_policy
 from gaponet.robot.spec import RobotSpec
 
-HANG_PERIODS = 5.0  # control periods without a sign of life after which the watchdog damps the robot
+WATCHDOG_PERIODS = 5.0  # control periods without a heartbeat after which the watchdog damps the robot
 
 
 class Controller:
-    """Plays targets on one robot, once: ramp to the start, track, hold or damp at the end."""
+    """Plays targets on one robot, once: go to the first target, track, hold or damp at the end."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class Controller:
         *,
         config: ControlConfig | None = None,
         safety: SafetyConfig | None = None,
-        compensator: Compensates | None = None,
+        compensator: TargetCompensator | None = None,
         clock: Clock | None = None,
         watchdog: bool = True,
         planner: Planner | None = None,
@@ -56,20 +56,21 @@ class Controller:
         """
         Args:
             driver: The robot; not yet connected.
-            robot: Its type.
+            robot: Its model and nominal values.
             config: Times of the phases.
             safety: Limits and checks of states; default SafetyConfig().
             compensator: Turns targets into commands; without one targets are sent as they are.
             clock: Default the machine's monotonic clock.
-            watchdog: Start the process that damps the robot if this one dies, where the driver has one.
-            planner: Checks the way to the first target, and targets that are not known in advance while it moves;
-                default one without payload, for a robot that has shapes (collision.toml).
-            unchecked: Do without one.
+            watchdog: Start the process that damps the robot if this one dies, if the driver supports one.
+            planner: Checks the path to the first target, and live targets while the robot moves; default one without
+                payload, for a robot that has shapes (collision.toml).
+            unchecked: Use no default planner.
             payload_mass: kg per hand, for the compensator and the recording; None if it is not known.
             on_event: Called with every change of phase.
-            on_connect: Called with the driver once the robot has answered and nothing was commanded; may refuse it.
-            folder: Where the recording is written as it grows, to be saved there; default a temporary file.
-            metadata: Saved with the recording (unit, model…).
+            on_connect: Called with the driver once the robot has answered and nothing was commanded; it refuses the run
+                by an exception.
+            folder: Folder in which the recording is written period by period; default a temporary file.
+            metadata: Saved with the recording (unit id, model …).
         """
         self.driver, self.clock, self.config = driver, clock or MonotonicClock(), config or ControlConfig()
         self.dt, safety = 1.0 / self.config.rate, safety or SafetyConfig()
@@ -84,20 +85,20 @@ class Controller:
             robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
             meta=(metadata or {}) | {"payload_mass": payload_mass},
         )  # fmt: skip
-        self.watch = Watch(driver.joint_names, self.context.joints, self.dt, safety, driver.noisy)
-        self.following = Following(self.context)
-        self.output = Output(self.context, self.watch)
+        self.monitor = StateMonitor(driver.joint_names, self.context.joints, self.dt, safety, driver.noisy)
+        self.following = FollowingMonitor(self.context)
+        self.output = Output(self.context, self.monitor)
         self.readiness = Readiness(self.context, self.output)
         self._targets: TargetGenerator | None = None
         self._folder, self._use_watchdog, self._on_event, self._on_connect = folder, watchdog, on_event, on_connect
-        self._k, self._now, self._since = 0, 0.0, 0  # this period, its start in s, the first period of the phase
-        self._state: State | None = None  # the last one
-        self._error: BaseException | None = None  # of others' code, raised when the robot is damped
+        self._k, self._now, self._phase_start = 0, 0.0, 0  # this period, its start in s, first period of the phase
+        self._state: State | None = None  # last one
+        self._error: BaseException | None = None  # of other code; raised when the robot is damped
         self._reported_full_disk = False
 
     @property
     def plan(self) -> Plan | None:
-        """May be given until it runs: its motion is played."""
+        """Plan whose motion is played; may be set until the run begins."""
         return self.readiness.plan
 
     @plan.setter
@@ -110,51 +111,51 @@ class Controller:
         return self.output.limits
 
     def run(self, policy: Policy | None = None, keys: bool = False) -> Recording:
-        """Go through all phases and return what was recorded, when the policy ends or the run is stopped.
+        """Go through all phases; return the recording when the policy ends or the run is stopped.
 
         Args:
-            policy: Says the targets of the run, once a control period; None: the plan's motion is played.
-            keys: Whether any key on the terminal, Ctrl-C included, stops the run.
+            policy: Gives the target of each control period; None: the plan's motion is played.
+            keys: Any key on the terminal, Ctrl-C included, stops the run.
 
         Raises:
             DriverError: The robot could not be reached; nothing was commanded.
             UsageError: Another process commands it, or this controller has run before.
-            Exception: What the policy or the compensator raised, after the robot has damped.
+            Exception: Any error of the policy or the compensator, raised after the robot has damped.
         """
         if self.phase is not Phase.CONNECT:
             raise UsageError("a controller runs once; make a new one")
         driver, output = self.driver, self.output
         with ExitStack() as stack:
-            stack.enter_context(uncollected())  # left last: the watchdog would take a collection for silence
+            stack.enter_context(no_garbage_collection())  # exited last: during one no heartbeat is sent
             lock = stack.enter_context(sole_publisher(driver.address))
             stack.callback(lambda: driver.close(hold=output.damping_since is None))
             driver.connect()
             self.recording.virtual = driver.virtual
             output.limits = output.servo_limits()
             self._on_connect(driver)
-            stack.enter_context(on_signal(self.stop))
-            pressed = stack.enter_context(Keys(self.stop)) if keys else None  # from the consent on, not from the loop
+            stack.enter_context(stop_on_signals(self.stop))
+            pressed = stack.enter_context(StopKeys(self.stop)) if keys else None  # counts from the consent on
             gains = {name: getattr(driver, name)[self.context.joints].tolist() for name in ("kp", "kd")}
             self.recording.meta |= gains | driver.facts
             if self._folder:
-                self.recording.grow_in(self._folder)
+                self.recording.write_to(self._folder)
             stack.callback(self.recording.rows.close)
             if self._use_watchdog and (spec := driver.watchdog()) is not None:
-                watchdog = output.watchdog = Watchdog(spec, lock, HANG_PERIODS * self.dt, self.config.damp)
-                stack.callback(lambda: watchdog.release(output.loose))
+                watchdog = output.watchdog = Watchdog(spec, lock, WATCHDOG_PERIODS * self.dt, self.config.damp)
+                stack.callback(lambda: watchdog.release(output.unconfirmed))
                 watchdog.wait_ready()
             if policy is None:
                 if self.plan is None or self.plan.motion is None:
                     raise UsageError("there is nothing to play: give a policy, or a plan with a motion")
-                policy = play(self.plan.motion, self.dt)
+                policy = motion_policy(self.plan.motion, self.dt)
             self._loop(policy, pressed)
             self._verify()
         if self._error:
             raise self._error
         return self.recording
 
-    def _loop(self, policy: Policy, keys: Keys | None) -> None:
-        start, due = self.clock.now(), 0  # due: the period that should follow the last one; _k: the one that can
+    def _loop(self, policy: Policy, keys: StopKeys | None) -> None:
+        start, due = self.clock.now(), 0  # due: the period after the last one; _k: the next one that is possible
         self._now = self.readiness.since = start
         self._fire(Trigger.CONSENT, "waiting for fresh states")
         for remark in self.driver.facts.get("remarks", ()):
@@ -166,16 +167,16 @@ class Controller:
             if keys:
                 keys.poll()
             watchdog = None if self.phase in ENDED else self.output.watchdog
-            if watchdog and (trouble := watchdog.trouble()):
-                self.stop(trouble)
+            if watchdog and (problem := watchdog.problem()):
+                self.stop(problem)
             self.recording.late.append(self._now - self.output.due)
             self._period(policy)
-            lost = int((self.clock.now() - start) / self.dt) - self._k  # whole periods that this one ran over
+            lost = int((self.clock.now() - start) / self.dt) - self._k  # whole periods by which this one ran over
             self.recording.missed += max(lost - 1, 0)
             self._k, due = self._k + max(1, lost), self._k + 1
 
     def _period(self, policy: Policy) -> None:
-        """Read, judge, send, record. Whatever fails in it, the robot damps."""
+        """Read, check, send, record. After any error in it the robot damps."""
         state = sent = None
         try:
             state, fault = self._read()
@@ -195,21 +196,21 @@ class Controller:
         if state:
             target, ctrl = sent or (None, None)
             self.recording.rows.append(Row(self._now, phase.value, target, ctrl, state))
-            trouble = self.recording.rows.trouble
-            if trouble and not self._reported_full_disk:
+            full = self.recording.rows.error
+            if full and not self._reported_full_disk:
                 self._reported_full_disk = True
-                self._note(f"nothing more is recorded ({trouble.strerror}); what was written is kept")
+                self._note(f"nothing more is recorded ({full.strerror}); what was written is kept")
 
     def _read(self) -> tuple[State | None, Fault | None]:
-        """Return the newest state, and what stops the robot now."""
+        """Return the newest state, and the fault that stops the robot now."""
         state = fault = None
         try:
             state = self.driver.read()
         except (DriverError, OSError) as error:
             fault = Fault("driver", str(error))
         if state:
-            ctrl = None if self.recording.not_obeyed else self.output.ctrl  # while it is let go nothing is to follow
-            fault = self.watch.check(self._now, state, ctrl, self._now - self.output.due)
+            ctrl = None if self.recording.disobedience else self.output.ctrl  # while it is let go no joint must follow
+            fault = self.monitor.check(self._now, state, ctrl, self._now - self.output.due)
             if self.phase in MOVING:
                 fault = fault or self.following.check(state, self.output)
             elif self.phase is Phase.IDLE and (fault is None or fault.kind != "stop"):
@@ -227,15 +228,15 @@ class Controller:
         elif first is not None:
             self.output.begin(state.qpos)
             self._targets = TargetGenerator(self.context, self.following, self.plan, state, first)
-            self._fire(Trigger.READY, f"to the first target in {self._targets.way.duration:.1f} s")
+            self._fire(Trigger.READY, f"to the first target in {self._targets.path.duration:.1f} s")
 
     def _send(self, state: State, policy: Policy) -> tuple[Array, Array] | None:
         """Send this period's command. Return target and command of all joints, (n) rad; None if none was sent."""
         while self._targets and self.phase in COMMANDING:
-            target = self._targets.step(self.phase, self._k - self._since, state, policy)
+            target = self._targets.step(self.phase, self._k - self._phase_start, state, policy)
             while self._targets.remarks:
                 self._note(self._targets.remarks.pop(0))
-            if isinstance(target, Change):
+            if isinstance(target, PhaseChange):
                 self._fire(*target)
                 continue
             weight = self._targets.weight
@@ -250,7 +251,7 @@ class Controller:
         left = self.output.damping_left(self._now)
         try:
             self.output.damp(left)
-        except Exception as error:  # whatever a driver raises, it is to damp: again next period; raised at the end
+        except Exception as error:  # of any kind: damp again in the next period, raise it at the end
             if not isinstance(error, DriverError | OSError):
                 self._error = self._error or error
             if not any(e.text == str(error) for e in self.recording.events):
@@ -259,7 +260,7 @@ class Controller:
             self._fire(Trigger.DAMPED, *self.output.confirm())
 
     def _verify(self) -> None:
-        """Ask the robot once more for all that it holds, at the end of a run without fault."""
+        """Read back all that the robot holds, at the end of a run without fault."""
         if self.output.weight is None or self.recording.fault:
             return
         try:
@@ -269,11 +270,11 @@ class Controller:
         if fault:
             self._note(fault.text, fault.kind, self.clock.now())
         elif self.following.share and not self.following.shown.any():
-            self.recording.not_obeyed = "no joint was told to go far enough to show whether the robot obeys"
-            self._note(f"no data: {self.recording.not_obeyed}", now=self.clock.now())
+            self.recording.disobedience = "no joint was told to go far enough to show whether the robot obeys"
+            self._note(f"no data: {self.recording.disobedience}", now=self.clock.now())
 
     def _fail(self, fault: Fault) -> None:
-        """Stop the robot because of a fault; the table says how."""
+        """Stop the robot after a fault, as TRANSITIONS has it."""
         output, trigger, text = self.output, Trigger.FAULT, fault.text
         if output.weight is None:
             trigger, text = Trigger.FAULT_BEFORE_COMMAND, f"{text}; nothing was commanded"
@@ -284,15 +285,15 @@ class Controller:
         self._fire(trigger, text, fault.kind)
 
     def _fire(self, trigger: Trigger, text: str, kind: str = "") -> None:
-        """Make the transition that the table has for an event, and record it."""
-        phase, action = TABLE[self.phase, trigger]
+        """Make the transition of an event, and record it."""
+        phase, action = TRANSITION_TABLE[self.phase, trigger]
         if action is Action.IGNORE:
             return
         if action is Action.RAISE:
             raise AssertionError(f"{trigger.name} in phase {self.phase}: {text}")
-        self.phase, self._since = phase, self._k
+        self.phase, self._phase_start = phase, self._k
         if action is Action.DAMP:
-            self.output.begin_damping(self._now, kind in SOFT)
+            self.output.begin_damping(self._now, kind in EXTERNAL_FAULTS)
         elif self._targets and self._state:
             if action is Action.GO_BACK:
                 self._targets.go_back(self._state)
@@ -302,11 +303,11 @@ class Controller:
 
     def _note(self, text: str, kind: str = "", now: float | None = None) -> None:
         event = Event(self._now if now is None else now, self.phase.value, kind, text)
-        if kind in ASTRAY:
-            self.recording.not_obeyed = self.recording.not_obeyed or text
+        if kind in DISOBEDIENCE_FAULTS:
+            self.recording.disobedience = self.recording.disobedience or text
         self.recording.events.append(event)
         try:
             self._on_event(event)
-        except Exception as error:  # a listener is the caller's code, and may raise anything: damp, raise it at the end
+        except Exception as error:  # the caller's code may raise anything: damp, raise it at the end
             self._error = self._error or error
             self.stop(f"its listener failed: {error}")

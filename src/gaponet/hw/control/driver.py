@@ -1,4 +1,4 @@
-"""What a controller needs of a robot: `State` in, position targets out, joints by name."""
+"""Interface between controller and robot: `State` in, position targets out, joints by name."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import GAPONetError
 
-End = Literal["hand_over", "hold", "damp"]
+EndAction = Literal["hand_over", "hold", "damp"]
 
 
 class DriverError(GAPONetError):
-    """A robot cannot be reached, does not answer, or answers nonsense; the message says what to check."""
+    """A robot cannot be reached, does not answer, or gives invalid answers; the message says what to check."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a robot was stopped: a kind of safety.FAULTS, and a sentence."""
+    """Reason why a robot is stopped: a kind of safety.FAULT_KINDS, and a sentence."""
 
     kind: str
     text: str
@@ -27,14 +27,14 @@ class Fault:
 
 @dataclass(frozen=True)
 class State:
-    """What a robot said last. All (n) arrays are in the robot's joint order.
+    """Last readings of a robot. All (n) arrays are in the robot's joint order.
 
     Attributes:
         time: When it was measured, on this machine's monotonic clock, s.
         qpos, qvel, tau, temperature: rad, rad/s, N·m, °C; temperature NaN where a robot does not measure it.
-        refused: Messages refused so far because their checksum was wrong.
+        refused: Number of messages with a wrong checksum so far.
         tilt: Angle of the trunk against the vertical, rad; 0 where a robot does not measure it.
-        fault: What the robot itself says is wrong, or that its operator pressed stop; the driver remembers it.
+        fault: Reported by the robot itself, or a stop by its operator; the driver keeps it for good.
     """
 
     time: float
@@ -54,23 +54,23 @@ class State:
 
 
 class Driver(Protocol):
-    """The way to one robot: connect, read states, write targets, damp.
+    """Connection to one robot: connect, read states, write targets, damp.
 
     Attributes:
-        address: What is driven ("unitree domain 0 arm_sdk", "/dev/ttyUSB0"); one controller at a time per address.
-        virtual: Whether there is no real robot behind it; None until the driver has found out.
+        address: Name of the connection ("unitree dds domain 0", "/dev/ttyUSB0"); one controller at a time per address.
+        virtual: True without a real robot; final once connected.
         joint_names: All joints of the robot, (n), in the order of every array.
-        commanded: The joints that `write` commands; the others are left to whoever commands them.
+        commanded: Joints that `write` commands; other controllers command the rest.
         noisy: Readings of a working robot are never twice the same, so equal ones mean that it is frozen.
-        reads_back: `read` and `verify` find out whether the robot holds what it was told (state.fault); of others it is
-            found out by whether the joints follow.
-        kp, kd: Gains that the real servos follow under `write`, (n), N·m/rad and N·m·s/rad; final once connected.
-        qpos_range: Where the real joints end, (n, 2) rad, where the robot itself was told; final once connected.
-        facts: What a recording keeps about the servos beside (registers, kind of machine; remarks, sentences for who
-            runs it); final once connected.
+        reads_back: `read` and `verify` check that the robot holds its commands and settings (state.fault). For other
+            robots the controller checks that the joints follow.
+        kp, kd: Gains of the real servos under `write`, (n), N·m/rad and N·m·s/rad; final once connected.
+        qpos_range: Joint ranges that the robot itself reports, (n, 2) rad, or None; final once connected.
+        facts: Stored with a recording (registers, kind of machine); `remarks`: sentences for the user; final once
+            connected.
         at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the robot's own controller
-            takes over), hold (servos keep the last target after `close`), damp (nobody holds it afterwards).
-        at_stop: What `damp` does to it, as a verb: damps, lowers.
+            takes over), hold (servos keep the last target after `close`), damp (nothing holds it afterwards).
+        at_stop: Effect of `damp`, as a verb: damps, lowers.
     """
 
     address: str
@@ -83,52 +83,52 @@ class Driver(Protocol):
     kd: Array
     qpos_range: Array | None
     facts: dict[str, Any]
-    at_end: End
+    at_end: EndAction
     at_stop: str
 
     def connect(self) -> None:
         """Open the bus and wait for a first state; commands nothing, publishes nothing.
 
         Raises:
-            DriverError: Nobody answers, or not the robot that was expected.
+            DriverError: No robot answers, or not the expected one.
         """
 
     def read(self) -> State:
-        """The newest state, at once; the same one again if nothing newer has come."""
+        """Return the newest state without waiting; the same one again if no newer one has come."""
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
-        """Position targets (n) rad for the commanded joints.
+        """Send position targets of the commanded joints.
 
         Args:
-            ctrl: Targets; entries of joints that are not commanded are ignored.
-            weight: 0 to 1: how far the robot hands itself over; ignored by robots that cannot share.
+            ctrl: (n) rad; entries of joints that are not commanded are ignored.
+            weight: Our share of control, 0 to 1; ignored by robots that cannot share.
         """
 
     def verify(self) -> Fault | None:
-        """What the robot no longer holds of what it was told, of all that can be asked; may take several periods."""
+        """Compare all that can be read back with what was sent; may take several periods."""
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
-        """No position command: joints only brake; where the hardware cannot, they sink as their torque is taken away.
+        """Brake all joints without a position command; joints that cannot brake sink as their torque is reduced.
 
         Args:
-            weight: The same as `write`'s; goes to 0.
-            share: The share of their torque that joints which cannot brake keep; goes from 1 to 0, or is 0 at once.
+            weight: Our share of control; decreases to 0.
+            share: Share of their torque that joints keep which cannot brake; decreases from 1 to 0, or is 0 at once.
         """
 
     def confirm(self) -> str:
-        """After `damp`: what the robot itself says of it, in words.
+        """Return what the robot itself reports after `damp`, in words.
 
         Raises:
-            DriverError: It does not say that it is damped or let go.
+            DriverError: It does not report that it is damped or let go.
         """
 
     def close(self, hold: bool = False) -> None:
         """Leave the bus; never raises.
 
         Args:
-            hold: Send nothing: nothing was commanded, or what was commanded last shall stay. Otherwise joints are left
-                damped or free.
+            hold: Send nothing: nothing was commanded, or the last command shall stay. Otherwise joints are left damped
+                or free.
         """
 
     def watchdog(self) -> dict[str, object] | None:
-        """How another process can damp this robot if this one dies (deploy.watchdog); None if it cannot."""
+        """Return how another process opens this robot to damp it (control.watchdog); None if it cannot."""

@@ -10,25 +10,31 @@ from gaponet.base.arrays import Array
 from gaponet.hw.control.clock import Clock
 from gaponet.hw.control.driver import Driver, DriverError, Fault, State
 from gaponet.hw.control.phases import ControlConfig
-from gaponet.hw.control.plan import MOVED, Compensates, Planner
-from gaponet.hw.control.safety import Limits, SafetyConfig, Watch, limit_command, limit_delta
+from gaponet.hw.control.plan import MAX_START_DRIFT_RAD, Planner, TargetCompensator
+from gaponet.hw.control.safety import Limits, SafetyConfig, StateMonitor, limit_command, limit_delta
 from gaponet.hw.control.watchdog import Watchdog
 from gaponet.robot.spec import RobotSpec
 
 MAX_BEYOND_RANGE_RAD = 0.05  # at the start, where only the MJCF says where a joint's range ends
-MAX_SEND_DELAY_S = 0.001  # between the last look at the clock and a command's leaving
+MAX_SEND_DELAY_S = 0.001  # between the last reading of the clock and the sending of a command
 MAX_SUSPENDED_S = 0.05  # less than any suspend, more than two clocks that are read in turn differ by
 
 
 @dataclass(frozen=True)
 class Context:
-    """Robot, settings and clock of one controller; indices of the commanded joints; control period, s."""
+    """Robot, settings and clock of one controller.
+
+    Attributes:
+        payload_mass: kg per hand; None if it is not known.
+        joints: Indices of the commanded joints.
+        dt: Control period, s.
+    """
 
     driver: Driver
     robot: RobotSpec
     config: ControlConfig
     safety: SafetyConfig
-    compensator: Compensates | None
+    compensator: TargetCompensator | None
     clock: Clock
     planner: Planner | None
     payload_mass: float | None
@@ -40,16 +46,18 @@ class Output:
     """Corrects, limits and sends commands to one robot, and damps it. Arrays are of the commanded joints.
 
     Attributes:
+        limits: Limits of commands; final once the driver is connected and `admit` has accepted the start.
+        watchdog: Gets a heartbeat before each command; None: there is none.
         due: When the present period should have begun, s.
         suspended_before: s for which the computer was suspended before the run.
         ctrl: The command in force, rad; None before the first one, and while the robot is damped.
         weight: Weight of the last command; None if nothing was ever commanded.
         damping_since: s of the clock; None if the robot was not damped.
-        loose: Nobody has confirmed that the robot is damped.
+        unconfirmed: The robot was damped and did not confirm it.
     """
 
-    def __init__(self, context: Context, watch: Watch) -> None:
-        self.context, self.watch = context, watch
+    def __init__(self, context: Context, monitor: StateMonitor) -> None:
+        self.context, self.monitor = context, monitor
         self.watchdog: Watchdog | None = None
         self.limits = self.servo_limits()
         self.due = self.suspended_before = 0.0
@@ -57,13 +65,13 @@ class Output:
         self.ctrl: Array | None = None
         self.weight: float | None = None
         self.damping_since: float | None = None
-        self.loose = self._soft = False
+        self.unconfirmed = self._lower = False
 
     def servo_limits(self) -> Limits:
-        """Return the limits by what the driver knows of the servos, which is final once it is connected."""
+        """Return the limits with gains and ranges of the driver's servos."""
         driver = self.context.driver
         gains = (driver.kp, driver.kd)
-        return Limits.of(self.context.robot, driver.commanded, self.context.safety, gains, driver.qpos_range)
+        return Limits.from_robot(self.context.robot, driver.commanded, self.context.safety, gains, driver.qpos_range)
 
     def suspended(self) -> Fault | None:
         """Return a fault if the computer was suspended: time stood still for this process, not for the robot."""
@@ -73,13 +81,13 @@ class Output:
         return Fault("suspend", f"the computer was suspended for {duration:.1f} s; keep it awake while a robot moves")
 
     def admit(self, qpos: Array) -> Fault | None:
-        """Widen the limits to where the robot is, (n) rad, so that this can be the first command; or refuse it."""
+        """Widen the limits to the measured position, (n) rad, so that it can be the first command; or refuse it."""
         driver, joints = self.context.driver, self.context.joints
         at, ranges = qpos[joints], self.context.robot.qpos_range[joints]
         # Servos that know their own range cut goals beyond it.
-        spare = MAX_BEYOND_RANGE_RAD if driver.qpos_range is None else MOVED
+        tolerance = MAX_BEYOND_RANGE_RAD if driver.qpos_range is None else MAX_START_DRIFT_RAD
         ends = ranges if driver.qpos_range is None else driver.qpos_range[joints]
-        low, high = np.minimum(ranges, ends)[:, 0] - spare, np.maximum(ranges, ends)[:, 1] + spare
+        low, high = np.minimum(ranges, ends)[:, 0] - tolerance, np.maximum(ranges, ends)[:, 1] + tolerance
         beyond = np.maximum(low - at, at - high)
         if beyond.max() > 0:
             i = int(beyond.argmax())
@@ -98,8 +106,8 @@ class Output:
     def expected(self) -> Array:
         """Return where the joints are requested to be, rad, as far as the robot is handed over.
 
-        That is not what was sent: a command never goes further from a joint than its torque allows, and so goes with
-        a joint that hangs.
+        This is not the last command: that never goes further from a joint than its torque limit allows, and so stays
+        with a joint that does not move.
         """
         handed = (self.weight or 0.0) if self.context.driver.at_end == "hand_over" else 1.0
         return self._start + handed * (self._requested - self._start)
@@ -120,15 +128,15 @@ class Output:
         return command if isinstance(command, Fault) else (full, command)
 
     def _write(self, ctrl: Array, weight: float, state: State) -> Array | Fault:
-        """Limit a command and write it, or say why none may leave. A period that stood still sends nothing."""
+        """Limit a command and write it, or return why none may be sent. A period that stood still sends nothing."""
         context, joints, before, last_look = self.context, self.context.joints, self.ctrl, -np.inf
         q, v = state.qpos[joints], state.qvel[joints]
         assert before is not None
-        if self.watchdog and not self.watchdog.beat(weight):  # first, so that it counts from before the first command
+        if self.watchdog and not self.watchdog.beat(weight):  # before the command, so that it guards the first one too
             return Fault("stop", "the watchdog ended")
         while (now := context.clock.now()) - last_look > MAX_SEND_DELAY_S:
             last_look = now
-            fault = self.watch.overrun(now - self.due) or self.suspended()
+            fault = self.monitor.overrun(now - self.due) or self.suspended()
             if fault or (self.watchdog and self.watchdog.fired()):
                 return fault or Fault("overrun", "this process stood still")
             out = limit_command(ctrl, before, q, v, context.dt, self.limits, now + MAX_SEND_DELAY_S - state.time)
@@ -147,12 +155,12 @@ class Output:
             return Fault("driver", str(error))
         return full
 
-    def begin_damping(self, now: float, soft: bool) -> None:
-        """Let `damp` begin now; soft: a robot that cannot brake is lowered."""
-        self.damping_since, self._soft, self.ctrl = now, soft, None
+    def begin_damping(self, now: float, lower: bool) -> None:
+        """Let `damp` begin now; lower: a robot that cannot brake is lowered, else its torque goes off at once."""
+        self.damping_since, self._lower, self.ctrl = now, lower, None
 
     def damping_left(self, now: float) -> float:
-        """Return the share of the time for damping that is left."""
+        """Return the share of the damping time that is left."""
         return max(1.0 - (now - (self.damping_since or 0.0)) / self.context.config.damp, 0.0)
 
     def damp(self, left: float) -> None:
@@ -160,13 +168,13 @@ class Output:
         weight = left * (self.weight or 0.0)
         if self.watchdog and not self.watchdog.fired():
             self.watchdog.beat(weight)
-        self.context.driver.damp(weight, left * self._soft)
+        self.context.driver.damp(weight, left * self._lower)
 
     def confirm(self) -> tuple[str, str]:
         """Return what the robot itself reports after damping, and the kind of fault if it does not confirm it."""
         try:
             return self.context.driver.confirm(), ""
         except (DriverError, OSError) as error:
-            self.loose = True
+            self.unconfirmed = True
             more = "; the watchdog goes on trying" if self.watchdog else ""
             return f"could NOT be damped: switch the supply off ({error}){more}", "driver"

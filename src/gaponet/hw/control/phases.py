@@ -40,7 +40,7 @@ class Trigger(Enum):
 
 
 class Action(Enum):
-    """What a controller does in a transition and until the next one."""
+    """Action of a controller in a transition and until the next one."""
 
     READ = "read states; send nothing"
     BLEND_IN = "send positions, from the measured one to the first target; weight 0 → 1 on rt/arm_sdk"
@@ -62,7 +62,7 @@ ENDED = (Phase.DAMP, Phase.STOPPED)
 _WAITING = (Phase.CONNECT, Phase.IDLE)
 _FAULTS = (Trigger.FAULT, Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG, Trigger.NOT_FOLLOWING)
 
-# Phases, triggers, next phase (None: the same one), action. All triggers: those that no row above has for the phase.
+# Phases, triggers, next phase (None: the same one), action. Earlier rows take precedence.
 TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, Action], ...] = (
     ((Phase.CONNECT,), (Trigger.CONSENT,), Phase.IDLE, Action.READ),
     ((Phase.IDLE,), (Trigger.READY,), Phase.BLEND_IN, Action.BLEND_IN),
@@ -81,9 +81,9 @@ TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, A
     (ENDED, tuple(Trigger), None, Action.IGNORE),
     ((*_WAITING, *COMMANDING), tuple(Trigger), None, Action.RAISE),
 )
-TABLE = {
-    (phase, trigger): (following or phase, action)
-    for phases, triggers, following, action in reversed(TRANSITIONS)
+TRANSITION_TABLE = {
+    (phase, trigger): (next_phase or phase, action)
+    for phases, triggers, next_phase, action in reversed(TRANSITIONS)
     for phase in phases
     for trigger in triggers
 }
@@ -96,13 +96,13 @@ class ControlConfig:
     rate: float = 50.0
     """Control periods per second."""
     blend: float = 2.0
-    """Least duration of the moves to the first target and back, s."""
+    """Shortest duration of the moves to the first target and back, s."""
     blend_speed: float = 0.5
     """Fastest joint in those moves, rad/s."""
     settle: float = 0.5
     """Standing still at the first target before the run, s."""
     blend_out: bool = True
-    """Go back to where the robot was found; a fault never waits for this."""
+    """Go back to where the robot was at the start; a fault never waits for this."""
     damp: float = 2.0
     """Damping after a fault, or handing the arms back after a run, before the robot is let go, s."""
 

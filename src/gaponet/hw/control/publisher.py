@@ -1,4 +1,4 @@
-"""One controller per robot on this machine: a lock that ends with its holder, whatever ends it."""
+"""Lock that admits one controller per robot on this machine; the system releases it when its holder ends."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pathlib import Path
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_file
 
-LOCKS = Path("/tmp")  # the same for all users of the computer, whatever TMPDIR says
+LOCK_FOLDER = Path("/tmp")  # the same for all users of the computer, whatever TMPDIR is
 
 
 @contextmanager
 def sole_publisher(address: str) -> Iterator[int]:
-    """Hold the lock of an address; gives its file descriptor, to be kept open by a watchdog.
+    """Hold the lock of an address; yield its file descriptor, which a watchdog keeps open.
 
     A port has one lock, whatever links and names lead to it: that of its device number.
 
@@ -26,9 +26,9 @@ def sole_publisher(address: str) -> Iterator[int]:
         UsageError: Another process on this machine commands this robot, or its lock cannot be used.
     """
     name = re.sub(r"[^A-Za-z0-9]+", "-", _device(address)).strip("-")
-    path = LOCKS / f"gaponet-{name}.lock"
+    path = LOCK_FOLDER / f"gaponet-{name}.lock"
     try:
-        descriptor = lock_file(path, _opened)
+        descriptor = lock_file(path, _open_lock)
     except OSError as error:
         raise UsageError(f"{address}: its lock {path} cannot be opened ({error.strerror}); ask its owner") from None
     if descriptor is None:
@@ -40,19 +40,21 @@ def sole_publisher(address: str) -> Iterator[int]:
 
 
 def _device(address: str) -> str:
-    """The number of the device that an address names, as a word; else the address itself."""
+    """Return the number of the device at an address, as a word; the address itself if it is no device."""
     try:
-        found = os.stat(address)
+        status = os.stat(address)
     except (OSError, ValueError):
         return address
-    if not stat.S_ISCHR(found.st_mode):
+    if not stat.S_ISCHR(status.st_mode):
         return address
-    return f"device {os.major(found.st_rdev)} {os.minor(found.st_rdev)}"
+    return f"device {os.major(status.st_rdev)} {os.minor(status.st_rdev)}"
 
 
-def _opened(path: Path) -> int:
-    """Its descriptor; the file is made where it is missing. Reading is enough for a lock, and is all that the next user
-    of the computer may do with this user's file."""
+def _open_lock(path: Path) -> int:
+    """Return the descriptor of a lock file, which is made if it is missing.
+
+    It is opened for reading only: that suffices for a lock, and other users may only read this user's file.
+    """
     for _ in range(3):
         try:
             # Any user of the computer may have put something there. Opening a pipe for reading would wait for a writer.
@@ -68,6 +70,6 @@ def _opened(path: Path) -> int:
             descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o644)
         except FileExistsError:  # another process was faster
             continue
-        os.fchmod(descriptor, 0o644)  # whatever the umask says
+        os.fchmod(descriptor, 0o644)  # whatever the umask is
         return descriptor
-    raise FileNotFoundError(2, "it comes and goes")
+    raise FileNotFoundError(errno.ENOENT, "other processes remove it again and again")

@@ -1,4 +1,4 @@
-"""Recording: every period of a controller, what it read, sent and why; as a Log of the motion, and as files."""
+"""Recording of a run: readings, commands and events of every period, as a Log of the motion and as files."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from gaponet.base.errors import LogError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.data.formats.table import NOT_OBEYED
 from gaponet.data.log import Channel, Log
-from gaponet.hw.control.rows import CYCLES, READINGS, Rows
-from gaponet.hw.control.safety import FAULTS
+from gaponet.hw.control.rows import READINGS, ROWS_SUFFIX, Rows
+from gaponet.hw.control.safety import FAULT_KINDS
+
+FOLDER_KIND = "recordings"
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
 
 
 class Event(NamedTuple):
-    """A change of phase: when (s, monotonic), into which, and why."""
+    """Change of phase: its time (s, monotonic), the new phase, kind of fault or end, and reason."""
 
     time: float
     phase: str
@@ -31,17 +34,20 @@ class Event(NamedTuple):
 
 @dataclass
 class Recording:
-    """What a controller did.
+    """Record of one run of a controller.
 
     Attributes:
-        virtual: Whether there was no real robot.
+        robot: Name of the robot.
+        virtual: True without a real robot.
         joint_names: All joints, (n).
+        commanded: The commanded ones.
         dt: Control period, s.
-        rows, events: In order of time.
-        missed: Periods in which the loop did not start at all.
+        events: In order of time.
+        missed: Number of periods in which the loop did not start at all.
         late: How late each period started, s.
-        meta: What the caller knows beside (unit, payload, gains, model).
-        not_obeyed: What the robot did not do as it was told; a recording with such a mark is no data.
+        meta: Further values of the caller (unit id, payload, gains, model).
+        disobedience: How the robot disobeyed, in words; such a recording is no data. Empty if it obeyed.
+        rows: Readings and commands of every period.
     """
 
     robot: str
@@ -53,42 +59,42 @@ class Recording:
     missed: int = 0
     late: array[float] = field(default_factory=lambda: array("d"))
     meta: dict[str, Any] = field(default_factory=dict)
-    not_obeyed: str = ""
+    disobedience: str = ""
+    rows: Rows = field(init=False)
 
     def __post_init__(self) -> None:
         self.rows = Rows(self.joint_names)
 
-    def grow_in(self, folder: Path) -> None:
-        """Where the periods shall be written as they come, to be saved there; before the first one.
+    def write_to(self, folder: Path) -> None:
+        """Write the periods to a file in a folder as they come. Call it before the first period.
 
         Raises:
             FolderError, OSError: Nothing can be written there.
         """
-        with lock_folder(folder, KIND):
-            self.rows.grow_in(folder)
+        with lock_folder(folder, FOLDER_KIND):
+            self.rows.write_to(folder)
 
     @property
     def fault(self) -> Event | None:
-        """The fault that ended it, if one did."""
-        return next((e for e in self.events if e.kind in FAULTS), None)
+        """Return the fault that ended the run, or None."""
+        return next((e for e in self.events if e.kind in FAULT_KINDS), None)
 
     def log(self, source: str = "controller", phase: str = "run") -> Log:
-        """The periods of a phase as a Log of the commanded joints, time from its first period, s.
+        """Return the periods of a phase as a Log of the commanded joints; its time begins with them, s.
 
-        A row is what to_sequence wants: the state read at the start of a period, and the command sent in it.
+        A row has the state read at the start of a period and the command sent in it, as to_sequence requires.
 
         Raises:
-            LogError: The robot did not obey, or the phase was not reached or has fewer than two periods, or the disk
-                was too full for all.
+            LogError: The robot did not obey; the phase has fewer than two periods; or the disk was full.
         """
-        if self.not_obeyed:
-            raise LogError(f"{source}: no data, the robot did not do what it was told: {self.not_obeyed}")
-        if self.rows.trouble:
-            raise LogError(f"{source}: not whole, {self.rows.trouble.strerror}; make room and record again")
+        if self.disobedience:
+            raise LogError(f"{source}: no data, the robot did not do what it was told: {self.disobedience}")
+        if self.rows.error:
+            raise LogError(f"{source}: not whole, {self.rows.error.strerror}; make room and record again")
         return self._log(source, phase)
 
     def _log(self, source: str, phase: str = "run") -> Log:
-        rows = self.during(phase)
+        rows = self.phase_rows(phase)
         if len(rows) < 2:
             last = self.events[-1] if self.events else None
             why = f"; it ended with: {last.text}" if last else ""
@@ -97,33 +103,33 @@ class Recording:
         time, values = np.array(rows["time"]), {"ctrl": rows["ctrl"][:, at]}
         for name in READINGS:
             column = rows[name][:, at]
-            if np.isfinite(column).all():  # a bus without thermometers, say
+            if np.isfinite(column).all():  # not every bus measures all of them
                 values[name] = column
         channels = {name: Channel(time - time[0], value) for name, value in values.items()}
         return Log(self.robot, self.commanded, channels, source, {"files": {}, **self.summary()})
 
-    def during(self, phase: str) -> Array:
-        """The periods of a phase in which a position was commanded, as of Rows.table."""
+    def phase_rows(self, phase: str) -> Array:
+        """Return the rows of Rows.table of a phase in which a position was commanded."""
         table = self.rows.table()
-        found = np.flatnonzero((table["phase"] == phase) & ~np.isnan(table["ctrl"]).all(axis=1))
-        if len(found) and found[-1] - found[0] + 1 == len(found):  # as it is: nothing is copied
-            return table[found[0] : found[-1] + 1]
-        return table[found]
+        at = np.flatnonzero((table["phase"] == phase) & ~np.isnan(table["ctrl"]).all(axis=1))
+        if len(at) and at[-1] - at[0] + 1 == len(at):  # a slice, which copies nothing
+            return table[at[0] : at[-1] + 1]
+        return table[at]
 
     def summary(self) -> dict[str, Any]:
-        """Phases, reasons and timing, for JSON; times from the first period, s."""
+        """Return events and timing for JSON; times begin with the first period, s."""
         table = self.rows.table()
         start = table["time"][0] if len(table) else 0.0
         late = np.array(self.late or [0.0])
         ages = table["time"] - table["state_time"] if len(table) else np.zeros(1)
-        trouble = {"not_whole": self.rows.trouble.strerror} if self.rows.trouble else {}
+        incomplete = {"not_whole": self.rows.error.strerror} if self.rows.error else {}
         return (
-            trouble
+            incomplete
             | self.meta
             | {
                 "robot": self.robot,
                 "virtual": self.virtual,
-                "obeyed": not self.not_obeyed,
+                "obeyed": not self.disobedience,
                 "rate_hz": 1 / self.dt,
                 "periods": len(table),
                 "missed": self.missed,
@@ -135,39 +141,38 @@ class Recording:
         )
 
     def save(self, folder: Path, name: str) -> Path:
-        """NAME.parquet for gaponet import (if the run was reached), all periods in NAME.cycles.npy, and NAME.json.
+        """Write NAME.parquet for gaponet import, all periods as NAME.cycles.npy, and NAME.json.
 
-        Where there is a recording of that name, this one is NAME-2, and so on. Returns the path of NAME.parquet.
+        NAME.parquet is written if the phase `run` was reached. If NAME exists, NAME-2 is used, and so on.
+
+        Returns:
+            The path of NAME.parquet.
 
         Raises:
-            OSError: A file could not be written; the periods that grew in this folder are kept all the same.
+            OSError: A file could not be written; the periods written so far stay in the folder.
         """
-        with lock_folder(folder, KIND):
+        with lock_folder(folder, FOLDER_KIND):
             return self._save(folder, name)
 
     def _save(self, folder: Path, name: str) -> Path:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        taken = {file.name.removesuffix(end) for end in (".json", CYCLES) for file in folder.glob(f"*{end}")}
+        taken = {file.name.removesuffix(end) for end in (".json", ROWS_SUFFIX) for file in folder.glob(f"*{end}")}
         name = next(n for k in itertools.count(1) if (n := f"{name}-{k}" if k > 1 else name) not in taken)
-        self.rows.save(folder / f"{name}{CYCLES}")
+        self.rows.save(folder / f"{name}{ROWS_SUFFIX}")
         path = folder / f"{name}.parquet"
         try:
-            if len(self.during("run")) >= 2:
+            if len(self.phase_rows("run")) >= 2:
                 log = self._log(str(path))
                 columns = {"time": log.channels["ctrl"].time}
                 for channel, (_, values) in log.channels.items():
                     columns |= {f"{channel}.{j}": values[:, i] for i, j in enumerate(log.joint_names)}
-                table = pa.table(columns, metadata={NOT_OBEYED: self.not_obeyed} if self.not_obeyed else None)
+                table = pa.table(columns, metadata={NOT_OBEYED: self.disobedience} if self.disobedience else None)
                 with atomic_write(path) as temporary:
                     pq.write_table(table, temporary)
             write_text(folder / f"{name}.json", json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n")
         except OSError as error:
-            kept = f"{error.strerror or error}; all periods that were written are in {name}{CYCLES}"
+            kept = f"{error.strerror or error}; all periods that were written are in {name}{ROWS_SUFFIX}"
             raise OSError(error.errno, kept, error.filename) from error
         return path
-
-
-KIND = "recordings"
-QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}

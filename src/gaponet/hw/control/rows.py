@@ -1,7 +1,7 @@
-"""The periods of a run in a file that grows: memory holds the last second, whatever else holds the file.
+"""Rows of a recording: each period is appended to a file, so that memory holds about a second only.
 
-The file is NumPy's .npy with a row per period and a named column per number (qpos.elbow_flex), and can be read with
-numpy.load at every moment of its growth, after a kill and on a full disk too: the head counts what is whole.
+The file is a NumPy .npy with one row per period and a named column per number (qpos.elbow_flex). numpy.load can read it
+at any time, also after a kill or on a full disk: its header counts the complete rows.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from gaponet.base.arrays import Array
 from gaponet.base.files import atomic_write
 from gaponet.hw.control.driver import State
 
-CYCLES = ".cycles.npy"
-CHUNK = 64  # rows written at once
+ROWS_SUFFIX = ".cycles.npy"
+CHUNK_ROWS = 64  # written at once
 READINGS = ("qpos", "qvel", "tau", "temperature")
 
 
 class Row(NamedTuple):
-    """One period: its start, phase, what was asked for and sent (n) rad (None: no position command), and the state."""
+    """One period: its start, s, phase, target and command (n) rad (None: no position command), and state."""
 
     time: float
     phase: str
@@ -37,63 +37,64 @@ class Row(NamedTuple):
 
 
 class Rows:
-    """Row after row; a thread writes them, so that no period waits for a disk.
+    """Appends rows; a thread writes them, so that no period waits for a disk.
 
     Attributes:
-        trouble: Why no more rows are kept, where that is so.
+        path: Path of the file; None for a temporary one.
+        error: Why no more rows are written; None if they are.
     """
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
         n = len(joint_names)
         scalars = [("time", "<f8"), ("state_time", "<f8"), ("tilt", "<f8"), ("refused", "<i8"), ("phase", "<U9")]
         vectors = ("target", "ctrl", *READINGS)
-        self._kind = np.dtype([*scalars, *((name, "<f8", (n,)) for name in vectors)])
-        self._head = scalars + [(f"{name}.{joint}", "<f8") for name in vectors for joint in joint_names]
-        self._chunk, self._count, self._absent = np.empty(CHUNK, self._kind), 0, np.full(n, np.nan)
+        self._dtype = np.dtype([*scalars, *((name, "<f8", (n,)) for name in vectors)])
+        self._columns = scalars + [(f"{name}.{joint}", "<f8") for name in vectors for joint in joint_names]
+        self._chunk, self._count, self._absent = np.empty(CHUNK_ROWS, self._dtype), 0, np.full(n, np.nan)
         self._file: IO[bytes] | None = None
         self.path: Path | None = None
-        self.trouble: OSError | None = None
+        self.error: OSError | None = None
         self._written = 0  # rows in the file
-        self._start = len(self._header(0))
-        self._todo: queue.Queue[bytes | None] = queue.Queue()
+        self._header_size = len(self._header(0))
+        self._pending: queue.Queue[bytes | None] = queue.Queue()
         self._writer: threading.Thread | None = None
 
-    def grow_in(self, folder: Path) -> None:
-        """Where the file shall grow; else it is a temporary one, made when it is needed, that goes with the process.
+    def write_to(self, folder: Path) -> None:
+        """Make the file in a folder; without this call it is a temporary one, which ends with the process.
 
         Raises:
             OSError: No file can be made there.
         """
-        descriptor, name = tempfile.mkstemp(CYCLES, "unfinished-", folder)
+        descriptor, name = tempfile.mkstemp(ROWS_SUFFIX, "unfinished-", folder)
         self.path = Path(name)
         self._open(os.fdopen(descriptor, "w+b", buffering=0))
 
     def append(self, row: Row) -> None:
-        """Keep one more."""
+        """Append a row."""
         target, ctrl = (self._absent if x is None else x for x in (row.target, row.ctrl))
         state = row.state
-        self._chunk[self._count % CHUNK] = (
+        self._chunk[self._count % CHUNK_ROWS] = (
             row.time, state.time, state.tilt, state.refused, row.phase, target, ctrl,
             *(getattr(state, name) for name in READINGS),
         )  # fmt: skip
         self._count += 1
-        if self._count % CHUNK == 0:
-            self._hand_over(CHUNK)
+        if self._count % CHUNK_ROWS == 0:
+            self._enqueue(CHUNK_ROWS)
 
     def table(self) -> Array:
-        """All rows that are kept, (rows,), with columns by name, (rows, n) those of joints; read from the file."""
+        """Return all rows as a structured array (rows,); columns of joints are (rows, n). It is read from the file."""
         if self._file is None:
             return self._chunk[: self._count]
         self._flush()
         if not self._written:
             return self._chunk[:0]
-        return np.memmap(self._file, self._kind, "r", self._start, (self._written,))
+        return np.memmap(self._file, self._dtype, "r", self._header_size, (self._written,))
 
     def close(self) -> None:
-        """No more rows come; a file without any goes."""
+        """Finish writing; a file without any row is removed."""
         if self._writer:
             self._flush()
-            self._todo.put(None)
+            self._pending.put(None)
             self._writer.join()
             self._writer = None
             if self.path and not self._written:
@@ -101,7 +102,7 @@ class Rows:
                 self.path = None
 
     def save(self, path: Path) -> None:
-        """Make this the file's place; what grew elsewhere is copied."""
+        """Move the file to a path, or copy a temporary one."""
         self.close()
         if self.path is not None:
             os.replace(self.path, path)
@@ -110,14 +111,14 @@ class Rows:
         rows = self.table()
         with atomic_write(path) as temporary, temporary.open("wb") as file:
             file.write(self._header(len(rows)))
-            for at in range(0, len(rows), CHUNK):
-                file.write(rows[at : at + CHUNK].tobytes())
+            for at in range(0, len(rows), CHUNK_ROWS):
+                file.write(rows[at : at + CHUNK_ROWS].tobytes())
 
     def _flush(self) -> None:
-        if self._writer and self._count % CHUNK:
-            self._hand_over(self._count % CHUNK)
-            self._count += -self._count % CHUNK
-        self._todo.join()
+        if self._writer and self._count % CHUNK_ROWS:
+            self._enqueue(self._count % CHUNK_ROWS)
+            self._count += -self._count % CHUNK_ROWS
+        self._pending.join()
 
     def __len__(self) -> int:
         return len(self.table())
@@ -125,9 +126,9 @@ class Rows:
     def __iter__(self) -> Iterator[Row]:
         return (self._row(record) for record in self.table())
 
-    def __getitem__(self, which: Any) -> Any:
-        found = self.table()[which]
-        return [self._row(record) for record in found] if isinstance(which, slice) else self._row(found)
+    def __getitem__(self, index: Any) -> Any:
+        records = self.table()[index]
+        return [self._row(record) for record in records] if isinstance(index, slice) else self._row(records)
 
     def _row(self, record: Any) -> Row:
         target, ctrl = (None if np.isnan(record[name]).all() else np.array(record[name]) for name in ("target", "ctrl"))
@@ -136,10 +137,10 @@ class Rows:
         state = State(float(record["state_time"]), qpos, qvel, tau, temperature, refused, tilt)
         return Row(float(record["time"]), str(record["phase"]), target, ctrl, state)
 
-    def _hand_over(self, rows: int) -> None:
+    def _enqueue(self, rows: int) -> None:
         if self._file is None:
             self._open(tempfile.TemporaryFile(buffering=0))  # noqa: SIM115
-        self._todo.put(self._chunk[:rows].tobytes())
+        self._pending.put(self._chunk[:rows].tobytes())
 
     def _open(self, file: Any) -> None:
         self._file = file
@@ -149,21 +150,21 @@ class Rows:
 
     def _write(self) -> None:
         assert self._file
-        descriptor, size = self._file.fileno(), self._kind.itemsize
-        while (data := self._todo.get()) is not None:
-            at, begun = self._start + self._written * size, 0
+        descriptor, size = self._file.fileno(), self._dtype.itemsize
+        while (data := self._pending.get()) is not None:
+            at, done = self._header_size + self._written * size, 0
             try:
-                while begun < len(data) and not self.trouble:
-                    begun += os.pwrite(descriptor, data[begun:], at + begun)
+                while done < len(data) and not self.error:
+                    done += os.pwrite(descriptor, data[done:], at + done)
             except OSError as error:
-                self.trouble = error
-            self._written += begun // size
-            os.pwrite(descriptor, self._header(self._written), 0)  # where it is already: no disk is too full for that
-            self._todo.task_done()
-        self._todo.task_done()
+                self.error = error
+            self._written += done // size
+            os.pwrite(descriptor, self._header(self._written), 0)  # overwrites: works on a full disk
+            self._pending.task_done()
+        self._pending.task_done()
 
     def _header(self, rows: int) -> bytes:
         text = io.BytesIO()
-        head = {"descr": self._head, "fortran_order": False, "shape": (rows,)}
-        np.lib.format.write_array_header_1_0(text, head)
+        header = {"descr": self._columns, "fortran_order": False, "shape": (rows,)}
+        np.lib.format.write_array_header_1_0(text, header)
         return text.getvalue()

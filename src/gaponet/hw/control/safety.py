@@ -1,18 +1,17 @@
-"""Which commands may leave, and when none may: limits, and checks on arrays. No clock, no bus, no file is touched.
+"""Limits of commands and checks of states, on arrays; no clock, bus or file is used.
 
-A position command leaves only if it is within
+A position command is sent only if it is within
 
 1. the joint range less a margin,
 2. the command rate: |u − u_previous| ≤ speed · dt,
-3. the torque that it asks for: |kp (u − q) − kd q̇| ≤ share · effort limit, wherever the joint can have got to since it
-   was measured, accelerating at most as `acceleration` says,
+3. the torque that it requests: |kp (u − q) − kd q̇| ≤ share · effort limit, wherever the joint can be since it was
+   measured, accelerating at most as `acceleration` allows,
 
 all three, for every joint. Each is an interval; the command is moved into their intersection. Range and rate always
 intersect, because the previous command was within the range. The torque interval follows the measured joint and may
-leave the other two: the joint was pushed away, or moves so fast that braking alone exceeds the limit. Then there is no
-position command that is safe, and `feasible` is False: the controller damps the robot instead. So no limit ever yields
-to another. The size and rate of a model's correction are bounded before that, on the request; the three limits above
-come last and may cut a correction further.
+leave the other two: the joint was pushed away, or moves so fast that braking alone exceeds the limit. Then no position
+command is safe, and `feasible` is False: the controller damps the robot instead. So no limit ever yields to another.
+Size and rate of a model's correction are bounded before that; the three limits come last and may cut it further.
 """
 
 from __future__ import annotations
@@ -27,9 +26,10 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Fault, State
 from gaponet.robot.spec import RobotSpec
 
-ROUNDING = 1e-9  # of a bound: kept free so that a limit computed back from a command is not passed by rounding
-
-STILL = 4  # new states in which one joint must read the same before that can count; at a turn two may by chance
+RELATIVE_ROUNDING = 1e-9  # of a bound: kept free, so that rounding does not exceed a limit that is computed back
+MIN_STILL_STATES = 4  # new states in which one joint must read the same; at a turn two may by chance
+CHECKSUM_WINDOW_S = 1.0  # in which wrong checksums are counted
+MIN_SPEED_RAD_S = 1e-6  # below it a joint counts as standing still for damping
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class SafetyConfig:
     speed: float = 5.0
     """Fastest change of a command, rad/s."""
     torque_share: float = 0.95
-    """Share of a joint's effort limit that a command may ask for."""
+    """Share of a joint's effort limit that a command may request."""
     acceleration: float = 50.0
-    """Fastest acceleration of a joint, rad/s²: how wrong an old state may be."""
+    """Fastest acceleration of a joint, rad/s²; bounds where it can be since its last state."""
     delta: float = 0.5
     """Largest correction of a model, rad."""
     delta_rate: float = 2.0
@@ -53,9 +53,9 @@ class SafetyConfig:
     frozen: int = 2
     """Control periods with new messages but equal readings until a state counts as frozen; 0: never."""
     frozen_travel: float = 0.3
-    """How far a command may move while nothing moves, rad, on coarse encoders whose readings may repeat."""
+    """Way of a command while nothing moves, rad; on coarse encoders, whose readings may repeat."""
     frozen_joint: float = 0.1
-    """How far one joint's command or velocity may move on while its position stands still, rad, on fine encoders."""
+    """Way of one joint's command or velocity while its position stands still, rad; on fine encoders."""
     joint_speed: float = 12.0
     """A joint that moves faster between two states has jumped, rad/s."""
     jump: float = 0.05
@@ -69,20 +69,17 @@ class SafetyConfig:
     tracking_time: float = 0.25
     """… for longer than this, s."""
     following: float = 0.25
-    """Share of its command's way that a joint must go along, on robots that do not say what they were told; 0: not
-    watched, for joints that press on something."""
+    """Share of its command's way that a joint must go, on robots whose commands cannot be read back; 0: not checked,
+    for joints that press on something."""
     overrun: float = 2.0
-    """Control periods by which a cycle may start late."""
+    """Control periods by which a period may start late."""
     refused: int = 20
     """Messages with a wrong checksum within one second."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if (
-                not np.isfinite(value)
-                or value < 0
-                or (value == 0 and name not in ("margin", "jump", "frozen", "following"))
-            ):
+            may_be_zero = name in ("margin", "jump", "frozen", "following")
+            if not np.isfinite(value) or value < 0 or (value == 0 and not may_be_zero):
                 raise UsageError(f"safety: {name} is {value}; give a positive number")
         if self.torque_share > 1:
             raise UsageError(f"safety: torque_share is {self.torque_share}; give at most 1, the effort limit itself")
@@ -90,7 +87,16 @@ class SafetyConfig:
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds of the commands to some joints, (n) each: rad, rad, rad/s, N·m, N·m/rad, N·m·s/rad, rad, rad/s, rad/s²."""
+    """Bounds of the commands to some joints, (n) each.
+
+    Attributes:
+        low, high: Range, rad.
+        speed: rad/s.
+        effort: N·m.
+        kp, kd: Gains of the real servos, N·m/rad and N·m·s/rad.
+        delta, delta_rate: Limits of a model's correction, rad and rad/s.
+        acceleration: rad/s².
+    """
 
     low: Array
     high: Array
@@ -103,7 +109,7 @@ class Limits:
     acceleration: Array
 
     @classmethod
-    def of(
+    def from_robot(
         cls,
         robot: RobotSpec,
         joints: tuple[str, ...],
@@ -111,12 +117,15 @@ class Limits:
         gains: tuple[Array, Array] | None = None,
         qpos_range: Array | None = None,
     ) -> Limits:
-        """Limits of a robot's joints, in the order of `joints`.
+        """Return the limits of a robot's joints, in the order of `joints`.
 
         Args:
             robot: Ranges and effort limits.
             gains: kp and kd of the real servos, all joints (n) each; default the robot's, before identification.
-            qpos_range: Ranges of the real joints, all (n, 2) rad, within the robot's; default those of the MJCF alone.
+            qpos_range: Ranges that the real robot reports, all joints (n, 2) rad; they narrow those of the MJCF.
+
+        Raises:
+            UsageError: The margin is wider than the range of a joint.
         """
         nominal = robot.nominal or robot
         kp, kd = gains or (nominal.kp, nominal.kd)
@@ -133,10 +142,13 @@ class Limits:
         )  # fmt: skip
 
 
-class Limited(NamedTuple):
-    """ctrl (..., n): what may be sent where feasible; else the previous command within range, which must not be sent.
+class LimitedCommand(NamedTuple):
+    """Result of limit_command, (..., n) each.
 
-    feasible (..., n): a command within all three limits exists. cut (..., n): the request was changed.
+    Attributes:
+        ctrl: The command to send where feasible, rad; else the previous one within range, which must not be sent.
+        feasible: A command within all three limits exists.
+        cut: The request was changed.
     """
 
     ctrl: Array
@@ -145,7 +157,7 @@ class Limited(NamedTuple):
 
 
 def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Array:
-    """A correction (..., n) rad bounded in size and in rate from the previous one; NaN becomes the previous one."""
+    """Return a correction (..., n) rad bounded in size and rate; NaN becomes the previous correction."""
     step = limits.delta_rate * dt
     wanted = np.clip(np.where(np.isfinite(delta), delta, previous), previous - step, previous + step)
     return np.clip(wanted, -limits.delta, limits.delta)
@@ -153,8 +165,8 @@ def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Arr
 
 def limit_command(
     target: Array, previous: Array, qpos: Array, qvel: Array, dt: float, limits: Limits, age: Array | float = 0.0
-) -> Limited:
-    """The nearest command to `target` within range, rate and torque, or the statement that there is none.
+) -> LimitedCommand:
+    """Return the nearest command to `target` within range, rate and torque, and if there is one.
 
     Args:
         target: Wanted, (..., n) rad.
@@ -164,36 +176,39 @@ def limit_command(
         age: Age of the state when the command leaves, s, or (..., n).
     """
     before = np.clip(previous, limits.low, limits.high)
-    step = limits.speed * dt * (1 - ROUNDING)
+    step = limits.speed * dt * (1 - RELATIVE_ROUNDING)
     low, high = np.maximum(limits.low, before - step), np.minimum(limits.high, before + step)
     with np.errstate(divide="ignore", invalid="ignore"):
-        brake, half = limits.kd * qvel / limits.kp, limits.effort * (1 - ROUNDING) / limits.kp
+        brake, half = limits.kd * qvel / limits.kp, limits.effort * (1 - RELATIVE_ROUNDING) / limits.kp
         # As measured, and where the joint can be by now: it went on and may have accelerated either way.
         spread = limits.acceleration * age * (age / 2 + limits.kd / limits.kp)
         for centre, width in ((qpos + brake, half), (qpos + qvel * age + brake, half - spread)):
-            rounding = ROUNDING * np.abs(centre)
+            rounding = RELATIVE_ROUNDING * np.abs(centre)
             low, high = np.maximum(low, centre - width + rounding), np.minimum(high, centre + width - rounding)
         finite = np.isfinite(target) & np.isfinite(previous) & np.isfinite(qpos) & np.isfinite(qvel)
         feasible = finite & (low <= high)
         ctrl = np.where(feasible, np.minimum(np.maximum(target, low), high), before)
-    return Limited(ctrl, feasible, ctrl != target)
+    return LimitedCommand(ctrl, feasible, ctrl != target)
 
 
-def damping(kd: Array, qvel: Array, effort: Array) -> Array:
-    """Damping gains (n) at most kd whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown."""
+def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
+    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown."""
     speed = np.abs(np.nan_to_num(qvel, nan=0.0, posinf=0.0, neginf=0.0))
-    return np.minimum(kd, effort / np.maximum(speed, 1e-6))
+    return np.minimum(kd, effort / np.maximum(speed, MIN_SPEED_RAD_S))
 
 
-# Kinds of faults, which docs/deploy-safety.md explains. SOFT: no fault of the robot itself; one that cannot brake is
-# lowered then, instead of let fall at once. ASTRAY: a joint did not go where it was sent; what was recorded is no data.
-SOFT = ("stale", "overrun", "suspend", "checksum", "target", "silence", "driver", "obedience", "error", "stop")
-FAULTS = (*SOFT, "frozen", "nan", "jump", "temperature", "tracking", "torque", "plan", "robot", "tilt")
-ASTRAY = ("obedience", "frozen", "jump", "tracking")
+# docs/deploy-safety.md explains the kinds of faults. EXTERNAL_FAULTS are not the robot's own: a robot that cannot brake
+# is then lowered; after any other its torque is switched off at once. After DISOBEDIENCE_FAULTS, where a joint did not
+# go where it was sent, the recording is no data.
+EXTERNAL_FAULTS = (
+    "stale", "overrun", "suspend", "checksum", "target", "silence", "driver", "obedience", "error", "stop",
+)  # fmt: skip
+FAULT_KINDS = (*EXTERNAL_FAULTS, "frozen", "nan", "jump", "temperature", "tracking", "torque", "plan", "robot", "tilt")
+DISOBEDIENCE_FAULTS = ("obedience", "frozen", "jump", "tracking")
 
 
-class Watch:
-    """Checks of successive states; the first fault is returned, and it is the caller who remembers it."""
+class StateMonitor:
+    """Checks successive states; it returns the first fault of each and remembers none."""
 
     def __init__(
         self, joint_names: tuple[str, ...], commanded: Array, dt: float, config: SafetyConfig, noisy: bool = True
@@ -203,23 +218,25 @@ class Watch:
             joint_names: Names of all joints, (n).
             commanded: Index of the commanded ones.
             dt: Control period, s.
-            noisy: Equal readings mean frozen at once; else only when the command has moved on (frozen_travel).
+            noisy: Equal readings count as frozen at once; else only after the command has moved by frozen_travel.
         """
         self.names, self.commanded, self.dt, self.config, self.noisy = joint_names, commanded, dt, config, noisy
         self._last: State | None = None
-        self._equal, self._travel = 0, np.zeros(len(commanded))
-        self._ctrl: Array | None = None
+        self._last_ctrl: Array | None = None
+        self._equal_states, self._travel = 0, np.zeros(len(commanded))  # of all readings; rad of commands meanwhile
+        # Of joints whose position stands still: the command then, the integral of the velocity since, states since.
         self._anchor: Array | None = None
-        self._glided, self._still = np.zeros(len(commanded)), np.zeros(len(commanded), int)
-        self._astray = 0.0
-        self._refused: list[tuple[float, int]] = []
+        self._integral, self._still_states = np.zeros(len(commanded)), np.zeros(len(commanded), int)
+        self._tracking_s = 0.0  # for which a joint has been far from its command
+        self._refused: list[tuple[float, int]] = []  # time, s, and messages refused until then
 
     def check(self, now: float, state: State, ctrl: Array | None, late: float = 0.0) -> Fault | None:
-        """What is wrong at the start of a control period.
+        """Return the first fault at the start of a control period.
 
         Args:
             now: s.
-            ctrl: The command that holds since the last period, (len(commanded),) rad; None where there is none.
+            state: The newest one.
+            ctrl: The command in force since the last period, (len(commanded),) rad; None where there is none.
             late: How late this period starts, s.
         """
         fault = (
@@ -235,18 +252,18 @@ class Watch:
             or self._tracking(state, ctrl)
             or self._checksum(now, state)
         )
-        self._last, self._ctrl = state, ctrl
+        self._last, self._last_ctrl = state, ctrl
         return fault
 
     def overrun(self, late: float) -> Fault | None:
-        """What is wrong if a period that was due `late` s ago has not sent its command yet."""
+        """Return a fault if a period that was due `late` s ago may not send its command any more."""
         if late > self.config.overrun * self.dt:
             return Fault("overrun", f"the period was {late * 1e3:.0f} ms late; make the loop lighter or slower")
         return None
 
     def _stale(self, now: float, state: State) -> Fault | None:
         age = now - state.time
-        if age > self.config.stale * self.dt * (1 + ROUNDING):
+        if age > self.config.stale * self.dt * (1 + RELATIVE_ROUNDING):
             return Fault("stale", f"the newest state is {age * 1e3:.0f} ms old, {age / self.dt:.1f} control periods")
         return None
 
@@ -283,17 +300,18 @@ class Watch:
         if last is None or state.time <= last.time or not self.config.frozen:
             return None
         if any(not np.array_equal(getattr(state, name), getattr(last, name)) for name in ("qpos", "qvel", "tau")):
-            self._equal, self._travel[:] = 0, 0.0
+            self._equal_states, self._travel[:] = 0, 0.0
             return None
-        self._equal += 1
-        if ctrl is not None and self._ctrl is not None:
-            self._travel += np.abs(ctrl - self._ctrl)
-        if self._equal < self.config.frozen or not (self.noisy or self._travel.max() > self.config.frozen_travel):
+        self._equal_states += 1
+        if ctrl is not None and self._last_ctrl is not None:
+            self._travel += np.abs(ctrl - self._last_ctrl)
+        repeats = self.noisy or self._travel.max() > self.config.frozen_travel
+        if self._equal_states < self.config.frozen or not repeats:
             return None
-        return Fault("frozen", f"{self._equal + 1} states in a row read exactly the same")
+        return Fault("frozen", f"{self._equal_states + 1} states in a row read exactly the same")
 
     def _frozen_joint(self, state: State, ctrl: Array | None) -> Fault | None:
-        """Fault where one encoder stands still while its command moves on or its velocity says that the joint moves."""
+        """Return a fault if one encoder stands still while its command or the integral of its velocity goes on."""
         qpos, last = state.qpos[self.commanded], self._last
         if last is not None and state.time <= last.time:
             return None  # the same state again
@@ -302,10 +320,11 @@ class Watch:
             return None
         moved = qpos != last.qpos[self.commanded]
         anchor = ctrl if self._anchor is None else np.where(moved, ctrl, self._anchor)
-        glided = self._glided + state.qvel[self.commanded] * (state.time - last.time)
-        self._anchor, self._glided = anchor, np.where(moved, 0.0, glided)
-        self._still = np.where(moved, 0, self._still + 1)
-        beyond = np.where(self._still < STILL, 0.0, np.maximum(np.abs(ctrl - anchor), np.abs(self._glided)))
+        integral = self._integral + state.qvel[self.commanded] * (state.time - last.time)
+        self._anchor, self._integral = anchor, np.where(moved, 0.0, integral)
+        self._still_states = np.where(moved, 0, self._still_states + 1)
+        way = np.maximum(np.abs(ctrl - anchor), np.abs(self._integral))
+        beyond = np.where(self._still_states < MIN_STILL_STATES, 0.0, way)
         worst = int(beyond.argmax())
         if beyond[worst] <= self.config.frozen_joint:
             return None
@@ -316,14 +335,14 @@ class Watch:
     def _tracking(self, state: State, ctrl: Array | None) -> Fault | None:
         error = np.zeros(1) if ctrl is None else np.abs(ctrl - state.qpos[self.commanded])
         worst = int(error.argmax())
-        self._astray = self._astray + self.dt if error[worst] > self.config.tracking else 0.0
-        if self._astray > self.config.tracking_time:
+        self._tracking_s = self._tracking_s + self.dt if error[worst] > self.config.tracking else 0.0
+        if self._tracking_s > self.config.tracking_time:
             joint = self.names[int(self.commanded[worst])]
             return Fault("tracking", f"{joint} is {error[worst]:.2f} rad from its command; is it blocked or unpowered?")
         return None
 
     def _checksum(self, now: float, state: State) -> Fault | None:
-        self._refused = [*(r for r in self._refused if now - r[0] <= 1.0), (now, state.refused)]
+        self._refused = [*(r for r in self._refused if now - r[0] <= CHECKSUM_WINDOW_S), (now, state.refused)]
         count = state.refused - self._refused[0][1]
         if count > self.config.refused:
             return Fault(

@@ -1,4 +1,4 @@
-"""Targets of one run: whether it may begin, then phase by phase the target or the end of the phase."""
+"""Targets of one run: readiness for the first command, then for each period the target or the end of the phase."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Fault, State
-from gaponet.hw.control.following import Following
+from gaponet.hw.control.following import FollowingMonitor
 from gaponet.hw.control.output import Context, Output
 from gaponet.hw.control.phases import Phase, Trigger
-from gaponet.hw.control.plan import MOVED, SLOW, Fence, Plan, advance
+from gaponet.hw.control.plan import MAX_START_DRIFT_RAD, MIN_SEARCH_PERIOD_S, CollisionGuard, Plan, advance
 from gaponet.hw.targets.policy import NotYet, Policy
 from gaponet.sysid.motion.minjerk import blend
 from gaponet.sysid.motion.path_planner import Search, Trajectory
 
-GOOD_STATES = 5  # periods in a row without a fault before anything is commanded
-PATIENCE_S = 5.0  # for them
+MIN_GOOD_STATES = 5  # periods in a row without a fault before anything is commanded
+MAX_WAIT_S = 5.0  # for them
 NO_STATE = Fault("stale", "no fresh state")
-SEARCH_SHARE = 0.3  # of a period, in which a search for a clear way is continued
-MAX_UNPROVEN_WEIGHT = 0.3  # beyond it a robot is not handed over before a joint has followed, where one goes …
-FAR_RAD = 0.4  # … that far to the first target: at that weight more than friction may swallow
-PAYLOAD_CHECK_S = 2.0  # of the run, after which what the hands hold is compared with what was stated
-ENDS = {"hand_over": "held while it is handed over", "hold": "hold", "damp": "damp"}  # by Driver.at_end
+SEARCH_SHARE = 0.3  # of a period in which a search for a clear path is continued
+MAX_UNPROVEN_WEIGHT = 0.3  # until a joint has followed, where one goes …
+FAR_RAD = 0.4  # … this far to the first target: at that weight more than friction may hide
+FULL_WEIGHT = 1.0 - 1e-9
+PAYLOAD_CHECK_S = 2.0  # of the run, after which the estimated payload is compared with the stated one
+END_TEXTS = {"hand_over": "held while it is handed over", "hold": "hold", "damp": "damp"}  # by Driver.at_end
 
 
 class Readiness:
-    """Waits for good states in a row, a prepared compensator, a first target, and a clear way to it.
+    """Waits for good states in a row, a prepared compensator, a first target, and a clear path to it.
 
     Attributes:
-        since: From when on it has waited for the robot, s.
+        since: Start of the wait for the robot, s.
         plan: May be given until the run begins: its motion is played.
     """
 
@@ -41,43 +42,43 @@ class Readiness:
         self.plan: Plan | None = None
         self._search: Search[Plan] | None = None
         self._prepared = context.compensator is None
-        self._good, self._fault = 0, NO_STATE
+        self._good_states, self._fault = 0, NO_STATE
 
     def count(self, fault: Fault | None) -> None:
-        """Count a state, with what is wrong with it."""
-        self._good, self._fault = (0, fault) if fault else (self._good + 1, NO_STATE)
+        """Count a state; a fault begins anew."""
+        self._good_states, self._fault = (0, fault) if fault else (self._good_states + 1, NO_STATE)
 
     def first_target(self, now: float, state: State, policy: Policy) -> Array | Fault | None:
         """Return the first target, (n) rad, if the robot may go there now; None: wait; a fault: it may not."""
         compensator, planner = self.context.compensator, self.context.planner
-        if self._good < GOOD_STATES:
+        if self._good_states < MIN_GOOD_STATES:
             never = Fault(self._fault.kind, f"never ready: {self._fault.text}")
-            return never if now - self.since > PATIENCE_S else None
+            return never if now - self.since > MAX_WAIT_S else None
         if compensator and not self._prepared:  # takes longer than a period; then wait for fresh states again
             compensator.reset(state.qpos, self.context.payload_mass)
-            self._prepared, self._good = True, 0
+            self._prepared, self._good_states = True, 0
             return None
         first = policy(0, state)
         if isinstance(first, NotYet):
             self.since = now  # all else is well
             return None
         if isinstance(first, Fault):  # senders of live targets wait while it plans
-            waits = first.kind == "silence" and self.plan and now - self.since <= PATIENCE_S
+            waits = first.kind == "silence" and self.plan and now - self.since <= MAX_WAIT_S
             return None if waits else first
         if first is None or not np.isfinite(first[self.context.joints]).all():
             return Fault("target", "the motion has no first target, or it is not a number")
         before = self.plan
-        fault = self._find_plan(first, state, now) or self.output.admit(state.qpos)
+        fault = self._update_plan(first, state, now) or self.output.admit(state.qpos)
         if fault or (planner and (before is None or self.plan is not before)):
             return fault
         return first
 
-    def _find_plan(self, first: Array, state: State, now: float) -> Fault | None:
-        """Make sure that a plan begins where the robot is, if there is a planner; it may take several periods."""
+    def _update_plan(self, first: Array, state: State, now: float) -> Fault | None:
+        """Let a plan begin where the robot is, if there is a planner; this may take several periods."""
         if self.plan is not None:
-            moved = np.abs(state.qpos - self.plan.found)[self.context.joints]
+            moved = np.abs(state.qpos - self.plan.start)[self.context.joints]
             joint = self.context.driver.commanded[int(moved.argmax())]
-            if moved.max() <= MOVED:
+            if moved.max() <= MAX_START_DRIFT_RAD:
                 return None
             if self.plan.motion is not None:
                 return Fault("plan", f"{joint} moved by {moved.max():.2f} rad since the plan was made; run it again")
@@ -94,8 +95,8 @@ class Readiness:
         return None
 
 
-class Change(NamedTuple):
-    """The end of a phase: its event, and text and kind that are recorded."""
+class PhaseChange(NamedTuple):
+    """End of a phase: its event, and text and kind for the recording."""
 
     trigger: Trigger
     text: str
@@ -107,23 +108,26 @@ class TargetGenerator:
 
     Attributes:
         weight: Weight of the last target: how far the robot is handed over.
-        remarks: Sentences for the recording; whoever records them takes them out.
+        path: To the first target; later the way back.
+        remarks: Sentences for the recording; the controller takes them out.
     """
 
-    def __init__(self, context: Context, following: Following, plan: Plan | None, state: State, first: Array) -> None:
-        """Begin where the robot is and go to the first target, (n) rad: by the ways of a plan, or straight."""
+    def __init__(
+        self, context: Context, following: FollowingMonitor, plan: Plan | None, state: State, first: Array
+    ) -> None:
+        """Begin where the robot is and go to the first target, (n) rad: by the paths of a plan, or straight."""
         self.context, self.following, self.plan = context, following, plan
         self.start = self._last = self._origin = state.qpos[context.joints]
-        self.way = plan.into if plan else self._straight(self.start, first[context.joints], state)
+        self.path = plan.approach if plan else self._straight(self.start, first[context.joints], state)
         live = context.planner and plan and plan.motion is None
-        self._fence = Fence(context.planner, state.qpos) if context.planner and live else None
+        self._guard = CollisionGuard(context.planner, state.qpos) if context.planner and live else None
         self._search: Search[Trajectory] | None = None  # for the way back
-        self._way_since = 0  # period of blend_out in which the way back began
-        self.weight = self._handed = self._progress = 0.0  # weights; s on the way to the first target
-        self._obstacle, self._released, self._checked_payload = "", "handed over", False
+        self._back_since = 0  # period of blend_out in which the way back began
+        self.weight = self._handed = self._progress = 0.0  # weights; s on the path to the first target
+        self._obstacle, self._release_text, self._checked_payload = "", "handed over", False
         self.remarks: list[str] = []
 
-    def step(self, phase: Phase, n: int, state: State, policy: Policy) -> Array | Change | Fault:
+    def step(self, phase: Phase, n: int, state: State, policy: Policy) -> Array | PhaseChange | Fault:
         """Return the target of the n-th period of a phase, or the end of the phase."""
         if phase is Phase.BLEND_IN:
             out = self._blend_in(state, policy)
@@ -133,29 +137,29 @@ class TargetGenerator:
             out = self._blend_out(n)
         else:
             out = self._release(n)
-        if self._fence and isinstance(out, np.ndarray) and np.isfinite(out).all():
-            return self._clear(self._fence, out, state)
+        if self._guard and isinstance(out, np.ndarray) and np.isfinite(out).all():
+            return self._clear(self._guard, out, state)
         return out
 
     def go_back(self, state: State) -> None:
-        """Begin the way back to where the robot was found."""
+        """Begin the way back to the start."""
         planner, joints = self.context.planner, self.context.joints
         self._origin = self._last
-        self.way = (self.plan and self.plan.back) or self._straight(self._last, self.start, state)
-        if self._fence and planner:
-            self._fence.homeward()
+        self.path = (self.plan and self.plan.retreat) or self._straight(self._last, self.start, state)
+        if self._guard and planner:
+            self._guard.allow_start_clearance()
             ends = state.qpos_with(joints, self._last), state.qpos_with(joints, self.start)
-            self._search = planner.back(*ends) if self.context.dt >= SLOW else None
+            self._search = planner.back(*ends) if self.context.dt >= MIN_SEARCH_PERIOD_S else None
 
     def hold(self, state: State) -> None:
         """Hold a robot that does not obey where it is: nothing moves, whatever listens again."""
-        self._last, self._released = state.qpos[self.context.joints], "let go; the robot did not obey"
+        self._last, self._release_text = state.qpos[self.context.joints], "let go; the robot did not obey"
 
-    def _blend_in(self, state: State, policy: Policy) -> Array | Change | Fault:
+    def _blend_in(self, state: State, policy: Policy) -> Array | PhaseChange | Fault:
         config, dt, following = self.context.config, self.context.dt, self.following
-        arrived = self._progress >= self.way.duration + config.settle
-        if arrived and self._handed > 1.0 - 1e-9:
-            return Change(Trigger.ARRIVED, "motion")
+        arrived = self._progress >= self.path.duration + config.settle
+        if arrived and self._handed > FULL_WEIGHT:
+            return PhaseChange(Trigger.ARRIVED, "motion")
         first = policy(0, state)
         if isinstance(first, Fault):
             return first
@@ -163,68 +167,68 @@ class TargetGenerator:
         far = np.abs(goal - self.start)
         unproven = bool(following.share) and far.max() >= FAR_RAD and not following.shown.any()
         if unproven and arrived:
-            return following.blame(int(far.argmax()))
-        self._last = self._along(self._progress, self.start, goal)
-        most = MAX_UNPROVEN_WEIGHT if unproven else 1.0
-        self._handed = max(self._handed, min(self._handed + dt / config.blend, most))
-        partly = self.context.driver.at_end == "hand_over" and self._handed < 1.0 - 1e-9
+            return following.fault(int(far.argmax()))
+        self._last = self._on_path(self._progress, self.start, goal)
+        max_weight = MAX_UNPROVEN_WEIGHT if unproven else 1.0
+        self._handed = max(self._handed, min(self._handed + dt / config.blend, max_weight))
+        partly = self.context.driver.at_end == "hand_over" and self._handed < FULL_WEIGHT
         # While it is handed over joints lag, each in its own way: the target stands meanwhile.
         if unproven or not (partly and far.max() >= FAR_RAD):
             self._progress += dt
         self.weight = self._handed
         return self._last
 
-    def _run(self, n: int, state: State, policy: Policy) -> Array | Change | Fault:
+    def _run(self, n: int, state: State, policy: Policy) -> Array | PhaseChange | Fault:
         target, self.weight = policy(n, state), 1.0
         if isinstance(target, Fault):
             return target
         if not self._checked_payload and n * self.context.dt >= PAYLOAD_CHECK_S:
             self._checked_payload = True
-            if doubt := getattr(self.context.compensator, "doubt", ""):  # not every compensator weighs
+            if doubt := getattr(self.context.compensator, "doubt", ""):  # not every compensator estimates the payload
                 self.remarks.append(f"compensation: {doubt}")
         if target is not None:
             self._last = np.array(target[self.context.joints], float)
             return self._last
         if self.context.config.blend_out:
-            return Change(Trigger.RETURN, "end of the motion", "end")
+            return PhaseChange(Trigger.RETURN, "end of the motion", "end")
         return self._end("end of the motion")
 
-    def _blend_out(self, n: int) -> Array | Change:
+    def _blend_out(self, n: int) -> Array | PhaseChange:
         if self._search:
             try:
-                way = advance(self._search, self.context.clock, SEARCH_SHARE * self.context.dt)
+                path = advance(self._search, self.context.clock, SEARCH_SHARE * self.context.dt)
             except UsageError as error:
                 return self._end(f"where it is: {error}")
-            if way is None:
+            if path is None:
                 return self._last
-            self._search, self._way_since, self.way = None, n, way
-        passed = (n - self._way_since) * self.context.dt
-        if passed <= self.way.duration + self.context.config.settle:
-            return self._along(passed, self._origin, self.start)
-        if self._fence and np.abs(self._last - self.start).max() > MOVED:
-            return self._end(f"where it is: {self._fence.near} would come too near on the way back")
+            self._search, self._back_since, self.path = None, n, path
+        passed = (n - self._back_since) * self.context.dt
+        if passed <= self.path.duration + self.context.config.settle:
+            return self._on_path(passed, self._origin, self.start)
+        if self._guard and np.abs(self._last - self.start).max() > MAX_START_DRIFT_RAD:
+            return self._end(f"where it is: {self._guard.obstacle} would come too near on the way back")
         self._last = self.start
         return self._end("back where it was found")
 
-    def _release(self, n: int) -> Array | Change:
+    def _release(self, n: int) -> Array | PhaseChange:
         if self.weight == 0.0:
-            return Change(Trigger.RELEASED, self._released)
+            return PhaseChange(Trigger.RELEASED, self._release_text)
         self.weight = max(1.0 - n * self.context.dt / self.context.config.damp, 0.0) * self._handed
         return self._last
 
-    def _end(self, text: str) -> Change:
+    def _end(self, text: str) -> PhaseChange:
         """Return the end of a run without fault, as the driver's robot can have it."""
         at_end = self.context.driver.at_end
-        return Change(Trigger[at_end.upper()], f"{text}; {ENDS[at_end]}", "end")
+        return PhaseChange(Trigger[at_end.upper()], f"{text}; {END_TEXTS[at_end]}", "end")
 
-    def _clear(self, fence: Fence, target: Array, state: State) -> Array:
+    def _clear(self, guard: CollisionGuard, target: Array, state: State) -> Array:
         """Return the target as far as limbs and plane leave the way free."""
         joints = self.context.joints
-        fence.at = state.qpos_with(joints, fence.at[joints])
-        self._last = fence.step(state.qpos_with(joints, target), state.qpos, self.context.dt)[joints]
-        if fence.near and fence.near != self._obstacle:
-            self.remarks.append(f"targets are cut: {fence.near} would come too near")
-        self._obstacle = fence.near or self._obstacle
+        guard.qpos = state.qpos_with(joints, guard.qpos[joints])
+        self._last = guard.step(state.qpos_with(joints, target), state.qpos, self.context.dt)[joints]
+        if guard.obstacle and guard.obstacle != self._obstacle:
+            self.remarks.append(f"targets are cut: {guard.obstacle} would come too near")
+        self._obstacle = guard.obstacle or self._obstacle
         return self._last
 
     def _straight(self, start: Array, goal: Array, state: State) -> Trajectory:
@@ -232,8 +236,8 @@ class TargetGenerator:
         points = np.stack([state.qpos_with(joints, start), state.qpos_with(joints, goal)])
         return Trajectory.minimum_jerk(points, config.blend_speed, np.inf, config.blend)
 
-    def _along(self, passed: float, start: Array, goal: Array) -> Array:
-        """Return where the way leads after some s, with its ends moved to where they truly are."""
-        joints, share = self.context.joints, float(blend(np.array(passed / self.way.duration)))
-        first, last = self.way.points[0][joints], self.way.points[-1][joints]
-        return self.way.at(passed)[joints] + (1 - share) * (start - first) + share * (goal - last)
+    def _on_path(self, passed: float, start: Array, goal: Array) -> Array:
+        """Return the place on the path after some s, with its ends moved to the true start and goal."""
+        joints, share = self.context.joints, float(blend(np.array(passed / self.path.duration)))
+        first, last = self.path.points[0][joints], self.path.points[-1][joints]
+        return self.path.at(passed)[joints] + (1 - share) * (start - first) + share * (goal - last)

@@ -1,2 +1,1 @@
-"""Drivers: one robot, or one virtual robot, behind `hw.control.driver.Driver`. Vendor libraries load when one
-connects."""
+"""Drivers: one robot each, behind `hw.control.driver.Driver`. Vendor libraries are imported when a driver connects."""

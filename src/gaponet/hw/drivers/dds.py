@@ -1,10 +1,10 @@
 # mypy: disable-error-code="misc, type-arg, valid-type, method-assign, unused-ignore, attr-defined, assignment"
-"""hg topics over cyclonedds: types for the bus, raw bytes for us. Imported when a bus is opened.
+"""Unitree's hg topics over cyclonedds: IDL types for the bus, bytes for this package. Imported when a bus is opened.
 
-The classes below are what other participants see of our types. They carry a message as bytes: `serialize` and
-`deserialize`, which cyclonedds calls on every sample, hand them through instead of walking 500 fields.
+Other participants see the classes below as the types of our topics. Messages are bytes: `serialize` and `deserialize`,
+which cyclonedds calls on every sample, pass them through instead of walking 500 fields.
 
-What is uint8 in Unitree's IDL is byte here: the wire is the same, and uint8 as cyclonedds 11 describes it ends every
+uint8 of Unitree's IDL is byte here. On the wire both are the same. uint8 as cyclonedds 11 describes it ends every
 program on libddsc 0.10, Unitree's SDK among them, with a null pointer in its discovery (eclipse-cyclonedds/cyclonedds
 issue 1554; tests/hw/control/test_peers.py).
 """
@@ -36,19 +36,26 @@ try:
 except ImportError:
     raise DriverError("cyclonedds is not installed; run: pip install 'gaponet[dds]'") from None
 
-QUEUE = 64  # messages kept for us between two reads: 128 ms at 500 Hz
-LARGEST = 64  # KiB of a message that is put together from its parts
+QUEUE_LENGTH = 64  # messages buffered between two reads: 128 ms at 500 Hz
+MAX_SAMPLE_KIB = 64  # of a message that is put together from fragments
+MAX_ENTRIES = 500  # of discovery that are read
+SHUTDOWN_S = 3.0  # longest wait for the deletion of the domains at the end of a process
+SCALARS = {"<f4": float32, "<i2": int16, "<u4": uint32, "u1": byte}
 
-KINDS = {"<f4": float32, "<i2": int16, "<u4": uint32, "u1": byte}
+
+def make_struct(typename: str, **fields: Any) -> Any:
+    """Return a final IDL struct; fields: name → IDL type."""
+    space = {"__annotations__": fields, "__module__": __name__}
+    name = typename.replace(".", ":").rpartition(":")[2].rstrip("_")
+    made = new_class(name, (IdlStruct,), {"typename": typename}, lambda ns: ns.update(space))
+    return annotate.autoid("sequential")(annotate.final(dataclass(made)))
 
 
 def _struct(name: str, fields: hg.Fields, **parts: type[IdlStruct]) -> type[IdlStruct]:
-    """The type of a message of drivers.hg under the name that it has in Unitree's IDL; parts: its structs, by field."""
-    members = {field: (parts.get(field) or KINDS[kind], count) for field, kind, count in fields}
+    """Return the IDL type of a message of drivers.hg under its name in Unitree's IDL; parts: its structs, by field."""
+    members = {field: (parts.get(field) or SCALARS[kind], count) for field, kind, count in fields}
     hints = {field: kind if count == 1 else array[kind, count] for field, (kind, count) in members.items()}
-    space = {"__annotations__": hints, "__module__": __name__}
-    made = new_class(name, (IdlStruct,), {"typename": f"unitree_hg.msg.dds_.{name}_"}, lambda ns: ns.update(space))
-    return annotate.autoid("sequential")(annotate.final(dataclass(made)))
+    return make_struct(f"unitree_hg.msg.dds_.{name}_", **hints)
 
 
 IMUState, MotorState = _struct("IMUState", hg.IMU), _struct("MotorState", hg.MOTOR_STATE)
@@ -57,8 +64,8 @@ LowState = _struct("LowState", hg.LOW_STATE, imu_state=IMUState, motor_state=Mot
 LowCmd = _struct("LowCmd", hg.LOW_CMD, motor_cmd=MotorCmd)
 
 
-def raw(kind: type[IdlStruct]) -> type[IdlStruct]:
-    """The same type on the bus, its samples bytes (`.data`, after the CDR header)."""
+def as_bytes(kind: type[IdlStruct]) -> type[IdlStruct]:
+    """Change a type so that its samples are bytes (`.data`, after the CDR header); on the bus it stays the same."""
 
     def serialize(self: Any, *_: Any, **__: Any) -> bytes:
         return hg.HEADER + self.data
@@ -73,6 +80,48 @@ def raw(kind: type[IdlStruct]) -> type[IdlStruct]:
     return kind
 
 
+class Writer:
+    """Publishes messages of one topic."""
+
+    def __init__(self, writer: DataWriter, kind: type[IdlStruct]) -> None:
+        self._writer, self._kind = writer, kind
+
+    def send(self, data: Array | bytes) -> None:
+        """Publish one message.
+
+        Raises:
+            DriverError: DDS refuses it.
+        """
+        sample = self._kind.__new__(self._kind)
+        sample.data = bytes(data)
+        try:
+            self._writer.write(sample)
+        except DDSException as error:
+            raise DriverError(f"DDS refused a message: {error}") from None
+
+
+class Reader:
+    """Receives messages of one topic and buffers the newest ones."""
+
+    def __init__(self, reader: DataReader, queue_length: int) -> None:
+        self._reader, self._queue_length = reader, queue_length
+
+    def samples(self) -> list[Any]:
+        """Return the samples since the last call, oldest first: bytes (`.data`) and source (`.sample_info`).
+
+        Raises:
+            DriverError: DDS fails.
+        """
+        try:
+            return [sample for sample in self._reader.take(N=self._queue_length) if hasattr(sample, "data")]
+        except DDSException as error:
+            raise DriverError(f"DDS does not give messages: {error}") from None
+
+    def receive(self) -> list[Array]:
+        """Return the messages since the last call, oldest first, as arrays of bytes."""
+        return [np.frombuffer(sample.data, np.uint8) for sample in self.samples()]
+
+
 class Bus:
     """One participant in a DDS domain, on one network interface."""
 
@@ -81,71 +130,83 @@ class Bus:
         Args:
             domain: 0 on a Unitree robot.
             interface: Network interface that reaches the robot: eth0, enp3s0…, lo for a robot on this machine.
+
+        Raises:
+            DriverError: There is no such interface, or DDS does not start on it.
         """
         if interface not in _interfaces():
             raise DriverError(f"no network interface '{interface}' here; there are {', '.join(_interfaces())}")
-        # lo does not say that it has multicast on Linux: programs on it, Unitree's SDK among them, are found by asking
-        # port after port, and those that were told to use it there nevertheless by their multicast.
-        lonely = interface == "lo"
-        multicast = ' multicast="true"' if lonely else ""
-        discovery = '<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="localhost"/></Peers>'
-        config = (
-            f'<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="{interface}"{multicast}/>'
-            f"</Interfaces><AllowMulticast>{'spdp' if lonely else 'true'}</AllowMulticast></General>"
-            f"<Discovery>{discovery if lonely else ''}</Discovery>"
-            # of Fast DDS, ROS 2's: its descriptions of types do not come through, and nothing would be matched
-            "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
-            f"<Internal><MaxSampleSize>{LARGEST} KiB</MaxSampleSize></Internal></Domain></CycloneDDS>"
-        )
         try:
-            self._domain = (
-                _DOMAINS[domain] if domain in _DOMAINS else _DOMAINS.setdefault(domain, Domain(domain, config))
-            )
+            if domain not in _DOMAINS:
+                _DOMAINS[domain] = Domain(domain, _configuration(interface))
             self._participant = DomainParticipant(domain)
         except DDSException as error:
             raise DriverError(f"DDS on {interface} does not start: {error}; is the interface up?") from None
         self._topics: dict[str, Topic] = {}
 
-    def writer(self, topic: str, kind: type[IdlStruct]) -> DataWriter:
-        """A writer as Unitree's SDK makes it: reliable, the newest sample only."""
-        return DataWriter(self._participant, self._topic(topic, kind))
+    def writer(self, topic: str, kind: type[IdlStruct]) -> Writer:
+        """Return a writer as Unitree's SDK makes it: reliable, the newest sample only."""
+        return Writer(DataWriter(self._participant, self._topic(topic, kind)), kind)
 
-    def reader(self, topic: str, kind: type[IdlStruct], keep: int = QUEUE) -> DataReader:
-        """A reader that keeps the newest that came since the last look."""
-        qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(keep))
-        return DataReader(self._participant, self._topic(topic, kind), qos)
+    def reader(self, topic: str, kind: type[IdlStruct], queue_length: int = QUEUE_LENGTH) -> Reader:
+        """Return a reader that buffers the newest messages since the last call."""
+        qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(queue_length))
+        return Reader(DataReader(self._participant, self._topic(topic, kind), qos), queue_length)
 
     def _topic(self, name: str, kind: type[IdlStruct]) -> Topic:
         if name not in self._topics:
-            self._topics[name] = Topic(self._participant, name, raw(kind))
+            self._topics[name] = Topic(self._participant, name, as_bytes(kind))
         return self._topics[name]
 
     def publishers(self, wait: float = 0.5) -> defaultdict[str, list[str]]:
-        """Who else publishes what, after listening for `wait` s: topic → programs, as they call themselves."""
+        """Return the other publishers after listening for `wait` s: topic → programs, as they call themselves."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication
 
         programs = BuiltinDataReader(self._participant, BuiltinTopicDcpsParticipant)
         publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         time.sleep(wait)
-        names = {e.key: _program(e.qos) for e in programs.read(N=500) if hasattr(e, "key")}
-        found: defaultdict[str, list[str]] = defaultdict(list)
-        for entry in publications.read(N=500):
+        names = {e.key: _program(e.qos) for e in programs.read(N=MAX_ENTRIES) if hasattr(e, "key")}
+        publishers: defaultdict[str, list[str]] = defaultdict(list)
+        for entry in publications.read(N=MAX_ENTRIES):
             if hasattr(entry, "topic_name") and entry.participant_key != self._participant.guid:
-                found[entry.topic_name].append(
-                    names.get(entry.participant_key, "a program that does not tell its name")
-                )
-        return found
+                name = names.get(entry.participant_key, "a program that does not tell its name")
+                publishers[entry.topic_name].append(name)
+        return publishers
+
+
+def _configuration(interface: str) -> str:
+    """Return cyclonedds' configuration for one network interface.
+
+    lo has no multicast on Linux by its own account. Programs on it, Unitree's SDK among them, are found by asking port
+    after port; programs that were configured to use multicast there nevertheless are found by that.
+    """
+    loopback = interface == "lo"
+    multicast = ' multicast="true"' if loopback else ""
+    discovery = '<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="localhost"/></Peers>'
+    return (
+        f'<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="{interface}"{multicast}/>'
+        f"</Interfaces><AllowMulticast>{'spdp' if loopback else 'true'}</AllowMulticast></General>"
+        f"<Discovery>{discovery if loopback else ''}</Discovery>"
+        # Type descriptions of Fast DDS, which ROS 2 uses, do not come through; without this nothing would be matched.
+        "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
+        f"<Internal><MaxSampleSize>{MAX_SAMPLE_KIB} KiB</MaxSampleSize></Internal></Domain></CycloneDDS>"
+    )
 
 
 def _program(qos: Qos) -> str:
-    """Name, process and machine of a participant, where it tells them."""
-    told = {policy.key: policy.value for policy in qos if isinstance(policy, Policy.Property)}
-    name, pid, host = (told.get(f"__{key}", "?") for key in ("ProcessName", "Pid", "Hostname"))
+    """Return name, process and machine of a participant, as far as it tells them."""
+    properties = {policy.key: policy.value for policy in qos if isinstance(policy, Policy.Property)}
+    name, pid, host = (properties.get(f"__{key}", "?") for key in ("ProcessName", "Pid", "Hostname"))
     return f"{name} (process {pid} on {host})"
 
 
+def _interfaces() -> list[str]:
+    import socket
+
+    return [name for _, name in socket.if_nameindex()]
+
+
 _DOMAINS: dict[int, Domain] = {}  # a domain is configured once per process
-SHUTDOWN_S = 3.0  # longest wait for the deletion of the domains at the end of a process
 
 
 @atexit.register
@@ -162,32 +223,3 @@ def _delete_domains() -> None:
     deleting = threading.Thread(target=delete, daemon=True)
     deleting.start()
     deleting.join(SHUTDOWN_S)
-
-
-def send(writer: DataWriter, kind: type[IdlStruct], data: Array | bytes) -> None:
-    """Publish one message."""
-    sample = kind.__new__(kind)
-    sample.data = bytes(data)
-    try:
-        writer.write(sample)
-    except DDSException as error:
-        raise DriverError(f"DDS refused a message: {error}") from None
-
-
-def samples(reader: DataReader, most: int = QUEUE) -> list[Any]:
-    """All messages since the last call, oldest first, each with bytes (`.data`) and source (`.sample_info`)."""
-    try:
-        return [sample for sample in reader.take(N=most) if hasattr(sample, "data")]
-    except DDSException as error:
-        raise DriverError(f"DDS does not give messages: {error}") from None
-
-
-def receive(reader: DataReader) -> list[Array]:
-    """All messages since the last call, oldest first, as bytes."""
-    return [np.frombuffer(s.data, np.uint8) for s in samples(reader)]
-
-
-def _interfaces() -> list[str]:
-    import socket
-
-    return [name for _, name in socket.if_nameindex()]

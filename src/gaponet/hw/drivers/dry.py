@@ -1,4 +1,4 @@
-"""A rehearsal on a real robot: everything is read, judged and computed, and nothing is sent."""
+"""Dry run on a real robot: everything is read, checked and computed, and nothing is sent."""
 
 from __future__ import annotations
 
@@ -10,74 +10,77 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.hw.control.driver import Driver, Fault, State
 from gaponet.hw.control.recording import Recording
+from gaponet.hw.control.safety import Limits
 
 
 class DryRun:
-    """A `Driver` around another one that only reads.
+    """A `Driver` around another one, of which only the readings are used.
 
-    Its states are the robot's, moved on by what the commands would have moved, as if the robot followed at once: else
-    the first motion would count as a joint that does not follow.
+    Its states are the robot's, moved on by the way of the commands, as if the robot followed at once. Without this the
+    first motion would count as a joint that does not follow.
     """
 
     def __init__(self, driver: Driver) -> None:
         """
         Args:
-            driver: The robot; one that publishes nothing when it connects.
+            driver: The robot; it must publish nothing when it connects.
         """
         self.driver = driver
-        self.address = driver.address  # under the same lock: a serial bus has one speaker, who only reads too
+        self.address = driver.address  # the same lock: a serial bus has one master, also one that only reads
         self.joint_names, self.commanded = driver.joint_names, driver.commanded
         self.noisy, self.at_end, self.at_stop = driver.noisy, driver.at_end, driver.at_stop
-        self.reads_back = True  # of what was not sent nothing can be read
-        self._adopt()
+        self.reads_back = True  # what was not sent cannot be checked
+        self.virtual, self.kp, self.kd, self.qpos_range, self.facts = self._known_once_connected()
         self._at = np.array([driver.joint_names.index(name) for name in driver.commanded])
-        self._base: Array | None = None  # where the joints were at the first command
-        self._moved: Array | float = 0.0
+        self._measured: Array | None = None  # qpos of the last state, rad
+        self._start: Array | None = None  # qpos at the first command, rad
+        self._moved: Array | float = 0.0  # way of the commands since then, rad
 
     def connect(self) -> None:
+        """Connect the robot's driver."""
         self.driver.connect()
-        self._adopt()
+        self.virtual, self.kp, self.kd, self.qpos_range, self.facts = self._known_once_connected()
 
-    def _adopt(self) -> None:
+    def _known_once_connected(self) -> tuple[bool, Array, Array, Array | None, dict[str, Any]]:
         inner = self.driver
-        self.virtual, self.kp, self.kd, self.qpos_range = inner.virtual, inner.kp, inner.kd, inner.qpos_range
-        self.facts: dict[str, Any] = inner.facts | {"dry_run": True}
+        return inner.virtual, inner.kp, inner.kd, inner.qpos_range, inner.facts | {"dry_run": True}
 
     def read(self) -> State:
-        """What the robot says, moved on."""
-        self._real = self.driver.read()
-        return replace(self._real, qpos=self._real.qpos + self._moved)
+        """Return the robot's state, moved on."""
+        state = self.driver.read()
+        self._measured = state.qpos
+        return replace(state, qpos=state.qpos + self._moved)
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
-        self._base = self._real.qpos if self._base is None else self._base
-        moved = np.zeros_like(self._base)
-        moved[self._at] = (ctrl - self._base)[self._at]
+        """Move the states on; send nothing."""
+        assert self._measured is not None
+        self._start = self._measured if self._start is None else self._start
+        moved = np.zeros_like(self._start)
+        moved[self._at] = (ctrl - self._start)[self._at]
         self._moved = moved
 
     def verify(self) -> Fault | None:
+        """Read back what the robot's driver can."""
         return self.driver.verify()
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
         """Send nothing."""
 
     def confirm(self) -> str:
+        """Return that nothing was sent."""
         return "nothing was sent"
 
     def close(self, hold: bool = False) -> None:
-        """Leave the bus; nothing was sent."""
+        """Leave the bus; nothing is sent."""
         self.driver.close(hold=True)
 
     def watchdog(self) -> dict[str, object] | None:
-        """Nothing is commanded, so nothing must be damped."""
+        """Return None: nothing is commanded, so nothing must be damped."""
         return None
 
 
-def would_send(recording: Recording, limits: Any) -> dict[str, dict[str, float]]:
-    """What would be sent, by joint: least and greatest command (rad), the fastest (rad/s), the largest torque (N·m).
-
-    Args:
-        limits: safety.Limits of its commanded joints.
-    """
+def summarize_commands(recording: Recording, limits: Limits) -> dict[str, dict[str, float]]:
+    """Return by joint the range of the commands (rad), the fastest one (rad/s) and the largest torque (N·m)."""
     table = recording.rows.table()
     rows = table[~np.isnan(table["ctrl"]).all(axis=1)]
     if not len(rows):
@@ -86,6 +89,6 @@ def would_send(recording: Recording, limits: Any) -> dict[str, dict[str, float]]
     ctrl, qpos, qvel = (rows[name][:, at] for name in ("ctrl", "qpos", "qvel"))
     speed = np.abs(np.diff(ctrl, axis=0, prepend=ctrl[:1])).max(axis=0) / recording.dt
     torque = np.abs(limits.kp * (ctrl - qpos) - limits.kd * qvel).max(axis=0)
-    table = np.stack([ctrl.min(axis=0), ctrl.max(axis=0), speed, torque], axis=1).tolist()
+    values = np.stack([ctrl.min(axis=0), ctrl.max(axis=0), speed, torque], axis=1).tolist()
     names = ("lowest_rad", "highest_rad", "fastest_rad_s", "torque_nm")
-    return {joint: dict(zip(names, row, strict=True)) for joint, row in zip(recording.commanded, table, strict=True)}
+    return {joint: dict(zip(names, row, strict=True)) for joint, row in zip(recording.commanded, values, strict=True)}

@@ -18,34 +18,34 @@ PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST = 0xFE
 ERRORS = ("voltage", "angle sensor", "overheat", "overcurrent", "", "overload")  # status bits; bit 4: torque is on
 FAULTY = sum(1 << bit for bit, word in enumerate(ERRORS) if word)
-RETRIES = 2  # what LeRobot's num_read_retries is
-TAGS = 8  # requests that replies can be told apart for
-LONGEST = 64  # bytes behind the length of a reply
-CHATTER = 4  # times the bytes that were asked for: a bus that says more is not listened to
+RETRIES = 2  # of a read, as LeRobot's num_read_retries
+REQUEST_TAGS = 8  # lengths of replies, by which the requests that they answer are told apart
+MAX_REPLY_BYTES = 64  # behind the length byte of a reply
+MAX_BYTES_RATIO = 4  # of received to requested bytes, after which a request is given up
 
 
 @dataclass(frozen=True)
 class Register:
-    """Where a value is, how many bytes, and which bit is its sign (None: unsigned)."""
+    """Register of a servo: address, size in bytes, and number of its sign bit (None: unsigned)."""
 
     address: int
     size: int
     sign: int | None = None
 
-    def cut(self, block: Register, data: bytes) -> int:
-        """The number of this register in the bytes of a block that holds it."""
+    def value_in(self, block: Register, data: bytes) -> int:
+        """Return the value of this register in the bytes of a block that contains it."""
         start = self.address - block.address
         return self.decode(data[start : start + self.size])
 
     def decode(self, data: bytes) -> int:
-        """Bytes → number."""
+        """Return the value of little-endian bytes."""
         value = int.from_bytes(data, "little")
         if self.sign is not None and value >> self.sign & 1:
             return -(value & (1 << self.sign) - 1)
         return value
 
     def encode(self, value: int) -> bytes:
-        """Number → bytes."""
+        """Return the little-endian bytes of a value."""
         if value < 0:
             assert self.sign is not None
             value = -value | 1 << self.sign
@@ -73,90 +73,96 @@ PRESENT_LOAD = Register(60, 2, 10)  # 0.1 % of full drive
 PRESENT_VOLTAGE = Register(62, 1)  # 0.1 V
 PRESENT_TEMPERATURE = Register(63, 1)  # °C
 PRESENT_CURRENT = Register(69, 2, 15)  # 6.5 mA
-SETTINGS = Register(3, 31)  # the block from MODEL to MODE
-RUNNING = Register(40, 31)  # the block from TORQUE_ENABLE to PRESENT_CURRENT
+SETTINGS = Register(3, 31)  # block from MODEL to MODE
+RUNNING = Register(40, 31)  # block from TORQUE_ENABLE to PRESENT_CURRENT
 STS3215 = 777  # model number
 
 
 class Stream(Protocol):
-    """What we need of a serial port; pyserial's Serial has it."""
+    """Byte stream with the methods that are used of pyserial's Serial."""
 
     def read(self, size: int = 1) -> bytes:
-        """Up to `size` bytes, waiting no longer than the port's time-out."""
+        """Return up to `size` bytes, after the port's time-out at the latest."""
 
     def write(self, data: bytes, /) -> int | None:
-        """Send."""
+        """Send bytes."""
 
     def reset_input_buffer(self) -> None:
-        """Drop what was received and not read."""
+        """Drop received bytes that were not read."""
 
 
 def checksum(body: bytes) -> int:
-    """Inverted sum of all bytes between FF FF and the checksum."""
+    """Return the inverted sum of all bytes between FF FF and the checksum."""
     return ~sum(body) & 0xFF
 
 
 def packet(servo: int, code: int, parameters: bytes = b"") -> bytes:
-    """An instruction, or a reply with `code` its status."""
+    """Return the bytes of an instruction, or of a reply, whose code is its status."""
     body = bytes([servo, len(parameters) + 2, code]) + parameters
     return b"\xff\xff" + body + bytes([checksum(body)])
 
 
 class ServoBus:
-    """Talks to servos; every reply is checked, and what it says of the servo's health is kept."""
+    """Sends requests to servos and checks every reply.
+
+    Attributes:
+        refused: Number of replies with a wrong checksum.
+        errors: Servo → error bits of all its replies so far.
+    """
 
     def __init__(self, stream: Stream, timeout: float = 0.01, retries: int = RETRIES) -> None:
         """
         Args:
+            stream: The port.
             timeout: Silence after which missing replies are given up, s.
-            retries: How often those are asked for again.
+            retries: How often these are requested again.
         """
         self.stream, self.timeout, self.retries = stream, timeout, retries
-        self.refused = 0  # replies with a wrong checksum
-        self.errors: dict[int, int] = {}  # servo → error bits of all its replies so far
+        self.refused = 0
+        self.errors: dict[int, int] = {}
         self._tag = 0
 
     def read(self, servo: int, register: Register) -> int:
-        """One register.
+        """Return the value of one register of a servo.
 
         Raises:
             DriverError: No answer, or damaged ones only.
         """
-        found = self._ask(READ, [servo], register.address, register.size)
-        if not found:
+        replies = self._request(READ, [servo], register.address, register.size)
+        if not replies:
             raise DriverError(f"servo {servo} does not answer; is it powered and is its number {servo}?")
-        return register.decode(found[servo])
+        return register.decode(replies[servo])
 
     def sync_read(self, servos: Iterable[int], block: Register, retries: int | None = None) -> dict[int, bytes]:
-        """The same block of several servos in one exchange; those that never answered well are missing."""
-        return self._ask(SYNC_READ, list(servos), block.address, block.size, retries)
+        """Return a block of each of several servos, in one exchange; servos without an intact reply are missing."""
+        return self._request(SYNC_READ, list(servos), block.address, block.size, retries)
 
     def sync_write(self, register: Register, values: dict[int, int]) -> None:
-        """Write one register of several servos; nobody acknowledges."""
+        """Write one register of several servos; they do not acknowledge it."""
         parameters = b"".join(bytes([servo]) + register.encode(value) for servo, value in values.items())
         self.stream.write(packet(BROADCAST, SYNC_WRITE, bytes([register.address, register.size]) + parameters))
 
     def broadcast(self, register: Register, value: int) -> None:
-        """Write one register of every servo there is, whatever its number; nobody acknowledges."""
+        """Write one register of all servos on the bus; they do not acknowledge it."""
         self.stream.write(packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value)))
 
-    def _ask(
+    def _request(
         self, instruction: int, servos: list[int], address: int, size: int, retries: int | None = None
     ) -> dict[int, bytes]:
-        """Replies by servo; those that are missing after a silence are asked for again.
+        """Return the replies by servo; those that are missing after a silence are requested again.
 
-        A reply does not say to what. So successive requests ask for 0 to 7 bytes more than are wanted: a reply's length
-        says which request it answers, and a late one to an earlier call is not taken for it.
+        A reply does not name its request. So successive requests are for 0 to 7 bytes more than needed: the length of a
+        reply shows which request it answers, and a late reply to an earlier call is not taken for it.
         """
-        found: dict[int, bytes] = {}
+        replies: dict[int, bytes] = {}
         sizes: set[int] = set()
         for _ in range(1 + (self.retries if retries is None else retries)):
-            missing = [servo for servo in servos if servo not in found]
+            missing = [servo for servo in servos if servo not in replies]
             if missing:
-                self._tag = (self._tag + 1) % TAGS
-                asked = size + self._tag
-                sizes.add(asked)
-                words = bytes([address, asked])
+                self._tag = (self._tag + 1) % REQUEST_TAGS
+                tagged_size = size + self._tag
+                sizes.add(tagged_size)
+                words = bytes([address, tagged_size])
                 several = instruction == SYNC_READ
                 self.stream.reset_input_buffer()
                 request = (
@@ -164,19 +170,19 @@ class ServoBus:
                     else packet(missing[0], instruction, words)
                 )  # fmt: skip
                 self.stream.write(request)
-                found |= self._replies(missing, asked, sizes, request)
-        return {servo: data[:size] for servo, data in found.items()}
+                replies |= self._replies(missing, tagged_size, sizes, request)
+        return {servo: data[:size] for servo, data in replies.items()}
 
     def _replies(self, servos: list[int], expected: int, sizes: set[int], request: bytes) -> dict[int, bytes]:
-        """Whole replies of these servos, in any order, until all are there or nothing more comes.
+        """Return intact replies of these servos, in any order, until all have come or nothing more comes.
 
-        An adapter with one wire for both directions echoes the request: what equals it is no reply.
+        An adapter with one wire for both directions echoes the request, which is then skipped.
         """
-        found: dict[int, bytes] = {}
-        data, patience = b"", CHATTER * (expected + 6) * len(servos)  # bytes
+        replies: dict[int, bytes] = {}
+        data, patience = b"", MAX_BYTES_RATIO * (expected + 6) * len(servos)  # bytes
         silent = time.monotonic() + self.timeout
-        while len(found) < len(servos) and patience > 0:
-            more = self.stream.read(max(1, (len(servos) - len(found)) * (expected + 6) - len(data)))
+        while len(replies) < len(servos) and patience > 0:
+            more = self.stream.read(max(1, (len(servos) - len(replies)) * (expected + 6) - len(data)))
             if more:
                 silent = time.monotonic() + self.timeout
             elif time.monotonic() >= silent:
@@ -184,18 +190,18 @@ class ServoBus:
             data, patience = data + more, patience - len(more)
             while (start := data.find(b"\xff\xff")) >= 0 and len(data) >= start + 6:
                 body = data[start + 2 : start + 4 + data[start + 3]]
-                if not 2 <= data[start + 3] <= LONGEST:
+                if not 2 <= data[start + 3] <= MAX_REPLY_BYTES:
                     data = data[start + 1 :]
                 elif len(body) < 2 + body[1]:
                     break
                 elif checksum(body[:-1]) != body[-1]:
                     self.refused += body[0] in servos
-                    data = data[start + 1 :]  # the next packet may begin within what looked like one
+                    data = data[start + 1 :]  # the next packet may begin within the damaged one
                 elif body == request[2:]:
                     data = data[start + len(request) :]
                 else:
                     data = data[start + 2 + len(body) :]
                     self.errors[body[0]] = self.errors.get(body[0], 0) | body[2]
                     if body[0] in servos and body[1] - 2 in sizes:
-                        found[body[0]] = body[3:-1]
-        return found
+                        replies[body[0]] = body[3:-1]
+        return replies

@@ -1,11 +1,11 @@
-"""Unitree's hg messages (H1-2, G1) as numpy records: layout on the wire, layout under the checksum, checksum.
+"""Unitree's hg messages (H1-2, G1) as arrays of bytes: layout on the wire and under the checksum, and the checksum.
 
-LowState and LowCmd have a fixed size, so one structured dtype reads or writes a whole message at once: 5 µs instead of
-2 ms that field by field takes, of the 2 ms that a 500 Hz state leaves.
+LowState and LowCmd have a fixed size, so that all motors' values of a field are read or written at once: 5 µs per
+message instead of 2 ms field by field, of the 2 ms between two states at 500 Hz.
 
-The figures are those of Unitree's public IDL (unitree_sdk2, unitree_hg): fields and types, little-endian CDR
-without padding at the end of a struct on the wire; the checksum is CRC-32/MPEG-2 over the 32-bit words of the C struct,
-which does pad. Tested against the serialiser of cyclonedds and a CRC written bit by bit; not against a robot.
+Fields and types are those of Unitree's public IDL (unitree_sdk2, unitree_hg). On the wire they are little-endian CDR
+without padding at the end of a struct. The checksum is CRC-32/MPEG-2 over the 32-bit words of the C struct, which has
+padding. Tested against the serialiser of cyclonedds and a CRC written bit by bit; not against a robot.
 """
 
 from __future__ import annotations
@@ -45,9 +45,10 @@ LOW_CMD: Fields = [
 
 
 def flatten(fields: Fields, start: int, padded: bool, prefix: str = "") -> tuple[list[tuple[str, str, int, int]], int]:
-    """Every scalar field as (path, type, count, offset), and the offset after the last.
+    """Return every scalar field as (path, type, count, offset), and the offset after the last.
 
     Args:
+        fields: Fields of a struct.
         start: Offset at which it begins.
         padded: Pad as C does (structs begin and end at multiples of 4), else as CDR does (only scalars are aligned).
     """
@@ -68,7 +69,7 @@ def flatten(fields: Fields, start: int, padded: bool, prefix: str = "") -> tuple
 
 
 class Message:
-    """A fixed-size message: named columns over its motors, and its checksum."""
+    """Layout of a fixed-size message: fields of all motors at once, other fields, and the checksum."""
 
     def __init__(self, fields: Fields, motors: str) -> None:
         wire, self.wire_size = flatten(fields, 0, padded=False)
@@ -80,7 +81,7 @@ class Message:
         self._gather = self._bytes(wire, packed)
 
     def _bytes(self, wire: list[tuple[str, str, int, int]], packed: list[tuple[str, str, int, int]]) -> Array:
-        """The place on the wire of every byte of the padded struct; padding points behind the message, at a zero."""
+        """Return the wire offset of every byte of the padded struct; padding points behind the message, at a 0."""
         source = np.full(self.packed_size, self.wire_size)
         for (_, kind, count, at), (_, _, _, to) in zip(wire, packed, strict=True):
             size = np.dtype(kind).itemsize * count
@@ -89,16 +90,16 @@ class Message:
         return np.ascontiguousarray(words[:, ::-1]).ravel()  # each word from its highest byte on
 
     def new(self) -> Array:
-        """An empty message, (wire_size,) bytes."""
+        """Return an empty message, (wire_size,) bytes."""
         return np.zeros(self.wire_size, np.uint8)
 
     def view(self, data: Array, path: str) -> Array:
-        """A field outside the motors as a writable view, (count,)."""
+        """Return a field outside the motors as a writable view, (count,)."""
         kind, count, at = self._at[path]
         return data[at : at + np.dtype(kind).itemsize * count].view(kind)
 
     def motors(self, data: Array, name: str) -> Array:
-        """A field of all motors, (35,) or (35, count), as a copy."""
+        """Return a field of all motors, (35,) or (35, count), as a copy."""
         kind, count, _ = self._at[self._path(name)]
         size = np.dtype(kind).itemsize * count
         values = np.ascontiguousarray(data[self.columns[name][:, None] + np.arange(size)]).view(kind)
@@ -114,9 +115,11 @@ class Message:
         return next(path for path in self._at if path.endswith(f"[0].{name}"))
 
     def checksum(self, data: Array) -> int:
-        """CRC-32/MPEG-2 of the words of the C struct: polynomial 0x04c11db7, start 0xffffffff, highest bit first."""
+        """Return CRC-32/MPEG-2 of the C struct's words: polynomial 0x04c11db7, start 0xffffffff, highest bit first."""
         ordered = np.append(data, np.uint8(0))[self._gather]
-        mirrored = zlib.crc32(MIRROR[ordered].tobytes()) ^ 0xFFFFFFFF  # zlib's is the same with all bits mirrored
+        mirrored = (
+            zlib.crc32(MIRRORED_BYTES[ordered].tobytes()) ^ 0xFFFFFFFF
+        )  # zlib's is the same with all bits mirrored
         return int(f"{mirrored:032b}"[::-1], 2)
 
     def seal(self, data: Array) -> None:
@@ -124,10 +127,10 @@ class Message:
         self.view(data, "crc")[0] = self.checksum(data)
 
     def intact(self, data: Array) -> bool:
-        """Whether the checksum is right."""
+        """Return True if the checksum is right."""
         return int(self.view(data, "crc")[0]) == self.checksum(data)
 
 
-MIRROR = np.array([int(f"{b:08b}"[::-1], 2) for b in range(256)], np.uint8)
+MIRRORED_BYTES = np.array([int(f"{b:08b}"[::-1], 2) for b in range(256)], np.uint8)
 LowState = Message(LOW_STATE, "motor_state")
 LowCmd = Message(LOW_CMD, "motor_cmd")

@@ -1,7 +1,9 @@
-"""Drivers by kind; a driver's module is imported when one of its kind is opened."""
+"""Drivers by name: those of this package and of extensions (entry points `gaponet.drivers`), imported when opened."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +11,34 @@ from gaponet import plugins
 from gaponet.hw.control.driver import Driver
 from gaponet.robot.spec import RobotSpec, load_robot
 
-DRIVERS = {"so101": "gaponet.hw.drivers.so101:SO101Driver", "unitree": "gaponet.hw.drivers.unitree:UnitreeDriver"}
+DRIVERS = {"unitree": "gaponet.hw.drivers.unitree:UnitreeDriver", "so101": "gaponet.hw.drivers.so101:SO101Driver"}
+
+
+def driver_names() -> tuple[str, ...]:
+    """Return the names of all installed drivers, extensions included; nothing is imported."""
+    return tuple(plugins.registry(plugins.DRIVERS, DRIVERS))
+
+
+def supported_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those options that the driver of a name has parameters for.
+
+    Raises:
+        UsageError: There is no such driver, or its package is broken.
+    """
+    parameters = inspect.signature(plugins.require(plugins.DRIVERS, name, DRIVERS, "driver")).parameters
+    return {option: value for option, value in options.items() if option in parameters}
 
 
 def open_driver(kind: str, robot: RobotSpec | str | Path, **options: Any) -> Driver:
-    """A driver, not yet connected.
+    """Return a driver that is not yet connected.
 
     Args:
-        kind: unitree, so101 or that of an extension; virtual ones live in the caller's process and are made there
-            (testing.virtual_driver).
-        options: Options of the driver's class.
+        kind: One of driver_names(). Virtual robots live in the caller's process (testing.virtual_driver).
+        robot: The robot, its name or its folder.
+        options: Parameters of the driver's class or function.
+
+    Raises:
+        UsageError: There is no such driver, or its package is broken.
     """
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     driver: Driver = plugins.require(plugins.DRIVERS, kind, DRIVERS, "driver")(spec, **options)

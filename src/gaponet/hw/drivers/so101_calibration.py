@@ -1,4 +1,4 @@
-"""What a LeRobot calibration says of an SO-101: in a JSON file, and in the servos themselves."""
+"""LeRobot's calibration of an SO-101, from its JSON file or from the servos themselves."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from gaponet.base.structure import read_json
 from gaponet.hw.control.driver import DriverError
 from gaponet.robot.spec import RobotSpec
 
-STEPS = 4096  # of an encoder, a turn
-STEP = 2 * np.pi / STEPS  # rad
-SPEAK = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")  # servo 1 to 6
-TURNS, GRIPPER = "wrist_roll", "gripper"  # has no stops; has its zero at one
-WHERE = "~/.cache/huggingface/lerobot/calibration/robots/so_follower/ID.json"
+STEPS_PER_TURN = 4096  # of an encoder
+STEP_RAD = 2 * np.pi / STEPS_PER_TURN
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")  # servo 1 to 6
+CONTINUOUS_JOINT, GRIPPER = "wrist_roll", "gripper"  # without stops; with its zero at a stop
+USUAL_FILE = "~/.cache/huggingface/lerobot/calibration/robots/so_follower/ID.json"
 
-Position = Annotated[int, at.Interval(ge=0, le=STEPS - 1)]
+Position = Annotated[int, at.Interval(ge=0, le=STEPS_PER_TURN - 1)]
 
 
 @dataclass(frozen=True)
 class ServoRow:
-    """One joint's row of the file; the register of that name holds the same, drive_mode and id aside."""
+    """Calibration of one joint: row of the file; all but id and drive_mode are also registers of the servo."""
 
     id: Annotated[int, at.Interval(ge=1, le=253)]
     drive_mode: Annotated[int, at.Interval(ge=0, le=1)]
@@ -36,86 +36,106 @@ class ServoRow:
 
 
 class ArmCalibration:
-    """Encoder steps ↔ rad of every joint, in the robot's order.
+    """Converts encoder steps to rad and back, for every joint in the robot's order.
 
-    0 rad is the middle of a joint's calibrated range, as in LeRobot. The gripper's is where it is in the MJCF: its
-    lower limit is the end of the range at which the jaw is closed.
+    0 rad is the middle of a joint's calibrated range, as in LeRobot. For the gripper it is the zero of the MJCF, whose
+    lower limit is the end of the calibrated range at which the jaw is closed.
+
+    Attributes:
+        rows: Calibration of each joint, by its name.
+        servos: Their ids.
+        low, high: Ends of the calibrated range, steps.
+        sign: 1 or −1: direction of the joint.
+        zero: Step at 0 rad.
     """
 
     def __init__(self, rows: dict[str, ServoRow], robot: RobotSpec) -> None:
         """
         Args:
+            rows: Calibration of each joint, by its name.
             robot: Order of the joints, and the gripper's lower limit.
         """
         ordered = [rows[joint] for joint in robot.joint_names]
         self.rows, self.servos = rows, [row.id for row in ordered]
         self.low, self.high = (np.array([getattr(row, end) for row in ordered]) for end in ("range_min", "range_max"))
         self.sign = np.array([-1.0 if row.drive_mode else 1.0 for row in ordered])
-        self.zero = (self.low + self.high) / 2  # step at 0 rad
+        self.zero = (self.low + self.high) / 2
         jaw = robot.index([GRIPPER])[0]
         closed = self.low[jaw] if self.sign[jaw] > 0 else self.high[jaw]
-        self.zero[jaw] = closed - self.sign[jaw] * robot.qpos_range[jaw, 0] / STEP
+        self.zero[jaw] = closed - self.sign[jaw] * robot.qpos_range[jaw, 0] / STEP_RAD
 
     @property
     def qpos_range(self) -> Array:
-        """Where the calibrated range ends, (n, 2) rad."""
+        """Calibrated range, (n, 2) rad."""
         return np.sort(np.stack([self.qpos(self.low), self.qpos(self.high)], axis=1), axis=1)
 
     def qpos(self, steps: Array) -> Array:
-        """Steps (n) → rad (n)."""
-        return (steps - self.zero) * STEP * self.sign
+        """Return rad (n) of steps (n)."""
+        return (steps - self.zero) * STEP_RAD * self.sign
 
     def steps(self, qpos: Array) -> Array:
-        """Rad (n) → the nearest whole steps (n) within the calibrated range."""
-        return np.clip(np.rint(qpos / (STEP * self.sign) + self.zero), self.low, self.high).astype(int)
+        """Return the nearest whole steps (n) within the calibrated range, of rad (n)."""
+        return np.clip(np.rint(qpos / (STEP_RAD * self.sign) + self.zero), self.low, self.high).astype(int)
 
 
 def read_calibration(path: str | Path, robot: RobotSpec) -> ArmCalibration:
-    """The calibration of a file that lerobot-calibrate wrote.
+    """Return the calibration of a file that lerobot-calibrate wrote.
 
     Raises:
-        UsageError: The file is not one, or lacks a joint.
+        UsageError: The file is no calibration, or lacks a joint.
     """
-    hint = f"give the file that lerobot-calibrate wrote for this arm ({WHERE})"
+    hint = f"give the file that lerobot-calibrate wrote for this arm ({USUAL_FILE})"
     rows = read_json(dict[str, ServoRow], Path(path), UsageError, hint)
-    for joint in SPEAK:
+    for joint in JOINTS:
         if joint not in rows:
             raise UsageError(f"{path}: no joint '{joint}', only {', '.join(rows) or 'none'}; {hint}")
         if rows[joint].range_min >= rows[joint].range_max:
             raise UsageError(f"{path}: {joint}: range_min is not below range_max; calibrate again")
-    if len({rows[joint].id for joint in SPEAK}) < len(SPEAK):
+    if len({rows[joint].id for joint in JOINTS}) < len(JOINTS):
         raise UsageError(f"{path}: two joints have the same id; {hint}")
-    return ArmCalibration({joint: rows[joint] for joint in SPEAK}, robot)
+    return ArmCalibration({joint: rows[joint] for joint in JOINTS}, robot)
 
 
-def numbered(robot: RobotSpec) -> ArmCalibration:
-    """Calibration of an arm of which only the servos' numbers are known, 1 to 6."""
-    whole = {joint: ServoRow(id=i + 1, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS - 1)
-             for i, joint in enumerate(SPEAK)}  # fmt: skip
-    return ArmCalibration(whole, robot)
+def uncalibrated(robot: RobotSpec) -> ArmCalibration:
+    """Return a calibration with the whole range of each encoder, for servos with the ids 1 to 6."""
+    rows = {joint: ServoRow(id=i + 1, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS_PER_TURN - 1)
+             for i, joint in enumerate(JOINTS)}  # fmt: skip
+    return ArmCalibration(rows, robot)
 
 
-def settle(given: ArmCalibration | None, held: dict[str, ServoRow], robot: RobotSpec, port: str) -> ArmCalibration:
-    """The calibration that holds: the file's if the servos hold the same, or the servos' own without a file.
+def resolve_calibration(
+    file: ArmCalibration | None, stored: dict[str, ServoRow], robot: RobotSpec, port: str
+) -> ArmCalibration:
+    """Return the calibration of the file if the servos store the same, or the servos' own without a file.
+
+    Args:
+        file: From the file; None without one.
+        stored: In the servos, by joint.
+        robot: Order of the joints.
+        port: For messages.
 
     Raises:
-        DriverError: The two differ, or neither says where the joints end.
+        DriverError: The two differ, or neither has the ends of the joints.
     """
-    if given is None:
-        blank = [j for j in SPEAK if j != TURNS and held[j].range_max - held[j].range_min >= STEPS - 1]
+    if file is None:
+        blank = [
+            j
+            for j in JOINTS
+            if j != CONTINUOUS_JOINT and stored[j].range_max - stored[j].range_min >= STEPS_PER_TURN - 1
+        ]
         if blank:
             raise DriverError(
                 f"{port}: the servos hold no calibration (no limits in {', '.join(blank)}); run lerobot-calibrate, "
-                f"which writes it into them, and say --calibration FILE ({WHERE})"
+                f"which writes it into them, and say --calibration FILE ({USUAL_FILE})"
             )
-        return ArmCalibration(held, robot)
-    for joint in SPEAK:
+        return ArmCalibration(stored, robot)
+    for joint in JOINTS:
         for field in ("homing_offset", "range_min", "range_max"):
-            said, found = getattr(given.rows[joint], field), getattr(held[joint], field)
-            if said != found:
+            in_file, in_servo = getattr(file.rows[joint], field), getattr(stored[joint], field)
+            if in_file != in_servo:
                 raise DriverError(
-                    f"{port}: {field} of {joint} is {said} in the calibration file and {found} in servo "
-                    f"{given.rows[joint].id}: the file of another arm, or an older one. Calibrate again, or let "
+                    f"{port}: {field} of {joint} is {in_file} in the calibration file and {in_servo} in servo "
+                    f"{file.rows[joint].id}: the file of another arm, or an older one. Calibrate again, or let "
                     "LeRobot write the file into the servos"
                 )
-    return given
+    return file

@@ -1,13 +1,17 @@
-"""UnitreeDriver: the H1-2 over DDS. State from rt/lowstate, commands to rt/arm_sdk or rt/lowcmd.
+"""UnitreeDriver: the H1-2 over DDS. States from rt/lowstate, commands to rt/arm_sdk or rt/lowcmd.
 
-Facts from Unitree's public SDK examples (h1_2_arm_sdk_dds_example.cpp, h1_2_low_level_example.py): motor numbers,
-topics, the weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine echoed from the state, mode_pr 0 for
-pitch/roll ankles. Tested against a virtual robot and against programs on Unitree's IDL and DDS version only. Not
-checked, for want of a robot: that `tick` counts milliseconds (measured when connecting; arrival times are used where it
-does not), how the robot behaves when commands cease, the sign and scale of tau_est, that slots without a motor stay
-zero, that motorstate is 0 where all is well. The arm_sdk example numbers the wrists yaw, pitch, roll, the low-level one
-roll, pitch, yaw (17 to 19 and 24 to 26): ours follows the latter, as the MJCF does; check it with one small wrist
-motion first.
+Motor numbers, topics, the weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine echoed from the state,
+and mode_pr 0 for pitch/roll ankles are from Unitree's public SDK examples (h1_2_arm_sdk_dds_example.cpp,
+h1_2_low_level_example.py). Tested against a virtual robot and against programs on Unitree's IDL and DDS version only.
+Not checked, for want of a robot:
+
+- that `tick` counts milliseconds (measured when connecting; arrival times are used where it does not)
+- how the robot behaves when commands cease
+- the sign and scale of tau_est
+- that slots without a motor stay zero, and that motorstate is 0 without an error
+
+The arm_sdk example numbers the wrists yaw, pitch, roll, the low-level one roll, pitch, yaw (17 to 19 and 24 to 26).
+This driver follows the latter, as the MJCF does; check it with one small wrist motion first.
 """
 
 from __future__ import annotations
@@ -21,14 +25,14 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.hw.control.driver import DriverError, End, Fault, State
-from gaponet.hw.control.hardware import outside_range, require_motor_limits
-from gaponet.hw.control.safety import damping
+from gaponet.hw.control.driver import DriverError, EndAction, Fault, State
+from gaponet.hw.control.hardware import range_violation, require_motor_limits
+from gaponet.hw.control.safety import damping_gains
 from gaponet.hw.drivers import hg
 from gaponet.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
-    from gaponet.hw.drivers.dds import Bus
+    from gaponet.hw.drivers.dds import Bus, Reader, Writer
 
 Topic = Literal["arm_sdk", "lowcmd"]
 Joints = Literal["arms", "upper_body", "all"]
@@ -40,17 +44,19 @@ MOTOR_NAMES = (
     "torso_joint",
     *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in ARM),
 )
-SPOKEN = ("mode", "q", "dq", "tau_est", "temperature", "vol", "motorstate")
+FIRST_MOTOR = {"arms": 13, "upper_body": 12, "all": 0}  # of the commanded ones
+MOTOR_FIELDS = ("mode", "q", "dq", "tau_est", "temperature", "vol", "motorstate")  # not all 0 in a slot with a motor
 WEIGHT_MOTOR = 27
-DAMPING = 4.0  # times the robot's kd: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
+KD_FACTOR = 4.0  # of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
 VIRTUAL_MARK = 0x54524956  # "VIRT" in LowState.reserve[0], written by our virtual robot
-TICKS = (0.001, 0.002)  # s, what a tick may be
-DRIFT = 2e-4  # how much slower the robot's clock may run than ours
-G1_MACHINES = (1, 2, 3, 4, 5, *range(10, 17))  # mode_machine of a G1 (unitree_ros); 6 is said of both, slots decide
+TICK_PERIODS_S = (0.001, 0.002)  # that the robot's tick may have
+MAX_CLOCK_DRIFT = 2e-4  # of the robot's clock, relative to ours
+G1_MACHINES = (1, 2, 3, 4, 5, *range(10, 17))  # mode_machine of a G1 (unitree_ros); 6 may be either, slots decide
 SELECT, L2_B = 1 << 3, 1 << 5 | 1 << 9  # stop keys in bytes 2 and 3 of wireless_remote
-CONNECT = 3.0  # s to wait for a robot
-LISTEN = 0.4  # s to listen for its rate
-SILENT = 0.5  # s without a state after which nobody knows what the robot does
+MAX_QUATERNION_ERROR = 0.1  # of its length
+CONNECT_TIMEOUT_S = 3.0
+LISTEN_S = 0.4  # in which the rate of the robot's tick is measured
+MAX_SILENCE_S = 0.5  # without a state after which nobody knows the robot's state
 
 
 class UnitreeDriver:
@@ -58,6 +64,7 @@ class UnitreeDriver:
 
     noisy = True
     reads_back = False
+    at_stop = "damps"
 
     def __init__(
         self,
@@ -71,49 +78,55 @@ class UnitreeDriver:
     ) -> None:
         """
         Args:
-            robot: The H1-2; its kp and kd, as before any identification, are sent with every command.
+            robot: The H1-2; its kp and kd before identification are sent with every command.
             topic: arm_sdk leaves legs and balance to the robot; lowcmd switches off all motors that are not commanded
                 and is for a robot that hangs.
             joints: arms, upper_body (with torso), or all.
             domain: DDS domain; 0 on a robot.
             interface: Network interface to the robot; lo for a virtual one on this machine.
-            sole: Refuse to connect where somebody else publishes the topic.
-            silent: Only listen: nothing is published, and whoever publishes is left in peace.
+            sole: Refuse to connect if another participant publishes the topic.
+            silent: Only listen: publish nothing, and accept other publishers.
+
+        Raises:
+            UsageError: The robot is no H1-2, or the topic does not take the legs.
+            RobotError: Gains or effort limits exceed those of the motors.
         """
         if set(robot.joint_names) != set(MOTOR_NAMES):
             raise UsageError(f"the unitree driver is for the 27 joints of h1_2; {robot.name} has others")
         if joints == "all" and topic != "lowcmd":
             raise UsageError("rt/arm_sdk does not take the legs; use joints arms or upper_body, or topic lowcmd")
         require_motor_limits(robot, "h1_2")
-        first = {"arms": 13, "upper_body": 12, "all": 0}[joints]
+        nominal = robot.before_identification
         self.robot, self.topic, self.joints = robot, topic, joints
-        self.kp, self.kd = (robot.nominal or robot).kp, (robot.nominal or robot).kd
+        self.kp, self.kd, self._effort_limit = nominal.kp, nominal.kd, nominal.effort_limit
         self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
-        self.at_end: End = "hand_over" if topic == "arm_sdk" else "damp"
-        self.at_stop = "damps"
+        self.at_end: EndAction = "hand_over" if topic == "arm_sdk" else "damp"
         self.domain, self.interface, self.sole, self.silent = domain, interface, sole, silent
         self.address = f"unitree dds domain {domain}"
         self.virtual = False
         self.joint_names = robot.joint_names
+        first = FIRST_MOTOR[joints]
         self.commanded = tuple(name for name in robot.joint_names if MOTOR_NAMES.index(name) >= first)
         self._motor = np.array([MOTOR_NAMES.index(name) for name in robot.joint_names])
         self._at = robot.index(self.commanded)
-        # As Unitree's own arm_sdk example does: with weight 1 the waist is ours, whether a motion moves it or not.
+        # As in Unitree's own arm_sdk example: with weight 1 the waist is ours, whether a motion moves it or not.
         held = [n for n in robot.joint_names if n == "torso_joint" and n not in self.commanded and topic == "arm_sdk"]
         self._held = robot.index(held)
-        self._found: Array | None = None  # where the held joints were at the first command, rad
+        self._held_qpos: Array | None = None  # of the held joints at the first command, rad
         self._command = hg.LowCmd.new()
-        self._refused = self.received = 0
-        self._fault: Fault | None = None  # the first one that the robot told; it may be in one message only
+        self._refused = self.received = self._machine = 0
+        self._fault: Fault | None = None  # the first one that the robot reported; it may be in one message only
         self._state: State | None = None
+        self._clock: TickClock | None = None
         self._bus: Bus | None = None
+        self._reader: Reader | None = None
+        self._writer: Writer | None = None
 
     def connect(self) -> None:
-        """Find the robot, learn its tick and machine mode, and make sure that nobody else commands it."""
+        """Find the robot, learn its tick and machine mode, and refuse if another participant commands it."""
         from gaponet.hw.drivers import dds
 
-        self._dds = dds
         self._bus = dds.Bus(self.domain, self.interface)
         topic = f"rt/{self.topic}"
         self._reader = self._bus.reader("rt/lowstate", dds.LowState)
@@ -125,74 +138,76 @@ class UnitreeDriver:
                 f"others publish {topic} on {self.interface}: {'; '.join(others)}; stop them first (on the "
                 "robot: leave debug programs, and for lowcmd release the motion mode)"
             )
-        heard = self._listen()
-        self._require_h1_2([data for _, data in heard])
-        self._clock = TickClock([now for now, _ in heard], [int(hg.LowState.view(d, "tick")[0]) for _, d in heard])
-        self._state = self._decode(heard[-1][1], heard[-1][0])
+        arrivals, messages = self._listen(self._reader)
+        self._require_h1_2(messages)
+        self._clock = TickClock(arrivals, [int(hg.LowState.view(data, "tick")[0]) for data in messages])
+        self._state = self._decode(messages[-1], self._clock, arrivals[-1])
         hg.LowCmd.view(self._command, "mode_machine")[:] = self._machine
         self.facts = {"mode_machine": self._machine, "topic": self.topic}
 
-    def _listen(self) -> list[tuple[float, Array]]:
-        """Intact messages of a while, and when they came."""
-        heard: list[tuple[float, Array]] = []
+    def _listen(self, reader: Reader) -> tuple[list[float], list[Array]]:
+        """Return the arrival times, s, of the intact messages of LISTEN_S, and these."""
+        arrivals: list[float] = []
+        messages: list[Array] = []
         start = time.monotonic()
-        while not heard or time.monotonic() < heard[0][0] + LISTEN:
+        while not arrivals or time.monotonic() < arrivals[0] + LISTEN_S:
             now = time.monotonic()
-            for data in self._dds.receive(self._reader)[-1:]:
+            for data in reader.receive()[-1:]:
                 if self._intact(data):
-                    heard.append((now, data))
-            if now - start > CONNECT and not heard:
+                    arrivals.append(now)
+                    messages.append(data)
+            if now - start > CONNECT_TIMEOUT_S and not arrivals:
                 wrong = f"; {self._refused} messages came, all damaged or of another type" if self._refused else ""
                 raise DriverError(
                     f"nobody speaks on rt/lowstate, domain {self.domain}, interface {self.interface}, within "
-                    f"{CONNECT:g} s{wrong}. Is the robot on, the cable in, the interface right? A virtual "
+                    f"{CONNECT_TIMEOUT_S:g} s{wrong}. Is the robot on, the cable in, the interface right? A virtual "
                     "one: gaponet virtual serve"
                 )
             time.sleep(0.001)
-        return heard
+        return arrivals, messages
 
     def _intact(self, data: Array) -> bool:
-        """Whether a message is whole; others are counted."""
+        """Return True if size and checksum of a message are right; count the others."""
         intact = len(data) == hg.LowState.wire_size and hg.LowState.intact(data)
         self._refused += not intact
         return intact
 
-    def _require_h1_2(self, heard: list[Array]) -> None:
-        """Refuse a robot that is not an H1-2: by its kind, and by which of the 35 motor slots ever say anything."""
-        self._machine = int(hg.LowState.view(heard[-1], "mode_machine")[0])
-        said = [np.abs(hg.LowState.motors(data, name)).reshape(hg.MOTORS, -1) for data in heard for name in SPOKEN]
-        spoken = np.concatenate(said, axis=1).max(axis=1) != 0
-        strange, silent = np.flatnonzero(spoken[len(MOTOR_NAMES) :]), np.flatnonzero(~spoken[: len(MOTOR_NAMES)])
+    def _require_h1_2(self, messages: list[Array]) -> None:
+        """Refuse a robot that is not an H1-2, by its mode_machine and by which of the 35 motor slots are not all 0."""
+        self._machine = int(hg.LowState.view(messages[-1], "mode_machine")[0])
+        fields = [hg.LowState.motors(data, name) for data in messages for name in MOTOR_FIELDS]
+        values = np.concatenate([field.reshape(hg.MOTORS, -1) for field in fields], axis=1)
+        used = np.abs(values).max(axis=1) != 0
+        strange, missing = np.flatnonzero(used[len(MOTOR_NAMES) :]), np.flatnonzero(~used[: len(MOTOR_NAMES)])
         if self._machine in G1_MACHINES:
-            found = f"its mode_machine is {self._machine}, a G1's"
+            reason = f"its mode_machine is {self._machine}, a G1's"
         elif len(strange):
-            found = f"there are motors in slots {', '.join(str(len(MOTOR_NAMES) + i) for i in strange)}, a G1's"
-        elif len(silent):
-            found = f"no motor in slot {silent[0]}, {MOTOR_NAMES[silent[0]]}"
+            reason = f"there are motors in slots {', '.join(str(len(MOTOR_NAMES) + i) for i in strange)}, a G1's"
+        elif len(missing):
+            reason = f"no motor in slot {missing[0]}, {MOTOR_NAMES[missing[0]]}"
         else:
             return
-        raise DriverError(f"the robot on {self.interface} is not an H1-2: {found}; nothing was sent")
+        raise DriverError(f"the robot on {self.interface} is not an H1-2: {reason}; nothing was sent")
 
     def read(self) -> State:
-        """The newest state whose checksum is right; its time is the robot's, mapped to ours (TickClock)."""
-        self._drain()
+        """Return the newest state with a right checksum; its time is the robot's, mapped to ours (TickClock)."""
         assert self._state is not None
-        return self._state
-
-    def _drain(self) -> None:
+        assert self._reader is not None
+        assert self._clock is not None
         now, newest = time.monotonic(), None
-        for data in self._dds.receive(self._reader):
+        for data in self._reader.receive():
             if self._intact(data):
                 newest = data
                 self.received += 1
-                self._fault = self._fault or self._told(data)
+                self._fault = self._fault or self._reported_fault(data)
         if newest is not None:
-            self._state = self._decode(newest, now)
-        elif self._state is not None and self._refused != self._state.refused:
+            self._state = self._decode(newest, self._clock, now)
+        elif self._refused != self._state.refused:
             self._state = replace(self._state, refused=self._refused)
+        return self._state
 
-    def _told(self, data: Array) -> Fault | None:
-        """What a robot says itself: its operator's stop keys, motor errors, that it is another one."""
+    def _reported_fault(self, data: Array) -> Fault | None:
+        """Return what the robot itself reports: its operator's stop keys, motor errors, another mode_machine."""
         keys = int(hg.LowState.view(data, "wireless_remote")[2:4].view("<u2")[0])
         if keys & SELECT or keys & L2_B == L2_B:
             return Fault("stop", f"asked to stop: {'select' if keys & SELECT else 'L2 + B'} on the robot's remote")
@@ -205,86 +220,90 @@ class UnitreeDriver:
             return Fault("robot", f"{MOTOR_NAMES[motor]} reports error 0x{errors[motor]:x}")
         return None
 
-    def _decode(self, data: Array, now: float) -> State:
+    def _decode(self, data: Array, clock: TickClock, now: float) -> State:
         message, at = hg.LowState, self._motor
-        measured = self._clock.time(int(message.view(data, "tick")[0]), now)
+        measured = clock.time(int(message.view(data, "tick")[0]), now)
         self.virtual = int(message.view(data, "reserve")[0]) == VIRTUAL_MARK
         q, dq, tau = (message.motors(data, name)[at].astype(float) for name in ("q", "dq", "tau_est"))
         temperature = message.motors(data, "temperature")[at].max(axis=1).astype(float)  # case and winding
         _, x, y, _ = quaternion = message.view(data, "imu_state.quaternion").astype(float)
-        # The vertical's share along the trunk; a quaternion that is none gives NaN, which is a tilt too.
-        upright = 1.0 - 2.0 * (x * x + y * y) if abs(np.linalg.norm(quaternion) - 1.0) < 0.1 else np.nan
+        # The vertical's component along the trunk; an invalid quaternion gives NaN, which counts as tilt.
+        valid = abs(np.linalg.norm(quaternion) - 1.0) < MAX_QUATERNION_ERROR
+        upright = 1.0 - 2.0 * (x * x + y * y) if valid else np.nan
         tilt = float(np.arccos(np.clip(upright, -1.0, 1.0)))
         return State(measured, q, dq, tau, temperature, self._refused, tilt, self._fault)
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
-        """Targets with the robot's gains; on rt/arm_sdk the weight tells how far it hands over.
+        """Send targets with the robot's gains; the weight is our share of control on rt/arm_sdk.
 
-        There the torso is held where it was found at the first command, if it is not commanded.
+        There the torso is held where it was at the first command, if it is not commanded.
+
+        Raises:
+            DriverError: A target is outside its joint's range, or DDS refuses the message.
         """
-        if problem := outside_range(self.robot, ctrl, self._at):
+        if problem := range_violation(self.robot, ctrl, self._at):
             raise DriverError(f"{problem}; it was not sent")
         self._send(ctrl, self.kp, self.kd, weight)
 
     def verify(self) -> None:
-        """Nothing can be asked; whether its joints follow is the controller's to watch."""
+        """Do nothing: nothing can be read back. The controller checks that the joints follow."""
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
-        """Stiffness zero and damping gains, no more than the effort limits allow at the present speed.
+        """Send stiffness 0 and damping gains, at most those that the effort limits allow at the present speed.
 
-        A torso that is only held stays held, until the weight is given back: a trunk that swings is no way to brake.
+        A torso that is only held stays held until the weight is 0: a trunk must not swing while the arms brake.
         """
         state = self._state
         qpos = np.nan_to_num(state.qpos) if state else np.zeros(len(self._motor))
         qvel = state.qvel if state else np.zeros(len(self._motor))
-        kd = damping(DAMPING * self.kd, qvel, (self.robot.nominal or self.robot).effort_limit)
+        kd = damping_gains(KD_FACTOR * self.kd, qvel, self._effort_limit)
         self._send(qpos, np.zeros_like(kd), kd, weight)
 
     def _send(self, ctrl: Array, kp: Array, kd: Array, weight: float) -> None:
-        if self._bus is None or self.silent:
+        if self._writer is None or self.silent:
             return
-        if self._found is None:
-            self._found = (ctrl if self._state is None else self._state.qpos)[self._held]
+        if self._held_qpos is None:
+            self._held_qpos = (ctrl if self._state is None else self._state.qpos)[self._held]
         motors, held, data = self._motor[self._at], self._held, self._command
-        for name, values, still in (
+        for name, values, held_values in (
             ("mode", np.ones(len(ctrl)), np.ones(len(held))),
-            ("q", ctrl, np.nan_to_num(self._found)),
-            ("kp", kp, np.where(np.isfinite(self._found), self.kp[held], 0.0)),
+            ("q", ctrl, np.nan_to_num(self._held_qpos)),
+            ("kp", kp, np.where(np.isfinite(self._held_qpos), self.kp[held], 0.0)),
             ("kd", kd, self.kd[held]),
         ):
             column = np.zeros(hg.MOTORS)
             column[motors] = values[self._at]
-            column[self._motor[held]] = still
+            column[self._motor[held]] = held_values
             if name == "q" and self.topic == "arm_sdk":
                 column[WEIGHT_MOTOR] = weight
             hg.LowCmd.set_motors(data, name, column)
         hg.LowCmd.seal(data)
-        self._dds.send(self._writer, self._dds.LowCmd, data)
+        self._writer.send(data)
 
     def confirm(self) -> str:
-        """It is still there and heard the damping, as far as a robot that only tells its state can show."""
+        """Check that the robot still sends states; it reports nothing else of its damping."""
         state = self.read()
-        if (age := time.monotonic() - state.time) > SILENT:
+        if (age := time.monotonic() - state.time) > MAX_SILENCE_S:
             raise DriverError(f"nothing was heard of the robot for {age:.1f} s")
         return "damped and let go"
 
     def close(self, hold: bool = False) -> None:
-        """Leave the bus; after damping on rt/arm_sdk the last word is weight 0: the arms are the robot's own again."""
+        """Leave the bus; after damping the last message has weight 0: the arms are the robot's own again (arm_sdk)."""
         if self._bus is None:
             return
         with contextlib.suppress(DriverError):
             if not hold:
                 self.damp(0.0)
-        self._bus = self._reader = self._writer = None  # type: ignore[assignment]
+        self._bus = self._reader = self._writer = None
 
     def publishers(self) -> dict[str, list[str]]:
-        """Who else publishes on the bus: topic → programs; those of the robot's topics are always named."""
+        """Return the other publishers on the bus: topic → programs; the robot's topics are always included."""
         assert self._bus is not None
-        found = self._bus.publishers()
-        return {topic: found[topic] for topic in ("rt/lowstate", "rt/arm_sdk", "rt/lowcmd", *sorted(found))}
+        publishers = self._bus.publishers()
+        return {topic: publishers[topic] for topic in ("rt/lowstate", "rt/arm_sdk", "rt/lowcmd", *sorted(publishers))}
 
     def watchdog(self) -> dict[str, object] | None:
-        """A second participant that is connected from the start and silent while the controller lives."""
+        """Return the options of a second participant: connected from the start, and silent until it damps."""
         return {
             "kind": "unitree", "robot": str(self.robot.folder.resolve()), "early": True, "topic": self.topic,
             "joints": self.joints, "domain": self.domain, "interface": self.interface, "sole": False,
@@ -292,34 +311,44 @@ class UnitreeDriver:
 
 
 class TickClock:
-    """Maps the robot's tick to this machine's monotonic clock, so that late messages are seen to be old.
+    """Maps the robot's tick to this machine's monotonic clock, so that delayed messages are seen to be old.
 
-    The offset is the smallest (arrival − tick) seen, that is, the fastest way a message ever took; it may grow slowly,
-    in case the robot's clock is slower than ours.
+    The offset is the smallest (arrival − tick) seen: that of the fastest message so far. It may grow slowly, in case
+    the robot's clock is slower than ours.
     """
 
     def __init__(self, arrivals: list[float], ticks: list[int]) -> None:
-        passed = (arrivals[-1] - arrivals[0]) / max((ticks[-1] - ticks[0]) % 2**32, 1)
-        self.tick = next((t for t in TICKS if 0.7 < passed / t < 1.4), None)  # s; None: not a clock, use arrivals
-        self._last_tick, self._turns = ticks[0], 0
-        self._offset, self._at, self._time = np.inf, arrivals[0], arrivals[0]
+        """
+        Args:
+            arrivals: Times of the first messages, s of the monotonic clock.
+            ticks: Their ticks.
+        """
+        period = (arrivals[-1] - arrivals[0]) / max((ticks[-1] - ticks[0]) % 2**32, 1)
+        # s; None: the tick is no clock, and arrival times are used
+        self.period = next((p for p in TICK_PERIODS_S if 0.7 < period / p < 1.4), None)
+        self._last_tick, self._wraps = ticks[0], 0
+        self._offset, self._last_arrival, self._time = np.inf, arrivals[0], arrivals[0]
         for arrival, tick in zip(arrivals, ticks, strict=True):
             self.time(tick, arrival)
 
     def time(self, tick: int, arrival: float) -> float:
-        """The time when the state with this tick was measured, s, at most its arrival; one tick always has one time."""
+        """Return the time at which the state with this tick was measured, s, at most its arrival.
+
+        The same tick always has the same time.
+        """
         if tick == self._last_tick and np.isfinite(self._offset):
             return self._time
         if tick < self._last_tick - 2**31:
-            self._turns += 1
-        elif tick < self._last_tick:  # the robot started again: its clock is another one
+            self._wraps += 1
+        elif tick < self._last_tick:  # the robot has restarted, and its clock with it
             self._offset = np.inf
         self._last_tick = tick
-        if self.tick is None:
+        if self.period is None:
             self._offset, self._time = 0.0, arrival
             return arrival
-        robot = (tick + self._turns * 2**32) * self.tick
-        self._offset = min(arrival - robot, self._offset + DRIFT * max(arrival - self._at, 0.0))
-        self._at = arrival
-        self._time = robot + self._offset
+        robot_time = (tick + self._wraps * 2**32) * self.period
+        drift = MAX_CLOCK_DRIFT * max(arrival - self._last_arrival, 0.0)
+        self._offset = min(arrival - robot_time, self._offset + drift)
+        self._last_arrival = arrival
+        self._time = robot_time + self._offset
         return self._time

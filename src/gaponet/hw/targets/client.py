@@ -1,4 +1,4 @@
-"""The other end of `gaponet run --targets zmq`: a robot as a policy or a teleoperator in another process has it."""
+"""Client of `gaponet run --targets zmq`: the robot as a policy or a teleoperator in another process sees it."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from gaponet.hw.targets.zeromq import ADDRESS
 
 
 class RemoteRobot:
-    """States come from a robot that `gaponet run --targets zmq` commands, targets go to it.
+    """Receives states of a robot that `gaponet run --targets zmq` commands, and sends it targets.
 
         with RemoteRobot() as robot:
             for state in robot:  # the newest, once per control period of the robot
                 robot.send(policy(state.qpos, state.qvel))
 
-    A policy that is slow, stalls or dies leaves the robot held, then damped; it never leaves it waiting.
+    While a policy is slow or stalls the robot is held; after 0.5 s (--live.hold) it damps.
 
     Attributes:
-        joint_names: All joints of the robot, in the order of every array; known from the first state on.
-        commanded: The ones among them that targets may be for.
-        ended: Why the run is over, where it told.
+        joint_names: All joints of the robot, in the order of every array; set with the first state.
+        commanded: Those that targets may name.
+        ended: Why the run is over; empty before.
     """
 
     def __init__(self, address: str = ADDRESS, patience: float = 10.0) -> None:
         """
         Args:
             address: Where `gaponet run` listens.
-            patience: s to wait for a state.
+            patience: Longest wait for a state, s.
         """
         self.address, self.patience = address, patience
         self.joint_names: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ class RemoteRobot:
         for option, value in ((zmq.LINGER, 200), (zmq.SNDHWM, 8), (zmq.RCVHWM, 8)):
             self._socket.setsockopt(option, value)
         self._socket.connect(address)
-        self._say({})
+        self._send({})
 
     def __enter__(self) -> RemoteRobot:
         return self
@@ -54,7 +54,7 @@ class RemoteRobot:
         self.close(end=kind is None)
 
     def __iter__(self) -> Iterator[State]:
-        """The newest state, whenever there is a newer one; until the run is over.
+        """Yield the newest state whenever there is a newer one, until the run is over.
 
         Raises:
             DriverError: No state came for `patience` s.
@@ -63,25 +63,25 @@ class RemoteRobot:
             yield state
 
     def send(self, target: Mapping[str, float] | Array) -> None:
-        """Where the robot shall be now: joint → rad, or an array (n) of all joints, rad, of which the commanded count.
+        """Send a target: joint → rad, or an array (n) of all joints, rad, of which the commanded ones count.
 
         Raises:
-            DriverError: An array before the first state: its joints' names are not known.
+            DriverError: An array was given before the first state, when the order of the joints is not known.
         """
         if not isinstance(target, Mapping):
             if not self.joint_names:
                 raise DriverError("take a state first: only then the order of the joints is known; or name them")
             named = dict(zip(self.joint_names, np.asarray(target, float).tolist(), strict=True))
             target = {name: named[name] for name in self.commanded}
-        self._say({"target": {name: float(value) for name, value in target.items()}})
+        self._send({"target": {name: float(value) for name, value in target.items()}})
 
     def close(self, end: bool = True) -> None:
-        """Leave. With `end` the robot goes back to where it was found; else it holds, then damps."""
+        """Leave. With `end` the robot goes back to where it started; without, it is held, then damps."""
         if end and not self.ended:
-            self._say({"end": True})
+            self._send({"end": True})
         self._context.destroy()
 
-    def _say(self, message: dict[str, object]) -> None:
+    def _send(self, message: dict[str, object]) -> None:
         with contextlib.suppress(zmq.Again):  # nobody reads; the next target is newer
             self._socket.send(json.dumps({"time": time.monotonic()} | message).encode(), zmq.NOBLOCK)
 
@@ -92,10 +92,10 @@ class RemoteRobot:
             )
         with contextlib.suppress(zmq.Again):
             while True:
-                said = json.loads(self._socket.recv(zmq.NOBLOCK))
-                self.ended = said.get("end", "")
+                message = json.loads(self._socket.recv(zmq.NOBLOCK))
+                self.ended = message.get("end", "")
                 if self.ended:
                     return None
-        self.joint_names, self.commanded = tuple(said["joint_names"]), tuple(said["commanded"])
-        qpos, qvel, tau = (np.array(said[name], float) for name in ("qpos", "qvel", "tau"))
-        return State(said["time"], qpos, qvel, tau, np.full_like(qpos, np.nan))
+        self.joint_names, self.commanded = tuple(message["joint_names"]), tuple(message["commanded"])
+        qpos, qvel, tau = (np.array(message[name], float) for name in ("qpos", "qvel", "tau"))
+        return State(message["time"], qpos, qvel, tau, np.full_like(qpos, np.nan))

@@ -1,4 +1,4 @@
-"""What says a controller's targets, once a control period: a motion, a function of your own, or live ones."""
+"""Policies: functions that give a controller's target of each period, from a motion, a user's code, or live targets."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Policy = Callable[[int, State], "Array | Fault | None"]
 
 
 class NotYet(Fault):
-    """There is no first target yet; until there is one nothing is commanded. Later it is a fault as any other."""
+    """There is no first target yet: nothing is commanded until there is one. After the first target it is a fault."""
 
 
-def play(motion: Motion, dt: float) -> Policy:
-    """A motion as a policy: row k in period k."""
+def motion_policy(motion: Motion, dt: float) -> Policy:
+    """Return a policy that plays a motion: row k in period k of dt s."""
     rows = motion.sample(dt)
     return lambda k, state: rows[k] if k < len(rows) else None

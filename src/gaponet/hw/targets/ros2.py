@@ -1,4 +1,4 @@
-# mypy: disable-error-code="misc, type-arg, valid-type, arg-type"
+# mypy: disable-error-code="misc, type-arg, valid-type"
 """Targets from a ROS 2 topic and states to another, over DDS, without ROS.
 
 Messages are those of ros2_control: its joint trajectory controller receives trajectory_msgs/JointTrajectory, its joint
@@ -10,11 +10,8 @@ and takes effect at once. A message without points ends the run. Types and topic
 import struct
 import time
 from collections.abc import Hashable
-from dataclasses import dataclass
 from typing import Any
 
-from cyclonedds.idl import IdlStruct
-from cyclonedds.idl import annotations as annotate
 from cyclonedds.idl.types import float64, int32, sequence, uint32
 
 from gaponet.hw.drivers import dds
@@ -26,60 +23,31 @@ STATES_TOPIC = "rt/joint_states"
 QUEUE_LENGTH = 8  # messages buffered between two calls; decoding one takes 0.1 ms
 MAX_TIME_FROM_START_S = 0.2  # later points belong to a planned trajectory
 
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    sec: int32
-    nanosec: uint32
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class Duration(IdlStruct, typename="builtin_interfaces::msg::dds_::Duration_"):
-    sec: int32
-    nanosec: uint32
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class JointTrajectoryPoint(IdlStruct, typename="trajectory_msgs::msg::dds_::JointTrajectoryPoint_"):
-    positions: sequence[float64]
-    velocities: sequence[float64]
-    accelerations: sequence[float64]
-    effort: sequence[float64]
-    time_from_start: Duration
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class JointTrajectory(IdlStruct, typename="trajectory_msgs::msg::dds_::JointTrajectory_"):
-    header: Header
-    joint_names: sequence[str]
-    points: sequence[JointTrajectoryPoint]
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
-    header: Header
-    name: sequence[str]
-    position: sequence[float64]
-    velocity: sequence[float64]
-    effort: sequence[float64]
+Time = dds.make_struct("builtin_interfaces::msg::dds_::Time_", sec=int32, nanosec=uint32)
+Duration = dds.make_struct("builtin_interfaces::msg::dds_::Duration_", sec=int32, nanosec=uint32)
+Header = dds.make_struct("std_msgs::msg::dds_::Header_", stamp=Time, frame_id=str)
+JointTrajectoryPoint = dds.make_struct(
+    "trajectory_msgs::msg::dds_::JointTrajectoryPoint_",
+    positions=sequence[float64],
+    velocities=sequence[float64],
+    accelerations=sequence[float64],
+    effort=sequence[float64],
+    time_from_start=Duration,
+)
+JointTrajectory = dds.make_struct(
+    "trajectory_msgs::msg::dds_::JointTrajectory_",
+    header=Header,
+    joint_names=sequence[str],
+    points=sequence[JointTrajectoryPoint],
+)
+JointState = dds.make_struct(
+    "sensor_msgs::msg::dds_::JointState_",
+    header=Header,
+    name=sequence[str],
+    position=sequence[float64],
+    velocity=sequence[float64],
+    effort=sequence[float64],
+)
 
 
 def encode(message: Any) -> bytes:
@@ -119,14 +87,14 @@ class ROS2Transport:
 
     def receive(self) -> list[Message]:
         """Return the messages since the last call."""
-        samples = dds.samples(self._reader, QUEUE_LENGTH)
+        samples = self._reader.samples()
         return [to_message(sample.sample_info.publication_handle, bytes(sample.data)) for sample in samples]
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
         """Publish a JointState of all joints, stamped with the wall clock, as ROS does."""
         header = Header(Time(*divmod(time.time_ns(), 10**9)), "")
         message = JointState(header, list(state["joint_names"]), state["qpos"], state["qvel"], state["tau"])
-        dds.send(self._writer, JointState, encode(message))
+        self._writer.send(encode(message))
 
     def close(self, reason: str) -> None:
         """Leave the bus."""

@@ -1,11 +1,10 @@
-"""What the wires bring: JSON over ZeroMQ and through a pipe, ROS 2's messages on a real DDS bus between processes."""
+"""Transports of live targets: JSON over ZeroMQ and through a pipe, ROS 2's messages on a real DDS bus."""
 
 from __future__ import annotations
 
 import json
 import os
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -21,11 +20,11 @@ from gaponet.hw.targets.pipe import PipeTransport
 STATE = {"time": 7.0, "joint_names": ("a", "b"), "commanded": ("b",), "qpos": [0.1, 0.2], "qvel": [0, 0], "tau": [1, 2]}
 
 
-def heard(wire, count, seconds=20.0):
+def received(transport, count, seconds=20.0):
     """At least that many messages."""
     found, deadline = [], time.monotonic() + seconds
     while len(found) < count and time.monotonic() < deadline:
-        found += wire.receive()
+        found += transport.receive()
         time.sleep(0.002)
     return found
 
@@ -33,10 +32,10 @@ def heard(wire, count, seconds=20.0):
 @pytest.fixture
 def listening():
     zeromq = pytest.importorskip("gaponet.hw.targets.zeromq")
-    wire = zeromq.ZeroMQTransport("tcp://127.0.0.1:*")
-    wire.address = wire._socket.last_endpoint.decode()
-    yield wire
-    wire.close("over")
+    transport = zeromq.ZeroMQTransport("tcp://127.0.0.1:*")
+    transport.address = transport._socket.last_endpoint.decode()
+    yield transport
+    transport.close("over")
 
 
 def test_a_policy_takes_states_sends_targets_and_hears_why_it_is_over(listening):
@@ -45,7 +44,7 @@ def test_a_policy_takes_states_sends_targets_and_hears_why_it_is_over(listening)
     with RemoteRobot(listening.address, patience=20.0) as robot:
         with pytest.raises(DriverError, match="take a state first"):
             robot.send(np.zeros(2))
-        (hello,) = heard(listening, 1)
+        (hello,) = received(listening, 1)
         assert not hello.target
         listening.publish(hello.sender, STATE)
         states = iter(robot)
@@ -54,7 +53,7 @@ def test_a_policy_takes_states_sends_targets_and_hears_why_it_is_over(listening)
         np.testing.assert_array_equal(state.qpos, STATE["qpos"])
         robot.send(state.qpos + 1)
         robot.send({"b": 3})
-        one, other = heard(listening, 2)
+        one, other = received(listening, 2)
         assert (one.target, other.target) == ({"b": 1.2}, {"b": 3.0})
         assert one.sender == other.sender == hello.sender
         assert hello.time < one.time < other.time
@@ -70,7 +69,7 @@ def test_a_policy_that_leaves_ends_the_run_and_one_that_crashes_does_not(listeni
         raise ZeroDivisionError
     with RemoteRobot(listening.address):
         pass
-    said = heard(listening, 3)
+    said = received(listening, 3)
     assert [m.end for m in said] == [False, False, True]
     assert len({m.sender for m in said}) == 2
 
@@ -87,8 +86,8 @@ def test_a_stranger_who_says_too_much_is_cut_off_and_nobody_else(listening):
         stranger.send(b"x" * (MAX_MESSAGE_BYTES + 1))
         stranger.send_multipart([b"", b"\x80\x04pickle"])
         sender.send(json.dumps({"time": 1.0, "target": {"a": 0.5}}).encode())
-        found = heard(listening, 1)
-        found += heard(listening, 1, 0.5)
+        found = received(listening, 1)
+        found += received(listening, 1, 0.5)
         assert [m.target for m in found if not m.error] == [{"a": 0.5}]
         assert len(listening.receive()) == 0
         listening.publish(b"nobody", STATE)
@@ -125,22 +124,22 @@ def test_two_cannot_listen_at_one_address(listening):
 
 def test_lines_through_a_pipe_may_come_in_parts_be_too_long_and_cease():
     read, write = os.pipe()
-    wire = PipeTransport(read)
-    assert wire.receive() == []
+    transport = PipeTransport(read)
+    assert transport.receive() == []
     line = b'{"time": 1, "target": {"a": 0.5}}\n'
     os.write(write, line[:7])
-    assert wire.receive() == []
+    assert transport.receive() == []
     os.write(write, line[7:] + line[:-1])
-    assert wire.receive() == [Message("stdin", 1.0, {"a": 0.5})]
+    assert transport.receive() == [Message("stdin", 1.0, {"a": 0.5})]
     os.write(write, b"\n")
-    assert len(wire.receive()) == 1
+    assert len(transport.receive()) == 1
     os.write(write, b"x" * (MAX_MESSAGE_BYTES + 1))
-    assert "has more than" in wire.receive()[0].error
+    assert "has more than" in transport.receive()[0].error
     os.write(write, b"x" * 100 + b'"time": 9}\n' + line)
-    assert [m.target for m in wire.receive()] == [{"a": 0.5}]
+    assert [m.target for m in transport.receive()] == [{"a": 0.5}]
     os.close(write)
-    assert "closed the pipe" in wire.receive()[0].error
-    assert wire.receive() == []
+    assert "closed the pipe" in transport.receive()[0].error
+    assert transport.receive() == []
     os.close(read)
 
 
@@ -195,37 +194,24 @@ def test_plans_and_what_is_no_trajectory_are_refused(ros2):
         assert message.error or message.end or message.target is not None
 
 
-def meet(ros2, domain: int, peer: list, **environ: str) -> tuple[dict, list[Message]]:
-    """What a program at the other end of ROS 2's topics says it has heard, and what it told us."""
-    wire = ros2.ROS2Transport(domain)
-    other = subprocess.Popen(peer, stdout=subprocess.PIPE, text=True, env={**os.environ, **environ})
-    try:
-        found, deadline = [], time.monotonic() + 60
-        while other.poll() is None and time.monotonic() < deadline:
-            wire.publish(None, STATE)
-            found += wire.receive()
-            time.sleep(0.01)
-        assert other.stdout
-        said = json.loads(other.stdout.read())
-    finally:
-        other.kill()
-        other.wait()
-        wire.close("over")
-    assert (
-        said.items()
-        >= {"name": ["a", "b"], "position": [0.1, 0.2], "velocity": [0.0, 0.0], "effort": [1.0, 2.0]}.items()
-    )
-    assert [m.error for m in found if m.error] == []
-    assert {m.sender for m in found} == {found[0].sender}
-    times = [m.time for m in found]
-    assert times == sorted(times)
-    return said, found
+def test_a_trajectory_on_the_bus_arrives_and_states_are_published(ros2):
+    from gaponet.hw.drivers import dds
 
-
-def test_both_ends_of_ros_2s_topics_between_processes(ros2):
     domain = 30 + os.getpid() % 150
-    _, found = meet(ros2, domain, [sys.executable, Path(__file__).with_name("ros2_peer.py"), str(domain)])
-    assert found[-1].target == {"a": 0.25, "b": -0.5}
+    transport, bus = ros2.ROS2Transport(domain), dds.Bus(domain, "lo")
+    writer = bus.writer(ros2.TOPIC, ros2.JointTrajectory)
+    reader = bus.reader(ros2.STATES_TOPIC, ros2.JointState)
+    found, states, deadline = [], [], time.monotonic() + 60
+    while not (found and states) and time.monotonic() < deadline:
+        writer.send(trajectory("ab", [0.25, -0.5])[4:])
+        transport.publish(None, STATE)
+        found += transport.receive()
+        states += reader.receive()
+        time.sleep(0.01)
+    transport.close("over")
+    assert (found[-1].error, found[-1].target) == ("", {"a": 0.25, "b": -0.5})
+    state = ros2.decode(ros2.JointState, bytes(states[-1]))
+    assert (state.name, state.position, state.effort) == (["a", "b"], [0.1, 0.2], [1.0, 2.0])
 
 
 @pytest.mark.peers
@@ -235,7 +221,26 @@ def test_ros_2_itself_is_heard_and_hears_us(ros2, version):
     packages = (f"ros-{version}-{name}" for name in ("rclpy", "rmw-fastrtps-cpp", "sensor-msgs", "trajectory-msgs"))
     python, domain = environment(f"ros-{version}", "3.12", tuple(packages)), 30 + os.getpid() % 150
     there = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    said, found = meet(ros2, domain, [python, Path(__file__).with_name("rclpy_peer.py"), "b"], **there)
+    transport = ros2.ROS2Transport(domain)
+    command = [python, Path(__file__).with_name("rclpy_peer.py"), "b"]
+    peer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, **there})
+    try:
+        found, deadline = [], time.monotonic() + 60
+        while peer.poll() is None and time.monotonic() < deadline:
+            transport.publish(None, STATE)
+            found += transport.receive()
+            time.sleep(0.01)
+        assert peer.stdout
+        said = json.loads(peer.stdout.read())
+    finally:
+        peer.kill()
+        peer.wait()
+        transport.close("over")
+    expected = {"name": ["a", "b"], "position": [0.1, 0.2], "velocity": [0.0, 0.0], "effort": [1.0, 2.0]}
+    assert said.items() >= expected.items()
+    assert [m.error for m in found if m.error] == []
+    assert len({m.sender for m in found}) == 1
+    assert [m.time for m in found] == sorted(m.time for m in found)
     assert said["targets"] > 5
     targets = [m.target["b"] for m in found if m.target]
     assert len(targets) > 5
