@@ -9,7 +9,7 @@ from arm import commands, record, write_arm
 
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.fleet import history, since
+from gaponet.fleet import changed_since, load_nights
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.evidence import estimate_uncertainty
@@ -45,7 +45,7 @@ def site(tmp_path_factory):
     return place
 
 
-def asked(site, name, capsys):
+def check_fleet(site, name, capsys):
     code = 0
     words = [site / "robots", site / name, "--out", site / "out", "--night", name, "--workers", "2", "--json"]
     try:
@@ -56,36 +56,36 @@ def asked(site, name, capsys):
 
 
 def test_two_nights_of_three_arms(site, capsys):
-    code, first = asked(site, "night1", capsys)
+    code, first = check_fleet(site, "night1", capsys)
     assert (code, {r: n["verdict"] for r, n in first.items()}) == (0, dict.fromkeys(("a1", "a2", "a3"), "same"))
-    code, second = asked(site, "night2", capsys)
+    code, second = check_fleet(site, "night2", capsys)
     assert code == 1
-    assert {r: n["verdict"] for r, n in second.items()} == {"a1": "same", "a2": "drifted", "a3": "not asked"}
+    assert {r: n["verdict"] for r, n in second.items()} == {"a1": "same", "a2": "drifted", "a3": "not checked"}
     assert {tuple(number) for number in second["a2"]["numbers"]} == {("shoulder", "kp"), ("elbow", "kp")}
     before, after = second["a2"]["adapted"]
     assert after < 0.5 * before
     today = ParameterUncertainty.load(load_robot(site / "out" / "adapted" / "a2"))
     assert [s["made_by"] for s in today.sources][-1] == "adapt"
-    assert since(history(site / "out" / "a2.json")) == "night2"
+    assert changed_since(load_nights(site / "out" / "a2.json")) == "night2"
     page = (site / "out" / "fleet.html").read_text(encoding="utf-8")
-    assert "3 robots: 1 same, 1 drifted, 1 not asked" in page
+    assert "3 robots: 1 same, 1 drifted, 1 not checked" in page
     assert "shoulder, kp" in page
 
-    # The same command goes on: what was asked is not asked again, what could not be read is.
+    # The same command goes on: a robot that was checked is not checked again, one that could not be read is.
     kept = (site / "out" / "a2.json").stat().st_mtime_ns
     logs(load_robot(site / "arm"), site / "night2", "a3", 2500)
-    code, again = asked(site, "night2", capsys)
+    code, again = check_fleet(site, "night2", capsys)
     assert {r: n["verdict"] for r, n in again.items()} == {"a1": "same", "a2": "drifted", "a3": "same"}
     assert (site / "out" / "a2.json").stat().st_mtime_ns == kept
-    assert [n["night"] for n in history(site / "out" / "a3.json")] == ["night1", "night2"]
+    assert [n["night"] for n in load_nights(site / "out" / "a3.json")] == ["night1", "night2"]
 
 
 def test_it_drifted_since_the_first_night_in_a_row():
     nights = [
-        {"night": str(k), "verdict": v} for k, v in enumerate(("drifted", "same", "drifted", "not asked", "drifted"))
+        {"night": str(k), "verdict": v} for k, v in enumerate(("drifted", "same", "drifted", "not checked", "drifted"))
     ]
-    assert since(nights) == "2"
-    assert since(nights[:2]) == ""
+    assert changed_since(nights) == "2"
+    assert changed_since(nights[:2]) == ""
 
 
 def test_a_folder_without_robots_is_refused(tmp_path, capsys):

@@ -1,7 +1,7 @@
-"""A fleet's night: is each robot still the one that is known? Those that moved are adapted; and one page: who
-drifted, by what, since when.
+"""Nightly check of a fleet: which robots changed, by what and since when; robots that drifted are adapted.
 
-OUT/ROBOT.json keeps every night of a robot; a night that is there is not asked again, so what was interrupted goes on.
+OUT/ROBOT.json holds every night of a robot. A robot that was checked is not checked again in the same night, so an
+interrupted night continues.
 """
 
 from __future__ import annotations
@@ -28,14 +28,23 @@ from gaponet.sysid.uncertainty import ParameterUncertainty
 from gaponet.sysid.uncertainty_table import format_change
 
 KIND = "fleet"
-SAME, FAILED = "same", "not asked"
+SAME, FAILED = "same", "not checked"
+FORMER_VERDICTS = {"not asked": FAILED}  # former name in ROBOT.json → name
 MARKS = {SAME: "·", "drifted": "■", "contradictory": "?", FAILED: "–"}
-SHOWN = 14  # nights
+MAX_NIGHTS_SHOWN = 14
 
 
 class Night(TypedDict):
-    """What came of a robot's logs: verdict of gaponet check, or why there is none; what moved, in words, and of which
-    joint and number; mrad before and after an adaptation; processor seconds."""
+    """Result of one robot's check in one night.
+
+    Attributes:
+        verdict: Verdict of gaponet check, or FAILED.
+        advice: What to do, or why there is no verdict.
+        moved: Parameters that changed, as text; `numbers` has their joint and field.
+        seconds: Duration of the recordings, s.
+        adapted: Error before and after an adaptation, mrad.
+        took: Processor time, s.
+    """
 
     night: str
     verdict: str
@@ -50,7 +59,7 @@ class Night(TypedDict):
 
 @dataclass(frozen=True)
 class Job:
-    """A robot of the fleet: its folder, its logs, where its adaptation goes (None: it is not adapted)."""
+    """One robot to check: its folder, its logs, and the folder of its adaptation (None: it is not adapted)."""
 
     name: str
     robot: Path
@@ -61,45 +70,46 @@ class Job:
     payload_mass: float | None
 
 
-def ask(job: Job) -> Night:
-    """One robot's night."""
+def check_robot(job: Job) -> Night:
+    """Check one robot, and adapt it if it drifted."""
     began, spec = time.process_time(), load_robot(job.robot)
-    known = ParameterUncertainty.require(spec)
+    uncertainty = ParameterUncertainty.require(spec)
     with unit_recordings(job.logs, spec, job.unit, (), job.payload_mass) as (_, sequences):
-        found = drift(spec, known, sequences, 1)
-    adapted, advice = None, found.advice
-    if found.verdict == "drifted" and job.out is not None:
+        drifted = drift(spec, uncertainty, sequences, 1)
+    adapted, advice = None, drifted.advice
+    if drifted.verdict == "drifted" and job.out is not None:
         try:
             made = adapt_robot(spec, job.logs, out=job.out, unit=job.unit, payload_mass=job.payload_mass)
             adapted = 1e3 * made.before, 1e3 * made.after
         except NoGainError:
-            advice += "; an adaptation does not follow these logs better"
+            advice += "; an adaptation does not reduce the error on these logs"
     return {
-        "night": job.night, "verdict": found.verdict, "advice": advice, "recordings": len(sequences),
+        "night": job.night, "verdict": drifted.verdict, "advice": advice, "recordings": len(sequences),
         "moved": [
-            f"{m.joint} {m.field} {format_change(m.field, m.by, known, m.joint)} ({m.sigmas:+.0f} σ)"
-            for m in found.moved
+            f"{m.joint} {m.field} {format_change(m.field, m.by, uncertainty, m.joint)} ({m.sigmas:+.0f} σ)"
+            for m in drifted.moved
         ],
-        "numbers": [(m.joint, m.field) for m in found.moved], "seconds": found.seconds,
+        "numbers": [(m.joint, m.field) for m in drifted.moved], "seconds": drifted.seconds,
         "adapted": adapted, "took": time.process_time() - began,
     }  # fmt: skip
 
 
-def night(
+def check_fleet(
     robots: Path, logs: Path, out: Path, name: str, adapt: bool = True, payload_mass: float | None = None,
     executor: str | Executor = "local", workers: int = 0,
 ) -> Iterator[tuple[str, Night, int]]:  # fmt: skip
-    """Ask every robot that was not asked that night yet, and write the page.
+    """Check every robot that was not checked this night, and write the page.
 
     Args:
         robots: Folder of robot folders.
-        logs: Folder with a folder of logs, or a dataset, of each robot's name; or one dataset with units so called.
-        out: Folder of what is found.
-        name: What the night is called, such as 2026-11-23.
-        adapt: Whether robots that drifted get OUT/adapted/ROBOT.
+        logs: Folder with a folder of logs, or a dataset, for each robot by name; or one dataset whose units have these
+            names.
+        out: Folder of the results.
+        name: Name of the night, such as 2026-11-23.
+        adapt: Write an adapted robot to OUT/adapted/ROBOT if it drifted.
 
     Yields:
-        Robot, its night, and how many robots there are; of those that were asked before at once.
+        Robot, its night, and the number of robots; first the robots that were checked before.
 
     Raises:
         UsageError: There are no robots.
@@ -107,43 +117,42 @@ def night(
     folders = sorted(p.parent for p in robots.glob("*/robot.toml"))
     if not folders:
         raise UsageError(f"{robots}: holds no robot folders; give a folder with one of gaponet identify for each robot")
-    one = (logs / "dataset.json").is_file()
+    one_dataset = (logs / "dataset.json").is_file()
     with lock_folder(out, KIND):
-        kept = {f.name: history(out / f"{f.name}.json") for f in folders}
+        nights = {f.name: load_nights(out / f"{f.name}.json") for f in folders}
         jobs = []
         for f in folders:
-            last = kept[f.name][-1] if kept[f.name] else None
+            last = nights[f.name][-1] if nights[f.name] else None
             if last and last["night"] == name and last["verdict"] != FAILED:
                 yield f.name, last, len(folders)
                 continue
-            place = out / "adapted" / f.name if adapt else None
-            jobs.append(
-                Job(f.name, f, logs if one else logs / f.name, f.name if one else "", name, place, payload_mass)
-            )
+            adapted = out / "adapted" / f.name if adapt else None
+            source, unit = (logs, f.name) if one_dataset else (logs / f.name, "")
+            jobs.append(Job(f.name, f, source, unit, name, adapted, payload_mass))
         with open_pool(executor, workers, 1) as pool:
-            for outcome in pool.run(ask, jobs):
+            for outcome in pool.run(check_robot, jobs):
                 if outcome.error is not None and not isinstance(outcome.error, GAPONetError | OSError):
                     raise outcome.error
-                found = outcome.value or _failed(name, outcome.error)
-                mine = [n for n in kept[outcome.job.name] if n["night"] != name]
-                kept[outcome.job.name] = [*mine, found]
-                write_json(out / f"{outcome.job.name}.json", kept[outcome.job.name])
-                yield outcome.job.name, found, len(folders)
-        write_text(out / "fleet.html", fleet_page(kept, name))
+                result, robot = outcome.value or _failed(name, outcome.error), outcome.job.name
+                nights[robot] = [*(n for n in nights[robot] if n["night"] != name), result]
+                write_json(out / f"{robot}.json", nights[robot])
+                yield robot, result, len(folders)
+        write_text(out / "fleet.html", fleet_page(nights, name))
 
 
-def history(file: Path) -> list[Night]:
-    """A robot's nights, the first first."""
-    return read_json(list[Night], file, UsageError, "remove it: its nights are forgotten") if file.is_file() else []
+def load_nights(file: Path) -> list[Night]:
+    """Return a robot's nights, the first one first."""
+    nights = read_json(list[Night], file, UsageError, "remove it to forget its nights") if file.is_file() else []
+    return [n | {"verdict": FORMER_VERDICTS.get(n["verdict"], n["verdict"])} for n in nights]
 
 
-def since(nights: list[Night]) -> str:
-    """The first of the nights in a row on which it was not the same robot; empty where it is."""
-    told, first = [n for n in nights if n["verdict"] != FAILED], ""
-    for n in reversed(told):
-        if n["verdict"] == SAME:
+def changed_since(nights: list[Night]) -> str:
+    """Return the first of the last nights in a row in which the robot was not the same; empty if it is the same."""
+    first = ""
+    for night in reversed([n for n in nights if n["verdict"] != FAILED]):
+        if night["verdict"] == SAME:
             break
-        first = n["night"]
+        first = night["night"]
     return first
 
 
@@ -152,22 +161,24 @@ def _failed(name: str, error: Exception | None) -> Night:
             "seconds": 0.0, "adapted": None, "took": 0.0}  # fmt: skip
 
 
-def fleet_page(kept: dict[str, list[Night]], name: str) -> str:
-    """One page: those that are not as they were, by what, since when; what moved in how many; all others by name."""
-    last = {robot: nights[-1] for robot, nights in kept.items() if nights}
+def fleet_page(nights: dict[str, list[Night]], name: str) -> str:
+    """Return the page: robots that changed, by what and since when; parameters by frequency; unchanged robots."""
+    last = {robot: results[-1] for robot, results in nights.items() if results}
     count = Counter(n["verdict"] for n in last.values())
-    odd = {r: n for r, n in last.items() if n["verdict"] != SAME}
-    strip = lambda robot: "".join(MARKS[n["verdict"]] for n in kept[robot][-SHOWN:])  # noqa: E731
-    lines = [
-        [robot, since(kept[robot]), strip(robot), "; ".join(n["moved"]) or n["verdict"],
-         "{:.1f} → {:.1f}".format(*n["adapted"]) if n["adapted"] else "", n["advice"]]
-        for robot, n in sorted(odd.items(), key=lambda item: (since(kept[item[0]]), item[0]))
-    ]  # fmt: skip
-    moved = Counter(number for n in odd.values() for number in n["numbers"])
-    said = ", ".join(f"{k} {verdict}" for verdict, k in count.items())
+    changed = {r: n for r, n in last.items() if n["verdict"] != SAME}
+
+    def row(robot: str, night: Night) -> list[str]:
+        marks = "".join(MARKS[n["verdict"]] for n in nights[robot][-MAX_NIGHTS_SHOWN:])
+        errors = "{:.1f} → {:.1f}".format(*night["adapted"]) if night["adapted"] else ""
+        moved = "; ".join(night["moved"]) or night["verdict"]
+        return [robot, changed_since(nights[robot]), marks, moved, errors, night["advice"]]
+
+    moved = Counter(number for n in changed.values() for number in n["numbers"])
     return render(
-        "fleet.html.j2", title=f"Fleet, {name}", summary=f"{len(last)} robots: {said}", changed=lines,
-        legend=", ".join(f"{mark} {what}" for what, mark in MARKS.items()),
+        "fleet.html.j2", title=f"Fleet, {name}",
+        summary=f"{len(last)} robots: {', '.join(f'{k} {verdict}' for verdict, k in count.items())}",
+        changed=sorted((row(robot, night) for robot, night in changed.items()), key=lambda r: (r[1], r[0])),
+        legend=", ".join(f"{mark} {verdict}" for verdict, mark in MARKS.items()),
         moved=[[f"{j}, {f}", str(k)] for (j, f), k in moved.most_common()],
         unchanged=", ".join(sorted(r for r, n in last.items() if n["verdict"] == SAME)),
     )  # fmt: skip

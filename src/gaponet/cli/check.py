@@ -98,21 +98,23 @@ def _check_fleet(
     from gaponet import fleet
     from gaponet.base.progress import progress_bar
 
-    when, found = night or date.today().isoformat(), dict[str, fleet.Night]()
+    when, results = night or date.today().isoformat(), dict[str, fleet.Night]()
     with progress_bar("checking") as update:
-        for name, mine, count in fleet.night(robots, Path(logs), out, when, adapt, payload_mass, executor, workers):
-            found[name] = mine
-            update(len(found), count, f"{name}: {mine['verdict']}")
-    odd = {name: mine for name, mine in sorted(found.items()) if mine["verdict"] != fleet.SAME}
-    if odd:
-        screen.table(f"Not as they were, {when}", ["robot", "since", "what moved, or what is wrong"], [
-            [name, fleet.since(fleet.history(out / f"{name}.json")), "; ".join(n["moved"]) or n["advice"]]
-            for name, n in odd.items()
+        checked = fleet.check_fleet(robots, Path(logs), out, when, adapt, payload_mass, executor, workers)
+        for name, result, count in checked:
+            results[name] = result
+            update(len(results), count, f"{name}: {result['verdict']}")
+    changed = {name: result for name, result in sorted(results.items()) if result["verdict"] != fleet.SAME}
+    if changed:
+        screen.table(f"Changed robots, {when}", ["robot", "since", "parameters that changed, or the problem"], [
+            [name, fleet.changed_since(fleet.load_nights(out / f"{name}.json")), "; ".join(n["moved"]) or n["advice"]]
+            for name, n in changed.items()
         ])  # fmt: skip
-    took = sum(n["took"] for n in found.values())
-    screen.say(f"{len(found) - len(odd)} of {len(found)} are the same; {took:.0f} s of processor; {out / 'fleet.html'}")
-    screen.result({"night": when, "robots": found, "page": str(out / "fleet.html")})
-    if odd:
+    took, page = sum(n["took"] for n in results.values()), out / "fleet.html"
+    unchanged = len(results) - len(changed)
+    screen.say(f"{unchanged} of {len(results)} are the same; {took:.0f} s of processor time; {page}")
+    screen.result({"night": when, "robots": results, "page": str(page)})
+    if changed:
         sys.stdout.flush()
         raise SystemExit(1)
 
