@@ -1,4 +1,4 @@
-"""Charts that several figures use: bars by group, lines over a quantity, trajectories against a reference."""
+"""Charts that several figures use: bars by group, trajectories against a reference."""
 
 from __future__ import annotations
 
@@ -138,47 +138,3 @@ def _positions(
     low, high = ax.get_ylim()
     if high - low < MIN_POSITION_SPAN:
         ax.set_ylim((low + high - MIN_POSITION_SPAN) / 2, (low + high + MIN_POSITION_SPAN) / 2)
-
-
-@styled
-def lines(
-    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[MeanStd]]]]],
-    axes: tuple[str, str],
-    ticks: ListOf[tuple[float, str]] = (),
-    log: bool = False,
-) -> Figure:
-    """Draw values over a quantity, one line with error bars per method.
-
-    On a linear x axis, lines with error bars are shifted apart a little, so that equal values remain visible.
-
-    Args:
-        panels: (title, {label: (colour, x, values)}), beside each other on one scale.
-        axes: Labels of x and y.
-        ticks: (x, label) of the ticks; default matplotlib's.
-        log: Use a logarithmic x axis.
-    """
-    fig = figure(3.6 * len(panels) + 0.6, 3.2)
-    for ax, (title, methods) in zip(fig.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels, strict=True):
-        spacing = np.diff(sorted({v for _, x, _ in methods.values() for v in x}))
-        apart = 0.0 if log or not spacing.size else 0.08 * float(spacing.min())
-        drawn = 0  # lines with error bars so far
-        spreading = sum(error_bars(values) is not None for _, _, values in methods.values())
-        for label, (colour, x, values) in methods.items():
-            std = error_bars(values)
-            shift = 0.0 if std is None else (drawn - (spreading - 1) / 2) * apart
-            drawn += std is not None
-            ax.errorbar(
-                np.add(x, shift), [v.mean for v in values], yerr=std, fmt="o-", ms=3.5,
-                color=colour, elinewidth=0.9, capsize=2, label=label,
-            )  # fmt: skip
-        if log:
-            ax.set_xscale("log")
-            ax.minorticks_off()
-        if ticks:
-            ax.set_xticks([x for x, _ in ticks], [t for _, t in ticks])
-        ax.set_xlabel(axes[0])
-        ax.set_title(title)
-    fig.axes[0].set_ylim(bottom=0)  # shared by all panels; switches autoscaling off
-    fig.axes[0].set_ylabel(axes[1])
-    legend(fig)
-    return fig

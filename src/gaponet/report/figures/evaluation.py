@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd
 from gaponet.data.repeatability import MOVED
 from gaponet.data.signals import busiest
-from gaponet.report.figures.charts import JointTrajectory, against, bars, lines
+from gaponet.report.figures.charts import JointTrajectory, against, bars
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 from gaponet.report.methods import colour, title
 
@@ -39,20 +39,24 @@ def _bars(methods: dict[str, Any], group: str, heading: str, label: Callable[[st
     return _degrees(bars([label(k) for k in keys], values, "mrad", heading))
 
 
+@styled
 def by_horizon(methods: dict[str, Any]) -> Figure:
     """Draw the MPJAE of each method against the time since the common start."""
-    keys = [k for k in methods["nominal"]["by_horizon"] if k != "whole"]
-    x = [float(k) for k in keys]
-    ticks = [*((v, f"{v:g} s") for v in x), (4 * x[-1], "whole\nmotion")]
-    drawn = {
-        title(n): (
-            colour(n),
-            [at for at, _ in ticks],
-            [MeanStd.from_values([m["by_horizon"][k]["mpjae"]], 1e3) for k in (*keys, "whole")],
-        )
-        for n, m in methods.items()
-    }
-    return _degrees(lines([("MPJAE by horizon of the free run", drawn)], ("", "mrad"), ticks, log=True))
+    horizons = [k for k in methods["nominal"]["by_horizon"] if k != "whole"]
+    ticks = {**{float(k): f"{float(k):g} s" for k in horizons}, 4 * float(horizons[-1]): "whole\nmotion"}
+    fig = figure(4.2, 3.2)
+    ax = fig.subplots()
+    for name, metrics in methods.items():
+        errors = [1e3 * metrics["by_horizon"][k]["mpjae"] for k in (*horizons, "whole")]
+        ax.plot(list(ticks), errors, "o-", ms=3.5, color=colour(name), label=title(name))
+    ax.set_xscale("log")
+    ax.minorticks_off()
+    ax.set_xticks(list(ticks), list(ticks.values()))
+    ax.set_title("MPJAE by horizon of the free run")
+    ax.set_ylim(bottom=0)
+    ax.set_ylabel("mrad")
+    legend(fig)
+    return _degrees(fig)
 
 
 @styled
