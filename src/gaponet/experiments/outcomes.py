@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gaponet.base.errors import ModelError
 from gaponet.base.executor import open_pool
@@ -21,6 +21,9 @@ from gaponet.experiments.train_cell import Outcome, evaluate_baselines, train_an
 from gaponet.report.candidate import split_of_run
 from gaponet.report.provenance import describe_provenance
 from gaponet.sim.model import model_hash
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 BASELINES = ("nominal", "delay_offset", "identified")
 Show = Callable[[Running, int], None]  # called with the running cells and the number of finished ones
@@ -55,7 +58,7 @@ class StudyOutcomes:
         return self.runs.get(word, [])
 
     def result(
-        self, study: Study, name: str, title: str, tables: ListOf[ResultTable], figures: Mapping[str, Any], *,
+        self, study: Study, name: str, title: str, tables: ListOf[ResultTable], figures: Mapping[str, Figure], *,
         sentences: ListOf[str], **more: Any,
     ) -> Result:  # fmt: skip
         """Return the result with the facts that are needed to repeat it."""

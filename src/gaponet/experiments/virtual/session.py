@@ -8,7 +8,7 @@ from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gaponet.base.errors import UsageError
 from gaponet.base.result_table import ResultTable
@@ -24,6 +24,9 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.testing.collect import fleet_of
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.physics import Physics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ class Session:
         return self.experiment.payloads or tuple(seen)
 
     def result(
-        self, name: str, title: str, tables: ListOf[ResultTable], figures: Mapping[str, Any], sentences: ListOf[str],
+        self, name: str, title: str, tables: ListOf[ResultTable], figures: Mapping[str, Figure], sentences: ListOf[str],
         config: CompensatorConfig | None = None, **more: Any,
     ) -> Result:  # fmt: skip
         """Return the result with the facts that are needed to repeat it.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from gaponet.base.result_table import MeanStd
 from gaponet.report.figures.style import DASHED, DOTTED, LETTER, figure, legend, styled
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -34,7 +35,7 @@ def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
     return fig
 
 
-def draw_bars(ax: Any, groups: ListOf[str], methods: Bars, size: float | None = None) -> None:
+def draw_bars(ax: Axes, groups: ListOf[str], methods: Bars, size: float | None = None) -> None:
     """Draw the bars into existing axes; size is the font size of the group labels."""
     width = 0.84 / len(methods)
     for i, (label, (colour, values)) in enumerate(methods.items()):
@@ -119,7 +120,7 @@ def against(
 
 
 def _positions(
-    ax: Any,
+    ax: Axes,
     time: Array,
     trajectory: JointTrajectory,
     looks: Mapping[str, tuple[str, str]],

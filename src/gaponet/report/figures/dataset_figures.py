@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import matplotlib as mpl
@@ -112,7 +113,7 @@ def composition(entries: list[Entry], title: str) -> Figure:
     return fig
 
 
-def _hours(entries: Any) -> float:
+def _hours(entries: Iterable[Entry]) -> float:
     return sum(e.rows * e.dt for e in entries) / 3600
 
 

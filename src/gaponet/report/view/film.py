@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.report.view.picture import Camera
 from gaponet.report.view.side_by_side import SideBySide
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 GIF_COLOURS = 200  # shared by all frames
 SUFFIXES = (".gif", ".mp4", ".png")
@@ -85,7 +88,7 @@ def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int],
     hundredths = max(round(100 / clip.fps), 2)  # a GIF counts in 1/100 s, and viewers slow down below 2
     times = clip.times(hundredths / 100 if suffix == ".gif" else 1 / clip.fps)
 
-    def pictures() -> Any:
+    def pictures() -> Iterator[Image]:
         for i, time in enumerate(times):
             yield camera.picture(float(time))
             progress(i + 1, len(times))
@@ -107,20 +110,20 @@ def largest_error_time(shown: SideBySide, clip: Clip) -> float:
     return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt
 
 
-def _write_gif(pictures: list[Any], path: Path, milliseconds: int) -> None:
+def _write_gif(pictures: list[Image], path: Path, milliseconds: int) -> None:
     """Write with one palette for all frames and no dithering, which keeps the file small."""
-    from PIL import Image
+    from PIL.Image import Dither, Quantize, new
 
     sample = pictures[:: max(len(pictures) // 4, 1)]
-    sheet = Image.new("RGB", (sample[0].width, sample[0].height * len(sample)))
+    sheet = new("RGB", (sample[0].width, sample[0].height * len(sample)))
     for i, picture in enumerate(sample):
         sheet.paste(picture, (0, i * picture.height))
-    palette = sheet.quantize(GIF_COLOURS, Image.Quantize.MAXCOVERAGE)
-    frames = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
+    palette = sheet.quantize(GIF_COLOURS, Quantize.MAXCOVERAGE)
+    frames = [p.quantize(palette=palette, dither=Dither.NONE) for p in pictures]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True)
 
 
-def _write_mp4(pictures: Any, path: Path, fps: float, size: tuple[int, int]) -> None:
+def _write_mp4(pictures: Iterator[Image], path: Path, fps: float, size: tuple[int, int]) -> None:
     writer = _ffmpeg().write_frames(str(path), size, fps=fps, quality=7, macro_block_size=2)
     writer.send(None)
     try:

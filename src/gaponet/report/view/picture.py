@@ -15,6 +15,7 @@ from gaponet.report.view.gl import INSTALL_HINT
 from gaponet.report.view.scene import Scene
 
 if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
     from PIL.ImageDraw import ImageDraw
 
 INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
@@ -80,10 +81,10 @@ class Camera:
     def __enter__(self) -> Camera:
         return self
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         self.renderer.close()
 
-    def picture(self, time: float) -> Any:
+    def picture(self, time: float) -> Picture:
         """Return the labelled frame at a time of the recording, s: a PIL image."""
         from PIL import Image, ImageDraw
 
@@ -107,7 +108,7 @@ class Camera:
         scene.model.vis.map.znear, scene.model.vis.map.zfar = 0.01, 20
         return lens
 
-    def _write(self, image: Any, draw: ImageDraw, time: float) -> None:
+    def _write(self, image: Picture, draw: ImageDraw, time: float) -> None:
         shown, layout, k = self.scene.shown, self.layout, len(self.scene.base)
         row, small, large = self.scene.row(time), self.fonts[13], self.fonts[17]
         self._head(draw, time)
@@ -138,7 +139,7 @@ class Camera:
         draw.text((pad + font.getlength(mark), pad * 0.8), left, INK, font)
         draw.text((self.layout.width - pad, pad * 0.8), right, INK, font, anchor="ra")
 
-    def _course(self, image: Any, draw: ImageDraw, row: int) -> None:
+    def _course(self, image: Picture, draw: ImageDraw, row: int) -> None:
         """Draw |error| against time of each motion, with a line at the present."""
         strip, x, (high, low) = self.strip
         top = self.layout.height - self.layout.course
@@ -147,7 +148,7 @@ class Camera:
         draw.line([(now, top + high), (now, top + low)], INK, 1)
 
     @cached_property
-    def strip(self) -> tuple[Any, Array, tuple[float, float]]:
+    def strip(self) -> tuple[Picture, Array, tuple[float, float]]:
         """Error curves of all pictures; x of each row; top and bottom of the axis, pixels."""
         from PIL import Image, ImageDraw
 
