@@ -91,8 +91,7 @@ def page(out: Path) -> Any:
 
 def result(out: Path) -> Any:
     """Return the rows of an experiment and its files."""
-    out = out / "rehearsal"
-    record = json.loads((out / "data.json").read_text())
+    record = json.loads((out / "compare.json").read_text())
     return [record["tables"][0]["rows"], sorted(p.name for p in (out / "cells").iterdir()), names(out)]
 
 
@@ -107,8 +106,8 @@ def cases(given: Path) -> dict[str, Case]:
         return ["train", data, "--out", str(out), "--budget", "4000", *resume, *TRAIN]
 
     def experiment(out: Path) -> list[str]:
-        return ["experiment", "data", data, "--out", str(out), "--quick", "--models", "mlp", "--seeds", "1",
-                "--shares", "1.0"]  # fmt: skip
+        return ["experiment", "compare", data, "--out", str(out), "--models", "mlp", "--seeds", "1", "--budget", "2000",
+                *TRAIN]  # fmt: skip
 
     return {
         "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),

@@ -1,12 +1,11 @@
-"""LeRobot on a VIRTUAL SO-101 behind a servo bus: python benchmarks/lerobot_so101.py WORK. Needs lerobot and plug-in.
+"""LeRobot on a VIRTUAL SO-101 behind a servo bus: python benchmarks/lerobot_so101.py WORK.
 
-`make lerobot` makes such an environment and runs this in it. LeRobot's own discovery finds the plug-in. Its own
-so101_follower, which speaks to the servos by Feetech's SDK, and its record() play excitation; gaponet imports it,
-identifies and trains; LeRobot opens what gaponet exports; record() plays motions that nothing was trained on,
-uncorrected and corrected by the processor step gaponet_correct, in turn. On the bus a frame passes with each goal, so a
-busy machine measures the same. Errors are of what LeRobot recorded: |observation − action of the frame before|, joints
-that move, after the way to the start.
-What is there already is not made again.
+`make lerobot` creates an environment with LeRobot and the plug-in, and runs this script. LeRobot's own so101_follower,
+with Feetech's SDK, and its record() play excitation. gaponet imports the recordings, identifies and trains; LeRobot
+opens the exported dataset. Then record() plays test motions, uncorrected and corrected by the processor step
+gaponet_correct. The bus advances one frame per goal, so that the load of the machine has no effect. The error is
+|observation − action of the frame before| of the joints that move, after the move to the start. Existing results are
+kept.
 """
 
 from __future__ import annotations
@@ -109,13 +108,13 @@ def wait_longer() -> None:
 def tell_where_it_is() -> None:
     """gaponet_motion plans from where the arm is; LeRobot's own robot tells it."""
     from lerobot.robots.so_follower import SO101Follower
-    from lerobot_robot_gaponet import saw
+    from lerobot_robot_gaponet import set_observation
 
     observe = SO101Follower.get_observation
 
     def observed(self):  # type: ignore[no-untyped-def]
         found = observe(self)
-        saw(found)
+        set_observation(found)
         return found
 
     SO101Follower.get_observation = observed

@@ -1,10 +1,10 @@
-"""A rival of networks: gradient-boosted trees on the same labels, one ensemble for each joint.
+"""Gradient-boosted trees as a rival of networks: one ensemble per joint, fitted to the same labels.
 
     gaponet experiment real --method benchmarks/trees.py:on_identified        needs scikit-learn
 
-They see position, speed and a − q of all operated joints and the payload; fitted on the states that the labels lead to,
-then on those that the trees themselves lead to as well. Among the methods of the real robots they stand on top of
-identification, and are left out where validation says that they add nothing, as networks are.
+Inputs are position, velocity and a − q of all operated joints, and the payload. The training states come from rollouts
+with the labels, then also from rollouts with the trees. On real robots, the trees correct the identified simulator; as
+with networks, they are left out if validation shows no improvement.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ LIMIT, ROUNDS, TREES, LEAF, MOST = 0.3, 1, 120, 60, 60_000  # rad, rounds of DAg
 
 
 class Trees:
-    """One ensemble for each operated joint, in the loop. Implements sim.replay.Corrector."""
+    """Corrector with one ensemble per operated joint; implements sim.replay.Corrector."""
 
     def __init__(self, robot: RobotSpec) -> None:
         self.robot, self.op, self.models = robot, robot.operated_index, []
 
     @classmethod
     def trained(cls, sequences: ListOf[Sequence], robot: RobotSpec, labels: Array, seed: int) -> Trees:
-        """Fitted to the labels of these recordings, (rows of all, n) rad."""
+        """Fit the labels of recordings, (rows of all, n) rad."""
         model, ends = cls(robot), np.cumsum([0, *map(len, sequences)])
         deltas = [np.nan_to_num(labels[start:end]) for start, end in pairwise(ends)]
         told = [s.ctrl.copy() for s in sequences]
@@ -55,7 +55,7 @@ class Trees:
         return model
 
     def fit(self, x: Array, y: Array, seed: int) -> None:
-        """Inputs (N, 3n + 1), labels (N, n) rad, NaN where a joint has none; a joint without any keeps its target."""
+        """Fit inputs (N, 3n + 1) to labels (N, n) rad; NaN is no label, and a joint without labels is not corrected."""
         from sklearn.ensemble import HistGradientBoostingRegressor
 
         rows, self.models = np.random.default_rng(seed).permutation(len(x)), []
@@ -66,7 +66,7 @@ class Trees:
 
     @staticmethod
     def inputs(qpos: Array, qvel: Array, ctrl: Array, payload: Array | float) -> Array:
-        """(k, 3n + 1) of operated joints; payload kg, of each or of all."""
+        """Return the inputs (k, 3n + 1) of operated joints; payload in kg, of each row or of all."""
         return np.concatenate([qpos, qvel, ctrl - qpos, np.broadcast_to(payload, len(qpos))[:, None]], axis=1)
 
     def reset(self, start: ListOf[Sequence]) -> None:
@@ -80,7 +80,7 @@ class Trees:
 
 
 def on_identified(question: Question) -> FittedSim:
-    """Trees on the identified robot, which stays as it is where validation says that they add nothing."""
+    """Correct the identified robot by trees, unless validation shows no improvement."""
     start, (train, val) = identified(question), train_val(question)
     labels = trajectory_labels(train, start.robot, LIMIT)
     answer = replace(start, corrector=Trees.trained(train, start.robot, labels, 0))

@@ -1,15 +1,15 @@
-"""Fine-tune a policy in the aligned simulator, then play it on a robot it has never met: ASAP's use of a gap model.
+"""Fine-tune a policy in the aligned simulator, then test it on an unseen robot: ASAP's use of a gap model.
 
     pip install "rsl-rl-lib>=5.5,<6"
     python examples/finetune_policy.py RUN        # RUN: gaponet train (or demo) on virtual H1-2 units 1 to 3
 
-A small network learns by PPO, in the nominal simulator, to make the arms follow motions with 0 to 3 kg in each hand. It
-then learns on in the aligned simulator and, to be fair, as long in the nominal one. All three are played on VIRTUAL
-unit 4 with other motions than they have learnt from; neither the gap model nor a policy has seen that unit.
+PPO trains a small network in the nominal simulator to follow arm motions with 0 to 3 kg in each hand. Training then
+continues in the aligned simulator and, for comparison, equally long in the nominal one. All three policies are tested
+on VIRTUAL unit 4 with other motions. Neither the gap model nor a policy was trained on that unit.
 
-The policy is told the measured state, the reference up to 0.2 s ahead, the payload, its last action, and what the
-nominal model says that the reference takes: torque by inverse dynamics, over kp. What it answers is added to the
-reference. It runs alone on the robot: the gap model takes part in training only.
+The policy observes the measured state, the reference up to 0.2 s ahead, the payload, its last action, and the torque of
+the reference by nominal inverse dynamics, divided by kp. Its output is added to the reference. On the robot, the policy
+runs without the gap model.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ Array = np.ndarray
 KINDS = ("reach", "pick_and_place", "lift", "wave", "stir", "mirror", "carry", "wander")
 LEARN = [f"{kind}-{variant}" for kind in KINDS for variant in ("both-0", "both-1", "left-0", "right-0")]
 TRY = [f"{kind}-both-0" for kind in KINDS]
-LEARN_SEED, TRY_SEED = 101, 202  # other numbers make other motions; those of the package's recipes have seed 0
-AHEAD = (2, 3, 5, 8, 11)  # rows of the reference that are seen beside the next one
-REACH, LIMIT = 0.1, 0.4  # rad that an action of 1 adds to the reference, and the most that any may
-NOISE = (0.0005, 0.02)  # rad, rad/s: in what a policy is told while it learns
+LEARN_SEED, TRY_SEED = 101, 202  # different motions; the package's recipes use seed 0
+AHEAD = (2, 3, 5, 8, 11)  # observed rows of the reference, beside the next one
+REACH, LIMIT = 0.1, 0.4  # rad: effect of an action of 1, and largest effect
+NOISE = (0.0005, 0.02)  # rad, rad/s, of observations in training
 EPISODE = 200  # control periods
-WARMTH = 12.0  # K above ambient, of the unit's motors
-SKIP = 50  # control periods at the start of a motion that are not counted
+WARMTH = 12.0  # K above ambient, of the motors
+SKIP = 50  # control periods at the start of a motion without effect on the score
 
 PPO: dict[str, Any] = {
     "num_steps_per_env": 16, "save_interval": 10**9, "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
@@ -66,7 +66,7 @@ PPO: dict[str, Any] = {
 
 
 class Task:
-    """Motions to follow and what a policy is told of them: rows of all motions one after another.
+    """Motions to follow and their observations; the rows of all motions are concatenated.
 
     Attributes:
         joints: Free joints, as in AlignedSim.
@@ -90,18 +90,18 @@ class Task:
             model = build_model(robot, mass)
             moves = [[c, v := np.gradient(c, robot.dt, axis=0), np.gradient(v, robot.dt, axis=0)] for c in ctrls]
             torque = np.concatenate([inverse_dynamics(model, *move) for move in moves])
-            damped = robot.kd * np.concatenate([move[1] for move in moves])  # the servo brakes what it drives
+            damped = robot.kd * np.concatenate([move[1] for move in moves])  # the servo damps its own motion
             loads.append(((torque + damped) / robot.kp)[:, operated])
         self.load = np.array(loads)
 
     def observe(self, q: Array, v: Array, row: Array, last: Array, mass: Array, action: Array) -> Array:
-        """What a policy is told, (N, 5 n + n len(AHEAD) + 1) float32.
+        """Return the observation, (N, 5 n + n len(AHEAD) + 1) float32.
 
         Args:
-            q, v: Measured now, operated joints, (N, n) rad, rad/s.
-            row, last: Where the motion stands, and its last row, (N,).
-            mass: kg, (N,).
-            action: The last one, (N, n).
+            q, v: Measured state of the operated joints, (N, n) rad, rad/s.
+            row, last: Present and last row of the motion, (N,).
+            mass: Payload, kg, (N,).
+            action: Last action, (N, n).
         """
         at = np.minimum(row + 1, last)
         then = self.reference[at][:, self.op]
@@ -112,14 +112,14 @@ class Task:
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def target(self, row: Array, last: Array, action: Array) -> Array:
-        """What is sent, (N, free) rad: the next row of the reference, and the action on the operated joints."""
+        """Return the target, (N, free) rad: the next row of the reference plus the action on operated joints."""
         out = self.reference[np.minimum(row + 1, last)]
         out[:, self.op] += np.clip(REACH * action, -LIMIT, LIMIT)
         return out
 
 
 class TrackingEnv(VecEnv):
-    """num_envs simulations that follow motions from a random row on; rsl_rl's interface."""
+    """Environment of rsl_rl: simulations that follow motions from a random row on."""
 
     def __init__(self, task: Task, sim: AlignedSim, seed: int) -> None:
         self.task, self.sim, self.rng = task, sim, np.random.default_rng(seed)
@@ -143,7 +143,7 @@ class TrackingEnv(VecEnv):
         self.episode_length_buf[torch.from_numpy(ids)] = 0
 
     def get_observations(self) -> TensorDict:
-        """Observation of a noisy state."""
+        """Observe the state with noise."""
         shape = (self.num_envs, self.task.n)
         q, v = (x[:, self.task.op] + s * self.rng.standard_normal(shape) for x, s in zip(
             (self.sim.qpos, self.sim.qvel), NOISE, strict=True))  # fmt: skip
@@ -151,7 +151,7 @@ class TrackingEnv(VecEnv):
         return TensorDict({"policy": torch.from_numpy(seen)}, batch_size=[self.num_envs])
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Reward: minus the mean error in units of 20 mrad, and a little for calm actions."""
+        """Step; the reward is minus the mean error in units of 20 mrad, minus a penalty for changes of the action."""
         action = actions.numpy().astype(float)
         self.sim.step(self.task.target(self.row, self.last, action))
         self.row += 1
@@ -169,7 +169,7 @@ class TrackingEnv(VecEnv):
 
 
 class Unit:
-    """One virtual unit, once per payload and motion, behind the calls of AlignedSim; its sensors are all one sees."""
+    """Copies of a virtual unit, one per payload and motion, with the methods of AlignedSim and sensor readings only."""
 
     def __init__(self, robot: RobotSpec, task: Task, name: str, payload_mass: Array, fleet: str = "easy") -> None:
         physics = load_fleet(fleet, robot).unit(name)
@@ -198,7 +198,7 @@ class Unit:
 
 
 def make_runner(env: TrackingEnv, start: OnPolicyRunner | None = None) -> OnPolicyRunner:
-    """PPO on an environment, from scratch or from where another runner stands."""
+    """Create PPO on an environment, from scratch or with the state of another runner."""
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
         runner = OnPolicyRunner(env, copy.deepcopy(PPO), log_dir=None, device="cpu")
     if start is not None:
@@ -209,7 +209,7 @@ def make_runner(env: TrackingEnv, start: OnPolicyRunner | None = None) -> OnPoli
 
 
 def train(name: str, runner: OnPolicyRunner, env: TrackingEnv, updates: int) -> OnPolicyRunner:
-    """Learn, and say the error of the policy as it explores."""
+    """Train and print the error of the exploring policy."""
     start = time.perf_counter()
     for k in range(1, updates + 1):
         runner.learn(1)
@@ -222,7 +222,7 @@ def train(name: str, runner: OnPolicyRunner, env: TrackingEnv, updates: int) -> 
 
 
 def follow(task: Task, plant: AlignedSim | Unit, policy: OnPolicyRunner | None) -> Array:
-    """Mean |q − reference| of every simulation or unit, (N,) rad: one motion of the task each, in turn, to its end."""
+    """Return the mean |q − reference| of every simulation or unit, (N,) rad; each plays one motion to its end."""
     count = len(plant.payload_mass)
     motion = np.arange(count) % len(task.first)
     row, last, action = task.first[motion].copy(), task.last[motion], np.zeros((count, task.n))
@@ -245,7 +245,7 @@ def follow(task: Task, plant: AlignedSim | Unit, policy: OnPolicyRunner | None) 
 
 
 def motions(robot: RobotSpec, heaviest: float, seed: int, names: list[str]) -> list[Array]:
-    """Upper-body motions that a seed makes, at the control period, (T, n) rad each."""
+    """Generate upper-body motions from a seed, at the control period, (T, n) rad each."""
     library = Library(robot, seed, heaviest)
     return [library.make(name).sample(robot.dt) for name in names]
 
@@ -259,16 +259,16 @@ def main(
     unit: str = "virtual-4",
     quick: bool = False,
 ) -> None:
-    """Learn, fine-tune, play on the unseen unit; print mean |error| to the reference in mrad.
+    """Train, fine-tune and test on the unseen unit; print the mean |error| to the reference in mrad.
 
     Args:
         run: Folder of gaponet train, H1-2.
         first: PPO updates in the nominal simulator.
         more: Further updates, once in the aligned and once in the nominal simulator.
         num_envs: Simulations side by side.
-        seeds: All is learnt anew with each.
-        unit: Of the easy fleet.
-        quick: Only see that it runs.
+        seeds: Seeds of training.
+        unit: Unit of the fleet `easy`.
+        quick: Test run with a few steps.
     """
     begin = time.perf_counter()
     torch.set_num_threads(1)  # the simulators take the other cores
@@ -285,36 +285,36 @@ def main(
         "aligned simulator": AlignedSim(corrected, model, tried, num_envs=len(tried), locked=task.locked),
         unit: Unit(robot, unseen, unit, tried),
     }
-    found: dict[str, list[Array]] = {}
+    results: dict[str, list[Array]] = {}
 
-    def judge(name: str, policy: OnPolicyRunner | None) -> None:
+    def evaluate(name: str, policy: OnPolicyRunner | None) -> None:
         errors = [follow(unseen, plant, policy).reshape(2, -1).mean(axis=1) for plant in plants.values()]
-        found.setdefault(name, []).append(1e3 * np.array(errors))
+        results.setdefault(name, []).append(1e3 * np.array(errors))
 
     print(f"{len(task.first)} motions to learn from, {len(unseen.first)} to try; {time.perf_counter() - begin:.0f} s")
-    judge("reference as target", None)
+    evaluate("reference as target", None)
     for seed in seeds:
         torch.manual_seed(seed)
         env = TrackingEnv(task, AlignedSim(robot, None, mass, num_envs=num_envs, locked=task.locked), seed)
         policy = train("nominal", make_runner(env), env, first)
-        judge("policy, nominal", policy)
+        evaluate("policy, nominal", policy)
         env.error = []
         longer = make_runner(env, policy)
         aligned = TrackingEnv(task, AlignedSim(corrected, model, mass, num_envs=num_envs, locked=task.locked), seed)
-        judge("policy, fine-tuned", train("fine-tuning", make_runner(aligned, policy), aligned, more))
-        judge("policy, nominal as long", train("nominal, on", longer, env, more))
-    print(table(found, list(plants), heaviest))
+        evaluate("policy, fine-tuned", train("fine-tuning", make_runner(aligned, policy), aligned, more))
+        evaluate("policy, nominal as long", train("nominal, on", longer, env, more))
+    print(table(results, list(plants), heaviest))
     print(f"{time.perf_counter() - begin:.0f} s in all")
 
 
-def table(found: dict[str, list[Array]], plants: list[str], heaviest: float) -> str:
-    """Markdown: mean over seeds (± standard deviation), at no payload and at the heaviest."""
+def table(results: dict[str, list[Array]], plants: list[str], heaviest: float) -> str:
+    """Return a Markdown table: mean over seeds (± standard deviation), without and with the largest payload."""
     columns = [f"{plant}, {p:g} kg" for plant in plants for p in (0, heaviest)]
     lines = [f"| mean abs error, mrad; units are VIRTUAL | {' | '.join(columns)} |"]
     lines.append("| --- |" + " ---: |" * len(columns))
-    for name, errors in found.items():
-        mean, spread = np.mean(errors, axis=0).ravel(), np.std(errors, axis=0).ravel()
-        cells = [f"{m:.1f} ± {s:.1f}" if len(errors) > 1 else f"{m:.1f}" for m, s in zip(mean, spread, strict=True)]
+    for name, errors in results.items():
+        mean, std = np.mean(errors, axis=0).ravel(), np.std(errors, axis=0).ravel()
+        cells = [f"{m:.1f} ± {s:.1f}" if len(errors) > 1 else f"{m:.1f}" for m, s in zip(mean, std, strict=True)]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -1,13 +1,13 @@
-"""Will a policy transfer? Trained in the nominal simulator, in the identified one, and in that with ranges: one table.
+"""Transfer of a policy trained in the nominal simulator, the identified one, and the identified one with ranges.
 
     pip install "rsl-rl-lib>=5.4.2,<6"
     python examples/policy_transfer.py WORK        # a VIRTUAL SO-101; minutes on two cores
 
-A VIRTUAL robot plays excitation, `gaponet identify` makes a robot folder of the recordings, and a small network learns
-by PPO to make the arm follow motions: in the simulator as its file says, in the identified one, and in sixteen of those
-that differ by what identification does not know (gaponet.export.rollout.drawn_robots). All are played on
-the VIRTUAL robot, on motions that nothing has learnt from. Last, `gaponet replay` is asked, before the robot is, what
-it will do under the targets of the nominal policy's own rollout.
+A VIRTUAL robot plays excitation, and `gaponet identify` writes a robot folder from the recordings. PPO trains a small
+network to follow motions in three simulators: the nominal one, the identified one, and sixteen samples of the
+identified one within its uncertainty (gaponet.export.rollout.drawn_robots). All policies are tested on the VIRTUAL
+robot with other motions. Finally, `gaponet replay` predicts the robot's motion under the targets of the nominal
+policy's own rollout.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from gaponet.export.rollout import drawn_robots
 from gaponet.robot.spec import RobotSpec, load_robot
 
 Array = np.ndarray
-RECORDED_SEED, LEARN_SEED, TRY_SEED = 0, 101, 202  # other numbers make other motions
+RECORDED_SEED, LEARN_SEED, TRY_SEED = 0, 101, 202  # different motions
 DRAWS = 16
 
 
 class Several:
-    """Simulations of several robots behind the calls of one AlignedSim, as many of each."""
+    """Simulations of several robots, equally many of each, with the methods of one AlignedSim."""
 
     def __init__(self, robots: list[RobotSpec], num_envs: int, locked: tuple[str, ...]) -> None:
         self.ids = np.array_split(np.arange(num_envs), len(robots))
@@ -46,7 +46,7 @@ class Several:
         self.num_envs, self.dt, self.payload_mass = num_envs, self.sims[0].dt, np.zeros(num_envs)
 
     def reset(self, qpos: Array, qvel: Array | float = 0.0, ids: Array | None = None) -> None:
-        """Rows of qpos and qvel are those of ids."""
+        """Reset the simulations `ids` to the rows of qpos and qvel."""
         ids = np.arange(self.num_envs) if ids is None else ids
         qvel = np.broadcast_to(qvel, qpos.shape)
         for sim, mine in zip(self.sims, self.ids, strict=True):
@@ -55,23 +55,23 @@ class Several:
                 sim.reset(qpos[at], qvel[at], ids=ids[at] - mine[0])
 
     def step(self, target: Array) -> None:
-        """One control period of all."""
+        """Step all simulations by one control period."""
         for sim, mine in zip(self.sims, self.ids, strict=True):
             sim.step(target[mine])
 
     @property
     def qpos(self) -> Array:
-        """(num_envs, n) rad."""
+        """Positions, (num_envs, n) rad."""
         return np.concatenate([sim.qpos for sim in self.sims])
 
     @property
     def qvel(self) -> Array:
-        """(num_envs, n) rad/s."""
+        """Velocities, (num_envs, n) rad/s."""
         return np.concatenate([sim.qvel for sim in self.sims])
 
 
 def identified(work: Path, robot: str, fleet: str, unit: str, quick: bool) -> Path:
-    """Recordings of the VIRTUAL unit, and the robot folder that is identified from them; what is there stays."""
+    """Record the VIRTUAL unit and identify a robot folder; existing ones are kept."""
     recipe, data, known = work / "recipe.toml", work / "data", work / "identified"
     work.mkdir(parents=True, exist_ok=True)
     names = ["tour-all-0", "tour-all-1", "limber-all-0", "limber-all-1"] if quick else ["*"]
@@ -87,7 +87,7 @@ def identified(work: Path, robot: str, fleet: str, unit: str, quick: bool) -> Pa
 
 
 def rollout(task: Task, robot: RobotSpec, policy: Any, file: Path) -> Array:
-    """The first motion by the policy in a simulator, as a log; its targets, (T, free) rad."""
+    """Simulate the first motion with the policy and write it as a log; returns its targets, (T, free) rad."""
     sim, actor = AlignedSim(robot, None, np.zeros(1), num_envs=1, locked=task.locked), policy.get_inference_policy()
     row, last, action = task.first[:1].copy(), task.last[:1], np.zeros((1, task.n))
     sim.reset(task.reference[row])
@@ -109,7 +109,7 @@ def rollout(task: Task, robot: RobotSpec, policy: Any, file: Path) -> Array:
 
 
 def forecast(work: Path, known: Path, task: Task, plant: Unit, targets: Array) -> str:
-    """What gaponet replay says of the rollout in WORK/rollout, and what the VIRTUAL robot does under its targets."""
+    """Compare the prediction of gaponet replay for WORK/rollout with the VIRTUAL robot under the same targets."""
     answer = work / "answer.npz"
     asked = ["replay", str(work / "rollout"), "--robot", str(known), "--out", str(answer), "--json"]
     with contextlib.redirect_stdout(out := io.StringIO()):
@@ -144,17 +144,17 @@ def main(
     seeds: tuple[int, ...] = (0, 1, 2),
     quick: bool = False,
 ) -> None:
-    """Record, identify, learn three times, play on the VIRTUAL robot; print mean |error| to the reference in mrad.
+    """Record, identify, train and test on the VIRTUAL robot; print the mean |error| to the reference in mrad.
 
     Args:
-        work: Folder for what is made.
+        work: Output folder.
         robot: Name or folder.
-        fleet: Of the VIRTUAL robot.
-        unit: Of the fleet.
-        updates: Of PPO, 16 periods each.
-        num_envs: Simulations side by side.
-        seeds: All is learnt anew with each.
-        quick: Only see that it runs.
+        fleet: Fleet of the VIRTUAL robot.
+        unit: Unit of the fleet.
+        updates: Updates of PPO, 16 periods each.
+        num_envs: Parallel simulations.
+        seeds: Seeds of training.
+        quick: Test run with a few steps.
     """
     torch.set_num_threads(1)
     updates, num_envs, seeds = (2, 16, (0,)) if quick else (updates, num_envs, seeds)
@@ -186,7 +186,7 @@ def main(
 
 
 def table(errors: dict[str, list[Array]]) -> str:
-    """Markdown: mean over motions, ± over seeds, and the paired difference to the nominal policy over motions."""
+    """Return a Markdown table: mean over motions, ± over seeds, and the paired difference to the nominal policy."""
     head = "| trained in | in its own simulator, mrad | on the VIRTUAL robot, mrad | to nominal, paired over motions |"
     lines = [head, "| --- | ---: | ---: | ---: |"]
     for name, runs in errors.items():

@@ -1,9 +1,9 @@
-"""LeRobot plug-in: an SO-101 whose targets are corrected and watched, motions to record, a processor step.
+"""LeRobot plug-in: an SO-101 with compensation and safety limits, a teleoperator of motions, and a processor step.
 
-LeRobot finds this module by the name of its distribution (register_third_party_plugins) and the classes by the names of
-their configurations. Angles are LeRobot's outside (degrees, gripper 0..100) and rad inside. The robot is commanded by
-`gaponet run --targets zmq` in a process of its own: compensator, limits, checks and watchdog are those of gaponet, and
-a policy that stalls leaves the arm held, then damped.
+LeRobot discovers this module by the name of its distribution (register_third_party_plugins) and the classes by the
+names of their configurations. Angles use LeRobot's units outside (degrees, gripper 0..100) and rad inside. A separate
+process, `gaponet run --targets zmq`, commands the robot with gaponet's compensator, limits, checks and watchdog. If a
+policy stalls, the arm is held, then damped.
 """
 
 import shlex
@@ -29,56 +29,56 @@ from gaponet.base import child_process
 from gaponet.robot.spec import RobotSpec, load_robot
 
 DEFAULT_RATE = 30.0  # Hz: LeRobot's own
-FOLLOWERS = ("so_follower", "so101_follower")  # LeRobot's names of it, newest first
-PAST = 50  # periods after which a correction has forgotten where it began
-START, BACK = 180.0, 60.0  # s: until the first state; until the arm is back where it was found
+FOLLOWERS = ("so_follower", "so101_follower")  # LeRobot's names of its own robot, newest first
+MEMORY_PERIODS = 50  # control periods after which a correction no longer depends on its start
+MAX_START_S, MAX_RETURN_S = 180.0, 60.0  # until the first state; until the arm is back at its first position
 
 
 class Units:
-    """LeRobot's values by name ↔ rad in the robot's order."""
+    """Conversion between LeRobot's values by name and rad in the robot's order."""
 
     def __init__(self, robot: RobotSpec) -> None:
         self.keys = [f"{joint}.pos" for joint in robot.joint_names]
         low, high = robot.qpos_range.T
-        share = np.array([unit == "fraction" for unit in robot.log_units])
-        self.scale = np.where(share, (high - low) / 100, np.pi / 180)
-        self.zero = np.where(share, low, 0.0)
+        fraction = np.array([unit == "fraction" for unit in robot.log_units])
+        self.scale = np.where(fraction, (high - low) / 100, np.pi / 180)
+        self.zero = np.where(fraction, low, 0.0)
 
     def rad(self, action: dict[str, Any]) -> np.ndarray:
-        """(n,) rad; NaN where a joint is not named."""
+        """Convert to (n,) rad; NaN for a joint that is not named."""
         return self.zero + self.scale * np.array([float(action.get(key, np.nan)) for key in self.keys])
 
     def named(self, qpos: np.ndarray) -> dict[str, float]:
-        """(n,) rad as LeRobot has it."""
+        """Convert (n,) rad to LeRobot's values."""
         return dict(zip(self.keys, ((qpos - self.zero) / self.scale).tolist(), strict=True))
 
 
-_seen: dict[str, float] = {}
+_last_observation: dict[str, float] = {}
 
 
-def saw(observation: dict[str, Any]) -> None:
-    """Where the arm of this process is, for gaponet_motion: gaponet_so101 says it; for another robot a program does."""
-    _seen.update({key: float(value) for key, value in observation.items() if key.endswith(".pos")})
+def set_observation(observation: dict[str, Any]) -> None:
+    """Tell gaponet_motion where the arm is. gaponet_so101 calls this; with another robot, the program must."""
+    _last_observation.update({key: float(value) for key, value in observation.items() if key.endswith(".pos")})
 
 
 @RobotConfig.register_subclass("gaponet_so101")
 @dataclass
 class GaponetSO101Config(RobotConfig):
-    """SO-101 follower; its calibration is what so101_follower's lerobot-calibrate wrote."""
+    """SO-101 follower with the calibration that lerobot-calibrate wrote for so101_follower."""
 
     port: str = "/dev/ttyACM0"
-    # That file, compared with what the servos hold; default that of --robot.id, without one the servos' counts.
+    # Calibration file, compared with the servos; default that of --robot.id, without an id the servos' counts.
     calibration: Path | None = None
-    known: Path | None = None  # robot folder of gaponet identify: targets are compensated by what is known of the arm
-    model: Path | None = None  # run of gaponet train, on top; without both targets go to the arm as they are
-    fps: float | None = None  # control rate, Hz, the same as LeRobot's: default what the model was trained at, else 30
+    known: Path | None = None  # robot folder of gaponet identify, for compensation
+    model: Path | None = None  # run of gaponet train, in addition; without both, targets are not corrected
+    fps: float | None = None  # control rate, Hz, equal to LeRobot's; default that of the model, else 30
     yes: bool = False  # do not ask before the arm moves
     options: str = ""  # further options of gaponet run: "--payload-mass 0.1 --safety.speed 2"
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
 
 
 class GaponetSO101(Robot):
-    """Targets go through compensator and limits to the arm; observations are the newest state of each period."""
+    """SO-101 behind compensator and limits; observations are the newest state of each period."""
 
     config_class = GaponetSO101Config
     name = "gaponet_so101"
@@ -96,7 +96,7 @@ class GaponetSO101(Robot):
         return self.action_features | {name: shape for name, shape, _ in self._pictures()}
 
     def _pictures(self) -> Iterator[tuple[str, tuple[int, int, int], Callable[[], Any]]]:
-        """Key, shape and reading of each camera's colours and depth, named as LeRobot's followers name them."""
+        """Yield key, shape and reader of each camera's colour and depth images; keys are those of LeRobot's robots."""
         for name, camera in self.cameras.items():
             size = camera.height, camera.width
             if getattr(camera, "use_rgb", True):
@@ -117,14 +117,14 @@ class GaponetSO101(Robot):
         return True
 
     def calibrate(self) -> None:
-        """lerobot-calibrate --robot.type=so101_follower does it; the servos hold what it found."""
+        """Refuse: lerobot-calibrate --robot.type=so101_follower calibrates the servos."""
         raise NotImplementedError(
             "gaponet_so101 calibrates nothing: lerobot-calibrate --robot.type=so101_follower, with "
             f"--robot.id={self.config.id or 'NAME'}; gaponet_so101 takes its file by that id"
         )
 
     def _calibration(self) -> Path | None:
-        """The file that was named, or the one that LeRobot's own follower wrote for this id."""
+        """Return the given calibration file, or the one that LeRobot's own follower wrote for this id."""
         if self.config.calibration is not None or not self.config.id:
             return self.config.calibration
         own = Path(self.calibration_fpath)
@@ -132,7 +132,7 @@ class GaponetSO101(Robot):
         return next((place for place in places if place.is_file()), None)
 
     def configure(self) -> None:
-        """Servos are left as they are set; the limits and the model's card ask what they have."""
+        """Keep the settings of the servos; gaponet run compares them with the robot and the model."""
 
     def connect(self, calibrate: bool = True) -> None:
         from gaponet.hw.control.consent import require_consent
@@ -140,7 +140,9 @@ class GaponetSO101(Robot):
         from gaponet.hw.targets.client import RemoteRobot
 
         if not self.config.yes:
-            require_consent(f"The SO-101 at {self.config.port} will move as LeRobot says.", option="--robot.yes=true")
+            require_consent(
+                f"The SO-101 at {self.config.port} will move as LeRobot commands.", option="--robot.yes=true"
+            )
         self._folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
         address, said = f"ipc://{self._folder.name}/targets", Path(self._folder.name, "said")
         with said.open("wb") as log:
@@ -153,7 +155,7 @@ class GaponetSO101(Robot):
                 next(self._states)
                 break
             except (DriverError, StopIteration):
-                if self._process.poll() is not None or time.monotonic() - began > START:
+                if self._process.poll() is not None or time.monotonic() - began > MAX_START_S:
                     self._remote.close(end=False)
                     self._leave()
                     raise DeviceNotConnectedError(f"gaponet run: {said.read_text(errors='replace').strip()}") from None
@@ -180,7 +182,7 @@ class GaponetSO101(Robot):
         if state is None:
             said = self._log.read_text(errors="replace").strip().splitlines() if self._process else []
             raise DeviceNotConnectedError(f"{self} is not connected, or was stopped: {' '.join(said[-2:])}")
-        saw(self.units.named(state.qpos))
+        set_observation(self.units.named(state.qpos))
         return self.units.named(state.qpos) | {name: read() for name, _, read in self._pictures()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
@@ -192,13 +194,13 @@ class GaponetSO101(Robot):
         return action
 
     def disconnect(self) -> None:
-        """The arm goes back to where it was found and is held there."""
+        """Return the arm to its first position, where it is held."""
         if self._process is not None:
             self._remote.close()
             try:
-                self._process.wait(BACK)
+                self._process.wait(MAX_RETURN_S)
             except subprocess.TimeoutExpired:
-                self._process.terminate()  # it damps
+                self._process.terminate()  # the arm is damped
             self._leave()
         for camera in self.cameras.values():
             camera.disconnect()
@@ -213,19 +215,19 @@ class GaponetSO101(Robot):
 @TeleoperatorConfig.register_subclass("gaponet_motion")
 @dataclass
 class GaponetMotionConfig(TeleoperatorConfig):
-    """Motions instead of a leader arm: what gaponet excite wrote, a motion file, or names of the library."""
+    """Motions instead of a leader arm: a folder of gaponet excite, motion files, or names of the library."""
 
-    motions: str = ""  # a folder, or files and names with commas between; each begins where the last one ended
+    motions: str = ""  # a folder, or files and names separated by commas; each starts where the previous one ended
     fps: float = DEFAULT_RATE  # as --dataset.fps
-    lead: float = 4.0  # s for which it stands where it was found, until the controller is there
-    payload_mass: float = 0.0  # kg in the gripper that the plan is for
+    lead: float = 4.0  # s at the first position, until the controller has started
+    payload_mass: float = 0.0  # kg in the gripper, for the plan
 
 
 class GaponetMotion(Teleoperator):
-    """Says one row of its motions a call, the last one for ever.
+    """Teleoperator that returns one row of its motions per call, at the end always the last one.
 
-    One plan from where the arm was found through all of them, checked before the first row is said, as of gaponet run:
-    joints that a motion does not name stay where they are, and ways from one to the next keep clear.
+    One plan leads from the arm's first position through all motions. It is checked before the first row, as in gaponet
+    run: joints that a motion does not name keep their position, and moves between motions avoid collisions.
     """
 
     config_class = GaponetMotionConfig
@@ -238,7 +240,7 @@ class GaponetMotion(Teleoperator):
         self.units = Units(self.spec)
         self._connected = False
         self._rows: np.ndarray | None = None
-        self._said = 0
+        self._next_row = 0
 
     @property
     def action_features(self) -> dict[str, type]:
@@ -263,13 +265,13 @@ class GaponetMotion(Teleoperator):
         """Nothing to do."""
 
     def connect(self, calibrate: bool = True) -> None:
-        self._connected, self._rows, self._said = True, None, 0
+        self._connected, self._rows, self._next_row = True, None, 0
 
     def plan(self, found: np.ndarray) -> np.ndarray:
-        """All rows (T, n) rad from where the arm was found, (n,) rad.
+        """Plan all rows (T, n) rad from the arm's position, (n,) rad.
 
         Raises:
-            UsageError: Some part of it would touch arm or table, or needs too much; the message says which.
+            UsageError: A part would collide with arm or table, or exceeds a limit; the message names it.
         """
         from gaponet.hw.control.phases import ControlConfig
         from gaponet.hw.control.plan import Planner
@@ -293,19 +295,19 @@ class GaponetMotion(Teleoperator):
         if not self._connected:
             raise DeviceNotConnectedError(f"{self} is not connected")
         if self._rows is None:
-            found = self.units.rad(_seen)
+            found = self.units.rad(_last_observation)
             if not np.isfinite(found).all():
                 raise DeviceNotConnectedError(
-                    "gaponet_motion plans from where the arm is, and nobody has said that: use it with gaponet_so101, "
-                    "or call lerobot_robot_gaponet.saw(observation) with your robot's first observation"
+                    "gaponet_motion plans from the arm's position, which is unknown: use it with gaponet_so101, "
+                    "or call lerobot_robot_gaponet.set_observation(observation) with your robot's first observation"
                 )
             self._rows = self.plan(found)
-        row = self._rows[min(self._said, len(self._rows) - 1)]
-        self._said += 1
+        row = self._rows[min(self._next_row, len(self._rows) - 1)]
+        self._next_row += 1
         return self.units.named(row)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Nobody feels it."""
+        """Ignore feedback."""
 
     def disconnect(self) -> None:
         self._connected = False
@@ -314,18 +316,18 @@ class GaponetMotion(Teleoperator):
 @ProcessorStepRegistry.register("gaponet_correct")
 @dataclass
 class GaponetCorrect(ProcessorStep):
-    """Corrects joint targets, once per control period, by a model at its rate, or by an identified robot at its.
+    """Processor step that corrects joint targets once per control period, by a model or an identified robot.
 
-    For a robot that is not gaponet_so101: the correction is bounded in size and rate, but nothing watches the arm. As
-    last step of a policy's postprocessor (gaponet export --to lerobot) actions are tensors (..., n) of all joints, one
-    or a chunk (1, T, n) to be sent one a period, and no state is known; as a robot action processor they are named, and
-    the observation is used.
+    It is for robots other than gaponet_so101: the correction is limited in size and rate, but no watchdog protects the
+    arm. As last step of a policy's postprocessor (gaponet attach), actions are tensors (..., n) of all joints, or a
+    chunk (1, T, n) that is sent one row per period, and the state is unknown. As a robot action processor, actions are
+    named, and the observation is used.
     """
 
     model: str = ""
     known: str = ""  # instead of a model, a robot folder of gaponet identify
     payload_mass: float = 0.0
-    dynamics: bool = False  # feed forward what moving asks for: for planned, smooth targets alone
+    dynamics: bool = False  # feed forward accelerations: only for planned, smooth targets
 
     def __post_init__(self) -> None:
         from gaponet.deploy.compensator import Compensator, CompensatorConfig
@@ -344,7 +346,7 @@ class GaponetCorrect(ProcessorStep):
 
     def reset(self) -> None:
         self._delta: np.ndarray | None = None
-        self._chunk: np.ndarray | None = None  # rows of the last one, and before them those of which it was the sequel
+        self._chunk: np.ndarray | None = None  # rows of the last chunk, after those that it continued
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         transition = transition.copy()
@@ -363,8 +365,8 @@ class GaponetCorrect(ProcessorStep):
         return transition
 
     def _corrected_chunk(self, action: torch.Tensor) -> torch.Tensor:
-        """All rows of one chunk. Nobody says how many of the last one were sent: it goes on at the nearest of them, as
-        the correction would have gone on after those before it."""
+        """Correct all rows of a chunk. LeRobot does not tell how many rows of the last chunk were sent: the correction
+        continues after the rows before the nearest one of that chunk."""
         if action.ndim > 2 and action.shape[:-2].numel() != 1:
             raise ValueError(f"gaponet_correct corrects one robot's chunk, not {tuple(action.shape)}")
         keys = self.units.keys
@@ -373,7 +375,7 @@ class GaponetCorrect(ProcessorStep):
         before = chunk[:0]
         if self._chunk is not None:
             nearest = int(np.abs(self._chunk - chunk[0]).max(axis=1).argmin())
-            before = self._chunk[max(0, nearest - PAST) : nearest]
+            before = self._chunk[max(0, nearest - MEMORY_PERIODS) : nearest]
         self._delta = None
         sent = np.array([self._corrected(row, None) for row in (*before, *chunk)])[len(before) :]
         self._chunk = np.concatenate([before, chunk])
@@ -382,7 +384,7 @@ class GaponetCorrect(ProcessorStep):
 
     def _corrected(self, target: np.ndarray, qpos: np.ndarray | None) -> np.ndarray:
         if not np.isfinite(target).all():
-            raise ValueError("gaponet_correct: the action holds something that is not a number, or lacks a joint")
+            raise ValueError("gaponet_correct: the action lacks a joint, or holds a value that is not a number")
         if self._delta is None:
             self.compensator.reset(target, self.payload_mass)
             self._delta = np.zeros_like(target)

@@ -1,4 +1,4 @@
-"""A folder full of modules that are called like Python's and everybody's: no command and no child of one runs any."""
+"""Commands and their children import no module of the current folder."""
 
 import importlib.metadata
 import os
@@ -56,7 +56,7 @@ if __name__ == "__main__":
 
 @pytest.fixture
 def poisoned(tmp_path):
-    """Such a folder, with a robot and a log of it."""
+    """Folder with modules named like all installed ones, a robot and a log."""
     for name in NAMES:
         (tmp_path / f"{name}.py").write_text(POISON)
     write_arm(tmp_path / "arm")
@@ -70,7 +70,7 @@ def poisoned(tmp_path):
 
 
 def python(folder: Path, code: str, *words: str, **env: str) -> str:
-    """A script that lies elsewhere, started in the folder."""
+    """Run a script of another folder in this folder; returns its output."""
     (folder / "elsewhere").mkdir(exist_ok=True)
     script = folder / "elsewhere" / "script.py"
     script.write_text(code)
@@ -84,27 +84,27 @@ def ran(folder: Path) -> list[str]:
     return (folder / MARK).read_text().split() if (folder / MARK).exists() else []
 
 
-def test_a_poisoned_folder_runs_where_python_looks_there(poisoned):
-    """The test's own proof: this is what must not happen."""
+def test_plain_python_imports_modules_of_the_current_folder(poisoned):
+    """Shows that the fixture works."""
     subprocess.run([sys.executable, "-c", "import numpy"], cwd=poisoned, capture_output=True)
     assert "numpy" in ran(poisoned)
 
 
-def test_no_command_runs_what_lies_in_the_folder(poisoned):
+def test_no_command_imports_modules_of_the_current_folder(poisoned):
     said = python(poisoned, EVERY_COMMAND)
     assert said.count("usage: gaponet") == len(COMMANDS), said
     assert ran(poisoned) == []
 
 
-def test_no_child_runs_what_lies_in_the_folder(poisoned):
+def test_no_child_imports_modules_of_the_current_folder(poisoned):
     pytest.importorskip("serial")
     assert python(poisoned, CHILDREN).splitlines() == ["1 imported", "watched", "3 computed"]
     assert ran(poisoned) == []
 
 
 @pytest.mark.parametrize("how", ["-m", "PYTHONPATH"])
-def test_a_command_runs_nothing_of_the_folder_however_it_is_started(poisoned, how):
-    """What Python itself loads before a module of ours can say anything is out of our hands."""
+def test_a_command_started_by_m_or_pythonpath_imports_none_of_them(poisoned, how):
+    """Modules that Python imports before gaponet are exempt."""
     started = [sys.executable, "-c", "import sys; print(*sys.modules)"]
     loaded = subprocess.run(started, cwd="/", capture_output=True, text=True).stdout.split()  # by .pth files as well
     library = sys.stdlib_module_names - {"json", "tomllib", "hashlib", "subprocess", "multiprocessing", "csv"}

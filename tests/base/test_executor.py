@@ -1,4 +1,4 @@
-"""Executors: workers that are killed cost nothing but time, on each of them; nothing is loaded unasked."""
+"""Executors: a killed worker costs time only; Ray is imported on request."""
 
 import os
 import pickle
@@ -25,7 +25,7 @@ def carried_out(pool, folder, numbers):
     return outcomes, {n: len(list(folder.glob(f"{n}-*"))) for n in numbers}
 
 
-def test_a_killed_worker_costs_its_own_job_another_attempt_and_no_other_job_anything(tmp_path, monkeypatch):
+def test_the_job_of_a_killed_worker_is_repeated_and_no_other_job(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     with open_pool("local", 2, 1) as pool:
         outcomes, attempts = carried_out(pool, tmp_path, range(8))
@@ -42,7 +42,7 @@ def test_a_killed_worker_costs_its_own_job_another_attempt_and_no_other_job_anyt
 
 
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs gaponet[ray]")
-def test_the_same_on_a_ray_of_this_machine(tmp_path, monkeypatch):
+def test_ray_repeats_the_job_of_a_killed_worker(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # jobs.py
     with open_pool("ray", 2, 1) as pool:
         outcomes, attempts = carried_out(pool, tmp_path, (0, 1, 7))
@@ -52,20 +52,20 @@ def test_the_same_on_a_ray_of_this_machine(tmp_path, monkeypatch):
         outcomes[7].result()
 
 
-def test_any_executor_of_the_standard_library_will_do():
+def test_executors_of_the_standard_library_are_accepted():
     for executor in (ThreadPoolExecutor(2), ProcessPoolExecutor(2)):
         with executor, open_pool(executor, 0, 1) as pool:
             assert list(pool.map(abs, range(-9, 0))) == [*range(9, 0, -1)]
 
 
 @pytest.mark.parametrize("where", ["dask", "submitit:cluster=local", "slurm", "local:2", object()])
-def test_what_is_no_executor_is_refused_and_the_answer_names_ray_and_python(where):
+def test_an_unknown_executor_is_refused_with_the_alternatives(where):
     answer = r"--executor .*: choose local, ray or ray:ADDRESS; from Python, give a concurrent\.futures\.Executor"
     with pytest.raises(UsageError, match=answer), open_pool(where, 0, 1):
         pass
 
 
-def test_ray_is_loaded_only_where_it_is_asked_for_and_named_where_it_is_missing(tmp_path, capsys, monkeypatch):
+def test_ray_is_imported_on_request_and_a_missing_ray_is_named(tmp_path, capsys, monkeypatch):
     code = "import sys, gaponet.base.executor, gaponet.experiments.outcomes; print('ray' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "False\n"
@@ -75,7 +75,7 @@ def test_ray_is_loaded_only_where_it_is_asked_for_and_named_where_it_is_missing(
     assert "pip install 'gaponet[ray]'" in capsys.readouterr().err
 
 
-def test_a_robot_goes_to_a_machine_that_has_not_its_folder(tmp_path):
+def test_a_pickled_robot_brings_its_folder(tmp_path):
     robot = write_arm(tmp_path / "here")
     sent = pickle.dumps(robot)
     assert pickle.loads(sent).folder == robot.folder

@@ -1,4 +1,4 @@
-"""Files whole or not at all, one writer to a folder, and nothing into somebody else's."""
+"""Atomic writes, one writer per folder, no writes into other people's folders."""
 
 import os
 import subprocess
@@ -15,7 +15,7 @@ def names(folder):
     return sorted(f.name for f in folder.iterdir())
 
 
-def test_a_file_that_could_not_be_written_is_as_it_was(tmp_path):
+def test_a_failed_write_leaves_the_file_unchanged(tmp_path):
     write_text(tmp_path / "a.json", "old")
 
     def full():
@@ -29,7 +29,7 @@ def test_a_file_that_could_not_be_written_is_as_it_was(tmp_path):
     assert names(tmp_path) == ["a.json"]
 
 
-def test_a_new_folder_is_marked_with_what_it_is(tmp_path):
+def test_a_new_folder_is_marked_with_its_kind(tmp_path):
     with lock_folder(tmp_path / "a" / "b", "run"):
         write_text(tmp_path / "a" / "b" / "x", "")
     assert (tmp_path / "a" / "b" / FOLDER_MARKER).read_text() == "run\n"
@@ -39,7 +39,7 @@ def test_a_new_folder_is_marked_with_what_it_is(tmp_path):
         require_own_folder(tmp_path / "a" / "b", "dataset")
 
 
-def test_a_block_that_fails_before_it_wrote_leaves_no_folder(tmp_path):
+def test_a_block_that_fails_before_writing_leaves_no_folder(tmp_path):
     (tmp_path / "empty").mkdir()
     for folder in (tmp_path / "a" / "b", tmp_path / "empty"):
         with pytest.raises(ZeroDivisionError), lock_folder(folder, "run"):
@@ -48,7 +48,7 @@ def test_a_block_that_fails_before_it_wrote_leaves_no_folder(tmp_path):
     assert names(tmp_path / "empty") == []
 
 
-def test_a_block_that_fails_after_it_wrote_removes_nothing(tmp_path):
+def test_a_block_that_fails_after_writing_removes_nothing(tmp_path):
     def fail():
         with lock_folder(tmp_path / "a", "run"):
             write_text(tmp_path / "a" / "x", "")
@@ -60,21 +60,14 @@ def test_a_block_that_fails_after_it_wrote_removes_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["notes.txt", ".env", "dataset"])
-def test_anything_of_somebody_elses_is_refused_and_left_alone(tmp_path, name):
+def test_a_folder_of_another_program_is_refused_and_unchanged(tmp_path, name):
     (tmp_path / name).mkdir()
     with pytest.raises(FolderError, match=f"holds {name}, so it is no run of gaponet"), lock_folder(tmp_path, "run"):
         pass
     assert names(tmp_path) == [name]
 
 
-def test_a_folder_from_before_there_was_a_mark_is_known_by_what_it_holds(tmp_path):
-    (tmp_path / "dataset.json").touch()
-    with lock_folder(tmp_path, "dataset"):
-        pass
-    assert names(tmp_path) == [FOLDER_MARKER, "dataset.json"]
-
-
-def test_a_second_writer_is_refused_with_the_firsts_process_or_waits_for_it(tmp_path):
+def test_a_second_writer_is_refused_or_waits_for_the_first(tmp_path):
     def other(wait):
         with lock_folder(tmp_path / "a", "run", wait):
             return True
@@ -87,7 +80,7 @@ def test_a_second_writer_is_refused_with_the_firsts_process_or_waits_for_it(tmp_
         assert patient.result()
 
 
-def test_what_a_killed_writer_left_half_written_goes_with_the_next(tmp_path):
+def test_the_next_writer_removes_unfinished_files_of_a_killed_one(tmp_path):
     code = (
         "import os, sys; from pathlib import Path; from gaponet.base.files import atomic_write, lock_folder\n"
         "with lock_folder(Path(sys.argv[1]), 'run'), atomic_write(Path(sys.argv[1]) / 'sub' / 'x') as file:\n"
@@ -104,10 +97,20 @@ def test_what_a_killed_writer_left_half_written_goes_with_the_next(tmp_path):
         assert names(out / "sub") == [mine.name, f"{FOLDER_MARKER}rc"]
 
 
-@pytest.mark.parametrize("place", ["cells/mlp-0", "rehearsal/cells/mlp-0", "without-b/cells/mlp-0"])
-def test_experiments_that_were_begun_before_there_was_a_mark_go_on(tmp_path, place):
-    (tmp_path / place).mkdir(parents=True)
-    (tmp_path / place / "setup.json").write_text("{}")
-    require_own_folder(tmp_path, "experiments")
-    with pytest.raises(FolderError, match="no dataset of gaponet"):
-        require_own_folder(tmp_path, "dataset")
+@pytest.mark.parametrize(
+    ("kind", "file"),
+    [
+        ("dataset", "dataset.json"),
+        ("experiments", "cells/a/setup.json"),
+        ("experiments", "without-b/cells/a/setup.json"),
+    ],
+)
+def test_a_folder_of_an_older_version_is_recognised_by_its_files(tmp_path, kind, file):
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).write_text("{}")
+    with lock_folder(tmp_path, kind):
+        pass
+    assert names(tmp_path)[0] == FOLDER_MARKER
+    (tmp_path / FOLDER_MARKER).unlink()
+    with pytest.raises(FolderError, match="so it is no run of gaponet"):
+        require_own_folder(tmp_path, "run")

@@ -1,11 +1,11 @@
-"""Progress where there is no terminal."""
+"""Progress without a terminal."""
 
 import time
 
 from gaponet.base import progress
 
 
-def test_a_pipe_gets_a_line_at_the_start_one_now_and_then_and_one_at_the_end(capfd, monkeypatch):
+def test_a_pipe_receives_a_first_line_one_per_interval_and_a_last_one(capfd, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     with progress.progress_bar("importing [all]") as update:
@@ -19,7 +19,7 @@ def test_a_pipe_gets_a_line_at_the_start_one_now_and_then_and_one_at_the_end(cap
     assert len(lines) == 5
 
 
-def test_what_is_complete_is_said_once_and_nothing_else_is_called_complete(capfd, monkeypatch):
+def test_100_percent_is_printed_once_at_the_end(capfd, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     with progress.progress_bar("training") as update:
@@ -35,7 +35,7 @@ def test_what_is_complete_is_said_once_and_nothing_else_is_called_complete(capfd
     ]  # fmt: skip
 
 
-def test_parts_that_run_side_by_side_are_told_together(capfd):
+def test_parallel_tasks_share_a_line(capfd):
     with progress.progress_bars("runs", 4) as show:
         show({"mlp seed 0": (0.5, "round 3"), "gaponet seed 0": (0.25, "")}, 1)
     assert capfd.readouterr().err.startswith(

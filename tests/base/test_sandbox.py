@@ -1,4 +1,4 @@
-"""A stranger's file may ask for what it wants: one line comes of it, and the next file is read."""
+"""An untrusted file that exceeds a limit gives a one-line error, and the next file is read."""
 
 import os
 import subprocess
@@ -21,7 +21,7 @@ from gaponet.robot.spec import load_robot
 limited = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
 
 
-def test_what_comes_back_is_what_was_returned(tmp_path):
+def test_results_are_returned_unchanged(tmp_path):
     got = parsed(tmp_path / "a", "answers")
     assert got["zeros"].shape == (1000, 3)
     assert got["name"][0] == "a"
@@ -43,7 +43,7 @@ def test_what_comes_back_is_what_was_returned(tmp_path):
     ],
 )
 @limited
-def test_whatever_a_parser_does_is_one_line_and_the_next_file_is_read(tmp_path, monkeypatch, how, said):
+def test_a_failing_parser_gives_one_line_and_the_next_file_is_read(tmp_path, monkeypatch, how, said):
     monkeypatch.setattr(sandbox, "PROCESSOR_S", 1.0)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(LogError) as error:
@@ -52,7 +52,7 @@ def test_whatever_a_parser_does_is_one_line_and_the_next_file_is_read(tmp_path, 
     assert parsed(Path("x"), "answers")["name"][0] == "x"
 
 
-def test_a_child_that_nobody_asks_ends_and_the_next_file_has_another(tmp_path, monkeypatch):
+def test_an_idle_child_ends_and_the_next_file_starts_another(tmp_path, monkeypatch):
     first = parsed(tmp_path, "prints")
     sandbox._Child.current.process.stdin.close()  # as after IDLE_S
     sandbox._Child.current.process.wait()
@@ -60,7 +60,7 @@ def test_a_child_that_nobody_asks_ends_and_the_next_file_has_another(tmp_path, m
     assert first != second == parsed(tmp_path, "prints")
 
 
-def test_the_child_ends_with_its_parent_and_is_one(tmp_path):
+def test_one_child_serves_all_files_and_ends_with_its_parent(tmp_path):
     assert parsed(tmp_path, "prints") == parsed(tmp_path, "prints")
     code = "from pathlib import Path; from base.hostile import parsed; print(parsed(Path('x'), 'prints'))"
     words = [sys.executable, "-c", code]
@@ -71,7 +71,7 @@ def test_the_child_ends_with_its_parent_and_is_one(tmp_path):
 
 @limited
 @pytest.mark.parametrize("name", ["mjcf cone", "mjcf supersphere", "mjcf nkey", "mjcf nuser_geom", "mjcf iterations"])
-def test_a_robot_that_wants_a_machine_is_refused(tmp_path, name):
+def test_a_robot_beyond_the_limits_is_refused(tmp_path, name):
     hostile.CASES[name].make(tmp_path)
     with pytest.raises(RobotError):
         _ = load_robot(tmp_path / "arm").qpos_range
@@ -79,7 +79,7 @@ def test_a_robot_that_wants_a_machine_is_refused(tmp_path, name):
 
 @limited
 @pytest.mark.parametrize("name", ["onnx Loop"])
-def test_a_network_that_wants_a_machine_is_refused(tmp_path, name, monkeypatch):
+def test_a_network_beyond_the_limits_is_refused(tmp_path, name, monkeypatch):
     monkeypatch.setattr(sandbox, "PROCESSOR_S", 1.0)
     hostile.CASES[name].make(tmp_path)
     with pytest.raises(ModelError, match=r"model\.onnx: is not read"):
@@ -87,7 +87,7 @@ def test_a_network_that_wants_a_machine_is_refused(tmp_path, name, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["pickle bytearray", "pickle repr", "csv sparse"])
-def test_a_log_that_wants_a_machine_is_refused(tmp_path, name, monkeypatch):
+def test_a_log_beyond_the_limits_is_refused(tmp_path, name, monkeypatch):
     monkeypatch.setattr(sandbox, "PROCESSOR_S", 1.0)
     hostile.CASES[name].make(tmp_path)
     robot = load_robot(tmp_path / "arm")
@@ -95,7 +95,7 @@ def test_a_log_that_wants_a_machine_is_refused(tmp_path, name, monkeypatch):
         list(read_logs(tmp_path / "logs", robot, allow_pickle=True, position_unit="rad", time_unit="s"))
 
 
-def test_a_plain_robot_and_what_was_tried_before_start_no_child(tmp_path, monkeypatch):
+def test_a_plain_or_already_accepted_robot_starts_no_child(tmp_path, monkeypatch):
     robot = write_arm(tmp_path / "arm")
     mesh = hostile.asset('<mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>')
     mesh(tmp_path / "meshed")
@@ -107,7 +107,7 @@ def test_a_plain_robot_and_what_was_tried_before_start_no_child(tmp_path, monkey
     assert load_robot(tmp_path / "meshed" / "arm").qpos_range.shape == (2, 2)
 
 
-def test_rows_are_counted_before_they_are_read(tmp_path):
+def test_rows_are_counted_before_reading(tmp_path):
     pq.write_table(pa.table({"time": pa.nulls(70_000_000, pa.int8())}), tmp_path / "a.parquet")
     assert (tmp_path / "a.parquet").stat().st_size < 1e6
     with pytest.raises(LogError, match="70,000,000 rows of 1 columns are 70,000,000 values, more than 512 MiB"):

@@ -1,4 +1,4 @@
-"""Whatever a file holds, it becomes the stated type or one line with file and field."""
+"""File contents become the stated type or a one-line error with file and field."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -37,12 +37,12 @@ BAD = [
 ]
 
 
-def test_a_good_table_becomes_its_type_with_tuples_and_floats():
+def test_a_valid_table_becomes_its_type_with_tuples_and_floats():
     assert validated(Servo, GOOD, "f", RobotError) == Servo(2.0, ("pan",))
 
 
 @pytest.mark.parametrize(("data", "said"), BAD)
-def test_a_bad_table_is_one_line_with_file_field_and_what_to_do(data, said):
+def test_an_invalid_table_gives_one_line_with_file_field_and_hint(data, said):
     with pytest.raises(RobotError) as error:
         validated(Servo, data, "robot.toml", RobotError, "mend it")
     text = str(error.value)
@@ -54,12 +54,12 @@ def test_a_bad_table_is_one_line_with_file_field_and_what_to_do(data, said):
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"\xff", b"[" * 100_000, b'{"gain": ' + b"9" * 5000 + b"}", b'"\\ud800"'])
-def test_text_that_is_not_json_is_one_line(text):
+def test_invalid_json_gives_one_line(text):
     with pytest.raises(RobotError, match="Invalid JSON"):
         parse_json(Servo, text, "card.json", RobotError)
 
 
-def test_a_missing_file_a_folder_and_a_huge_one_are_refused_before_reading(tmp_path):
+def test_missing_files_folders_and_huge_files_are_refused_before_reading(tmp_path):
     huge = tmp_path / "huge"
     with huge.open("wb") as file:
         file.truncate(1 << 40)
@@ -70,7 +70,7 @@ def test_a_missing_file_a_folder_and_a_huge_one_are_refused_before_reading(tmp_p
 
 
 @pytest.mark.parametrize("text", [b"gain = ", b"gain = nan", b"\xff", b"gain = " + b"[" * 5000, b"gain=" + b"9" * 5000])
-def test_a_bad_toml_is_one_line(tmp_path, text):
+def test_invalid_toml_gives_one_line(tmp_path, text):
     file = tmp_path / "robot.toml"
     file.write_bytes(text)
     with pytest.raises(RobotError, match="robot"):

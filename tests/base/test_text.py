@@ -9,7 +9,7 @@ from gaponet.base.text import escape_markdown, format_uncertainty
     [(7.43e-5, 1.3, "0.0 ± 1.3"), (320.4, 168.0, "320 ± 170"), (19.63, 0.912, "19.63 ± 0.91"),
      (-0.01234, 0.00071, "-0.01234 ± 0.00071"), (1234.0, 5678.0, "1200 ± 5700"), (2.0, float("nan"), "2.000 ± nan")],
 )  # fmt: skip
-def test_a_measured_number_has_the_digits_that_its_error_allows(value, error, text):
+def test_the_standard_error_determines_the_digits(value, error, text):
     assert format_uncertainty(value, error) == text
 
 
@@ -25,9 +25,9 @@ def test_a_measured_number_has_the_digits_that_its_error_allows(value, error, te
         ),
     ],
 )
-def test_no_error_shows_the_keys_of_an_address(text, shown):
+def test_errors_do_not_show_credentials_of_addresses(text, shown):
     assert str(GAPONetError(text)) == shown
 
 
-def test_a_name_in_markdown_fetches_no_picture():
+def test_markdown_markup_in_a_name_is_escaped():
     assert escape_markdown("![x](https:evil.example)") == r"!\[x\](https:evil.example)"

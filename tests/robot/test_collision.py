@@ -21,7 +21,7 @@ def test_distance_of_segments():
     assert distance(x, ([0.3, 0, 0], [0.4, 0, 0])) == 0  # on it
 
 
-def test_distance_of_segments_is_the_smallest_over_all_pairs_of_points():
+def test_segment_distance_is_the_minimum_over_pairs_of_points():
     rng = np.random.default_rng(0)
     s = np.linspace(0, 1, 201)[:, None]
     for _ in range(20):
@@ -37,7 +37,7 @@ def h1():
     return robot, Collision(robot, build_model(robot))
 
 
-def test_hanging_arms_are_clear_and_folded_ones_are_not(h1):
+def test_hanging_arms_are_free_and_folded_ones_collide(h1):
     robot, collision = h1
     hit = robot.qpos_home.copy()
     hit[robot.index(["left_shoulder_yaw_joint"])] = -1.5  # forearm into the belly
@@ -49,7 +49,7 @@ def test_hanging_arms_are_clear_and_folded_ones_are_not(h1):
     assert "left_elbow_link" in nearest or "left_wrist_yaw_link" in nearest
 
 
-def test_left_and_right_are_mirrored(h1):
+def test_left_and_right_shapes_are_mirrored(h1):
     robot, collision = h1
     left, right = robot.qpos_home.copy(), robot.qpos_home.copy()
     left[robot.index(["left_shoulder_roll_joint"])] = -0.3
@@ -62,7 +62,7 @@ def test_a_robot_without_shapes_is_not_checked(arm):
     assert Collision(arm, build_model(arm)).distance(np.zeros((3, 2))).tolist() == [np.inf] * 3
 
 
-def test_a_shape_without_thickness_is_an_error(arm):
+def test_a_negative_radius_is_an_error(arm):
     file = arm.folder / "collision.toml"
     file.write_text('capsule = [{ body = "upper", from = [0, 0, 0], to = [0, 0, 1], radius = -50.0 }]')
     with pytest.raises(RobotError, match=r"collision.toml.*radius"):
@@ -71,7 +71,7 @@ def test_a_shape_without_thickness_is_an_error(arm):
         check_robot(arm)
 
 
-def test_a_shape_on_a_body_that_does_not_exist_is_an_error(arm):
+def test_a_shape_on_an_unknown_body_is_an_error(arm):
     file = arm.mjcf.parent / "collision.toml"
     file.write_text('capsule = [{ body = "nose", from = [0, 0, 0], to = [0, 0, 1], radius = 0.1 }]')
     with pytest.raises(RobotError, match="capsule names body 'nose', the MJCF has: world, upper, fore"):
@@ -79,7 +79,7 @@ def test_a_shape_on_a_body_that_does_not_exist_is_an_error(arm):
 
 
 @pytest.mark.parametrize("name", ["so101", "h1_2", "g1_29", "g1_23", "fr3", "ur10e"])
-def test_every_robot_of_the_package_is_clear_at_home_and_knows_what_it_stands_on(name):
+def test_packaged_robots_are_free_at_home_and_have_a_plane(name):
     robot = load_robot(name)
     collision = Collision(robot, build_model(robot))
     assert collision.distance(robot.qpos_home[None])[0] >= collision.clearance
@@ -87,7 +87,7 @@ def test_every_robot_of_the_package_is_clear_at_home_and_knows_what_it_stands_on
     assert len(collision.above)
 
 
-def test_free_space_is_what_mujoco_finds(so101):
+def test_distances_agree_with_contacts_of_mujoco(so101):
     collision, judge = Collision(so101, build_model(so101)), Contacts(so101)
     postures = np.random.default_rng(0).uniform(*so101.qpos_range.T, (300, 6))
     touching = np.array([judge.deepest(q)[0] > 0 for q in postures])
@@ -97,7 +97,7 @@ def test_free_space_is_what_mujoco_finds(so101):
     assert touching[free < 0].all()
 
 
-def test_the_table_may_stand_elsewhere(so101):
+def test_the_height_of_the_plane_can_be_set(so101):
     down = so101.qpos_home.copy()
     down[so101.index(["shoulder_lift"])] = 1.0
     lower = Collision(so101, build_model(so101), height=-0.2)

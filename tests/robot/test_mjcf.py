@@ -1,4 +1,4 @@
-"""A stranger's MJCF is refused in one line, before it takes memory or time."""
+"""An untrusted MJCF is refused in one line, before it needs memory or time."""
 
 import os
 
@@ -29,14 +29,14 @@ BIG = '<worldbody><replicate count="200000"><body><geom size="1"/></body></repli
     ],
 )
 @pytest.mark.parametrize("ask", [build_model, lambda robot: robot.qpos_range])
-def test_it_says_what_is_wrong_whoever_asks_first(tmp_path, old, new, said, ask):
+def test_an_oversized_or_invalid_mjcf_is_refused(tmp_path, old, new, said, ask):
     robot = write_arm(tmp_path / "arm", xml=XML.replace(old, new))
     with pytest.raises(RobotError, match=said) as error:
         ask(robot)
     assert "\n" not in str(error.value)
 
 
-def test_a_pipe_as_a_mesh_is_not_waited_for(tmp_path):
+def test_a_pipe_as_a_mesh_is_refused_at_once(tmp_path):
     mesh = '<asset><mesh file="m.obj"/></asset><worldbody>'
     robot = write_arm(tmp_path / "arm", xml=XML.replace("<worldbody>", mesh))
     os.mkfifo(tmp_path / "arm" / "m.obj")

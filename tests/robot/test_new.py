@@ -1,4 +1,4 @@
-"""gaponet robot new: a vendor's model becomes a robot folder that moves as the model does."""
+"""gaponet robot new: a robot folder has the dynamics of the vendor's model."""
 
 import tomllib
 from pathlib import Path
@@ -53,7 +53,7 @@ def furthest(made: NewRobot) -> tuple[float, float]:
     return float(worst[0]), float(worst[1])
 
 
-def test_base_fingers_and_leg_are_frozen_and_the_arm_weighs_what_it_did(tmp_path):
+def test_unlogged_joints_are_fixed_and_gravity_and_inertia_are_unchanged(tmp_path):
     made = make(tmp_path, joints=ARM)
     assert made.robot.joint_names == ("shoulder", "elbow", "roll")
     assert max(furthest(made)) < 1e-9
@@ -62,7 +62,7 @@ def test_base_fingers_and_leg_are_frozen_and_the_arm_weighs_what_it_did(tmp_path
     assert any("left_slide at 0.03 m" in note and "hip at -0.4 rad" in note for note in made.notes)
 
 
-def test_a_finger_that_follows_another_and_a_base_that_hangs_are_said_to_be_held(tmp_path):
+def test_notes_name_coupled_joints_and_a_free_base(tmp_path):
     body = '<body><joint name="{0}" axis="1 0 0" range="-1 1"/><geom type="sphere" size=".02" pos="0 0 .1"/>{1}</body>'
     file = tmp_path / "fingers.xml"
     file.write_text(
@@ -75,13 +75,13 @@ def test_a_finger_that_follows_another_and_a_base_that_hangs_are_said_to_be_held
     assert any("the base is fixed here" in note for note in notes)
 
 
-def test_frozen_joints_stand_where_the_keyframe_says(tmp_path):
+def test_fixed_joints_have_the_position_of_the_keyframe(tmp_path):
     made = make(tmp_path, joints=ARM, keyframe="low")
     assert max(furthest(made)) < 1e-9
     np.testing.assert_allclose(made.robot.qpos_home, [0.0, 0.5, 0.0])
 
 
-def test_the_folder_needs_nothing_of_the_repository_and_names_nothing_that_was_dropped(tmp_path):
+def test_the_folder_names_no_file_and_no_dropped_element(tmp_path):
     made = make(tmp_path, joints=ARM)
     text = made.robot.mjcf.read_text(encoding="utf-8")
     assert not any(word in text for word in ("slide", "file=", "<sensor", "<keyframe", "<tendon", "<equality"))
@@ -89,7 +89,7 @@ def test_the_folder_needs_nothing_of_the_repository_and_names_nothing_that_was_d
     assert not any(g.contype or g.conaffinity for g in spec.geoms)
 
 
-def test_gains_and_limits_come_from_actuators_through_their_gears_and_say_so(tmp_path):
+def test_gains_and_limits_come_from_actuators_with_their_gears_and_sources(tmp_path):
     made = make(tmp_path, kp=("hip=200", "roll=3"), kd=("hip=9", "roll=0.2"))
     joints = written(made)
     assert joints["shoulder"]["kp"] == 60.0
@@ -122,18 +122,18 @@ def test_mounts_and_operated_joints_are_what_the_user_says(tmp_path):
     assert made.robot.operated == ("elbow", "roll")
 
 
-def test_contacts_are_kept_by_choice(tmp_path):
+def test_contacts_are_an_option(tmp_path):
     made = make(tmp_path, contacts=True)
     assert made.robot.contacts
     assert any(g.contype for g in read_mjcf(made.robot.mjcf).geoms)
 
 
-def test_meshes_that_are_not_there_are_left_out_and_said(tmp_path):
+def test_missing_meshes_are_omitted_with_a_note(tmp_path):
     made = make(tmp_path, write_mjcf(tmp_path / "repo", mesh=False))
     assert any("1 mesh(es) are not in" in note and note.endswith("link") for note in made.notes)
 
 
-def test_names_with_a_slash_and_classes_with_a_material_are_taken(tmp_path):
+def test_names_with_a_slash_and_classes_with_a_material_are_accepted(tmp_path):
     model = write_mjcf(tmp_path / "repo")
     text = model.read_text().replace('"elbow"', '"left/elbow"').replace("<asset>", '<asset><material name="dark"/>')
     text = text.replace("<default>\n", '<default>\n<default class="dark"><geom material="dark"/></default>\n', 1)
@@ -174,7 +174,7 @@ def hand(*links: str) -> str:
     return "".join(['<robot name="r"><link name="base"/>', *links, *turns, "</robot>"])
 
 
-def test_what_vendors_write_and_no_body_has_is_mended_and_said(tmp_path):
+def test_impossible_inertias_are_replaced_with_a_note(tmp_path):
     links = [LINK.format("left_arm", 1.0, 0.01, ""), LINK.format("left_palm", 0.5, 0, ""),
              LINK.format("left_hand_a", 0, 0, ""), LINK.format("left_hand_b", 0.1, 1e-4, "")]  # fmt: skip
     (tmp_path / "r.urdf").write_text(hand(*links))
@@ -192,7 +192,7 @@ def test_what_vendors_write_and_no_body_has_is_mended_and_said(tmp_path):
     ]  # not a finger, and not twice
 
 
-def test_a_mesh_that_cannot_be_read_is_left_out_and_said(tmp_path):
+def test_an_unreadable_mesh_is_omitted_with_a_note(tmp_path):
     (tmp_path / "bad.stl").write_bytes(b"solid nothing of the kind" * 10)
     shape = '<visual><geometry><mesh filename="bad.stl"/></geometry></visual>'
     links = [LINK.format(name, 0.5, 0.01, shape) for name in ("left_arm", "left_palm", "left_hand_a", "left_hand_b")]
@@ -202,7 +202,7 @@ def test_a_mesh_that_cannot_be_read_is_left_out_and_said(tmp_path):
     assert made.vendor.nmesh == 0
 
 
-def test_a_package_elsewhere_is_named(tmp_path):
+def test_the_folder_of_a_package_is_an_option(tmp_path):
     urdf = write_urdf(tmp_path / "a", URDF.replace("bar_description", "other"))
     assert make(tmp_path / "b", urdf, kp=("50",), packages=(f"other={tmp_path}/a/bar_description",)).vendor.nmesh == 1
 
@@ -222,7 +222,7 @@ def test_a_package_elsewhere_is_named(tmp_path):
         ({"rate": 0.0}, "--rate 0.0"),
     ],
 )
-def test_what_does_not_fit_the_model_is_refused_and_nothing_is_written(tmp_path, wanted, words):
+def test_options_that_do_not_fit_the_model_are_refused(tmp_path, wanted, words):
     with pytest.raises(UsageError) as error:
         make(tmp_path, **wanted)
     assert words in str(error.value)

@@ -1,4 +1,4 @@
-"""The packaged robots weigh what their published models weigh, and list joints as their vendors do."""
+"""Packaged robots have the masses of their published models and the joint order of their vendors."""
 
 import mujoco
 import numpy as np
@@ -29,7 +29,7 @@ LEG = ("HipPitch", "HipRoll", "HipYaw", "Knee", "AnklePitch", "AnkleRoll")
 ARM = ("ShoulderPitch", "ShoulderRoll", "ShoulderYaw", "Elbow", "WristRoll", "WristPitch", "WristYaw")
 
 
-def test_a_g1_weighs_what_unitrees_urdf_weighs_in_100_postures():
+def test_g1_has_the_gravity_and_inertia_of_unitrees_urdf():
     robot = load_robot("g1_29")
     model = build_model(robot)
     model.dof_armature[:] = 0
@@ -49,13 +49,13 @@ def test_a_g1_weighs_what_unitrees_urdf_weighs_in_100_postures():
 
 
 @pytest.mark.parametrize("name", LINKS)
-def test_links_have_their_published_masses(name):
+def test_links_have_published_masses(name):
     model = build_model(load_robot(name))
     moving = [float(model.body_mass[b]) for b in model.jnt_bodyid]
     assert moving == LINKS[name]
 
 
-def test_gravity_pulls_a_stretched_ur10e_as_its_links_say():
+def test_gravity_of_a_stretched_ur10e_follows_from_its_links():
     """Upper arm and forearm level: torques about the shoulder and the elbow, by hand."""
     robot = load_robot("ur10e")
     model = build_model(robot)
@@ -68,7 +68,7 @@ def test_gravity_pulls_a_stretched_ur10e_as_its_links_say():
     np.testing.assert_allclose(np.abs(data.qfrc_bias[1:3]), [shoulder, elbow], rtol=0.01)
 
 
-def test_motors_of_a_g1_stand_in_the_sdk_s_order():
+def test_joints_of_g1_have_the_order_of_the_sdk():
     names = [*(f"Left{x}" for x in LEG), *(f"Right{x}" for x in LEG), "WaistYaw", "WaistRoll", "WaistPitch",
              *(f"Left{x}" for x in ARM), *(f"Right{x}" for x in ARM)]  # fmt: skip
     large, small = load_robot("g1_29"), load_robot("g1_23")

@@ -1,4 +1,4 @@
-"""A robot whose MJCF includes, names meshes and turns frames fits into one file and moves the same."""
+"""An MJCF with includes, meshes and frames in one file has the same dynamics."""
 
 import mujoco
 import numpy as np
@@ -27,7 +27,7 @@ def fall(robot, payload):
 
 
 @pytest.mark.parametrize("contacts", [False, True])
-def test_the_copy_needs_no_other_file_has_the_same_hash_and_moves_the_same(tmp_path, contacts):
+def test_the_copy_needs_no_other_file_and_has_the_same_hash_and_motion(tmp_path, contacts):
     robot = write_files_arm(tmp_path / "arm", contacts=contacts)
     save_robot(robot, tmp_path / "kept")
     moved = (tmp_path / "kept").rename(tmp_path / "moved")
@@ -43,14 +43,14 @@ def test_the_copy_needs_no_other_file_has_the_same_hash_and_moves_the_same(tmp_p
         assert np.abs(fall(copy, payload) - qpos).max() < (1e-6 if contacts else 1e-12)
 
 
-def test_a_copy_of_the_copy_is_the_same_file(tmp_path):
+def test_a_copy_of_the_copy_is_identical(tmp_path):
     save_robot(write_files_arm(tmp_path / "arm"), tmp_path / "once")
     save_robot(load_robot(tmp_path / "once"), tmp_path / "twice")
     for name in ("robot.toml", "robot.xml"):
         assert (tmp_path / "twice" / name).read_bytes() == (tmp_path / "once" / name).read_bytes()
 
 
-def test_what_one_file_cannot_hold_with_all_its_digits_is_refused_and_nothing_is_left(tmp_path):
+def test_numbers_beyond_the_precision_of_one_file_are_refused(tmp_path):
     tendon = '<tendon><fixed name="t" stiffness="1.23456789"><joint joint="elbow" coef="1"/></fixed></tendon></mujoco>'
     robot = write_files_arm(tmp_path / "arm", xml=XML.replace("</mujoco>", tendon))
     with pytest.raises(RobotError, match="does not fit into one file that moves the same; write it without"):
@@ -58,7 +58,7 @@ def test_what_one_file_cannot_hold_with_all_its_digits_is_refused_and_nothing_is
     assert [p.name for p in tmp_path.iterdir()] == ["arm"]
 
 
-def test_a_mesh_that_is_only_looked_at_becomes_its_box(tmp_path):
+def test_a_visual_mesh_becomes_its_bounding_box(tmp_path):
     robot = write_files_arm(tmp_path / "arm")
     save_robot(robot, tmp_path / "kept")
     model = build_model(load_robot(tmp_path / "kept"))
@@ -68,7 +68,7 @@ def test_a_mesh_that_is_only_looked_at_becomes_its_box(tmp_path):
     assert model.geom_size[model.geom_type == box].max() == pytest.approx(0.1, rel=0.1)
 
 
-def test_the_mjcf_may_lie_in_a_folder_of_its_own(tmp_path):
+def test_the_mjcf_may_be_in_a_subfolder(tmp_path):
     (tmp_path / "arm" / "model").mkdir(parents=True)
     (tmp_path / "arm" / "model" / "arm.xml").write_text(PLAIN)
     (tmp_path / "arm" / "robot.toml").write_text('mjcf = "model/arm.xml"\n' + TOML)

@@ -1,4 +1,4 @@
-"""Robots are folders: names, gains and limits come from there, and a broken folder says what is wrong."""
+"""Robot folders: names, gains and limits; errors name the field."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from gaponet.robot.spec import load_robot, packaged_robots, robot_argument
 from gaponet.sim.model import build_model, model_hash
 
 
-def test_the_package_holds_its_robots():
+def test_packaged_robots_are_listed():
     assert packaged_robots() == ["fr3", "g1_23", "g1_29", "h1_2", "so101", "ur10e", "xl330_bench"]
 
 
@@ -23,14 +23,11 @@ def test_h1_2_operates_the_ten_arm_joints_of_27():
     assert robot.joint_names[robot.operated_index[3]] == "left_elbow_joint"
 
 
-def test_so101_leaves_its_gripper_alone(so101):
+def test_so101_does_not_operate_its_gripper(so101):
     assert so101.joint_names[-1] == "gripper"
     assert "gripper" not in so101.operated
     assert so101.log_units[-1] == "fraction"
-
-
-def test_20_ms_in_steps_of_5_ms_is_4_steps(so101):
-    assert so101.decimation == 4
+    assert so101.decimation == 4  # 20 ms in steps of 5 ms
 
 
 def test_gains_cannot_be_changed_after_loading(so101):
@@ -44,15 +41,15 @@ def test_an_unlimited_joint_has_an_infinite_range(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["Pitch", "shoulder_lift", "/so101/upper_arm/shoulder_lift", " Pitch "])
-def test_a_joint_is_known_by_its_aliases_and_by_the_end_of_a_path(so101, name):
+def test_joints_resolve_by_alias_and_by_the_end_of_a_path(so101, name):
     assert so101.resolve(name, "a.csv") == "shoulder_lift"
 
 
-def test_the_users_map_wins_over_aliases(so101):
+def test_the_users_map_has_priority_over_aliases(so101):
     assert so101.resolve("Pitch", "a.csv", {"Pitch": "elbow_flex"}) == "elbow_flex"
 
 
-def test_an_unknown_joint_names_the_file_and_the_nearest_joints(so101):
+def test_an_unknown_joint_error_names_the_file_and_similar_joints(so101):
     with pytest.raises(JointMismatchError, match=r"a\.csv names joint 'elbow', which robot 'so101' does not have; "
                        r"nearest: elbow_flex, \w+, \w+\. Map it with --map elbow=elbow_flex$"):  # fmt: skip
         so101.resolve("elbow", "a.csv")
@@ -60,7 +57,7 @@ def test_an_unknown_joint_names_the_file_and_the_nearest_joints(so101):
         so101.index(["elbow"])
 
 
-def test_an_unknown_robot_names_those_of_the_package():
+def test_an_unknown_robot_error_lists_the_packaged_ones():
     with pytest.raises(
         RobotError,
         match=r"no robot 'nope': in the package are fr3, g1_23, .*, xl330_bench; or give a folder",
@@ -89,7 +86,7 @@ def test_an_unknown_robot_names_those_of_the_package():
         ('body = "fore"\n', "", r"payload_mount\[0\]\.body: is missing"),
     ],
 )
-def test_a_broken_robot_toml_says_what_is_wrong(tmp_path, old, new, message):
+def test_an_invalid_robot_toml_error_names_the_field(tmp_path, old, new, message):
     toml = TOML.replace(old, new)
     if "operated" not in new and old == "kp = 20.0":
         toml = TOML.replace(old, new, 1)
@@ -97,14 +94,14 @@ def test_a_broken_robot_toml_says_what_is_wrong(tmp_path, old, new, message):
         write_arm(tmp_path / "arm", toml=toml)
 
 
-def test_a_folder_without_mjcf_says_where_to_put_it(tmp_path):
+def test_a_missing_mjcf_error_names_its_place(tmp_path):
     write_arm(tmp_path / "arm")
     (tmp_path / "arm" / "robot.xml").unlink()
     with pytest.raises(RobotError, match=r"robot\.xml is missing beside it"):
         load_robot(tmp_path / "arm")
 
 
-def test_identified_values_survive_a_folder_and_the_nominal_robot_stays_known(tmp_path):
+def test_a_folder_stores_identified_values_and_the_nominal_robot(tmp_path):
     robot = write_arm(tmp_path / "arm")
     fitted = robot.with_servos({"elbow": {"kp": 12.5, "frictionloss": 0.11, "delay": 0.03, "offset": -0.01}})
     save_robot(fitted, tmp_path / "fitted")
@@ -119,7 +116,7 @@ def test_identified_values_survive_a_folder_and_the_nominal_robot_stays_known(tm
     assert load_robot(tmp_path / "again").nominal is None
 
 
-def test_scaled_gains_survive_a_folder_and_are_not_scaled_twice(tmp_path):
+def test_a_folder_stores_scaled_gains_once(tmp_path):
     fitted = write_arm(tmp_path / "arm").with_servos({"elbow": {"kp": 12.5}}).with_gain_scale(10.0)
     save_robot(fitted, tmp_path / "firm")
     back = load_robot(tmp_path / "firm").with_gain_scale(10.0)
@@ -127,7 +124,7 @@ def test_scaled_gains_survive_a_folder_and_are_not_scaled_twice(tmp_path):
     assert (back.kp.tolist(), back.nominal.kp.tolist()) == ([200.0, 125.0], [200.0, 200.0])
 
 
-def test_an_identified_joint_that_does_not_exist_is_refused(tmp_path):
+def test_an_unknown_identified_joint_or_field_is_refused(tmp_path):
     with pytest.raises(RobotError, match=r"identified\.wing"):
         write_arm(tmp_path, TOML + "[identified.wing]\nkp = 3.0\n")
     with pytest.raises(RobotError, match=r"identified\.elbow\.mass: is not a known field"):
@@ -135,20 +132,20 @@ def test_an_identified_joint_that_does_not_exist_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["so101", "h1_2", "g1_29", "g1_23", "fr3", "ur10e"])
-def test_a_packaged_robot_is_kept_whole_and_may_be_moved(name, tmp_path):
+def test_a_copied_robot_folder_can_be_moved(name, tmp_path):
     save_robot(load_robot(name), tmp_path / "here")
     (tmp_path / "here").rename(tmp_path / "there")
     assert load_robot(tmp_path / "there").mjcf.parent == tmp_path / "there"
 
 
-def test_a_folder_as_an_option_is_found_by_that_option(tmp_path, monkeypatch):
+def test_robot_argument_leads_to_the_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(Path("mine"))
     for folder in (Path("mine"), tmp_path / "mine", Path("..") / tmp_path.name / "mine"):
         assert load_robot(robot_argument(folder)).name == "arm"
 
 
-def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot(tmp_path, monkeypatch):
+def test_names_are_packaged_robots_and_paths_are_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "arm")
     with pytest.raises(RobotError, match=r"no robot 'arm': in the package are fr3, .*, xl330_bench; for the folder "
@@ -160,7 +157,7 @@ def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot
         load_robot("./so101")
 
 
-def test_a_name_that_could_mean_two_robots_is_refused_with_both(tmp_path, monkeypatch):
+def test_an_ambiguous_name_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "so101")
     with pytest.raises(RobotError, match=r"'so101' is a robot of the package and a folder here; write (.*) or \./so101"
@@ -173,12 +170,12 @@ def test_a_name_that_could_mean_two_robots_is_refused_with_both(tmp_path, monkey
     assert load_robot("so101").name == "so101"  # one and the same
 
 
-def test_shapes_for_collision_and_for_looking_are_kept_too(tmp_path):
+def test_collision_shapes_are_copied(tmp_path):
     save_robot(load_robot("h1_2"), tmp_path / "h1_2")
     assert (tmp_path / "h1_2" / "collision.toml").is_file()
 
 
-def test_identified_tables_anywhere_in_the_file_belong_to_the_identified_robot_alone(tmp_path):
+def test_identified_tables_belong_to_the_identified_robot_only(tmp_path):
     robot = write_arm(tmp_path / "arm", TOML.replace("[[payload", "[identified.elbow]\nkp = 9.0\n[[payload"))
     save_robot(robot, tmp_path / "both")
     save_robot(robot.nominal, tmp_path / "nominal")

@@ -82,9 +82,9 @@ def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_wh
     config = plugin.GaponetMotionConfig(motions=f"{tmp_path / 'roll.csv'},sweep-shoulder_pan", fps=20.0, lead=0.5)
     motion = plugin.GaponetMotion(config)
     motion.connect()
-    with pytest.raises(ConnectionError, match="plans from where the arm is"):
+    with pytest.raises(ConnectionError, match="position, which is unknown"):
         motion.get_action()
-    plugin.saw(seen(gripper=62.0))
+    plugin.set_observation(seen(gripper=62.0))
     said = [motion.get_action()]
     said += [motion.get_action() for _ in range(len(motion._rows) + 5)]
     units = motion.units
@@ -103,6 +103,6 @@ def test_a_motion_that_goes_into_the_table_is_refused_before_a_row_is_said(plugi
     (tmp_path / "shove.csv").write_text("time,shoulder_lift,elbow_flex\n0,1.7,0.3\n0.1,1.7,0.3\n")
     motion = plugin.GaponetMotion(plugin.GaponetMotionConfig(motions=str(tmp_path)))
     motion.connect()
-    plugin.saw(seen(gripper=10.0))
+    plugin.set_observation(seen(gripper=10.0))
     with pytest.raises(UsageError, match=r"'shove' begins with .* and the plane at 0 m"):
         motion.get_action()
