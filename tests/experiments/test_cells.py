@@ -61,7 +61,7 @@ def test_a_cell_that_fails_leaves_the_others_alone(data, arm, tmp_path, local, m
     assert os.environ["OMP_NUM_THREADS"] == "5"
 
 
-def test_a_full_disk_and_a_missing_package_are_said_and_leave_no_file(data, arm, tmp_path, local):
+def test_a_full_disk_and_a_missing_package_are_reported_without_a_file(data, arm, tmp_path, local):
     made = cells(data, arm, tmp_path / "out", seeds=(4, 5, 0))
     left = made[2].folder.with_name(made[2].folder.name + ".error.txt")
     left.parent.mkdir(parents=True)
@@ -74,7 +74,7 @@ def test_a_full_disk_and_a_missing_package_are_said_and_leave_no_file(data, arm,
     assert list((tmp_path / "out").rglob("*.error.txt")) == []
 
 
-def test_ctrl_c_lets_every_running_cell_keep_what_it_reached(data, arm, tmp_path, local):
+def test_ctrl_c_lets_every_running_cell_write_its_checkpoint(data, arm, tmp_path, local):
     made = cells(data, arm, tmp_path / "out", seeds=(0, 1, 2))
 
     def stop(running, done):
@@ -87,7 +87,7 @@ def test_ctrl_c_lets_every_running_cell_keep_what_it_reached(data, arm, tmp_path
     assert list((tmp_path / "out" / "cells").glob(".gaponet*")) == []
 
 
-def test_an_interrupted_cell_goes_on_and_a_trained_one_is_not_trained_again(data, arm, tmp_path):
+def test_an_interrupted_cell_is_resumed_and_a_trained_one_is_not_trained_again(data, arm, tmp_path):
     (cell,) = cells(data, arm, tmp_path / "out", budget="1200")
     told = []
 
@@ -104,7 +104,7 @@ def test_an_interrupted_cell_goes_on_and_a_trained_one_is_not_trained_again(data
     assert train_cell(cell, lambda share, note: pytest.fail("trained again")) == facts
 
 
-def test_a_cell_kept_from_another_set_up_is_refused(data, arm, tmp_path):
+def test_a_cell_with_another_setup_is_refused(data, arm, tmp_path):
     (cell,) = cells(data, arm, tmp_path / "out")
     cell.folder.mkdir(parents=True)
     with pytest.raises(UsageError, match="no part of a comparison"):
@@ -120,7 +120,7 @@ def test_a_model_named_twice_is_refused(data, arm, tmp_path):
         cells(data, arm, tmp_path / "out", ("mlp", "gaponet", "mlp"))
 
 
-def test_what_is_the_same_for_all_cells_is_fitted_once(data, arm, tmp_path, monkeypatch):
+def test_cells_share_the_fit_of_delay_and_offset(data, arm, tmp_path, monkeypatch):
     fits = []
     whole = DelayOffset.fit
     monkeypatch.setattr(DelayOffset, "fit", lambda *args: fits.append(1) or whole(*args))

@@ -35,7 +35,7 @@ def table(result, name):
     return next(t for t in result.tables if t.name == name)
 
 
-def test_the_main_table_has_spread_ratio_and_the_worst_payload(result):
+def test_the_main_table_has_deviation_ratio_and_the_worst_payload(result):
     made = table(result, "totals")
     assert made.columns == (
         "method", "weights", "MPJAE mrad", "of nominal", "Q_dis rad·s", "worst payload", "new unit", "min",
@@ -74,7 +74,7 @@ def test_everything_is_written_and_no_line_is_lost(result, tmp_path):
     assert "| method | seed |" not in text  # it has one line per seed and group, for programs
 
 
-def test_bars_carry_the_spread_over_seeds(result):
+def test_bars_show_the_deviation_over_seeds(result):
     ax = result.figures["compare"].axes[0]
     assert [t.get_text() for t in ax.get_xticklabels()] == ["0 kg", "0.5 kg", "3 kg", "b\n(new unit)"]
     assert [bar.get_height() for bar in ax.containers[0]] == [10, 10, 30, 30]

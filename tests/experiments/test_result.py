@@ -34,7 +34,7 @@ def result():
                   (first, second), figures, ("It is < 3.",))  # fmt: skip
 
 
-def test_a_spread_has_the_sample_standard_deviation_and_one_value_has_none():
+def test_several_values_have_a_sample_standard_deviation_and_one_value_has_none():
     assert format_cell(MeanStd.from_values([0.001, 0.003], 1e3)) == "2.00 ± 1.41"
     assert format_cell(MeanStd.from_values([0.5])) == "0.50"
     assert format_cell(MeanStd.from_values([])) == ""
@@ -89,7 +89,7 @@ def test_a_folder_without_results_and_a_result_without_its_figure_are_named(resu
         write(result, tmp_path / "thing.md")
 
 
-def test_a_command_does_not_tell_where_its_folders_lie():
+def test_a_published_command_has_no_private_paths():
     assert command_line(["experiment", "compare", "/home/me/data", "out", "--seeds", "3"]) == (
         "gaponet experiment compare data out --seeds 3"
     )

@@ -9,7 +9,7 @@ from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 BASE = TrainConfig(pretraining=PretrainingConfig(rounds=7))
 
 
-def test_what_the_word_does_not_say_is_as_in_the_base():
+def test_settings_that_a_word_does_not_name_come_from_the_base():
     variant = parse_variant("mlp", BASE)
     assert variant.kind == "mlp"
     assert variant.config.pretraining.rounds == 7
@@ -49,6 +49,6 @@ def test_a_field_that_may_be_absent_reads_none():
         ("gaponet:history=0", "it must be positive"),
     ],
 )
-def test_a_word_that_makes_no_sense_is_refused_with_what_there_is(word, complaint):
+def test_an_invalid_word_is_refused_with_the_valid_ones(word, complaint):
     with pytest.raises(UsageError, match=complaint):
         parse_variant(word, BASE)

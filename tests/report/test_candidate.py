@@ -36,7 +36,7 @@ def fitted(arm, data, tmp_path):
     return tmp_path / "fitted"
 
 
-def test_an_identified_folder_is_taken_where_a_run_is(fitted, data, arm, capsys):
+def test_an_identified_folder_is_accepted_like_a_run(fitted, data, arm, capsys):
     found = gp.evaluate(fitted, data).to_dict()
     assert (list(found["methods"]), found["motions"], found["unseen"]) == (["nominal", "identified"], ["motion2"], True)
     assert found["ratio_to_nominal"]["identified"] < 0.5
@@ -53,7 +53,7 @@ def test_an_identified_folder_is_taken_where_a_run_is(fitted, data, arm, capsys)
     assert f"next: gaponet export {fitted}" in said
 
 
-def test_one_unit_alone_can_be_asked(fitted, data):
+def test_an_evaluation_can_be_limited_to_one_unit(fitted, data):
     assert select_entries([fitted], data, units=("a",)) == select_entries([fitted], data)
     with pytest.raises(DatasetError, match="no unit 'other'; it holds: a"):
         select_entries([fitted], data, units=("other",))
@@ -67,12 +67,12 @@ def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_record
         select_entries([fitted], data)
 
 
-def test_a_run_has_seen_what_its_robot_was_identified_from(fitted, data, tmp_path):
+def test_recordings_that_a_runs_robot_was_identified_from_are_not_unseen(fitted, data, tmp_path):
     run = untrained(tmp_path / "run", gp.load_robot(fitted), data, train=("motion2",), val=(), test=("motion0",))
     assert select_entries([run], data, ("motion0",))[1] is False
 
 
-def test_a_robot_of_which_nothing_is_identified_is_told_apart(arm, data, tmp_path):
+def test_a_robot_that_is_not_identified_is_refused(arm, data, tmp_path):
     save_robot(arm, tmp_path / "plain")
     with pytest.raises(UsageError, match="nothing was identified of this robot; gaponet identify DATASET"):
         Candidate.load(tmp_path / "plain", arm)
@@ -87,7 +87,7 @@ def scores(**errors):
     } for name, e in errors.items()}  # fmt: skip
 
 
-def test_what_the_network_adds_is_said_when_it_is_nothing(tmp_path):
+def test_the_verdict_states_the_gain_of_a_network_even_if_it_is_zero(tmp_path):
     useless = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(3.0, 3.2))
     said = verdict(useless)
     assert said[1] == "After identification the error is 3.10 mrad, 84 % less."

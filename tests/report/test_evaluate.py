@@ -109,7 +109,7 @@ def test_a_dataset_keeps_the_nominal_robot_where_an_identified_one_is_given(arm,
     assert model_hash(load_robot(made.path / "robot")) == model_hash(arm)
 
 
-def test_what_any_of_the_runs_has_seen_is_not_unseen(arm, data, run, tmp_path):
+def test_recordings_that_any_run_was_fitted_to_are_not_unseen(arm, data, run, tmp_path):
     other = untrained(tmp_path / "other", arm, data, kind="mlp", train=("m2", "m3"), val=("m0",), test=("m1",))
     assert [e.meta.motion for e in select_entries([run], data)[0]] == ["m3"]
     with pytest.raises(DatasetError, match="every sequence was used in training"):

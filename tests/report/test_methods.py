@@ -13,7 +13,7 @@ def test_every_method_that_is_measured_has_a_name():
         assert method in METHODS
 
 
-def test_a_word_says_where_a_model_starts_and_what_is_changed_in_it():
+def test_the_title_of_a_word_names_start_and_changed_settings():
     assert title("identified+gaponet") == "identification + GAPONet"
     assert title("mlp:mlp_match=on") == "MLP, full coupling, as many weights"
     assert title("gaponet:history=8:payload_input=off") == "GAPONet, payload unobserved (history 8)"

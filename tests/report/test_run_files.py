@@ -76,7 +76,7 @@ def test_trajectories_of_other_sizes_are_refused(tmp_path, bad):
         read_trajectories(tmp_path, METRICS, 2)
 
 
-def test_a_validation_cut_short_by_a_crash_is_none(tmp_path):
+def test_an_incomplete_last_validation_is_skipped(tmp_path):
     line = {"stage": "ppo", "steps": 1, "seconds": 0.5, "reward": None, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
     (tmp_path / "progress.jsonl").write_text(json.dumps(line) + "\n" + json.dumps(line)[:20])
     assert read_progress(tmp_path) == [line]

@@ -4,5 +4,5 @@ from gaponet.report.tables import mrad
 from gaponet.sim.metrics import standard_error
 
 
-def test_errors_are_milliradian_and_what_there_is_none_of_is_a_dash():
+def test_errors_are_in_milliradian_and_missing_ones_are_a_dash():
     assert [mrad(x) for x in (0.01234, None, standard_error([0.01]))] == ["12.34", "–", "–"]

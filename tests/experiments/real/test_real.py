@@ -35,7 +35,7 @@ def played(arm, tmp_path):
     return data
 
 
-def test_every_card_is_of_a_robot_that_is_there_and_stands_on_the_page():
+def test_every_card_has_an_existing_robot_and_a_row_on_the_page():
     cards, page = read_cards(CARDS), PAGE.read_text(encoding="utf-8")
     for card in cards.set:
         robot = load_robot(ROBOTS / card.robot if card.robot not in packaged_robots() else card.robot)
@@ -44,7 +44,7 @@ def test_every_card_is_of_a_robot_that_is_there_and_stands_on_the_page():
         assert card.elsewhere in {"", *(c.name for c in cards.set)}
 
 
-def test_a_unit_left_out_is_learned_from_by_adaptation_alone_and_never_asked_what_it_saw(arm, played):
+def test_only_adaptation_uses_recordings_of_a_unit_left_out_and_none_of_the_tested_motions(arm, played):
     for question in questions("a unit left out", played, arm, None):
         (unit,) = {s.meta.unit_id for s in question.test}
         assert unit not in {s.meta.unit_id for s in question.train}
@@ -54,7 +54,7 @@ def test_a_unit_left_out_is_learned_from_by_adaptation_alone_and_never_asked_wha
         list(questions("of life", played, arm, None))
 
 
-def test_repetitions_are_no_motions_set_the_floor_and_are_measured_once(arm, played, tmp_path):
+def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(arm, played, tmp_path):
     (question,) = questions("new motions", played, arm, None)
     assert repeatability(question) == pytest.approx(0.002 * 4 / 3, rel=1e-3)  # 1, 1 and 2 steps of 2 mrad
     methods = {k: METHODS[k] for k in ("nominal", "delay_offset")}
@@ -72,9 +72,7 @@ def test_repetitions_are_no_motions_set_the_floor_and_are_measured_once(arm, pla
     ]
 
 
-def test_networks_are_trained_once_and_left_out_where_they_add_nothing_to_an_identified_robot(
-    arm, played, tmp_path, monkeypatch
-):
+def test_networks_are_trained_once_and_rejected_without_a_gain_over_identification(arm, played, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "ONE_ROUND", replace(module.ONE_ROUND, num_envs=12, gradient_steps=0, sensor_states=16))
     (question,) = questions("new motions", played, arm, None)
     methods = {title: method for title, method in module.networks(240).values() if "MLP" not in title}
@@ -93,7 +91,7 @@ def test_networks_are_trained_once_and_left_out_where_they_add_nothing_to_an_ide
     assert cards == [file.stat().st_mtime_ns for file in tmp_path.rglob("card.json")]
 
 
-def test_only_what_is_there_is_asked(tmp_path):
+def test_unknown_sets_and_questions_are_refused_and_absent_sets_skipped(tmp_path):
     bench = Bench(read_cards(), tmp_path, tmp_path / "work", METHODS, say=lambda text: None)
     for only, asked, told in ((("a robot",), (), "no set 'a robot'"), ((), ("why",), "no question 'why'")):
         with pytest.raises(UsageError, match=told):
@@ -101,7 +99,7 @@ def test_only_what_is_there_is_asked(tmp_path):
     assert bench.run()["rows"] == []
 
 
-def test_the_method_on_the_page_is_one(arm, played, tmp_path):
+def test_the_method_on_the_page_runs(arm, played, tmp_path):
     code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
     (tmp_path / "mine.py").write_text(code)
     name, method = load_method(f"{tmp_path / 'mine.py'}:half_gravity")
@@ -113,9 +111,7 @@ def test_the_method_on_the_page_is_one(arm, played, tmp_path):
         load_method("nothing.py:f")
 
 
-def test_a_method_that_fails_loses_its_own_row_and_joints_that_were_recorded_alone_are_told_by_payload(
-    arm, played, tmp_path
-):
+def test_a_failing_method_loses_its_own_row_and_single_joints_are_tabulated_by_payload(arm, played, tmp_path):
     alone = Dataset.create(tmp_path / "alone", arm)
     for e in played.entries:
         one = played.read(e)

@@ -39,13 +39,13 @@ def test_a_fleet_driven_with_other_gains_than_the_dataset_is_refused(robot):
         session.unit  # noqa: B018
 
 
-def test_without_zero_errors_encoders_tell_the_truth(delivered):
+def test_without_encoder_zero_errors_both_offsets_are_equal(delivered):
     found, _, _ = delivered
     for d in found:
         np.testing.assert_allclose(d.offset, d.measured, atol=1e-6)
 
 
-def test_what_is_near_has_settled(delivered):
+def test_a_hand_within_1_cm_has_settled(delivered):
     found, _, _ = delivered
     assert any(d.near for d in found)
     assert all(
@@ -79,7 +79,7 @@ def test_the_table_holds_centimetres_and_shares_worked_by_hand():
     ]
 
 
-def test_sentences_say_what_became_better_and_what_worse():
+def test_sentences_name_improvements_and_deteriorations():
     found = [score("raw", None, p, 0.04, 0.1) for p in (0.0, 0.4)]
     found += [score("gaponet", 0, 0.0, 0.05, 0.01), score("gaponet", 0, 0.4, 0.02, 0.01)]
     said = sentences(found)

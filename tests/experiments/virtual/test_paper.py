@@ -27,7 +27,7 @@ def placed(method, offset, payload=3.0):
     return HoldError(method, seed, payload, where, where, True, True, 1.0, "lift", where)
 
 
-def test_the_printed_table_1_saves_less_than_the_paper_claims():
+def test_the_printed_table_1_has_smaller_reductions_than_the_paper_claims():
     table = ratio_table(
         [placed("raw", (0.02, 0.02, 0.02)), placed("mlp", (0.01, 0.01, 0.01)), placed("gaponet", (0.005,) * 3)]
     )
@@ -37,7 +37,7 @@ def test_the_printed_table_1_saves_less_than_the_paper_claims():
     assert row["GAPONet: Z"] == 0.5
 
 
-def test_claims_are_cuts_of_each_part_at_all_payloads_and_at_the_heaviest():
+def test_claims_are_reductions_at_all_payloads_and_at_the_heaviest():
     def score(part, method, payload, value):
         return Score(
             part, method, None if method in ("nominal", "raw") else 0, "generated", "m", payload, np.full(2, value), 1.0
@@ -52,7 +52,7 @@ def test_claims_are_cuts_of_each_part_at_all_payloads_and_at_the_heaviest():
     assert [row[2].mean for row in table.rows] == pytest.approx([50, 75, -100, 0, 90])
 
 
-def test_the_papers_network_and_ours_share_the_rows_that_ours_has_a_switch_for(make_study):
+def test_our_network_has_the_rows_of_table_2_that_it_supports(make_study):
     study = make_study()
     words = [row.word for row in table_2_rows(study)]
     assert words == [

@@ -25,7 +25,7 @@ def mean(scores, part, method, payload):
     return np.mean([s.q_dis for s in scores if (s.part, s.method, s.payload) == (part, method, payload)])
 
 
-def test_what_knows_the_robot_is_nearer_to_it_and_brings_it_nearer_to_its_targets(tracked):
+def test_a_model_of_the_robot_reduces_both_alignment_and_compensation_errors(tracked):
     _, scores, _ = tracked
     for payload in (0.0, 0.4):
         q = {m: mean(scores, "alignment", m, payload) for m in ("nominal", "mlp", "gaponet")}
@@ -43,7 +43,7 @@ def test_every_motion_counts_for_its_own_length(tracked):
     assert lengths["m1", "alignment"] == pytest.approx(79 * 0.02)  # the common start is no error
 
 
-def test_seeds_are_apart_and_the_example_is_of_the_heaviest_payload(tracked):
+def test_seeds_are_separate_and_the_example_has_the_heaviest_payload(tracked):
     _, scores, example = tracked
     assert {s.seed for s in scores if s.method == "gaponet"} == {0, 1}
     assert {s.seed for s in scores if s.method in ("raw", "nominal")} == {None}
@@ -56,7 +56,7 @@ def score(method, seed, payload, value, part="alignment"):
     return Score(part, method, seed, "generated", "m", payload, np.full(2, value), 1.0)
 
 
-def test_the_table_holds_means_spreads_and_cuts_worked_by_hand(robot):
+def test_the_table_holds_means_deviations_and_reductions_worked_by_hand(robot):
     scores = [score("nominal", None, 0.0, 0.1), score("nominal", None, 0.4, 0.3)]
     scores += [score("mlp", 0, p, v) for p, v in ((0.0, 0.1), (0.4, 0.15))]
     scores += [score("gaponet", seed, p, v) for seed in (0, 1) for p, v in ((0.0, 0.03 + 0.02 * seed), (0.4, 0.06))]
@@ -69,7 +69,7 @@ def test_the_table_holds_means_spreads_and_cuts_worked_by_hand(robot):
     assert "beats 'MLP, full coupling' at every payload" in said
 
 
-def test_a_defeat_is_said(robot):
+def test_a_larger_error_than_a_rivals_is_reported(robot):
     found = (("nominal", None, 0.1), ("mlp", 0, 0.3), ("shared_mlp", 0, 0.05), ("gaponet", 0, 0.2))
     scores = [score(m, s, 0.0, v) for m, s, v in found]
     said = " ".join(sentences(scores, "alignment", joint_sets(robot)[0]))

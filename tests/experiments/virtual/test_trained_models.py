@@ -38,7 +38,7 @@ def runs(arm, tmp_path, monkeypatch):
     return write
 
 
-def test_methods_come_in_order_and_changed_models_are_passed_over(arm, runs, tmp_path):
+def test_methods_are_sorted_and_models_with_changed_settings_are_skipped(arm, runs, tmp_path):
     runs("a", "gaponet", 1, [])
     runs("b", "gaponet", 0, [])
     runs("c", "mlp", 0, ["mlp_match=on"])
@@ -49,7 +49,7 @@ def test_methods_come_in_order_and_changed_models_are_passed_over(arm, runs, tmp
         assert [(t.method, t.seed) for t in load_trained([folder], arm)] == expected
 
 
-def test_two_of_one_seed_and_none_at_all_are_refused(arm, runs, tmp_path):
+def test_duplicate_seeds_and_empty_folders_are_refused(arm, runs, tmp_path):
     first, second = runs("a", "mlp", 0), runs("b", "mlp", 0)
     with pytest.raises(UsageError, match="MLP, full coupling seed 0 is there already"):
         load_trained([first, second], arm)

@@ -27,7 +27,7 @@ def used(arm, tmp_path):
     return data, [type(t)(t.method, t.seed, run, t.model, t.robot) for t in trained(arm)]
 
 
-def test_a_motion_under_another_name_is_found_out(arm, used):
+def test_a_training_motion_under_another_name_is_refused(arm, used):
     again = UnseenMotion("new", "generated", commands(140, 0))  # as m0, and goes on
     with pytest.raises(UsageError, match="'new' is motion 'm0' of training"):
         require_unseen([again], used[0], arm, used[1])
@@ -36,14 +36,14 @@ def test_a_motion_under_another_name_is_found_out(arm, used):
         require_unseen([chosen], used[0], arm, used[1])
 
 
-def test_a_test_motion_is_unseen_and_its_nearest_is_told(arm, used):
+def test_a_test_motion_is_unseen_and_gets_its_nearest_training_motion(arm, used):
     (motion,) = require_unseen([UnseenMotion("m2", "files", commands(100, 2))], used[0], arm, used[1])
     away = [np.sqrt(((commands(100, 2) - commands(100, i)) ** 2).mean()) for i in (0, 1)]
     assert motion.nearest[0] == f"m{int(np.argmin(away))}"
     assert motion.nearest[1] == pytest.approx(min(away), rel=1e-4)
 
 
-def test_motions_are_made_anew_and_read_from_files(arm, tmp_path):
+def test_motions_are_generated_and_read_from_files(arm, tmp_path):
     made = generated(arm, 3, 0.2)
     assert len({m.name for m in made}) == 3
     assert all(m.source == "generated" and m.ctrl.shape[1] == 2 for m in made)

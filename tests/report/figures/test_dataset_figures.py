@@ -44,7 +44,7 @@ def test_the_same_data_give_the_same_svg(tmp_path):
     assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
 
 
-def test_what_has_no_data_is_left_out_with_a_reason(arm, tmp_path):
+def test_a_figure_without_data_is_skipped_with_a_reason(arm, tmp_path):
     data = Dataset.create(tmp_path / "data", arm)
     still = np.full((60, 2), 0.1)
     data.append(arm_sequence(arm, still, still + 0.01))
@@ -57,7 +57,7 @@ def test_what_has_no_data_is_left_out_with_a_reason(arm, tmp_path):
     assert len(written) == 4
 
 
-def test_only_twins_that_a_picture_needs_are_made(dataset, arm):
+def test_only_simulations_that_a_figure_needs_are_made(dataset, arm):
     dataset.append(recordings(arm, 1, rows=60, unit="b")[0])  # with one payload only
     for picture in FIGURES.values():
         picture(dataset, arm, lambda *_: None)
@@ -68,7 +68,7 @@ def test_the_motion_whose_torques_change_most_is_shown(dataset, arm):
     assert {e.meta.motion for e in largest_torque_change(dataset, arm)} == {"m2"}
 
 
-def test_spikes_are_no_swing():
+def test_spikes_do_not_count_as_swing():
     values = np.zeros((100, 1))
     values[50] = 1000.0
     assert swing(values) == [0.0]
@@ -80,7 +80,7 @@ def test_items_are_chosen_evenly():
     assert evenly_spaced(list(range(101)), 3) == [0, 50, 100]
 
 
-def test_virtual_stands_in_the_title(dataset, arm):
+def test_the_title_names_virtual_robots(dataset, arm):
     real = dataset.entries
     virtual = Dataset.create(dataset.path.parent / "virtual", arm)
     virtual.append(recordings(arm, 1, rows=20)[0])
@@ -121,7 +121,7 @@ def test_a_sequence_without_temperature_has_no_such_row(arm):
     assert [ax.get_ylabel() for ax in fig.axes[::2]] == ["position, rad", "torque, N·m"]
 
 
-def test_the_gap_below_an_overlay_is_recorded_minus_twin(arm):
+def test_the_gap_below_an_overlay_is_recorded_minus_simulated(arm):
     ctrl = wave(60, 2)
     fig = draw.overlay(arm_sequence(arm, ctrl, ctrl + 0.1), ctrl, ["elbow"], "t")
     gap = next(line for line in fig.axes[1].lines if len(line.get_ydata()) == 60)

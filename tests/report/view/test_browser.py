@@ -78,7 +78,7 @@ def test_the_canvas_shows_the_robot_and_it_moves_when_played_and_stands_when_not
 
 @pytest.mark.parametrize("width", [390, 1200])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_report_asks_nobody_and_fits_desk_and_phone(evaluated, width, scheme):
+def test_the_report_loads_nothing_else_and_fits_desk_and_phone(evaluated, width, scheme):
     from browser import Browser, wait
 
     from gaponet.report.report import write_report

@@ -108,12 +108,12 @@ def test_the_box_holds_the_robot_in_every_frame(four):
     assert right - left < 0.6
 
 
-def test_a_robot_that_stands_beside_a_table_can_be_dressed(arm):
+def test_a_robot_with_a_table_can_be_drawn(arm):
     assert visual_spec(dataclasses.replace(arm, table=Table(-0.05, 0.3, 3000.0)), "#c8102e", 0.0).compile().npair == 0
 
 
 @pytest.mark.parametrize("name", ["h1_2", "so101"])
-def test_the_robots_of_the_package_can_be_dressed(name):
+def test_the_robots_of_the_package_can_be_drawn(name):
     robot = load_robot(name)
     spec = visual_spec(robot, "#c8102e", 1.0)
     model = spec.compile()

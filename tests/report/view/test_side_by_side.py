@@ -32,7 +32,7 @@ def test_the_nominal_copy_is_the_twin_and_its_mean_error_the_mpjae(dataset, arm)
     assert shown.motions[-1].mpjae == 0.0
 
 
-def test_the_target_stands_where_the_last_command_wants_the_robot(dataset, arm):
+def test_the_target_copy_shows_the_previous_command(dataset, arm):
     """Row t's command is for t + 1."""
     shown = side_by_side(dataset, dataset.entries[0], arm)
     np.testing.assert_array_equal(shown.motions[0].qpos[1:], shown.real.ctrl[:-1])
@@ -59,7 +59,7 @@ def test_a_motion_that_is_not_there_is_named_with_those_that_are(dataset, arm):
         select_entry(dataset, (), "motion1", payload_mass=1.0)
 
 
-def test_a_recording_that_no_run_has_seen_comes_first(dataset, arm, tmp_path):
+def test_a_recording_that_no_run_was_fitted_to_comes_first(dataset, arm, tmp_path):
     run = untrained(tmp_path / "run", arm, dataset, train=("motion0", "motion1"), val=("motion3",), test=("motion2",))
     first = untrained(tmp_path / "first", arm, dataset, train=("motion1",), val=("motion3",), test=("motion0",))
     assert select_entry(dataset, (first,)).meta.motion == "motion0"
