@@ -200,7 +200,7 @@ def test_a_payload_that_nobody_announced_is_found(robot, model):
 def test_a_payload_that_was_told_is_compared_with_what_the_servos_give(robot, model, held, told, doubted):
     arm, compensator = WeakArm(robot, WeakArm.masses[held]), Compensator(robot, model, NOW, payload_step=0.1)
     play(arm, np.repeat([[0.3, -0.2]], 200, axis=0), compensator, told)
-    assert (f"{told:g} kg were told, and the torques are those of about" in compensator.doubt) == doubted
+    assert (f"{told:g} kg were stated, but the torques are those of about" in compensator.doubt) == doubted
     assert compensator.payload_mass[0] == told
 
 
@@ -208,10 +208,10 @@ def test_torques_that_are_no_payloads_are_not_believed_to_be_the_largest(robot, 
     target = np.array([0.3, -0.2])
     compensator = Compensator(robot, model, NOW, payload_step=0.1)
     compensator.reset(target, None)
-    per_kg = np.subtract(*compensator.estimate._gravity(target)[::-1])
+    per_kg = np.subtract(*compensator.payload_estimate.gravity(target)[::-1])
     across = 6.0 * np.array([-per_kg[1], per_kg[0]]) + 2.0 * per_kg  # mostly what no payload does
     for _ in range(200):
-        compensator.step(target, target, np.zeros(2), compensator.estimate._gravity(target)[0] + across)
+        compensator.step(target, target, np.zeros(2), compensator.payload_estimate.gravity(target)[0] + across)
     assert compensator.payload_mass[0] == 0.0
 
 
@@ -221,10 +221,10 @@ def test_a_blocked_joint_winds_nothing_up(robot, model):
     compensator.reset(target, 0.0)
     for _ in range(500):  # 10 s against a stop
         compensator.step(target, np.array([-0.5, -0.5]))
-    wound = compensator.integral.copy()
+    wound = compensator.feedback.integral.copy()
     assert np.abs(wound).max() <= NOW.feedback_limit
     periods = 0
-    while (compensator.saturated > 0).any():  # it slips free, a little beyond the target
+    while (compensator.feedback.saturation > 0).any():  # it slips free, a little beyond the target
         compensator.step(target, np.array([0.4, 0.4]))
         periods += 1
     assert periods <= 50
@@ -235,9 +235,9 @@ def test_without_fresh_states_feedback_waits(robot, model):
     compensator.reset(np.zeros(2), 0.0)
     for _ in range(20):
         compensator.step(np.zeros(2), np.array([0.1, 0.1]))
-    before = compensator.integral.copy()
+    before = compensator.feedback.integral.copy()
     compensator.step(np.zeros(2), None)
-    np.testing.assert_array_equal(compensator.integral, before)
+    np.testing.assert_array_equal(compensator.feedback.integral, before)
     assert (before < 0).all()
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from arm import commands, write_arm
 
-from gaponet.deploy.feedforward import ACCELERATION, SPEED, Feedforward
+from gaponet.deploy.feedforward import MAX_ACCELERATION, MAX_SPEED, Feedforward
 from gaponet.sim.batch import BatchSim
 
 
@@ -42,8 +42,8 @@ def test_a_target_that_stands_asks_for_nothing_and_a_jump_for_a_bounded_torque(r
     moving.update(np.zeros((1, 2)))
     np.testing.assert_array_equal(moving.torque(), 0.0)
     moving.update(np.full((1, 2), 1.0))
-    np.testing.assert_array_equal(moving.qvel, SPEED)
-    np.testing.assert_array_equal(moving.qacc, ACCELERATION)
+    np.testing.assert_array_equal(moving.qvel, MAX_SPEED)
+    np.testing.assert_array_equal(moving.qacc, MAX_ACCELERATION)
 
 
 def test_the_low_pass_lessens_the_noise_of_targets(robot):

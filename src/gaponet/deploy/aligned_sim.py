@@ -1,8 +1,8 @@
-"""AlignedSim: the simulator that behaves like the robot. An identified robot's does of itself; with a model a target
-becomes target + Δa on its way to the servos.
+"""AlignedSim: a simulator that behaves like the robot.
 
-In the simulator that the model was trained in, Δa is the model's; in another one, what makes it move as the corrected
-one would (deploy/transfer.py).
+An identified robot needs no model for that. With a model, a target becomes target + Δa before it reaches the servos. In
+the simulator of training, Δa is the model's correction. In another simulator, commands are transferred so that it moves
+like the corrected one (deploy/transfer.py).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.deploy.transfer import Inverse, Reference, Transfer, periods_of
+from gaponet.deploy.transfer import Inverse, Reference, Transfer, control_periods_of
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
@@ -21,9 +21,9 @@ from gaponet.sim.inverse import PROBES, ClosedForm, Probed
 
 
 class AlignedSim:
-    """num_envs aligned simulations, one control period per step; the same as sim.replay with the model's corrector.
+    """num_envs aligned simulations, one control period per step. It equals sim.replay with the model's corrector.
 
-        sim = AlignedSim(load_robot("./my_h1_2"), payload_mass=3.0)  # and GapModel.load("run"), where a model helps
+        sim = AlignedSim(load_robot("./my_h1_2"), payload_mass=3.0)  # and GapModel.load("run"), if a model helps
         sim.reset(qpos)
         sim.step(target)          # for one control period
         sim.qpos, sim.qvel
@@ -45,12 +45,11 @@ class AlignedSim:
         simulator_payload: Array | float | None = None,
         inverse: Inverse = "closed",
     ) -> None:
-        """Refuse another robot, joints, rate or payload than trained on, or a simulator too far from that of training.
-
+        """
         Args:
-            robot: The simulator. In one that the model was not trained in, commands are transferred.
-            model: What training made; or an identified robot, which the simulator then moves like; None for the
-                simulator as it is.
+            robot: The simulator. If the model was trained in another one, commands are transferred.
+            model: A trained model, or an identified robot that the simulator then moves like; None for the simulator
+                without correction.
             payload_mass: kg in each hand of payload_side, one number or one per simulation.
             payload_side: "both", or the side of one mount.
             dt: Control period, s; default the robot's.
@@ -68,8 +67,8 @@ class AlignedSim:
         self.num_envs = 1 if num_envs is None else num_envs
         self.payload_mass = np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs))
         conditions = [Condition(float(mass), payload_side, self.dt) for mass in self.payload_mass]
-        own, told = conditions, simulator_payload is not None
-        if told:
+        own, other_payload = conditions, simulator_payload is not None
+        if other_payload:
             masses = np.broadcast_to(np.asarray(simulator_payload, float), self.num_envs)
             own = [c._replace(payload_mass=float(m)) for c, m in zip(conditions, masses, strict=True)]
         self.sim = BatchSim(robot, own, nthread, locked)
@@ -81,30 +80,32 @@ class AlignedSim:
             raise UsageError(f"joint '{missing[0]}' is corrected by the model and cannot be locked")
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
         self.loop, self.transfer = None, None
-        if isinstance(model, GapModel) and not told and model.corrects(robot) and periods_of(model, self.dt) == 1:
-            self.loop = model.loop(self.num_envs)
+        trained = model if isinstance(model, GapModel) and not other_payload else None
+        if trained is not None and trained.corrects(robot) and control_periods_of(trained, self.dt) == 1:
+            self.loop = trained.loop(self.num_envs)
         elif model is not None:
             inverted = _inverse_of(self.sim, robot, own, locked, inverse, nthread)
             self.transfer = Transfer(model, inverted, conditions, locked, nthread, extrapolate)
-        late = max(robot.delay.max(), 0.0 if self.transfer is None else self.transfer.sim.robot.delay.max())
-        self._depth = 1 + int(np.ceil(late / self.dt))
+        delay = max(robot.delay.max(), 0.0 if self.transfer is None else self.transfer.sim.robot.delay.max())
+        self._depth = 1 + int(np.ceil(delay / self.dt))  # past targets that delayed servos need
         self.target = np.zeros((self.num_envs, self.n))
+        self._uncorrected = self.target[:, self.op]
         self.reset()
 
     @property
     def qpos(self) -> Array:
-        """Joint positions, rad; a live view: a write is the state at the next step."""
+        """Joint positions, rad; a view: writing to it changes the state of the simulation."""
         return self.sim.qpos[0] if self.single else self.sim.qpos
 
     @property
     def qvel(self) -> Array:
-        """Joint velocities, rad/s; a live view."""
+        """Joint velocities, rad/s; a view."""
         return self.sim.qvel[0] if self.single else self.sim.qvel
 
     @property
     def delta(self) -> Array:
         """Correction of the last step, of the operated joints, rad."""
-        delta = self.target[:, self.op] - self._asked
+        delta = self.target[:, self.op] - self._uncorrected
         return delta[0] if self.single else delta
 
     def reset(
@@ -114,12 +115,12 @@ class AlignedSim:
         ctrl: Array | None = None,
         ids: Array | slice = slice(None),
     ) -> None:
-        """Start the simulations, or some of them, in a new state.
+        """Reset simulations to a state.
 
         Args:
             qpos: Positions, rad; default home.
             qvel: Velocities, rad/s.
-            ctrl: Target in force before, rad, which late servos (robot.delay) still follow; default qpos.
+            ctrl: Target in force before, rad, which delayed servos (robot.delay) still follow; default qpos.
             ids: Which simulations, (k,); arrays are then (k, n).
         """
         count = len(np.arange(self.num_envs)[ids])
@@ -132,15 +133,15 @@ class AlignedSim:
         if self.transfer is not None:
             self.transfer.reset(ids, q, v, self._past(u))
         self.target[ids] = u
-        self._asked = self.target[:, self.op]
+        self._uncorrected = self.target[:, self.op]
 
     def step(self, ctrl: Array) -> None:
-        """Step one control period under targets `ctrl`, rad, which the model corrects."""
+        """Step one control period with targets `ctrl`, rad, which the model corrects."""
         sim, op, target = self.sim, self.op, self.target
         target[:] = ctrl
-        self._asked = target[:, op]
+        self._uncorrected = target[:, op]
         if self.loop is not None:
-            self.loop.delta(sim.qpos[:, op], sim.qvel[:, op], self._asked, self.payload_mass)
+            self.loop.delta(sim.qpos[:, op], sim.qvel[:, op], self._uncorrected, self.payload_mass)
             target[:, op] = self.loop.applied
         if self.transfer is not None:
             target[:] = self.transfer.command(sim.qpos, sim.qvel, target)
@@ -153,7 +154,7 @@ class AlignedSim:
 def _inverse_of(
     sim: BatchSim, robot: RobotSpec, conditions: list[Condition], locked: tuple[str, ...], how: Inverse, nthread: int
 ) -> ClosedForm | Probed:
-    """The inverse of a batch of robots; by answers, copies of each, without the table, step ahead."""
+    """Return the inverse dynamics of a batch of robots; by probes, from copies of each robot without the table."""
     if how == "closed":
         return ClosedForm.of(BatchSim(robot, conditions, nthread, locked))
     count = max(len(PROBES), 1 + sim.n)
@@ -161,13 +162,13 @@ def _inverse_of(
     ahead = int(np.ceil(robot.delay.max() / conditions[0].dt - 1e-9))
 
     def answer(targets: Array, qvel: Array) -> tuple[Array, Array]:
-        asked = np.arange(len(targets) * sim.num_envs)
+        rows = np.arange(len(targets) * sim.num_envs)
         copies.set_state({name: np.concatenate([x] * count) for name, x in sim.state().items()})
         copies.qvel[:] = np.tile(qvel, (count, 1))
-        told = np.zeros((copies.num_envs, copies.n))
-        told[asked] = targets.reshape(len(asked), -1)
+        full = np.zeros((copies.num_envs, copies.n))
+        full[rows] = targets.reshape(len(rows), -1)
         for _ in range(1 + ahead):
-            copies.step(told, asked)
-        return copies.qpos[asked].reshape(targets.shape), copies.qvel[asked].reshape(targets.shape)
+            copies.step(full, rows)
+        return copies.qpos[rows].reshape(targets.shape), copies.qvel[rows].reshape(targets.shape)
 
     return Probed(answer, conditions[0].dt, ahead)

@@ -1,19 +1,19 @@
-"""The inverse use: commands u that make the robot do what it was asked.
+"""Compensator: commands with which the real robot does what it is asked to do.
 
-A shadow, the simulator of the robot as it is known (nominal, identified or adapted), is given a′ and shows how the
-robot should move. Without a model u = a′: the feed-forward of what is known. With one, the robot that is given u moves
-like the shadow that is given u + G(u); so u + G(u) = a′ is solved, by u ← u + γ (a′ − u − G(u)).
+A shadow simulates the robot, with nominal, identified or adapted parameters. It receives targets a′ and shows how the
+robot should move. Without a model, the command is u = a′. With a model, the robot with command u moves like the shadow
+with target u + G(u), G being the model's correction. So u + G(u) = a′ is solved by u ← u + γ (a′ − u − G(u)).
 
-    aim "target":     a′ = a + τ / kp, τ the torque with which the shadow would move as the targets do: gravity, and
-                      with dynamics what their velocity and acceleration ask for (feedforward.py)
-    aim "simulator":  a′ = a, so that the robot does what the simulator does, sag and lag included
+    aim "target":     a′ = a + τ / kp. τ is the torque with which the shadow follows the targets: gravity and, with
+                      dynamics, the torque for their velocity and acceleration (feedforward.py)
+    aim "simulator":  a′ = a, so that the robot moves like the simulator, including sag and lag
 
-G is asked at the shadow's state and history, not at the robot's. If the compensation is right they are the same; and
-what is sent does not depend on what is measured: there is no loop that could become unstable, and noise does not reach
-the servos. (Evaluated at the measured state, the error was no smaller and the commands four times rougher.)
+G is evaluated at the state and history of the shadow, not of the robot. If the compensation is right, both are the
+same. The command does not depend on measurements, so there is no loop that can become unstable, and measurement noise
+does not reach the servos. (With the measured state, the error was not smaller and commands were four times rougher.)
 
-What is then still missing is integrated, slowly and low-passed: a loaded arm swings on its servo with little damping
-(3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1), and an integrator alone is unstable there above 2ζω, 2 1/s.
+The remaining error is integrated, slowly and with a low-pass. A loaded arm swings on its servo with little damping
+(3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1). There, an integrator alone is unstable above 2ζω, 2 1/s.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
 
-SETTLE = 100  # control periods in which the shadow comes to rest at a start
+SETTLING_PERIODS = 100  # control periods in which the shadow comes to rest at a start
 
 
 @dataclass(frozen=True)
@@ -42,18 +42,18 @@ class CompensatorConfig:
     """Settings of the compensator."""
 
     aim: Literal["target", "simulator"] = "target"
-    """target: the commanded positions. simulator: what the simulator makes of them."""
+    """target: the robot reaches the commanded positions. simulator: the robot moves like the simulator."""
     dynamics: bool = False
-    """Whether, with aim target, what moving asks for is fed forward, not only what holding does. For smooth targets:
-    planned motions halve their error with it, but 5 mrad of noise on targets becomes 0.2 rad on commands."""
+    """With aim target: feed forward the torque of motion too, not only of holding. For smooth targets: it halves the
+    error of planned motions, but amplifies 5 mrad of noise on targets to 0.2 rad on commands."""
     acceleration_time: float = 0.02
     """Low-pass of the targets' acceleration, s."""
     gain: float = 0.5
-    """γ of an iteration; 0.5 converges wherever a change of u changes u + G(u) by a factor between 0 and 4."""
+    """γ of the iteration; 0.5 converges if the derivative of u + G(u) is between 0 and 4."""
     iterations: int = 2
-    """Iterations per control period, which begin at the last period's answer."""
+    """Iterations per control period. They start at the last period's solution."""
     feedback: float = 0.5
-    """Rate at which the remaining error is integrated, 1/s; 0 for none."""
+    """Gain of the integrator of the remaining error, 1/s; 0 for none."""
     feedback_time: float = 0.5
     """Time constant of the low-pass before the integrator, s."""
     feedback_limit: float = 0.1
@@ -61,11 +61,11 @@ class CompensatorConfig:
     limit: float = 0.5
     """Largest |u − a|, rad."""
     blend: float = 1.0
-    """Time in which compensation is blended in after a start, s."""
+    """Time in which the compensation increases from 0 to 1 after a start, s."""
     lead: int = 0
-    """How many control periods early targets are given, where the motion is known ahead. Zero is causal."""
+    """Control periods by which targets are given early, if the motion is known ahead. Zero is causal."""
     payload_max: float = 3.0
-    """Largest payload that is taken or estimated without a model, kg; a model knows which it was trained with."""
+    """Largest payload without a model, stated or estimated, kg. With a model, the training data give it."""
 
     def __post_init__(self) -> None:
         if not (
@@ -80,7 +80,7 @@ class CompensatorConfig:
 
 
 class Compensator:
-    """Targets → commands for one robot, or num_envs of them. Causal: past states, the present target.
+    """Targets → commands for one robot, or for num_envs robots. It is causal.
 
         compensate = Compensator(load_robot("./my_so101"))  # and a model, where one helps
         compensate.reset(target, payload_mass=3.0)
@@ -104,112 +104,113 @@ class Compensator:
     ) -> None:
         """
         Args:
-            robot: The robot as it is known: nominal, identified or adapted. With a model, how it should move is
-                known from the simulator that the model was trained in, whichever other one is given here; with aim
-                simulator no other one is taken.
-            model: What training made; None for the feed-forward of the robot alone.
-            config: How the robot is made to follow.
+            robot: Nominal, identified or adapted parameters of the robot. With a model and aim target, the simulator of
+                training replaces another one. With aim simulator, another one is refused.
+            model: The trained model; None for the feed-forward of the robot alone.
             dt: Control period, s; default the robot's.
-            num_envs: Robots side by side; None for one, with arrays (n,).
+            num_envs: Number of robots; None for one, with arrays (n,).
             payload_side: The hands that carry the payload: "both", or the side of one mount.
-            payload_step: Masses that the shadow can carry are this far apart, up to the heaviest trained on (without a
-                model, config.payload_max), kg.
+            payload_step: Distance between the masses that the shadow can carry, kg.
             nthread: Threads of the shadow simulators.
-            extrapolate: Take payloads beyond those trained on, up to the model's payload_max, and servos of other
-                gains.
-            adaptation: What `adapt` found for the unit that is commanded; the shadow is then that unit.
+            extrapolate: Accept payloads beyond the training data, up to the model's payload_max, and other servo gains.
+            adaptation: Result of `adapt` for this unit; the shadow then has the unit's parameters.
+
+        Raises:
+            ModelError: The model does not fit the robot, the control period or the aim.
         """
         self.dt = robot.dt if dt is None else dt
-        heaviest = config.payload_max
+        max_mass = config.payload_max
         if model is not None:
-            robot = _corrected(model, robot, self.dt, config)
-            heaviest = model.config.payload_max if extrapolate else model.heaviest
+            robot = _simulator_of(model, robot, self.dt, config)
+            max_mass = model.config.payload_max if extrapolate else model.heaviest
         robot = robot if adaptation is None else adaptation.robot(robot)
         self.robot, self.model, self.config, self.single = robot, model, config, num_envs is None
         self.extrapolate = extrapolate
         self.num_envs = num = 1 if num_envs is None else num_envs
-        heaviest = heaviest if robot.payload_mounts else 0.0
-        self.masses = np.linspace(0.0, heaviest, 1 + int(np.ceil(heaviest / payload_step - 1e-9)))
+        max_mass = max_mass if robot.payload_mounts else 0.0
+        self.masses = np.linspace(0.0, max_mass, 1 + int(np.ceil(max_mass / payload_step - 1e-9)))
         locked = idle_joints(robot, robot.operated)
-        # The last rows never move: they hold the model with each mass, to be copied when a payload changes.
+        # The last rows never move. Their models have one of the masses each, and are copied when a payload changes.
         carried = [Condition(float(m), payload_side, self.dt) for m in (*[0.0] * num, *self.masses)]
         self.shadow = BatchSim(robot, carried, nthread, locked)
         self.ids, self.op = np.arange(num), robot.operated_index
         self.free = robot.index(self.shadow.joint_names)
-        self.at = np.searchsorted(self.free, self.op)  # operated joints among the shadow's
+        self.operated = np.searchsorted(self.free, self.op)  # operated joints among the shadow's
         self.low, self.high = robot.qpos_range[self.op].T
-        self.kp, self.zero = robot.kp[self.op], robot.offset[self.op]
+        self.kp, self.zero_offset = robot.kp[self.op], robot.offset[self.op]
         self.bias: Array = self.shadow.batch.bind("qfrc_bias")
         self.loop = None if model is None else model.loop(num)
-        self.moving = Feedforward(self.shadow, self.at, robot, self.dt, self.config.acceleration_time)
-        self.estimate = PayloadEstimate(self.shadow, self.at, robot, len(self.masses), self.dt)
-        self._carried = np.full(num, -1)
-        self.payload_mass, self.announced, self.periods = np.zeros(num), False, 0
-        self.offset, self.integral, self.missing, self.sent, self.saturated = np.zeros((5, num, len(self.op)))
-        self._target: Array | None = None  # the last one that was a number; None before `reset`
-        self._aimed: list[Array] = []  # newest last
+        self.feedforward = Feedforward(self.shadow, self.operated, robot, self.dt, config.acceleration_time)
+        self.feedback = Feedback(config, self.dt)
+        self.payload_estimate = PayloadEstimate(self.shadow, self.operated, robot, len(self.masses), self.dt)
+        self._carried = np.full(num, -1)  # index of the mass that each shadow carries
+        self.payload_mass, self.payload_stated, self.periods = np.zeros(num), False, 0
+        self.offset, self.command = np.zeros((2, num, len(self.op)))  # u − a′ of the iteration; last command, rad
+        self._target: Array | None = None  # last finite target; None before `reset`
+        self._references: list[Array] = []  # positions that the robot should have, newest last
 
     # ---- use
 
     def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:
-        """Refuse servos with gains (n) other than those that the data were recorded with, unless `extrapolate`.
+        """Refuse servo gains, (n,), that differ from those of the recordings, unless `extrapolate`.
 
-        Without a model, those are the robot's own before identification.
+        Without a model, these are the robot's gains before identification.
         """
         if self.extrapolate:
             return
         if self.model is not None:
             self.model.require_gains(joint_names, kp, kd)
             return
-        known = self.robot.nominal or self.robot
-        for joint, i in zip(known.operated, known.operated_index, strict=True):
+        nominal = self.robot.nominal or self.robot
+        for joint, i in zip(nominal.operated, nominal.operated_index, strict=True):
             for name, gains in (("kp", kp), ("kd", kd)):
-                was, now = float(getattr(known, name)[i]), float(gains[joint_names.index(joint)])
+                was, now = float(getattr(nominal, name)[i]), float(gains[joint_names.index(joint)])
                 if abs(now - was) > GAIN_TOLERANCE * max(was, now):
                     raise RobotError(
-                        f"{known.folder}: {name} of {joint} is {was:g} there, the servo has {now:.4g}; set the servo, "
-                        "or robot.toml and identify on logs made with it, or extrapolate (--extrapolate)"
+                        f"{nominal.folder}: {name} of {joint} is {was:g} there, the servo has {now:.4g}; set the "
+                        "servo, or robot.toml and identify on logs made with it, or extrapolate (--extrapolate)"
                     )
 
     def reset(self, target: Array, payload_mass: Array | float | None = None) -> None:
-        """Begin at rest at a target, uncompensated; commands blend in from there.
+        """Start at rest at a target, without compensation, which then blends in.
 
         Args:
             target: The target in force, rad.
             payload_mass: kg, one number or (num_envs,); None to estimate it from commands and positions.
 
         Raises:
-            ModelError: A payload beyond those trained on, without `extrapolate`.
-            UsageError: A target or payload that is not a number.
+            ModelError: The payload is outside the training data, without `extrapolate`.
+            UsageError: The target or the payload is not finite.
         """
-        self.announced = payload_mass is not None or len(self.masses) == 1
-        self.estimate.reset(self.num_envs)
+        self.payload_stated = payload_mass is not None or len(self.masses) == 1
+        self.payload_estimate.reset(self.num_envs)
         if payload_mass is None:
             self._carry(np.zeros(self.num_envs))
         else:
             self.set_payload(payload_mass)
-        a = self._all(target)
+        a = self._as_rows(target)
         if not np.isfinite(a).all():
             raise UsageError("compensator: the target to begin at is not a number")
-        self._target, self.sent, self.periods = a, a[:, self.op], 0
+        self._target, self.command, self.periods = a, a[:, self.op], 0
         if self.loop is not None:
             self.loop.reset()
-        self.offset, self.integral, self.missing = np.zeros((3, *self.sent.shape))
-        self.moving.reset(self.sent)
+        self.offset = np.zeros(self.command.shape)
+        self.feedback.reset(self.command.shape)
+        self.feedforward.reset(self.command)
         rest = np.clip(a[:, self.free], *self.shadow.range.T)
         self.shadow.reset(self.ids, rest, 0.0, past=rest[:, None])  # type: ignore[arg-type]
         self.shadow.batch.forward(self.ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        for _ in range(SETTLE):
-            self._shadow_step(rest, self._wanted(rest[:, self.at]))
-        self._aimed = [self._shadow_qpos()] * (self.config.lead + 1)
+        for _ in range(SETTLING_PERIODS):
+            self._step_shadow(rest, self._shadow_target(rest[:, self.operated]))
+        self._references = [self._shadow_qpos()] * (self.config.lead + 1)
 
     def set_payload(self, payload_mass: Array | float) -> None:
-        """A payload was picked up or put down, kg, one number or (num_envs,); errors as of `reset`."""
+        """Set the payload after a pick or place, kg, one number or (num_envs,); errors as of `reset`."""
         self.require_payload(payload_mass)
         self._carry(np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs)))
 
     def require_payload(self, payload_mass: Array | float) -> None:
-        """Refuse a payload, kg, that is none, or that the model or the shadow does not know."""
+        """Refuse payloads, kg, that are not physical or that the model or the shadow cannot carry."""
         if self.model is not None:
             self.model.require_payload(payload_mass, self.extrapolate)
             return
@@ -221,7 +222,7 @@ class Compensator:
             )
 
     def _carry(self, payload_mass: Array) -> None:
-        """The shadow carries the nearest of `masses`."""
+        """Let the shadow carry the nearest of `masses`."""
         self.payload_mass = payload_mass
         nearest = np.abs(self.payload_mass[:, None] - self.masses).argmin(axis=1)
         if (nearest != self._carried).any():
@@ -233,97 +234,87 @@ class Compensator:
         """Commands for the coming control period, rad.
 
         Args:
-            target: What the robot is asked for, rad; with a lead, that many periods from now. Where it is not a number,
-                the last that was one holds.
-            qpos: Measured now, rad; None where no fresh state has arrived: feedback then waits, as it does where qpos
-                or qvel is not a number.
-            qvel: Measured now, rad/s.
-            tau: Measured joint torque, N·m, for the payload estimate; default that of the servo law, kp (u − q) − kd q̇.
+            target: Target of the robot, rad; with a lead, that many periods from now. If it is not finite, the last
+                finite one holds.
+            qpos: Measured position, rad; None if no new state has arrived. Feedback then pauses, as it does for a qpos
+                or qvel that is not finite.
+            qvel: Measured velocity, rad/s.
+            tau: Measured joint torque, N·m, for the payload estimate; default kp (u − q) − kd q̇.
 
         Raises:
             UsageError: `reset` was not called before.
         """
         if self._target is None:
             raise UsageError("compensator: step before reset; call reset(target) once, then step every control period")
-        given = self._all(target)
-        self._target = a_all = np.where(np.isfinite(given), given, self._target)
-        a = a_all[:, self.op]
-        self._aimed = [*self._aimed[1:], self._shadow_qpos()]
+        given = self._as_rows(target)
+        self._target = targets = np.where(np.isfinite(given), given, self._target)
+        a = targets[:, self.op]
+        self._references = [*self._references[1:], self._shadow_qpos()]
         if qpos is not None:
-            v, force = (None if x is None else self._all(x)[:, self.op] for x in (qvel, tau))
-            self._observe(self._all(qpos)[:, self.op], v, force)
-        self.moving.update(a)
-        wanted = self._wanted(a)
-        u = self._solve(wanted) + self.integral
+            v, torque = (None if x is None else self._as_rows(x)[:, self.op] for x in (qvel, tau))
+            self._process_state(self._as_rows(qpos)[:, self.op], v, torque)
+        self.feedforward.update(a)
+        shadow_target = self._shadow_target(a)
+        u = self._invert(shadow_target) + self.feedback.integral
         share = min(1.0, self.periods * self.dt / self.config.blend) if self.config.blend else 1.0
-        free_u = a + share * (u - a)
+        unlimited = a + share * (u - a)
         limit = self.config.limit
-        self.sent = np.clip(np.clip(free_u, a - limit, a + limit), self.low, self.high)
-        self.saturated = np.sign(free_u - self.sent)  # +1 where the command could not be higher
+        self.command = np.clip(np.clip(unlimited, a - limit, a + limit), self.low, self.high)
+        self.feedback.saturation = np.sign(unlimited - self.command)
         self.periods += 1
-        self._shadow_step(a_all[:, self.free], wanted)
-        out = a_all.copy()
-        out[:, self.op] = self.sent
-        return out[0] if self.single else out
+        self._step_shadow(targets[:, self.free], shadow_target)
+        commands = targets.copy()
+        commands[:, self.op] = self.command
+        return commands[0] if self.single else commands
 
     @property
     def doubt(self) -> str:
-        """That one robot holds another payload than was stated, by what its servos have given of late; or nothing."""
-        return self.estimate.contradicts(float(self.payload_mass[0])) if self.announced and self.single else ""
+        """Message if the servo torques of one robot are those of another payload than stated; else ""."""
+        if not (self.payload_stated and self.single):
+            return ""
+        return self.payload_estimate.contradiction(float(self.payload_mass[0]))
 
-    @property
-    def aimed(self) -> Array:
-        """Where the robot should have been at the last step, operated joints, rad."""
-        return self._aimed[0][0] if self.single else self._aimed[0]
+    # ---- internals
 
-    # ---- parts
-
-    def _wanted(self, a: Array) -> Array:
-        """a′: what the shadow is given."""
+    def _shadow_target(self, a: Array) -> Array:
+        """Return a′, the shadow's targets of the operated joints, (num_envs, n) rad."""
         if self.config.aim == "simulator":
             return np.clip(a, self.low, self.high)
-        tau = self.bias[: self.num_envs, self.at]
+        tau = self.bias[: self.num_envs, self.operated]
         if self.config.dynamics:
-            tau = tau + self.moving.torque(tau)
-        return np.clip(a + tau / self.kp - self.zero, self.low, self.high)
+            tau = tau + self.feedforward.torque(tau)
+        return np.clip(a + tau / self.kp - self.zero_offset, self.low, self.high)
 
-    def _solve(self, wanted: Array) -> Array:
-        """u with u + G(u) = wanted, G at the shadow; wanted itself without a model."""
+    def _invert(self, shadow_target: Array) -> Array:
+        """Return u with u + G(u) = a′. Without a model, u = a′."""
         if self.loop is None:
-            return wanted
-        q, v, config = *(x[: self.num_envs, self.at] for x in (self.shadow.qpos, self.shadow.qvel)), self.config
-        return self.loop.solve(q, v, wanted, self.payload_mass, self.offset, config.gain, config.iterations)
+            return shadow_target
+        q, v = (x[: self.num_envs, self.operated] for x in (self.shadow.qpos, self.shadow.qvel))
+        gain, iterations = self.config.gain, self.config.iterations
+        return self.loop.solve(q, v, shadow_target, self.payload_mass, self.offset, gain, iterations)
 
-    def _observe(self, q: Array, v: Array | None, tau: Array | None) -> None:
-        """Integrate what is missing; anti-windup: not further where the command is at a limit."""
-        config = self.config
+    def _process_state(self, q: Array, v: Array | None, tau: Array | None) -> None:
+        """Update feedback and payload estimate from a measured state."""
         v = np.zeros_like(q) if v is None else v
-        seen = np.isfinite(q + v + (0.0 if tau is None else tau)).all(axis=1)  # robots
+        valid = np.isfinite(q + v + (0.0 if tau is None else tau)).all(axis=1)  # robots
         if self.periods:
-            # A blocked joint misses much; it must not take long to forget.
-            wrong = np.clip(self._aimed[0] - q, -config.feedback_limit, config.feedback_limit)
-            missing = self.missing + (wrong - self.missing) * min(1.0, self.dt / max(config.feedback_time, self.dt))
-            further = missing * self.saturated > 0
-            grown = self.integral + config.feedback * self.dt * np.where(further, 0.0, missing)
-            limited = np.clip(grown, -config.feedback_limit, config.feedback_limit)
-            self.missing = np.where(seen[:, None], missing, self.missing)
-            self.integral = np.where(seen[:, None], limited, self.integral)
-        if not self.announced:
-            self._carry(self.estimate.update(q, v, self.sent, tau, seen))
+            self.feedback.update(self._references[0] - q, valid)
+        if not self.payload_stated:
+            self._carry(self.payload_estimate.update(q, v, self.command, tau, valid))
         elif self.single and len(self.masses) > 1:
-            self.estimate.update(q, v, self.sent, tau, seen)
+            self.payload_estimate.update(q, v, self.command, tau, valid)
 
     def _shadow_qpos(self) -> Array:
-        return self.shadow.qpos[: self.num_envs, self.at]
+        return self.shadow.qpos[: self.num_envs, self.operated]
 
-    def _shadow_step(self, targets: Array, wanted: Array) -> None:
+    def _step_shadow(self, targets: Array, operated_targets: Array) -> None:
         full = np.zeros((self.shadow.num_envs, self.shadow.n))
         full[: self.num_envs] = targets
-        full[: self.num_envs, self.at] = wanted
+        full[: self.num_envs, self.operated] = operated_targets
         self.shadow.step(full, self.ids)
 
-    def _all(self, values: Array) -> Array:
-        """(num_envs, n) of what may be (n,)."""
+    def _as_rows(self, values: Array) -> Array:
+        """Return (n,) or (num_envs, n) as (num_envs, n)."""
         values = np.asarray(values, float)
         shape = (self.num_envs, len(self.robot.joint_names))
         if values.shape != (shape[1:] if self.single else shape):
@@ -331,8 +322,37 @@ class Compensator:
         return values.reshape(shape)
 
 
-def _corrected(model: GapModel, robot: RobotSpec, dt: float, config: CompensatorConfig) -> RobotSpec:
-    """The simulator in which a model is asked: the given one, or that of its training; refuses what cannot be."""
+class Feedback:
+    """Integrator of the remaining position error, with a low-pass, limits and anti-windup. Arrays are (num_envs, n).
+
+    Attributes:
+        integral: Correction of the command, rad.
+        saturation: +1 where the command is at its upper limit, −1 at its lower one, else 0.
+    """
+
+    def __init__(self, config: CompensatorConfig, dt: float) -> None:
+        """dt: Control period, s."""
+        self.config, self.dt = config, dt
+        self.integral, self.saturation, self._filtered = np.zeros((3, 0, 0))
+
+    def reset(self, shape: tuple[int, ...]) -> None:
+        """Start without correction."""
+        self.integral, self.saturation, self._filtered = np.zeros((3, *shape))
+
+    def update(self, error: Array, valid: Array) -> None:
+        """Process position errors, rad, of the robots `valid`, (num_envs,)."""
+        config, limit = self.config, self.config.feedback_limit
+        # A blocked joint has a large error, which must not take long to decrease.
+        limited = np.clip(error, -limit, limit)
+        filtered = self._filtered + (limited - self._filtered) * min(1.0, self.dt / max(config.feedback_time, self.dt))
+        winds_up = filtered * self.saturation > 0
+        integral = self.integral + config.feedback * self.dt * np.where(winds_up, 0.0, filtered)
+        self._filtered = np.where(valid[:, None], filtered, self._filtered)
+        self.integral = np.where(valid[:, None], np.clip(integral, -limit, limit), self.integral)
+
+
+def _simulator_of(model: GapModel, robot: RobotSpec, dt: float, config: CompensatorConfig) -> RobotSpec:
+    """Return the simulator that the model corrects: the given one or that of training."""
     model.require_rate(dt)
     if model.config.holds:
         raise ModelError(f"{model.path}: holds corrections or sensors; to be inverted it must be trained without")

@@ -1,8 +1,8 @@
-"""What moving asks for beyond holding: inertia, damping and friction (by the servo's law where it was identified), at
-the targets' velocity and acceleration. The delay of a servo is not compensated: that overshoots.
+"""Feed-forward torque for motion: inertia, damping and friction, on top of the torque that holds a posture.
 
-Both come from the last targets, so this is causal; a noise of the targets is amplified by inertia / (kp dt²), which the
-low-pass of the acceleration lessens.
+Velocity and acceleration come from the last targets, so the feed-forward is causal. It amplifies noise of the targets
+by inertia / (kp dt²); the low-pass of the acceleration reduces that. The delay of servos is not compensated, because
+that leads to overshoot.
 """
 
 from __future__ import annotations
@@ -15,44 +15,49 @@ from gaponet.sim.batch import BatchSim
 from gaponet.sim.inverse import Inertia
 from gaponet.sim.servo import friction_limit, present
 
-SPEED, ACCELERATION = 4.0, 40.0  # rad/s, rad/s²: as far as targets are believed; a step of theirs asks for more
-FRICTION_SPEED = 0.05  # rad/s at which three quarters of the friction are fed forward; none where nothing moves
+MAX_SPEED, MAX_ACCELERATION = 4.0, 40.0  # rad/s, rad/s²; a step of the targets would have more
+FRICTION_SPEED = 0.05  # rad/s at which three quarters of the friction are fed forward; at rest none is
 
 
 class Feedforward:
-    """Torques for moving of the first `num` simulations of a batch; all have the same joints."""
+    """Torques for the motion of the first `num` simulations of a batch; all have the same joints.
 
-    def __init__(self, sim: BatchSim, at: Array, robot: RobotSpec, dt: float, acceleration_time: float) -> None:
+    Attributes:
+        target, qvel, qacc: Last targets, their velocity and filtered acceleration, (num, n operated).
+    """
+
+    def __init__(self, sim: BatchSim, operated: Array, robot: RobotSpec, dt: float, acceleration_time: float) -> None:
         """
         Args:
             sim: Its present state gives the inertia.
-            at: Operated joints among the simulation's.
-            robot: For its velocity feedback and law of friction.
+            operated: Operated joints among the simulation's, (n,).
+            robot: Velocity feedback and servo model.
             dt: Control period, s.
-            acceleration_time: Low-pass, s.
+            acceleration_time: Time constant of the low-pass, s.
         """
         model, op = next(iter(sim.models.values())), robot.operated_index
         self.dt, self.share = dt, min(1.0, dt / max(acceleration_time, dt))
-        self.damping = robot.kd[op] + model.dof_damping[at]
-        self.friction = model.dof_frictionloss[at]
-        self.law = present({name: getattr(robot, name)[op] for name in SERVO_TERMS})
-        self.inertia = Inertia(sim.batch, model, at)
+        self.damping = robot.kd[op] + model.dof_damping[operated]
+        self.friction = model.dof_frictionloss[operated]
+        self.servo_terms = present({name: getattr(robot, name)[op] for name in SERVO_TERMS})
+        self.inertia = Inertia(sim.batch, model, operated)
+        self.target, self.qvel, self.qacc = np.zeros((3, 0, len(op)))
 
     def reset(self, target: Array) -> None:
-        """At rest at targets (num, n operated), rad."""
+        """Start at rest at targets, (num, n operated) rad."""
         self.target, self.qvel, self.qacc = target.copy(), np.zeros_like(target), np.zeros_like(target)
 
     def update(self, target: Array) -> None:
-        """The targets of the coming period, rad."""
+        """Set the targets of the coming control period, (num, n operated) rad."""
         before = self.qvel
-        self.qvel = np.clip((target - self.target) / self.dt, -SPEED, SPEED)
-        qacc = np.clip((self.qvel - before) / self.dt, -ACCELERATION, ACCELERATION)
+        self.qvel = np.clip((target - self.target) / self.dt, -MAX_SPEED, MAX_SPEED)
+        qacc = np.clip((self.qvel - before) / self.dt, -MAX_ACCELERATION, MAX_ACCELERATION)
         self.qacc = self.qacc + self.share * (qacc - self.qacc)
         self.target = target.copy()
 
     def torque(self, holding: Array | float = 0.0) -> Array:
-        """N·m, (num, n operated), on top of `holding`, what gravity asks for."""
+        """Return the torque for motion, (num, n operated) N·m; holding is the torque against gravity."""
         inertial = np.einsum("kij,kj->ki", self.inertia.matrix(len(self.qacc)), self.qacc)
         moving = inertial + self.damping * self.qvel
-        most = friction_limit(self.law, self.friction, self.qvel, holding + moving, holding)
-        return np.asarray(moving + most * np.tanh(self.qvel / FRICTION_SPEED))
+        friction = friction_limit(self.servo_terms, self.friction, self.qvel, holding + moving, holding)
+        return np.asarray(moving + friction * np.tanh(self.qvel / FRICTION_SPEED))

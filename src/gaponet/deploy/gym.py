@@ -1,4 +1,4 @@
-"""gymnasium: an environment on AlignedSim, and a wrapper that aligns a MuJoCo environment of one's own.
+"""gymnasium: environments on AlignedSim, and a wrapper that aligns a user's MuJoCo environment.
 
 Needs gymnasium: pip install "gaponet[gym]".
 """
@@ -39,9 +39,9 @@ class TrackingEnv(gymnasium.Env):
         Args:
             sim: One simulation (num_envs None).
             references: Joint motions to follow, (T, n) rad each, in the order of sim.joint_names, one row per period.
-            reach: What an action of 1 adds, rad.
-            preview: Rows of the reference that are seen.
-            seed: Seed of the choice of motion and start.
+            reach: Offset of the target for action 1, rad.
+            preview: Number of reference rows in the observation.
+            seed: Seed of the choice of motions.
         """
         if not sim.single or not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
             raise UsageError(f"TrackingEnv needs one simulation and motions (T, {sim.n}) of at least 3 rows")
@@ -50,14 +50,15 @@ class TrackingEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, ((2 + preview) * n,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n,), np.float32)
         self.np_random = np.random.default_rng(seed)
+        self.motion, self.t = 0, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """A motion from its first row; options may name it: {"motion": 3}."""
+        """Start a motion at its first row: a random one, or options {"motion": 3}."""
         super().reset(seed=seed)
         choice = (options or {}).get("motion")
         self.motion = int(self.np_random.integers(len(self.references))) if choice is None else int(choice)
-        self.reference, self.t = self.references[self.motion], 0
-        self.sim.reset(self.reference[0])
+        self.t = 0
+        self.sim.reset(self.references[self.motion][0])
         return self._observe(), {"motion": self.motion}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -69,10 +70,17 @@ class TrackingEnv(gymnasium.Env):
         self.t += 1
         error = self.sim.qpos[op] - self._row(0)[op]
         info = {"error": error, "delta": self.sim.delta}
-        return self._observe(), -float(np.mean(error**2)) / 0.01, False, self.t >= len(self.reference) - 2, info
+        return (
+            self._observe(),
+            -float(np.mean(error**2)) / 0.01,
+            False,
+            self.t >= len(self.references[self.motion]) - 2,
+            info,
+        )
 
     def _row(self, ahead: int) -> Array:
-        return self.reference[min(self.t + ahead, len(self.reference) - 1)]
+        reference = self.references[self.motion]
+        return reference[min(self.t + ahead, len(reference) - 1)]
 
     def _observe(self) -> Array:
         op = self.sim.op
@@ -82,14 +90,14 @@ class TrackingEnv(gymnasium.Env):
 
 
 class TrackingVectorEnv(gymnasium.vector.VectorEnv):
-    """TrackingEnv in all worlds of one AlignedSim; a world whose motion has ended begins another in its next step."""
+    """TrackingEnv in all worlds of one AlignedSim. A world starts another motion in the step after the end of one."""
 
     metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self, sim: AlignedSim, references: ListOf[Array], reach: float = 0.2, preview: int = 2, seed: int = 0
     ) -> None:
-        """The arguments are those of TrackingEnv; the simulator has any number of worlds."""
+        """Arguments as of TrackingEnv; the simulator has any number of worlds."""
         if not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
             raise UsageError(f"TrackingVectorEnv needs motions (T, {sim.n}) of at least 3 rows")
         self.sim, self.reach, self.preview, self.num_envs = sim, reach, preview, sim.num_envs
@@ -107,13 +115,13 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv):
         self.np_random = np.random.default_rng(seed)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """A motion for each world from its first row; options may name them: {"motion": 3}, or one for each world."""
+        """Start a motion in each world at its first row; options: {"motion": 3}, or an array with one per world."""
         super().reset(seed=seed)
         self._begin(np.ones(self.num_envs, bool), (options or {}).get("motion"))
         return self._observe(), {"motion": self.motion.copy()}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Step one control period; worlds that ended with the last one begin anew instead, and are rewarded 0."""
+        """Step one control period. Worlds whose motion has ended are reset instead, with reward 0."""
         op, fresh = self.sim.op, self.ended
         target = self._row(1).copy()
         target[:, op] += self.reach * np.clip(actions, -1.0, 1.0)
@@ -173,12 +181,12 @@ gymnasium.register("gaponet/Tracking-v0", entry_point=MADE, vector_entry_point=M
 
 
 class AlignedActions(gymnasium.Wrapper):
-    """Any gymnasium environment on MuJoCo (unwrapped.model, .data, .dt) whose actions are targets in rad: aligned."""
+    """Aligns a gymnasium environment on MuJoCo (unwrapped.model, .data, .dt) whose actions are targets in rad."""
 
     def __init__(
         self, env: gymnasium.Env, model: Reference, payload_mass: float, prefix: str = "", extrapolate: bool = False
     ) -> None:
-        """Transfers or refuses as deploy.mujoco_loop does; model is an identified robot, or a model on top of one."""
+        """Arguments as of MujocoAligner."""
         super().__init__(env)
         scene: Any = env.unwrapped
         self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix, extrapolate)

@@ -1,4 +1,4 @@
-"""How heavy is what the robot holds? From the torque that holds the arms up, where nobody says it."""
+"""Estimate of the payload mass from the torques that hold the arms, if nobody states the mass."""
 
 from __future__ import annotations
 
@@ -9,77 +9,87 @@ from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim
 
-MEMORY = 1.0  # s: time constant of forgetting
-RATE = 1.0  # kg/s: a payload that appears at once is believed over this time, so that commands do not jump
-STILL = 0.5  # rad/s: a sample counts half at this speed, less when faster
-CERTAIN = 4.0  # (N·m/kg)²: leverage below which the present guess is kept
-# Share of the torques beyond the empty arm's that is as the largest payload's (virtual H1-2, 3 kg held: 0.57 to 0.97,
-# nothing held and positions read 0.12 rad wrong: up to 0.56); friction leaves less of it to a smaller one.
-ALIKE = 0.55
+FORGETTING_TIME_S = 1.0  # time constant
+MAX_RATE_KG_S = 1.0  # of the estimate: a payload that appears at once must not make commands jump
+HALF_WEIGHT_SPEED = 0.5  # rad/s; samples at this speed have half the weight, faster ones less
+MIN_LEVERAGE = 4.0  # (N·m/kg)²; below it, the estimate does not change
+# Least share of the excess torque over the empty arm's that must look like the largest payload's. On a virtual H1-2,
+# 3 kg give 0.57 to 0.97, and no payload with positions wrong by 0.12 rad up to 0.56. Friction lowers the share of
+# smaller payloads.
+MIN_SIMILARITY = 0.55
 
 
 class PayloadEstimate:
-    """Least squares with forgetting on gravity: τ = τ_0(q) + m dτ(q), in which the mass m per hand is linear.
+    """Least squares with forgetting: τ = τ_0(q) + m dτ(q) is linear in the mass m per hand.
 
-    Friction hides ± a few N·m, so this is good to some hundred grams on an arm of 40 N·m, and slow on purpose. Torques
-    that are not alike a payload's, the less the heavier it would be, are believed to be none.
+    Friction hides a few N·m, so the error is some hundred grams on an arm with 40 N·m. The estimate is slow on purpose.
+    Torques that do not look like a payload's give the mass 0.
+
+    Attributes:
+        mass: Estimate of each robot, (num,) kg, with a limited rate.
+        latest: Estimate without the limit, (num,) kg.
+        certain: Robots with enough leverage, (num,).
     """
 
-    def __init__(self, sim: BatchSim, at: Array, robot: RobotSpec, masses: int, dt: float) -> None:
+    def __init__(self, sim: BatchSim, operated: Array, robot: RobotSpec, num_masses: int, dt: float) -> None:
         """
         Args:
-            sim: Its last `masses` rows carry payloads from 0 to the largest; the first and last of those are used.
-            at: Operated joints among the simulation's.
+            sim: Its last num_masses rows carry payloads from 0 to the largest. The first and last of them are used.
+            operated: Operated joints among the simulation's, (n,).
             dt: Control period, s.
         """
-        self.sim, self.at, self.dt = sim, at, dt
-        self.rows = np.array([sim.num_envs - masses, sim.num_envs - 1])
+        self.sim, self.operated, self.dt = sim, operated, dt
+        self.rows = np.array([sim.num_envs - num_masses, sim.num_envs - 1])
         self.kp, self.kd = robot.kp[robot.operated_index], robot.kd[robot.operated_index]
-        self.heaviest = float(sorted(c[0] for c in sim.models)[-1])
+        self.max_mass = float(sorted(c[0] for c in sim.models)[-1])
         self.bias: Array = sim.batch.bind("qfrc_bias")
         self.home = robot.qpos_home[robot.index(sim.joint_names)]
+        self.mass, self._projection, self._leverage, self._energy, self.latest = np.zeros((5, 0))
+        self.certain = np.zeros(0, bool)
 
     def reset(self, num: int) -> None:
-        """Nothing in the hands of num robots."""
-        self.mass, self.top, self.weight, self.energy = (np.zeros(num) for _ in range(4))
-        self.guess, self.certain = np.zeros(num), np.zeros(num, bool)
+        """Start with empty hands of num robots."""
+        self.mass, self._projection, self._leverage, self._energy, self.latest = np.zeros((5, num))
+        self.certain = np.zeros(num, bool)
 
-    def update(self, qpos: Array, qvel: Array, sent: Array, tau: Array | None, seen: Array) -> Array:
-        """Take in one control period; all (num, n operated). Returns kg per robot, (num,).
+    def update(self, qpos: Array, qvel: Array, command: Array, tau: Array | None, valid: Array) -> Array:
+        """Process one control period of all robots; return the mass per robot, (num,) kg.
 
         Args:
-            qpos, qvel: Measured, rad, rad/s.
-            sent: Command in force, rad.
-            tau: Measured torque, N·m; None for the servo law's.
-            seen: Robots (num,) whose state is one; of the others nothing is learned.
+            qpos, qvel: Measured, (num, n operated) rad, rad/s.
+            command: Command in force, (num, n operated) rad.
+            tau: Measured torque, (num, n operated) N·m; None for the servo model's.
+            valid: Robots with a finite state, (num,). The others are skipped.
         """
-        torque = self.kp * (sent - qpos) - self.kd * qvel if tau is None else tau
-        keep = np.exp(-self.dt / MEMORY)
-        for i in np.flatnonzero(seen):
-            empty, full = self._gravity(qpos[i])
-            per_kg = (full - empty) / self.heaviest
-            share = 1.0 / (1.0 + (np.abs(qvel[i]).max() / STILL) ** 2)
-            self.top[i] = keep * self.top[i] + share * float(per_kg @ (torque[i] - empty)) * self.dt
-            self.energy[i] = keep * self.energy[i] + share * float(np.sum((torque[i] - empty) ** 2)) * self.dt
-            self.weight[i] = keep * self.weight[i] + share * float(per_kg @ per_kg) * self.dt
-        guess = self.top / np.maximum(self.weight, 1e-9)
-        alike = self.top * np.abs(self.top) / np.maximum(self.weight * self.energy, 1e-9)
-        guess = np.clip(guess, 0.0, self.heaviest)
-        guess = np.where(alike < ALIKE * (guess / self.heaviest) ** 2, 0.0, guess)
-        self.certain = self.weight > CERTAIN * MEMORY * 0.1
-        self.guess = np.where(self.certain, guess, self.mass)
-        self.mass = self.mass + np.clip(self.guess - self.mass, -RATE * self.dt, RATE * self.dt)
+        torque = self.kp * (command - qpos) - self.kd * qvel if tau is None else tau
+        keep = np.exp(-self.dt / FORGETTING_TIME_S)
+        for i in np.flatnonzero(valid):
+            empty, full = self.gravity(qpos[i])
+            per_kg, excess = (full - empty) / self.max_mass, torque[i] - empty
+            weight = 1.0 / (1.0 + (np.abs(qvel[i]).max() / HALF_WEIGHT_SPEED) ** 2)
+            self._projection[i] = keep * self._projection[i] + weight * float(per_kg @ excess) * self.dt
+            self._energy[i] = keep * self._energy[i] + weight * float(np.sum(excess**2)) * self.dt
+            self._leverage[i] = keep * self._leverage[i] + weight * float(per_kg @ per_kg) * self.dt
+        estimate = np.clip(self._projection / np.maximum(self._leverage, 1e-9), 0.0, self.max_mass)
+        explained = self._projection * np.abs(self._projection)
+        similarity = explained / np.maximum(self._leverage * self._energy, 1e-9)
+        estimate = np.where(similarity < MIN_SIMILARITY * (estimate / self.max_mass) ** 2, 0.0, estimate)
+        self.certain = self._leverage > MIN_LEVERAGE * FORGETTING_TIME_S * 0.1
+        self.latest = np.where(self.certain, estimate, self.mass)
+        change = MAX_RATE_KG_S * self.dt
+        self.mass = self.mass + np.clip(self.latest - self.mass, -change, change)
         return self.mass
 
-    def contradicts(self, told: float) -> str:
-        """What the first robot's torques say, if that is another payload than was told, kg; else nothing."""
-        if not self.certain[0] or abs(self.guess[0] - told) <= self.heaviest / 2:
+    def contradiction(self, stated: float) -> str:
+        """Return a message if the first robot's torques are those of another payload than stated, kg; else ""."""
+        if not self.certain[0] or abs(self.latest[0] - stated) <= self.max_mass / 2:
             return ""
-        return f"{told:g} kg were told, and the torques are those of about {self.guess[0]:.1f} kg: what is in the hand?"
+        estimate = f"{self.latest[0]:.1f} kg"
+        return f"{stated:g} kg were stated, but the torques are those of about {estimate}: what is in the hand?"
 
-    def _gravity(self, qpos: Array) -> Array:
-        """Torque that holds a posture, empty and with the largest payload, (2, n) N·m."""
+    def gravity(self, qpos: Array) -> Array:
+        """Return the torques that hold a posture, empty and with the largest payload, (2, n) N·m."""
         self.sim.qpos[self.rows], self.sim.qvel[self.rows] = self.home, 0.0
-        self.sim.qpos[self.rows[:, None], self.at] = qpos
+        self.sim.qpos[self.rows[:, None], self.operated] = qpos
         self.sim.batch.forward(self.rows, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        return self.bias[self.rows][:, self.at]
+        return self.bias[self.rows][:, self.operated]

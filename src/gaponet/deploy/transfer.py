@@ -1,14 +1,14 @@
-"""Transfer: the commands with which one simulator moves as another one does, with its operator.
+"""Transfer: commands with which one simulator, the target, moves like another one, the reference.
 
-An operator is trained in one simulator, the reference. Of the robot it knows how it moves; how a simulator must be told
-to move so is known in closed form, of any simulator. So in each control period the reference, put where the target
-simulator is, takes the period's step, and the target is told the inverse of that step (sim/inverse.py).
+A model is trained in one simulator, the reference. In each control period, the reference is set to the state of the
+target simulator and steps with the model's correction. The target's command is the inverse dynamics of that step
+(sim/inverse.py).
 
-Exact, but for what happens within a control period: free motion, whatever differs: gains, damping, friction, inertia,
-payload, offsets, delays up to the reference's, torque limits, integrator, time step. A push moves the target, and the
-reference goes on from there. In contact the motors give what the reference's would in free space, and the target's
-contacts answer to that; what the reference itself touches (the table of an identified one) the target is stopped at by
-its motors.
+In free motion the result is exact, except for what happens within a control period. The simulators may differ in gains,
+damping, friction, inertia, payload, offsets, delays up to the reference's, torque limits, integrator and time step.
+After a push, the reference continues from the target's state. In contact, the motors have the torques of the reference
+in free space, and the target's contacts respond to them. Where the reference itself has a contact (the table of an
+identified robot), the target's motors stop the motion.
 """
 
 from __future__ import annotations
@@ -30,17 +30,18 @@ from gaponet.sim.replay import idle_limbs
 Inverse = Literal["closed", "probes"]
 Reference = GapModel | RobotSpec  # a model with the simulator of its run, or a simulator alone
 
-GAINS = (0.15, 5.0)  # of kp, to the reference's; this and what follows as far as was measured
-BAND = 0.06  # rad, frictionloss / kp
-STEP = 0.0051  # s
-LATER = 0.005  # s, servos than the reference's
-RESTING = 0.02  # rad/s: of a joint that is pressed on something, so that its friction is not seen
+# Ranges in which transfer was measured.
+KP_RATIO_BOUNDS = (0.15, 5.0)  # target to reference
+MAX_FRICTION_BAND_RAD = 0.06  # frictionloss / kp
+MAX_TIMESTEP_S = 0.0051
+MAX_EXTRA_DELAY_S = 0.005  # of the target's servos
+STICTION_SPEED = 0.02  # rad/s at which three quarters of the friction act, for joints that are blocked by a contact
 
 
 class Transfer:
-    """Commands for num_envs simulations of the target; the reference runs along, one simulation for each.
+    """Commands for num_envs simulations of the target, with one simulation of the reference for each.
 
-    Arrays are (num_envs, n) in the order of `joint_names`, the reference's joints without those locked.
+    Arrays are (num_envs, n) in the order of `joint_names`, the reference's joints that are not locked.
     """
 
     def __init__(
@@ -54,15 +55,15 @@ class Transfer:
     ) -> None:
         """
         Args:
-            reference: How the robot moves.
+            reference: The model, or the simulator that the target is to move like.
             inverse: The target's inverse dynamics, for the same joints.
-            conditions: The reference's payloads and the control period.
+            conditions: Payloads and control period of the reference.
             locked: Joints that the reference has clamped at home.
             nthread: Threads of the reference, 0 for all cores.
-            extrapolate: Take a target beyond those that were measured.
+            extrapolate: Accept a target outside the measured ranges.
 
         Raises:
-            ModelError: The model cannot be asked at this control period, or the target is beyond those measured.
+            ModelError: The control period does not fit the model, or the target is outside the measured ranges.
         """
         model = reference if isinstance(reference, GapModel) else None
         robot = reference.simulator() if isinstance(reference, GapModel) else reference
@@ -72,82 +73,86 @@ class Transfer:
             _require_measured(inverse, ClosedForm.of(sim), sim.joint_names)
         self.joint_names = sim.joint_names
         self.op = np.array([sim.joint_names.index(name) for name in robot.operated])
-        self.every = 1 if model is None else max(periods_of(model, c.dt) for c in dict.fromkeys(conditions))
+        self.periods = 1 if model is None else max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
         self.loop = None if model is None else model.loop(self.num_envs)
         self.payload_mass = np.array([c.payload_mass for c in conditions])
         self._delta = np.zeros((self.num_envs, len(self.op)))
-        self._offset = np.zeros((self.num_envs, sim.n))  # of the last command from where the joint was, rad
-        self._asked = 0  # control periods since the operator was asked
-        self._limit = sim.batch.expand("dof_frictionloss")  # the servo's law writes there
-        self._held: Array = sim.batch.bind("qfrc_constraint")
+        self._offset = np.zeros((self.num_envs, sim.n))  # last command minus position, rad
+        self._elapsed = 0  # control periods since the start
+        self._frictionloss = sim.batch.expand("dof_frictionloss")  # the servo model writes it
+        self._constraint_force: Array = sim.batch.bind("qfrc_constraint")
         self._dt = (sim.nstep * sim.timestep)[:, None]
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array) -> None:
-        """Begin anew in some simulations, in a state (k, n), under targets of the periods before, (k, depth, n)."""
+        """Reset simulations to a state, (k, n), with the targets of past control periods, (k, depth, n)."""
         self.sim.reset(ids, qpos, qvel, past=past)
         self._offset[ids], self._delta[ids] = 0.0, 0.0
         if self.loop is not None:
             self.loop.reset(ids)
         if len(np.arange(self.num_envs)[ids]) == self.num_envs:
-            self._asked = 0
+            self._elapsed = 0
 
     def command(self, qpos: Array, qvel: Array, target: Array) -> Array:
-        """What to command over the coming control period; once per period.
+        """Return the commands of the coming control period, rad, without joint limits. Call this once per period.
 
         Args:
-            qpos, qvel: The target simulator's state, rad, rad/s.
-            target: What the robot would be asked for, rad.
-
-        Returns:
-            rad, not limited to the joints' range.
+            qpos, qvel: State of the target simulator, rad, rad/s.
+            target: Targets of the robot, rad.
         """
         self.sim.qpos[:], self.sim.qvel[:] = qpos, qvel
-        asked = self._corrected(qpos, qvel, target)
-        periods = [self._period(asked)]
+        corrected = self._corrected(qpos, qvel, target)
+        periods = [self._step_reference(corrected)]
         if self.inverse.ahead:
-            reached = self.sim.state()
-            periods += [self._period(asked) for _ in range(self.inverse.ahead)]
-            self.sim.set_state(reached)
-        out = self.inverse(periods, qpos + self._offset)
-        self._offset = out - qpos
-        return out
+            state = self.sim.state()
+            periods += [self._step_reference(corrected) for _ in range(self.inverse.ahead)]
+            self.sim.set_state(state)
+        commands = self.inverse(periods, qpos + self._offset)
+        self._offset = commands - qpos
+        return commands
 
     def _corrected(self, qpos: Array, qvel: Array, target: Array) -> Array:
-        """Target + Δa, the operator asked in periods as long as those that it was trained with."""
-        out = np.array(target, float)
+        """Return target + Δa. The model has the control period of training, which can be several of these."""
+        corrected = np.array(target, float)
         if self.loop is not None:
-            if self._asked % self.every == 0:
-                at = self.op
-                self._delta[:] = self.loop.delta(qpos[:, at], qvel[:, at], out[:, at], self.payload_mass)
-            self._asked += 1
-            out[:, self.op] += self._delta
-        return out
+            if self._elapsed % self.periods == 0:
+                op = self.op
+                self._delta[:] = self.loop.delta(qpos[:, op], qvel[:, op], corrected[:, op], self.payload_mass)
+            self._elapsed += 1
+            corrected[:, self.op] += self._delta
+        return corrected
 
-    def _period(self, asked: Array) -> Period:
-        """Step the reference."""
+    def _step_reference(self, targets: Array) -> Period:
         sim = self.sim
         qpos, qvel = sim.qpos.copy(), sim.qvel.copy()
-        sim.step(asked)
-        ends = sim.qpos.copy(), sim.qvel.copy()
-        return Period(qpos, qvel, *ends, self._friction(ends[0] - qpos))
+        sim.step(targets)
+        end = sim.qpos.copy(), sim.qvel.copy()
+        return Period(qpos, qvel, *end, self._friction_share(end[0] - qpos))
 
-    def _friction(self, way: Array) -> Array:
-        """Shares of friction; where a joint is held by more than its friction, by stops or contacts, from its speed."""
-        share = -self._held / np.maximum(self._limit, 1e-9)
-        by_speed = np.tanh(way / self._dt / RESTING)
-        return np.where((np.abs(share) > 1.05) | (self._limit == 0), by_speed, np.clip(share, -1.0, 1.0))
+    def _friction_share(self, motion: Array) -> Array:
+        """Return the used share of friction. Where stops or contacts block a joint, it follows from the speed."""
+        share = -self._constraint_force / np.maximum(self._frictionloss, 1e-9)
+        by_speed = np.tanh(motion / self._dt / STICTION_SPEED)
+        blocked = (np.abs(share) > 1.05) | (self._frictionloss == 0)
+        return np.where(blocked, by_speed, np.clip(share, -1.0, 1.0))
 
 
 class TransferCorrector:
-    """Transfer in the free run of sim.replay: the target is the simulator that is stepped."""
+    """Transfer in rollouts of sim.replay."""
 
     def __init__(self, reference: Reference, target: RobotSpec, extrapolate: bool = False) -> None:
-        """reference: How the robot moves. target: The simulator that is replayed in."""
+        """
+        Args:
+            reference: The model, or the simulator that the target is to move like.
+            target: The simulator of the rollout.
+            extrapolate: Accept a target outside the measured ranges.
+        """
         self.reference, self.target, self.extrapolate = reference, target, extrapolate
         self.robot = reference.simulator() if isinstance(reference, GapModel) else reference
+        self.transfer: Transfer | None = None
+        self.free = np.zeros(0, int)  # joints that are not locked
 
     def reset(self, start: ListOf[Sequence]) -> None:
-        """Begin one simulation per sequence at its first row."""
+        """Start one simulation per sequence at its first row."""
         locked = idle_limbs(start, self.robot)
         own = BatchSim(self.target, [Condition.of(s, self.target) for s in start], locked=locked)
         reference = [Condition.of(s, self.robot) for s in start]
@@ -157,48 +162,50 @@ class TransferCorrector:
         self.transfer.reset(slice(None), first[0], first[1], past=first[2][:, None])
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
-        """Commands, (k, n_all) rad."""
-        out, free = np.array(target, float), self.free
-        out[:, free] = self.transfer.command(qpos[:, free], qvel[:, free], target[:, free])
-        return out
+        """Return commands, (k, n_all) rad."""
+        assert self.transfer is not None
+        commands, free = np.array(target, float), self.free
+        commands[:, free] = self.transfer.command(qpos[:, free], qvel[:, free], target[:, free])
+        return commands
 
 
 def _require_measured(inverse: ClosedForm | Probed, reference: ClosedForm, joints: tuple[str, ...]) -> None:
-    """Refuse a target outside the range that transfer was measured in: LATER, GAINS, BAND, STEP."""
+    """Refuse a target outside the measured ranges."""
     periods = (inverse.ahead - reference.ahead) * reference.dt
-    later = periods if isinstance(inverse, Probed) else inverse.delay - reference.delay
-    if later.max() > LATER:
+    extra_delay = periods if isinstance(inverse, Probed) else inverse.delay - reference.delay
+    if extra_delay.max() > MAX_EXTRA_DELAY_S:
+        joint = joints[extra_delay.argmax() % len(joints)]
         raise ModelError(
-            f"joint '{joints[later.argmax() % len(joints)]}': its servo is {1e3 * later.max():.0f} ms later than the "
-            "reference's, and cannot follow it: it hears of a target when the reference has moved. Make the reference "
-            "as late (delay in robot.toml; gaponet identify), or extrapolate (extrapolate=True, --extrapolate)"
+            f"joint '{joint}': its servo is {1e3 * extra_delay.max():.0f} ms later than the reference's, and cannot "
+            "follow it: the reference moves before this servo receives a target. Make the reference as late (delay in "
+            "robot.toml; gaponet identify), or extrapolate (extrapolate=True, --extrapolate)"
         )
     if isinstance(inverse, Probed):
-        return  # what is in a black box is not known
-    for what, value, (least, most) in (
-        ("kp, as a ratio to the reference's,", inverse.kp / reference.kp, GAINS),
-        ("frictionloss / kp, rad,", inverse.frictionloss / inverse.kp, (0.0, BAND)),
-        ("the physics step, s,", np.tile(inverse.h, len(joints)), (0.0, STEP)),
+        return  # its parameters are unknown
+    for quantity, values, (low, high) in (
+        ("kp, as a ratio to the reference's,", inverse.kp / reference.kp, KP_RATIO_BOUNDS),
+        ("frictionloss / kp, rad,", inverse.frictionloss / inverse.kp, (0.0, MAX_FRICTION_BAND_RAD)),
+        ("the physics step, s,", np.tile(inverse.h, len(joints)), (0.0, MAX_TIMESTEP_S)),
     ):
-        for joint, least_of, most_of in zip(joints, value.min(axis=0), value.max(axis=0), strict=True):
-            for x in (least_of, most_of):
-                if not least * (1 - 1e-6) <= x <= most * (1 + 1e-6):
+        for joint, *extremes in zip(joints, values.min(axis=0), values.max(axis=0), strict=True):
+            for value in extremes:
+                if not low * (1 - 1e-6) <= value <= high * (1 + 1e-6):
                     raise ModelError(
-                        f"joint '{joint}': {what} is {x:.3g}; transfer was measured from {least:g} to {most:g}. Train "
-                        "in this simulator, or extrapolate (extrapolate=True, --extrapolate)"
+                        f"joint '{joint}': {quantity} is {value:.3g}; transfer was measured from {low:g} to {high:g}. "
+                        "Train in this simulator, or extrapolate (extrapolate=True, --extrapolate)"
                     )
 
 
-def periods_of(model: GapModel, dt: float) -> int:
-    """How many control periods of dt s are one of those that a model was trained with.
+def control_periods_of(model: GapModel, dt: float) -> int:
+    """Return the number of control periods of dt s in a control period of training.
 
     Raises:
-        ModelError: None of these is a whole number of them.
+        ModelError: It is not a whole number.
     """
     for trained in model.card.get("dt") or [dt]:
-        times = max(1, round(trained / dt))
-        if abs(dt * times / trained - 1) <= RATE_TOLERANCE:
-            return times
+        count = max(1, round(trained / dt))
+        if abs(dt * count / trained - 1) <= RATE_TOLERANCE:
+            return count
     rates = ", ".join(f"{1 / trained:.1f}" for trained in model.card["dt"])
     raise ModelError(
         f"{model.path}: trained at {rates} Hz, asked to run at {1 / dt:.1f} Hz; run the loop at a trained rate or a "
