@@ -44,7 +44,7 @@ class CompensatorConfig:
     aim: Literal["target", "simulator"] = "target"
     """target: the robot reaches the commanded positions. simulator: the robot moves like the simulator."""
     dynamics: bool = False
-    """With aim target: feed forward the torque of motion too, not only of holding. For smooth targets: it halves the
+    """Feed forward the torque of motion too, not only of holding; aim target alone. For smooth targets: it halves the
     error of planned motions, but amplifies 5 mrad of noise on targets to 0.2 rad on commands."""
     acceleration_time: float = 0.02
     """Low-pass of the targets' acceleration, s."""
