@@ -5,6 +5,7 @@ import json
 import pytest
 from arm import recordings, write_arm
 
+from gaponet.cli import view as module
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 
@@ -38,7 +39,6 @@ def test_a_picture_is_written_and_the_numbers_printed(place, capsys):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ([], "--render out.gif"),
         (["--render", "a.avi"], ".gif, .mp4, .png"),
         (["--render", "a.png", "--show", "gaponet"], "models are given with --model RUN"),
         (["--render", "a.png", "--motion", "dance"], "no motion 'dance'"),
@@ -49,9 +49,12 @@ def test_a_picture_is_written_and_the_numbers_printed(place, capsys):
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_mistakes_get_one_line_and_exit_code_2(place, capsys, monkeypatch, words, complaint):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.chdir(place)
     assert view(place, *(w.format(place) for w in words)) == 2
     assert complaint in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_a_missing_viewer_is_named_before_anything_is_simulated(place, capsys, monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    assert view(place) == 2
+    assert "gaponet view needs viser; run: pip install 'gaponet[view]'" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,7 +43,7 @@ def view(
     robot: Robot = None,
     json: Json = False,
 ) -> None:
-    """Watch a recording beside its simulations: window, browser, film.
+    """Watch a recording beside its simulations: browser, film.
 
     Args:
         model: Robot folders of gaponet identify and run folders of gaponet train; each gives a copy of the robot.
@@ -50,9 +51,9 @@ def view(
         unit: Which unit's recording, where there are several.
         payload_mass: Which payload's recording, kg.
         show: Copies from left to right; aligned stands for the identified robot and every --model.
-        render: Write a .gif, .mp4 or .png instead, without a display (.png: the moment of the largest nominal error).
-        web: Serve the scene to a browser instead, without a display; needs gaponet[view].
-        port: Port of --web.
+        render: Write a .gif, .mp4 or .png instead (.png: the moment of the largest nominal error).
+        web: The default without --render; accepted as before.
+        port: Port of the browser's page, on this machine.
         start: s into the recording; default: where most happens.
         duration: s of the recording.
         speed: Below 1 is slow motion.
@@ -65,7 +66,7 @@ def view(
         azimuth: Camera, degrees; 180 looks at the robot's front.
         elevation: Camera, degrees; negative looks down.
     """
-    _require_screen(render, web)
+    _require_viewer(render)
     from gaponet.report.view.film import Clip
     from gaponet.report.view.scene import Scene, View
     from gaponet.report.view.side_by_side import select_entry, side_by_side
@@ -83,31 +84,28 @@ def view(
     scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, render is not None, closeup)
     if render is not None:
         _film(scene, clip, render, width, magnify, course, out)
-    elif web:
+    else:
         from gaponet.report.view.web import serve
 
         serve(scene, clip, port, magnify, out.say)
-    else:
-        from gaponet.report.view.watch import watch
-
-        watch(scene, clip, magnify)
     out.result({
         "sequence": entry.id, "virtual": entry.meta.virtual, "seen": shown.seen, "start": clip.start,
         "duration": clip.duration, "mpjae": errors, "render": None if render is None else str(render),
     })  # fmt: skip
 
 
-def _require_screen(render: Path | None, web: bool) -> None:
-    """Refuse, before anything is simulated, what could not be seen."""
-    from gaponet.report.view.gl import choose_gl, has_display
+def _require_viewer(render: Path | None) -> None:
+    """Refuse a file that cannot be rendered, or a missing viewer, before anything is simulated."""
+    if render is None:
+        if find_spec("viser") is None:
+            raise UsageError("gaponet view needs viser; run: pip install 'gaponet[view]'")
+        return
+    from gaponet.report.view.gl import choose_gl
 
-    if render is not None:
-        choose_gl()
-        from gaponet.report.view.film import require_writable
+    choose_gl()
+    from gaponet.report.view.film import require_writable
 
-        require_writable(render)
-    elif not web and not has_display():
-        raise UsageError("no display here; write a film with --render out.gif, or serve a browser with --web")
+    require_writable(render)
 
 
 def _introduce(out: Out, meta: SequenceMeta, errors: dict[str, float], seen: bool | None) -> None:

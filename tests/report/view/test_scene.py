@@ -13,7 +13,6 @@ from gaponet.report.view.film import Clip, require_writable, write
 from gaponet.report.view.picture import Camera
 from gaponet.report.view.scene import Scene, View, visual_spec
 from gaponet.report.view.side_by_side import Copy, SideBySide
-from gaponet.report.view.watch import LEFT, SPACE, Playback
 from gaponet.robot.spec import Table, load_robot
 from gaponet.sim.model import build_model
 
@@ -191,17 +190,6 @@ def test_bad_clips_and_files_are_refused_with_what_to_do(four, tmp_path):
         require_writable(tmp_path / "a.avi")
     with pytest.raises(UsageError, match="make it first"):
         require_writable(tmp_path / "nowhere" / "a.gif")
-
-
-def test_keys_pause_and_jump_round_the_clip():
-    play = Playback(Clip(2.0, 4.0, speed=0.5), 2.0)
-    play.advance(1.0)
-    assert play.time == pytest.approx(2.5)
-    play.key(SPACE)
-    play.advance(1.0)
-    assert play.time == pytest.approx(2.5)
-    play.key(LEFT)  # before the start: comes in from the end
-    assert play.time == pytest.approx(5.5)
 
 
 def test_the_browser_gets_a_mesh_for_every_body_where_it_is(four):
