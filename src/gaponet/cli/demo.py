@@ -91,7 +91,7 @@ def demo(
 
 def require_extras() -> None:
     """Say at once, and together, what is not installed."""
-    if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "markupsafe")):
+    if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")):
         raise UsageError("the demo trains and draws: pip install 'gaponet[train,report]'")
 
 
