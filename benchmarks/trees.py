@@ -32,7 +32,7 @@ class Trees:
     """Corrector with one ensemble per operated joint; implements sim.replay.Corrector."""
 
     def __init__(self, robot: RobotSpec) -> None:
-        self.robot, self.op, self.models = robot, robot.operated_index, []
+        self.robot, self.op, self.models, self.payload = robot, robot.operated_index, [], np.zeros(0)
 
     @classmethod
     def trained(cls, sequences: ListOf[Sequence], robot: RobotSpec, labels: Array, seed: int) -> Trees:

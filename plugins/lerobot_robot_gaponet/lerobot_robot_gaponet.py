@@ -61,6 +61,65 @@ def set_observation(observation: dict[str, Any]) -> None:
     _last_observation.update({key: float(value) for key, value in observation.items() if key.endswith(".pos")})
 
 
+@dataclass
+class _Controller:
+    """Process of gaponet run, with the connection to it and the file of its messages."""
+
+    process: "subprocess.Popen[bytes]"
+    remote: Any
+    states: Iterator[Any]
+    folder: "tempfile.TemporaryDirectory[str]"
+
+    @classmethod
+    def start(cls, command: Callable[[str], list[str]]) -> "_Controller":
+        """Start the command for an address and wait for the first state.
+
+        Raises:
+            DeviceNotConnectedError: The process ended, or sent no state within MAX_START_S; with its messages.
+        """
+        from gaponet.hw.control.driver import DriverError
+        from gaponet.hw.targets.client import RemoteRobot
+
+        folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
+        address, start = f"ipc://{folder.name}/targets", time.monotonic()
+        with Path(folder.name, "messages").open("wb") as log:
+            process = subprocess.Popen(command(address), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        remote = RemoteRobot(address, patience=0.5)
+        controller = cls(process, remote, iter(remote), folder)
+        try:
+            while True:
+                try:
+                    next(controller.states)
+                    break
+                except (DriverError, StopIteration):
+                    if process.poll() is not None or time.monotonic() - start > MAX_START_S:
+                        raise DeviceNotConnectedError(f"gaponet run: {controller.messages()}") from None
+                    controller.states = iter(remote)
+        except BaseException:  # Ctrl-C, too: nobody else knows the process
+            remote.close(end=False)
+            controller.end()
+            raise
+        remote.patience = 5.0
+        return controller
+
+    def messages(self) -> str:
+        return Path(self.folder.name, "messages").read_text(errors="replace").strip()
+
+    def stop(self) -> None:
+        """End the run: the arm returns to its first position; after MAX_RETURN_S it is damped."""
+        self.remote.close()
+        try:
+            self.process.wait(MAX_RETURN_S)
+        except subprocess.TimeoutExpired:
+            self.end()
+
+    def end(self) -> None:
+        """Terminate the process, if it runs: the arm is damped."""
+        if self.process.poll() is None:
+            self.process.terminate()
+            self.process.wait()
+
+
 @RobotConfig.register_subclass("gaponet_so101")
 @dataclass
 class GaponetSO101Config(RobotConfig):
@@ -89,7 +148,7 @@ class GaponetSO101(Robot):
         self.cameras = make_cameras_from_configs(config.cameras)
         self.spec = load_robot("so101")
         self.units = Units(self.spec)
-        self._process: subprocess.Popen[bytes] | None = None
+        self._controller: _Controller | None = None
 
     @cached_property
     def observation_features(self) -> dict[str, type | tuple]:
@@ -110,7 +169,7 @@ class GaponetSO101(Robot):
 
     @property
     def is_connected(self) -> bool:
-        return self._process is not None and all(camera.is_connected for camera in self.cameras.values())
+        return self._controller is not None and all(camera.is_connected for camera in self.cameras.values())
 
     @property
     def is_calibrated(self) -> bool:
@@ -136,30 +195,12 @@ class GaponetSO101(Robot):
 
     def connect(self, calibrate: bool = True) -> None:
         from gaponet.hw.control.consent import require_consent
-        from gaponet.hw.control.driver import DriverError
-        from gaponet.hw.targets.client import RemoteRobot
 
         if not self.config.yes:
             require_consent(
                 f"The SO-101 at {self.config.port} will move as LeRobot commands.", option="--robot.yes=true"
             )
-        self._folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
-        address, said = f"ipc://{self._folder.name}/targets", Path(self._folder.name, "said")
-        with said.open("wb") as log:
-            self._process = subprocess.Popen(self._command(address), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        self._remote = RemoteRobot(address, patience=0.5)
-        began, self._log = time.monotonic(), said
-        while True:  # until the first state
-            try:
-                self._states = iter(self._remote)
-                next(self._states)
-                break
-            except (DriverError, StopIteration):
-                if self._process.poll() is not None or time.monotonic() - began > MAX_START_S:
-                    self._remote.close(end=False)
-                    self._leave()
-                    raise DeviceNotConnectedError(f"gaponet run: {said.read_text(errors='replace').strip()}") from None
-        self._remote.patience = 5.0
+        self._controller = _Controller.start(self._command)
         for camera in self.cameras.values():
             camera.connect()
 
@@ -178,38 +219,28 @@ class GaponetSO101(Robot):
         return child_process.module_command("gaponet", "run", *words, *shlex.split(config.options))
 
     def get_observation(self) -> dict[str, Any]:
-        state = next(self._states, None) if self._process else None
+        state = next(self._controller.states, None) if self._controller else None
         if state is None:
-            said = self._log.read_text(errors="replace").strip().splitlines() if self._process else []
-            raise DeviceNotConnectedError(f"{self} is not connected, or was stopped: {' '.join(said[-2:])}")
+            end = self._controller.messages().splitlines()[-2:] if self._controller else []
+            raise DeviceNotConnectedError(f"{self} is not connected, or was stopped: {' '.join(end)}")
         set_observation(self.units.named(state.qpos))
         return self.units.named(state.qpos) | {name: read() for name, _, read in self._pictures()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        if self._process is None:
+        if self._controller is None:
             raise DeviceNotConnectedError(f"{self} is not connected")
         target = self.units.rad(action)
         named = zip(self.spec.joint_names, target.tolist(), strict=True)
-        self._remote.send({joint: rad for joint, rad in named if np.isfinite(rad)})
+        self._controller.remote.send({joint: rad for joint, rad in named if np.isfinite(rad)})
         return action
 
     def disconnect(self) -> None:
         """Return the arm to its first position, where it is held."""
-        if self._process is not None:
-            self._remote.close()
-            try:
-                self._process.wait(MAX_RETURN_S)
-            except subprocess.TimeoutExpired:
-                self._process.terminate()  # the arm is damped
-            self._leave()
+        if self._controller is not None:
+            self._controller.stop()
+            self._controller = None
         for camera in self.cameras.values():
             camera.disconnect()
-
-    def _leave(self) -> None:
-        process, self._process = self._process, None
-        if process and process.poll() is None:
-            process.terminate()
-            process.wait()
 
 
 @TeleoperatorConfig.register_subclass("gaponet_motion")

@@ -34,10 +34,6 @@ class MeanStd:
         std = float(finite.std(ddof=1)) if len(finite) > 1 else math.nan
         return cls(float(finite.mean()) if len(finite) else math.nan, std, len(finite))
 
-    def divided_by(self, value: float) -> MeanStd:
-        """Return mean and standard deviation as multiples of an exact number."""
-        return MeanStd(self.mean / value, self.std / value, self.count)
-
     @property
     def standard_error(self) -> float:
         """Standard error of the mean; NaN for a single value."""

@@ -77,6 +77,13 @@ def test_an_arm_is_not_moved_without_consent(plugin, monkeypatch):
         robot.connect()
 
 
+def test_a_controller_that_ends_at_its_start_is_an_error_with_its_messages(plugin):
+    pytest.importorskip("zmq")
+    command = [sys.executable, "-c", "raise SystemExit('no arm at the port')"]
+    with pytest.raises(ConnectionError, match="gaponet run: no arm at the port"):
+        plugin._Controller.start(lambda address: command)
+
+
 def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_what_it_holds(plugin, so101, tmp_path):
     (tmp_path / "roll.csv").write_text("time,wrist_roll\n" + "\n".join(f"{0.1 * k},{0.05 * k}" for k in range(5)))
     config = plugin.GaponetMotionConfig(motions=f"{tmp_path / 'roll.csv'},sweep-shoulder_pan", fps=20.0, lead=0.5)
