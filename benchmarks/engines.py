@@ -20,9 +20,9 @@ from pathlib import Path
 import tyro
 
 from gaponet.base.files import write_text
-from gaponet.export import folder as exporting
-from gaponet.export.forms import comparable, left, plain_form, recordings_of
-from gaponet.export.mujoco_servos import read
+from gaponet.export import export_folder as exporting
+from gaponet.export.plain_servos import comparable, fit_plain_servos, read_recordings, rollout_error
+from gaponet.export.shipped.mujoco_servos import read
 from gaponet.report.candidate import read_origin
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -40,7 +40,7 @@ VERSION = "import sys, importlib.metadata as m; print(m.version(sys.argv[1]))"
 def nearest(robot: RobotSpec, train: list, folder: Path) -> RobotSpec:
     """The robot fitted without its law, once."""
     if not (folder / "robot.toml").is_file():
-        save_robot(plain_form(robot, train), folder)
+        save_robot(fit_plain_servos(robot, train), folder)
     return load_robot(folder)
 
 
@@ -66,7 +66,7 @@ def tested(spec: RobotSpec, plain: RobotSpec, robot: Path, exported: Path) -> No
     hashes = set(origin["parts"]["test"].values())
     motions = comparable(dataset.sequences([e for e in dataset.entries if e.hash in hashes]), spec, 0.0)
     facts = read(exported / "facts.json")
-    forms = {"in gaponet": left(motions, spec), "in gaponet, without the law": left(motions, plain)}
+    forms = {"in gaponet": rollout_error(motions, spec), "in gaponet, without the law": rollout_error(motions, plain)}
     for form, what in (("joints", "MJCF with servo_law.py"), ("plain", "MJCF alone")):
         forms[what] = exporting._played(exported / facts["file"], facts, motions, spec, form)
     print(f"\n{len(motions)} test motions: " + ", ".join(f"{k} {1e3 * x:.2f} mrad" for k, x in forms.items()))
@@ -88,11 +88,11 @@ def main(
         environments: Where each engine's environment lies.
         test: Also ask the test motions.
     """
-    spec, recordings = load_robot(robot), recordings_of(robot, data, load_robot(robot))
+    spec, recordings = load_robot(robot), read_recordings(robot, data, load_robot(robot))
     assert recordings is not None, "no recordings: give --data"
     mass = min(s.meta.payload_mass for s in recordings[1])
     plain = nearest(spec, recordings[0], work / "plain")
-    exporting.plain_form = lambda *_, **__: plain  # type: ignore[assignment]
+    exporting.fit_plain_servos = lambda *_, **__: plain  # type: ignore[assignment]
     print("| engine | form | there, mrad | in gaponet | s | left out |\n| --- | --- | ---: | ---: | ---: | --- |")
     for to in dict.fromkeys(to for to, *_ in CHECKS.values()):
         notes_file = work / f"{to}.json"

@@ -7,7 +7,7 @@ import pytest
 from arm import commands, record, recordings, write_arm
 
 from gaponet.cli.main import main
-from gaponet.export.rollout import answers, summary, validation_error
+from gaponet.export.rollout import predict, summary, validation_error
 from gaponet.robot.folder import save_robot
 
 REAL = {"kp": 0.7, "delay": 2}  # of nominal, control periods
@@ -68,7 +68,7 @@ def test_a_band_holds_nine_tenths_of_what_a_robot_does_that_was_identified_a_lit
     wrong = arm.with_servos({j: {"kp": 14.5, "delay": 0.038, "frictionloss": 0.06} for j in arm.operated})
     known = validation_error(wrong, [s for s in recordings(arm, 8, **REAL) if not s.meta.payload_mass])
     fresh = [record(arm, commands(300, seed), f"new{seed}", **REAL) for seed in range(20, 26)]
-    found = summary(answers(wrong, fresh, known), arm.operated)
+    found = summary(predict(wrong, fresh, known), arm.operated)
     assert all(0.8 < s["inside"] <= 1.0 for s in found.values())
     assert all(1e-4 < s["band"] < 0.01 for s in found.values())
 
@@ -77,7 +77,7 @@ def test_what_is_not_known_widens_a_band_where_motion_shows_it(arm):
     still, moving = (record(arm, ctrl, "x") for ctrl in (np.zeros((100, 2)), commands(100, 1)))
     known, robot = 1e-3, arm.with_servos({"elbow": {"delay": 0.02}})
     drawn = [robot.with_servos({"elbow": {"delay": delay}}) for delay in (0.01, 0.03)]
-    first, second = answers(robot, [still, moving], np.full(2, known), drawn)
-    assert first.half.max() < 1.5 * known
-    assert second.half[:, 1].max() > 3 * known
-    assert second.half[:, 0].max() < 1.5 * known
+    first, second = predict(robot, [still, moving], np.full(2, known), drawn)
+    assert first.half_width.max() < 1.5 * known
+    assert second.half_width[:, 1].max() > 3 * known
+    assert second.half_width[:, 0].max() < 1.5 * known

@@ -17,9 +17,9 @@ from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.export import actuator_net
 from gaponet.export.actuator_net import ActuatorNet
-from gaponet.export.folder import export_networks
-from gaponet.export.forms import own_motions
-from gaponet.export.mujoco_servos import read
+from gaponet.export.export_folder import export_networks
+from gaponet.export.plain_servos import own_motions
+from gaponet.export.shipped.mujoco_servos import read
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.training.config import TrainConfig
 from gaponet.sim.replay import replay
@@ -63,7 +63,7 @@ def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(run, tmp_
     monkeypatch.setattr(actuator_net, "STEPS", 300)
     assert main(["export", str(run), "--to", "actuator-net", "--out", str(tmp_path)]) == 0
     facts = read(tmp_path / "facts.json")
-    left = facts["left_mrad"]
+    left = facts["error_mrad"]
     assert left["the run, in gaponet"] < 1
     assert left["actuator networks"] < 5 < 40 < left["of these the servo alone"]
     assert facts["actuator_net"]["gain"] == 1.0
@@ -100,5 +100,5 @@ def test_engines_play_the_networks_as_plain_mujoco_does_here(run, tmp_path, name
     python = environment(name, "3.11", (package,))
     said = subprocess.run([python, check], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
     there, here = re.findall(r": ([\d.]+) mrad; in gaponet ([\d.]+)", said)[0]
-    assert float(here) == pytest.approx(1e3 * made.left["actuator networks"], abs=0.01)
+    assert float(here) == pytest.approx(1e3 * made.errors["actuator networks"], abs=0.01)
     assert float(there) == pytest.approx(float(here), rel=0.05, abs=0.05)

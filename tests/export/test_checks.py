@@ -11,8 +11,8 @@ import pytest
 import torch
 from environments import environment
 
-from gaponet.export import folder as exporting
-from gaponet.export.forms import own_motions
+from gaponet.export import export_folder as exporting
+from gaponet.export.plain_servos import own_motions
 from gaponet.robot.spec import load_robot
 
 pytestmark = pytest.mark.peers
@@ -37,7 +37,9 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     motions = [s.rows(slice(0, 100 + 27 * i)) for i, s in enumerate(own_motions(robot, count=5))]
     with pytest.MonkeyPatch.context() as patch:  # the nearest numbers are searched for in test_export_robot.py
         patch.setattr(
-            exporting, "plain_form", lambda r, *_, **__: r.with_servos({j: dict.fromkeys(law, 0.0) for j in found})
+            exporting,
+            "fit_plain_servos",
+            lambda r, *_, **__: r.with_servos({j: dict.fromkeys(law, 0.0) for j in found}),
         )
         for to in {to for to, *_ in ENGINES.values()}:
             exporting.export_robot(robot, to, folder / to, (motions, motions))

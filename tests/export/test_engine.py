@@ -14,22 +14,21 @@ from runs import random_run
 
 from gaponet.base.errors import ModelError
 from gaponet.cli.main import main
-from gaponet.export import action_term
-from gaponet.export.action_term import (
+from gaponet.export.export_folder import export_model
+from gaponet.export.shipped import gaponet_action
+from gaponet.export.shipped.gaponet_action import (
     AlignedAction,
     Aligner,
+    DelayBuffers,
     DelayedAction,
-    LateServos,
-    ServoLaw,
+    ServoModel,
     hold_friction,
     isaaclab_actuators,
     read_facts,
 )
-from gaponet.export.facts import mjcf_text, simulator_facts
-from gaponet.export.folder import export_model
-from gaponet.export.program import program
-from gaponet.export.scene_facts import require_scene
-from gaponet.export.step import delta_step
+from gaponet.export.shipped.scene_facts import require_scene
+from gaponet.export.simulator_facts import mjcf_text, simulator_facts
+from gaponet.export.torch_program import delta_step, program
 from gaponet.nn.config import ModelConfig
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.spec import SERVO_TERMS, load_robot
@@ -198,7 +197,7 @@ def test_late_servos_of_a_world_that_begins_stay_where_it_begins(place, model):
     q = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
     own.reset(slice(None), q, 0 * q, past=q[:, None])
     fresh = torch.tensor([True, False, True])
-    LateServos(sim, "robot", ["elbow", "shoulder"]).begin(fresh, torch.tensor(q[:, ::-1].copy()))
+    DelayBuffers(sim, "robot", ["elbow", "shoulder"]).restart(fresh, torch.tensor(q[:, ::-1].copy()))
     np.testing.assert_allclose(late[[0, 2]], own.batch.bind("history")[[0, 2]], atol=1e-7)
     assert (late[1] == 7.0).all()
 
@@ -258,7 +257,7 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     data = SimpleNamespace(**{name: torch.tensor(x).float() for name, x in seen.items()})
     sim = SimpleNamespace(mj_model=scene, model=model, data=data, device="cpu", num_envs=20)
     sim.expand_model_fields, entity = lambda fields: None, SimpleNamespace(update=lambda dt: None)
-    found = ServoLaw(sim, entity, "robot", ["shoulder", "elbow"], simulator_facts(robot, robot.dt))
+    found = ServoModel(sim, entity, "robot", ["shoulder", "elbow"], simulator_facts(robot, robot.dt))
     entity.update(0.005)
     found.before(torch.tensor(ctrl).float())
     terms, kp = {name: getattr(robot, name) for name in SERVO_TERMS}, robot.kp
@@ -266,7 +265,7 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
     asked = servo_torque(terms, kp, ctrl + robot.offset, q)
     np.testing.assert_allclose(model.actuator_biasprm[:, :, 0], asked - kp * (ctrl - q), atol=1e-5)
-    found.begin(torch.ones(20, dtype=torch.bool), torch.full((20, 2), 0.01))
+    found.restart(torch.ones(20, dtype=torch.bool), torch.full((20, 2), 0.01))
     np.testing.assert_allclose(found.torque, np.tile(kp * (robot.offset + 0.01), (20, 1)), atol=1e-6)
 
 
@@ -300,10 +299,10 @@ def isaac_lab(monkeypatch):
 
 def test_isaac_labs_classes_are_found_by_name_as_hydra_looks_for_them(place, monkeypatch):
     isaac_lab(monkeypatch)
-    config = action_term.isaaclab_action(place / "torch")
+    config = gaponet_action.isaaclab_action(place / "torch")
     there = f"{config.class_type.__module__}:{config.class_type.__qualname__}"
-    assert there == "gaponet.export.action_term:IsaacLabTerm"
-    assert config.class_type is action_term.IsaacLabTerm is action_term.__dict__["IsaacLabTerm"]
+    assert there == "gaponet.export.shipped.gaponet_action:IsaacLabTerm"
+    assert config.class_type is gaponet_action.IsaacLabTerm is gaponet_action.__dict__["IsaacLabTerm"]
     assert config.class_type.__doc__
     assert config.folder == str(place / "torch")
     (servos,) = isaaclab_actuators(place / "torch").values()
@@ -323,8 +322,8 @@ def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_
         pass
 
     term = Late()
-    term.late([0.007, 0.0], 0.005)
-    term.begin(torch.ones(2, 2), torch.zeros(2, 2))
+    term.set_delays([0.007, 0.0], 0.005)
+    term.restart(torch.ones(2, 2), torch.zeros(2, 2))
     term.aligner.past.fresh = torch.tensor([False, False])
     term._processed_actions = torch.ones(2, 2)
     told = []

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -13,13 +14,15 @@ from arm import XML, write_arm
 
 from gaponet.base.errors import RobotError
 from gaponet.cli.main import main
-from gaponet.export import folder as exporting
-from gaponet.export.facts import simulator_facts
-from gaponet.export.folder import export_robot
-from gaponet.export.forms import left, own_motions, plain_form
-from gaponet.export.mujoco_servos import delay_weights, play
-from gaponet.robot.spec import SERVO_TERMS
-from gaponet.sim.model import build_model
+from gaponet.export import export_folder as exporting
+from gaponet.export import plain_servos
+from gaponet.export.export_folder import export_robot
+from gaponet.export.plain_servos import fit_plain_servos, own_motions, rollout_error
+from gaponet.export.shipped.mujoco_servos import Check, delay_weights, play
+from gaponet.export.simulator_facts import simulator_facts
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import SERVO_FIELDS, SERVO_TERMS, load_robot
+from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
 
 FOUND = {
@@ -97,7 +100,7 @@ def quick(monkeypatch, robot):
     """The form without the law is not searched for: that is identification's, and tried below."""
     monkeypatch.setattr(
         exporting,
-        "plain_form",
+        "fit_plain_servos",
         lambda r, *a, **k: r.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND}),
     )
 
@@ -105,10 +108,10 @@ def quick(monkeypatch, robot):
 def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(lawful, mine, tmp_path, quick):
     made = export_robot(lawful, "mjcf", tmp_path / "out", source=mine)
     assert made.virtual
-    assert made.left["in gaponet"] == pytest.approx(0.0, abs=1e-9)
-    assert made.left["scene.xml with servo_law.py"] < 2e-5
-    assert made.left["scene.xml alone"] == pytest.approx(made.left["in gaponet, fitted without the law"], rel=0.02)
-    assert made.left["scene.xml alone"] > 0.003
+    assert made.errors["in gaponet"] == pytest.approx(0.0, abs=1e-9)
+    assert made.errors["scene.xml with servo_law.py"] < 2e-5
+    assert made.errors["scene.xml alone"] == pytest.approx(made.errors["in gaponet, fitted without the law"], rel=0.02)
+    assert made.errors["scene.xml alone"] > 0.003
     assert any("elbow met something at -1.20 rad" in note for note in made.notes)
     before, now = (mujoco.MjModel.from_xml_path(str(f)) for f in (mine, made.file))
     assert np.array_equal(before.key_qpos, now.key_qpos)
@@ -139,7 +142,7 @@ def test_the_check_travels(robot, mine, tmp_path):
         [sys.executable, "check.py"], cwd=tmp_path / "out", check=True, capture_output=True, text=True
     )
     assert "the MJCF alone: 0.0" in said.stdout
-    assert made.left["scene.xml alone"] < 2e-5
+    assert made.errors["scene.xml alone"] < 2e-5
 
 
 def test_an_engine_that_steps_twice_as_long_keeps_delays_and_tells_its_price(robot, mine, tmp_path):
@@ -148,7 +151,7 @@ def test_an_engine_that_steps_twice_as_long_keeps_delays_and_tells_its_price(rob
     model = mujoco.MjModel.from_xml_path(str(made.file))
     assert model.opt.timestep == 0.01
     assert model.actuator_delay.tolist() == [0.013, 0.0, 0.006]
-    assert 2e-5 < made.left["scene.xml alone"] < 0.002
+    assert 2e-5 < made.errors["scene.xml alone"] < 0.002
 
 
 def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_on(
@@ -163,7 +166,7 @@ def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_
     assert servo.biasprm[:2].tolist() == [0.0, -24.0]
     assert servo.ctrlrange.tolist() == pytest.approx([-90 * 0.42 / 24, 90 * 0.42 / 24])
     assert "targets of elbow were not in rad before (degrees?)" in made.notes[-1]
-    assert made.left["scene.xml with servo_law.py"] < 2e-5
+    assert made.errors["scene.xml with servo_law.py"] < 2e-5
     assert f'-    <general name="second" joint="elbow" {degrees}/>' in (tmp_path / "out/changes.diff").read_text()
 
 
@@ -171,7 +174,7 @@ def test_a_joint_that_turns_without_end_leaves_beside_one_that_does_not(tmp_path
     xml = XML.replace(' range="-1.5 1.5"/>', "/>", 1).replace("<option ", '<option timestep="0.005" ')
     endless = write_arm(tmp_path / "arm", xml=xml).with_servos(LAWS)
     made = export_robot(endless, "mjcf", tmp_path / "out")
-    assert made.left["robot.xml with servo_law.py"] < 2e-5
+    assert made.errors["robot.xml with servo_law.py"] < 2e-5
 
 
 def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_names(robot, lawful, tmp_path, quick):
@@ -202,7 +205,7 @@ def test_a_file_in_one_line_takes_a_payload_right_before_a_joint(robot, tmp_path
     model, own = mujoco.MjModel.from_xml_path(str(made.file)), build_model(robot, 0.2)
     assert model.body_mass.sum() == pytest.approx(own.body_mass.sum())
     assert model.dof_armature.tolist() == own.dof_armature.tolist()
-    assert made.left["scene.xml alone"] < 2e-5
+    assert made.errors["scene.xml alone"] < 2e-5
 
 
 def test_an_engine_with_another_order_of_joints_is_told_by_name(lawful, tmp_path, quick):
@@ -220,7 +223,7 @@ def test_an_engine_with_another_order_of_joints_is_told_by_name(lawful, tmp_path
     model = mujoco.MjModel.from_xml_path(str(made.file))
     assert [model.actuator(i).name for i in range(3)] == ["a", "z", "b"]
     assert model.actuator_gainprm[:, 0].tolist() == [24.0, 7.0, 16.0]
-    assert made.left["scene.xml with servo_law.py"] < 2e-5
+    assert made.errors["scene.xml with servo_law.py"] < 2e-5
 
 
 def test_a_joint_with_two_servos_is_refused(robot, mine, tmp_path):
@@ -257,10 +260,45 @@ def test_a_delay_buffer_of_five_lines_is_mujocos_own_delay(robot, tmp_path):
 def test_the_nearest_servos_without_a_law_are_nearer_than_those_with_the_law_struck_out(lawful):
     motions = own_motions(lawful, count=4)
     struck = lawful.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND})
-    plain = plain_form(lawful, motions[:2])
+    plain = fit_plain_servos(lawful, motions[:2])
     assert not plain.has_servo_model
-    assert left(motions[2:], plain) < 0.8 * left(motions[2:], struck)
-    assert plain_form(struck, motions) is struck
+    assert rollout_error(motions[2:], plain) < 0.8 * rollout_error(motions[2:], struck)
+    assert fit_plain_servos(struck, motions) is struck
+
+
+def test_an_export_of_an_unchanged_robot_does_not_fit_again(lawful, tmp_path, monkeypatch):
+    save_robot(lawful, tmp_path / "identified")
+    fits, motions = [], own_motions(lawful, count=2)
+    fitted = lambda sequences, start, **_: SimpleNamespace(robot=start.with_servos({"elbow": {"kp": 23.0}}))  # noqa: E731
+    monkeypatch.setattr(plain_servos, "identify", lambda *given, **how: fits.append(given) or fitted(*given, **how))
+    first, again = (fit_plain_servos(load_robot(tmp_path / "identified"), motions) for _ in range(2))
+    assert len(fits) == 1
+    assert not first.has_servo_model
+    assert all(np.array_equal(getattr(first, f), getattr(again, f), equal_nan=True) for f in SERVO_FIELDS)
+    assert model_hash(first) == model_hash(again)
+    assert again.nominal is not None
+    fit_plain_servos(load_robot(tmp_path / "identified"), [replace(s, qvel=s.qvel + 1.0) for s in motions])
+    assert len(fits) == 2
+    (tmp_path / "identified" / "plain_servos.json").write_text("damaged")
+    fit_plain_servos(load_robot(tmp_path / "identified"), motions)
+    assert len(fits) == 3
+    fit_plain_servos(lawful, motions)
+    assert not (lawful.folder / "plain_servos.json").exists()  # a folder that the user made
+
+
+def test_check_motions_run_in_worlds_that_restart(robot, tmp_path, capsys):
+    motions = [s.rows(slice(0, 20 + 7 * i)) for i, s in enumerate(own_motions(robot, count=5))]
+    export_robot(robot, "newton", tmp_path, (motions, motions))
+    check, recorded = Check(tmp_path), {}
+
+    def start(begun, ctrl):
+        for world, motion in begun.items():
+            assert np.array_equal(ctrl[world], motion["ctrl"][0])
+            recorded[world] = iter(motion["qpos"][1:])
+
+    path = check.run(start, lambda ctrl: np.array([next(recorded[w], np.zeros(2)) for w in range(check.worlds)]))
+    check.report("recorded", path)
+    assert capsys.readouterr().out == "recorded, 3 worlds: 0.00 mrad; in gaponet 0.00\n"
 
 
 def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path, capsys):

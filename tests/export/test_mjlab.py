@@ -14,7 +14,7 @@ from runs import random_run
 
 from gaponet.cli.main import main
 from gaponet.deploy.aligned_sim import AlignedSim
-from gaponet.export.folder import export_model
+from gaponet.export.export_folder import export_model
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model

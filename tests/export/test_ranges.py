@@ -15,7 +15,7 @@ from gaponet.robot.spec import load_robot
 from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, to_axes
 
 FIELDS = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
-SERVO = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
+SERVO_FIELDS = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
 ERRORS = np.array([0.05, 0.001, 1e-4, 1e-4, 2e-3, 1e-3])
 
 
@@ -25,7 +25,7 @@ def source(values, unit="a", days=()):
             "values": {j: tuple(v) for j, v in values.items()}, "covariance": covariance}  # fmt: skip
 
 
-def written(arm, folder, servo=SERVO, errors=ERRORS, sources=1):
+def written(arm, folder, servo=SERVO_FIELDS, errors=ERRORS, sources=1):
     """A robot folder that knows its values; friction and damping err together."""
     save_robot(arm.with_servos(dict.fromkeys(arm.joint_names, servo)), folder)
     robot = load_robot(folder)
@@ -87,7 +87,7 @@ def test_any_day_needs_two_days_and_any_robot_three(arm, tmp_path, capsys):
     wide = exported(capsys, two, "--scope", "any-day")[1]["ranges"]["elbow"]["frictionloss"]
     close = exported(capsys, two)[1]["ranges"]["elbow"]["frictionloss"]
     assert wide[2] - wide[0] > 1.5 * (close[2] - close[0])
-    other = written(arm, tmp_path / "other", SERVO | {"kp": 24.0})
+    other = written(arm, tmp_path / "other", SERVO_FIELDS | {"kp": 24.0})
     low, _, high = exported(capsys, one, "--scope", "any-robot", "--units", two, other)[1]["ranges"]["elbow"]["kp"]
     assert low < 16
     assert high > 24

@@ -11,7 +11,7 @@ from environments import environment
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
-from gaponet.export.folder import export_robot
+from gaponet.export.export_folder import export_robot
 
 FOUND = {
     "shoulder": {"kp": 16.0, "damping": 0.8, "frictionloss": 0.1, "delay": 0.013, "armature": 0.05},
@@ -60,8 +60,8 @@ def test_a_urdf_keeps_all_but_its_dynamics_and_efforts_and_the_loss_has_its_pric
     assert mujoco.MjModel.from_xml_path(str(made.file)).dof_damping.ravel().tolist() == [0.8, 0.6]
     lost = next(note for note in made.notes if "no place" in note)
     assert "kp, armature, delay" in lost
-    alone = made.left["mine.urdf alone, all else as before"]
-    assert alone > 100 * made.left["in gaponet"] + 0.002
+    alone = made.errors["mine.urdf alone, all else as before"]
+    assert alone > 100 * made.errors["in gaponet"] + 0.002
     changed = (tmp_path / "out/changes.diff").read_text().splitlines()
     assert sum(line[:1] in "+-" and line[:3] not in ("+++", "---") for line in changed) == 9
 

@@ -9,7 +9,7 @@ import torch
 from arm import recordings, write_arm
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.export.program import export_program
+from gaponet.export.torch_program import export_program
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network

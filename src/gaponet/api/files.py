@@ -12,8 +12,8 @@ from gaponet.robot.folder import STORED_ROBOT, has_stored_robot
 from gaponet.robot.spec import load_robot
 
 if TYPE_CHECKING:
-    from gaponet.export.folder import Exported
-    from gaponet.export.ranges import Engine, Ranges, Scope
+    from gaponet.export.export_folder import ExportedFolder
+    from gaponet.export.randomization import Engine, Randomization, Scope
 
 RobotTarget = Literal["mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json"]
 NetworkTarget = Literal["onnx", "torch", "actuator-net"]
@@ -48,12 +48,12 @@ def export_robot(
         RobotError: The file cannot be edited.
         UsageError: No recording was made with this payload and the robot's gains.
     """
-    from gaponet.export import folder as files
-    from gaponet.export.forms import recordings_of
+    from gaponet.export import export_folder as files
+    from gaponet.export.plain_servos import read_recordings
 
     holder = Path(robot)
     spec, source = load_robot(simulator_folder(holder)), None if into is None else Path(into)
-    recordings, folder = recordings_of(simulator_folder(holder), data, spec), Path(out) if out else holder / to
+    recordings, folder = read_recordings(simulator_folder(holder), data, spec), Path(out) if out else holder / to
     made = files.export_robot(spec, to, folder, recordings, source, prefix, payload_mass, progress)
     return _exported(made, folder, to, spec.name)
 
@@ -80,7 +80,7 @@ def export_network(
     Raises:
         ModelError, UsageError: The run holds no such model, or its payload is beyond those trained on.
     """
-    from gaponet.export.folder import export_model, export_networks
+    from gaponet.export.export_folder import export_model, export_networks
     from gaponet.nn.artifact import GapModel
 
     holder = Path(run)
@@ -95,7 +95,7 @@ def export_network(
 
 def randomization(
     robot: Place, *, out: Place, engine: Engine = "json", scope: Scope = "today", units: tuple[Place, ...] = ()
-) -> tuple[Path, Ranges]:
+) -> tuple[Path, Randomization]:
     """Write the ranges of an identified robot's parameters, for domain randomisation.
 
     Args:
@@ -108,10 +108,10 @@ def randomization(
     Returns:
         The file, and the ranges with sampled units.
     """
-    from gaponet.export.ranges import ranges, write_ranges
+    from gaponet.export.randomization import sample_units, write_randomization
 
-    made = ranges(simulator_folder(Path(robot)), scope, tuple(map(Path, units)))
-    return write_ranges(made, engine, Path(out)), made
+    made = sample_units(simulator_folder(Path(robot)), scope, tuple(map(Path, units)))
+    return write_randomization(made, engine, Path(out)), made
 
 
 def simulator_folder(holder: Path) -> Path:
@@ -119,10 +119,10 @@ def simulator_folder(holder: Path) -> Path:
     return holder / STORED_ROBOT if has_stored_robot(holder) else holder
 
 
-def _exported(made: Exported, folder: Path, to: str, robot: str) -> ExportResult:
+def _exported(made: ExportedFolder, folder: Path, to: str, robot: str) -> ExportResult:
     script = folder / "check.py"
     return ExportResult(
-        path=made.file or folder, to=to, robot=robot, errors=made.left, motions=made.motions, virtual=made.virtual,
+        path=made.file or folder, to=to, robot=robot, errors=made.errors, motions=made.motions, virtual=made.virtual,
         notes=tuple(made.notes), check=script if script.is_file() else None,
     )  # fmt: skip
 

@@ -194,13 +194,13 @@ def replay(
         UsageError: Neither recordings nor an uncertainty of the robot exist.
     """
     from gaponet.data.reading import read_first
-    from gaponet.export.forms import recordings_of
-    from gaponet.export.rollout import SHARE, answers, drawn_robots, summary, validation_error
+    from gaponet.export.plain_servos import read_recordings
+    from gaponet.export.rollout import BAND_SHARE, predict, sample_robots, summary, validation_error
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
     spec = as_robot(Path(robot) if isinstance(robot, str) else robot)
-    uncertainty, recordings = ParameterUncertainty.load(spec), recordings_of(spec.folder, data, spec)
-    drawn = drawn_robots(spec) if uncertainty is not None else []
+    uncertainty, recordings = ParameterUncertainty.load(spec), read_recordings(spec.folder, data, spec)
+    drawn = sample_robots(spec) if uncertainty is not None else []
     errors: Array
     if recordings is not None:
         errors = validation_error(spec, recordings[1])
@@ -220,10 +220,10 @@ def replay(
             progress=progress,
         )  # fmt: skip
         rollouts = report.dataset.sequences(list(report.added))
-    found = answers(spec, rollouts, errors, drawn)
+    found = predict(spec, rollouts, errors, drawn)
     joints = summary(found, spec.operated)
-    differ = sorted((j for j, s in joints.items() if s["inside"] < SHARE), key=lambda j: joints[j]["inside"])
+    differ = sorted((j for j, s in joints.items() if s["inside"] < BAND_SHARE), key=lambda j: joints[j]["inside"])
     return ReplayResult(
-        robot=spec, joints=joints, differ=tuple(differ), rollouts=tuple(found), share=SHARE, drawn=len(drawn),
+        robot=spec, joints=joints, differ=tuple(differ), rollouts=tuple(found), share=BAND_SHARE, drawn=len(drawn),
         band_from_recordings=recordings is not None,
     )  # fmt: skip

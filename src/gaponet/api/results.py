@@ -18,7 +18,7 @@ from gaponet.base.arrays import Array
 if TYPE_CHECKING:
     from gaponet.data.offsets import UnitOffsets
     from gaponet.data.store import Dataset, Entry
-    from gaponet.export.rollout import Answer
+    from gaponet.export.rollout import Prediction
     from gaponet.nn.artifact import GapModel
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.finding import Finding
@@ -364,7 +364,7 @@ class ReplayResult:
     robot: RobotSpec
     joints: Mapping[str, Mapping[str, Any]]
     differ: tuple[str, ...]
-    rollouts: tuple[Answer, ...] = field(repr=False)
+    rollouts: tuple[Prediction, ...] = field(repr=False)
     share: float
     drawn: int
     band_from_recordings: bool
@@ -378,7 +378,7 @@ class ReplayResult:
         }  # fmt: skip
         for k, a in enumerate(self.rollouts):
             series = {"target": a.target, "rollout": a.rollout, "robot": a.robot}
-            series |= {"low": a.robot - a.half, "high": a.robot + a.half, "dt": np.array(a.dt)}
+            series |= {"low": a.robot - a.half_width, "high": a.robot + a.half_width, "dt": np.array(a.dt)}
             arrays |= {f"{name}_{k}": values for name, values in series.items()}
         with atomic_write(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)

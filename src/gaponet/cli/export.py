@@ -17,7 +17,7 @@ from gaponet.report.tables import mrad
 from gaponet.sysid.uncertainty_table import FIELD_UNITS
 
 if TYPE_CHECKING:
-    from gaponet.export.ranges import Engine, Scope
+    from gaponet.export.randomization import Engine, Scope
 
 CHECKED_IN = {"mjcf": "MuJoCo", "actuator-net": "mjlab"}
 Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.", metavar="ROBOT|RUN")]
@@ -104,10 +104,10 @@ def export(
 
 
 def _show_ranges(screen: Out, robot: Path, out: Path, engine: Engine, scope: Scope, units: tuple[Path, ...]) -> None:
-    from gaponet.export.ranges import as_rows
+    from gaponet.export.randomization import table_rows
 
     file, made = api.randomization(robot, out=out, engine=engine, scope=scope, units=units)
-    screen.table(f"{made.robot}, {scope}: 9 of 10 units lie within", *as_rows(made, FIELD_UNITS))
+    screen.table(f"{made.robot}, {scope}: 9 of 10 units lie within", *table_rows(made, FIELD_UNITS))
     for note in made.notes:
         screen.say(f"  {note}", "note", "cyan")
     if made.unknown:

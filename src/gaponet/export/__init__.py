@@ -1,1 +1,1 @@
-"""Exports to other simulators: MJCF, URDF, configurations, action terms, actuator networks, randomisation."""
+"""Export identified robots and trained networks to other engines."""

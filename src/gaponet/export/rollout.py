@@ -1,4 +1,4 @@
-"""What a robot would have done under a rollout's targets, and how sure that is."""
+"""Predict what an identified robot does under the targets of a policy's rollout, with an error band."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.export.ranges import ranges
+from gaponet.export.randomization import sample_units
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
 
-SHARE = 0.9  # of recorded rows that a band holds
-WIDTH = 1.645  # standard errors on either side that hold as much
-DRAWS = 16  # robots
+BAND_SHARE = 0.9  # of recorded rows inside the band
+BAND_STD = 1.645  # standard deviations on either side that hold as much
+SAMPLED_ROBOTS = 16
 
 
 @dataclass(frozen=True)
-class Answer:
+class Prediction:
     """One rollout, (T, n) rad over the operated joints.
 
     Attributes:
-        name: The rollout's.
+        name: Name of the rollout.
         dt: s.
-        target: What the policy asked for.
-        rollout: What its simulator did.
-        robot: What the robot would do.
-        half: Half the width of the band around that.
+        target: Targets of the policy.
+        rollout: Motion in the policy's simulator.
+        robot: Predicted motion of the robot.
+        half_width: Half the width of the band around the prediction.
     """
 
     name: str
@@ -37,79 +37,84 @@ class Answer:
     target: Array
     rollout: Array
     robot: Array
-    half: Array
+    half_width: Array
 
     @property
     def inside(self) -> Array:
-        """Where the rollout lies in the band, (T, n)."""
-        return np.asarray(np.abs(self.rollout - self.robot) <= self.half)
+        """True where the rollout lies in the band, (T, n)."""
+        return np.asarray(np.abs(self.rollout - self.robot) <= self.half_width)
 
 
-def drawn_robots(robot: RobotSpec, draws: int = DRAWS, seed: int = 0) -> list[RobotSpec]:
-    """Robots that differ by what is not known of this one today, whole servos at a time (export/ranges.py).
+def sample_robots(robot: RobotSpec, samples: int = SAMPLED_ROBOTS, seed: int = 0) -> list[RobotSpec]:
+    """Sample robots from the uncertainty of this robot's values today (export/randomization.py).
 
     Raises:
-        UsageError: Its folder keeps values alone.
+        UsageError: The robot folder has no uncertainties.
     """
-    units = ranges(robot, samples=draws, seed=seed).units
+    units = sample_units(robot, samples=samples, seed=seed).units
     return [
         robot.with_servos({j: {f: float(v[k, i]) for f, v in units.items()} for i, j in enumerate(robot.operated)})
-        for k in range(draws)
+        for k in range(samples)
     ]
 
 
 def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:
-    """|error| that SHARE of the rows of every recording stay below, for each operated joint, (n,) rad.
+    """Return an |error| that BAND_SHARE of the rows of every recording stay below, (n,) rad for the operated joints.
 
-    Of all rows together it would be too narrow: motions differ, and there are few of them.
+    The quantile over all rows together would be too narrow: motions differ, and there are few of them.
     """
     op = robot.operated_index
-    twins = replay(recordings, robot, lock_idle=True)
-    errors = [np.abs(s.qpos - t.qpos)[1:, op] for s, t in zip(recordings, twins, strict=True)]
-    return np.asarray(np.max([np.quantile(e, SHARE, axis=0) for e in errors], axis=0))
+    rollouts = replay(recordings, robot, lock_idle=True)
+    errors = [np.abs(s.qpos - r.qpos)[1:, op] for s, r in zip(recordings, rollouts, strict=True)]
+    return np.asarray(np.max([np.quantile(e, BAND_SHARE, axis=0) for e in errors], axis=0))
 
 
-def answers(robot: RobotSpec, rollouts: ListOf[Sequence], known: Array, drawn: ListOf[RobotSpec] = ()) -> list[Answer]:
+def predict(
+    robot: RobotSpec, rollouts: ListOf[Sequence], error: Array, sampled: ListOf[RobotSpec] = ()
+) -> list[Prediction]:
     """Play the targets of rollouts on the robot from their first states.
 
     Args:
         robot: Identified.
-        rollouts: Sequences with the targets as ctrl and the simulator's states.
-        known: (n,) rad, as of `validation_error`: how far the robot was from its own recordings.
-        drawn: Robots that it may be as well (`drawn_robots`); how far they go from it here is added to the band.
+        rollouts: Sequences with the targets as ctrl and the states of the policy's simulator.
+        error: (n,) rad, as of `validation_error`.
+        sampled: Robots as of `sample_robots`; their deviation from the prediction is added to the band.
     """
     op = robot.operated_index
-    played = [t.qpos[:, op] for t in replay(rollouts, robot, lock_idle=True)]
+    played = [r.qpos[:, op] for r in replay(rollouts, robot, lock_idle=True)]
     spread = [np.zeros_like(q) for q in played]
-    if drawn:
-        others = [replay(rollouts, other, lock_idle=True) for other in drawn]
+    if sampled:
+        others = [replay(rollouts, other, lock_idle=True) for other in sampled]
         spread = [
-            WIDTH * np.sqrt(np.mean([(o[k].qpos[:, op] - q) ** 2 for o in others], axis=0))
+            BAND_STD * np.sqrt(np.mean([(o[k].qpos[:, op] - q) ** 2 for o in others], axis=0))
             for k, q in enumerate(played)
         ]
     return [
-        Answer(s.meta.motion, s.dt, s.ctrl[:, op], s.qpos[:, op], q, np.sqrt(known**2 + wide**2))
-        for s, q, wide in zip(rollouts, played, spread, strict=True)
+        Prediction(s.meta.motion, s.dt, s.ctrl[:, op], s.qpos[:, op], q, np.sqrt(error**2 + std**2))
+        for s, q, std in zip(rollouts, played, spread, strict=True)
     ]
 
 
-def summary(found: ListOf[Answer], joints: ListOf[str]) -> dict[str, dict[str, Any]]:
-    """Joint → what its rollouts say in all, rad, and shares of time."""
-    apart = np.concatenate([np.abs(a.rollout - a.robot)[1:] for a in found])
-    inside, half = (
-        np.concatenate([x[1:] for x in each]) for each in ([a.inside for a in found], [a.half for a in found])
-    )
-    behind = [np.concatenate([np.abs(getattr(a, f) - a.target)[1:] for a in found]) for f in ("rollout", "robot")]
-    first = np.concatenate([np.abs(a.rollout - a.robot)[1 : 1 + round(1 / a.dt)] for a in found])
-    most = np.array([np.abs(a.rollout - a.robot).max(axis=0) for a in found])
-    where = [found[i] for i in most.argmax(axis=0)]
-    worst_at = [float(np.abs(a.rollout - a.robot)[:, j].argmax() * a.dt) for j, a in enumerate(where)]
+def summary(predictions: ListOf[Prediction], joints: ListOf[str]) -> dict[str, dict[str, Any]]:
+    """Return mean and largest differences of each joint over all rollouts, rad and shares of time."""
+
+    def rows(values: Any) -> Array:
+        """All rows but the first ones, which are given."""
+        return np.concatenate([values(p)[1:] for p in predictions])
+
+    difference = rows(lambda p: np.abs(p.rollout - p.robot))
+    inside, band = rows(lambda p: p.inside), rows(lambda p: p.half_width)
+    rollout_behind, robot_behind = (rows(lambda p, f=f: np.abs(getattr(p, f) - p.target)) for f in ("rollout", "robot"))
+    first = np.concatenate([np.abs(p.rollout - p.robot)[1 : 1 + round(1 / p.dt)] for p in predictions])
+    largest = np.array([np.abs(p.rollout - p.robot).max(axis=0) for p in predictions])
+    worst = [predictions[i] for i in largest.argmax(axis=0)]
+    worst_at = [float(np.abs(p.rollout - p.robot)[:, j].argmax() * p.dt) for j, p in enumerate(worst)]
     return {
         joint: {
-            "rollout_behind": float(behind[0][:, j].mean()), "robot_behind": float(behind[1][:, j].mean()),
-            "apart": float(apart[:, j].mean()), "apart_first_second": float(first[:, j].mean()),
-            "band": float(half[:, j].mean()), "inside": float(inside[:, j].mean()),
-            "worst": float(most[:, j].max()), "worst_in": where[j].name, "worst_at": worst_at[j],
+            "rollout_behind": float(rollout_behind[:, j].mean()), "robot_behind": float(robot_behind[:, j].mean()),
+            "apart": float(difference[:, j].mean()), "apart_first_second": float(first[:, j].mean()),
+            "band": float(band[:, j].mean()), "inside": float(inside[:, j].mean()),
+            "worst": float(largest[:, j].max()), "worst_in": worst[j].name, "worst_at": worst_at[j],
         }
         for j, joint in enumerate(joints)
     }  # fmt: skip

@@ -4,7 +4,7 @@ A LeRobot set has one rate and the same features in every frame; a dataset with 
 becomes several sets, in folders of their own. One Parquet row group per episode. Where a file ends, the content hash
 of its last episode says: files of 2 MB in the mean, of a 2,000th of what lies before them where that is more. Some
 data files share a file of meta/episodes. No file depends on episodes that come after it, so that a dataset that grew
-has its earlier files again, byte by byte, and a push sends the others only (share/move.py).
+has its earlier files again, byte by byte, and a push sends the others only (share/push_pull.py).
 
     beyond the standard     features observation.velocity, .acceleration, .torque, .equivalent_torque, .temperature
                             features.<name>.info.unit: SI

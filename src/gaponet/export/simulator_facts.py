@@ -1,15 +1,15 @@
-"""The simulator that a model was trained in, as numbers with units and as one MJCF with its servos."""
+"""The simulator of a robot for other engines: numbers with units (facts.json), and one MJCF with its servos."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from typing import Any
+from typing import Any, TypedDict
 
 import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError
-from gaponet.export.scene_facts import joint_fields, solver_options
+from gaponet.export.shipped.scene_facts import joint_fields, solver_options
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text, set_attributes
@@ -22,47 +22,83 @@ UNITS = {
     "payload_mass": "kg", "stribeck": "N·m", "stribeck_speed": "rad/s", "target_speed": "rad/s", "friction_motor": "1",
     "friction_external": "1", "min_torque": "N·m", "encoder_step": "rad",
 }  # fmt: skip
-Joints = dict[str, dict[str, Any]]  # name → numbers of its joint and servo, SI
-PLAIN_FIELDS = ("armature", "damping", "frictionloss")  # of a joint, as an MJCF has them
 MEANING = {
     "offset": "the servo aims at command + offset",
     "zero": "the MJCF's angle is reading + zero; robot.xml has it as ref",
-    "dof_invweight0_factor": "of joints' dof_invweight0 after compilation, so that friction holds; no MJCF can say it",
-    "law": "what servos do beyond PD, by joint; in no MJCF, but in servo_law.py and, for mjlab, the action term",
-    "plain": "the numbers that were fitted for servos without that law; the same as joints where there is none",
-    "left_mrad": "mean |error| of joints on the motions of check.npz, in gaponet",
+    "dof_invweight0_factor": "of joints' dof_invweight0 after compilation, for stiff friction; MJCF has no such field",
+    "law": "servo model beyond PD, by joint; not in any MJCF, but in servo_law.py and, for mjlab, in the action term",
+    "plain": "numbers fitted for PD servos without the servo model; equal to joints without one",
+    "error_mrad": "mean |error| of joints on the motions of check.npz, in gaponet",
     "mujoco": "fields of the compiled MjModel by their names",
 }
+
+
+class ServoFacts(TypedDict):
+    """An identified servo and its joint, SI units."""
+
+    home: float
+    range: list[float] | None
+    kp: float
+    kd: float
+    effort_limit: float
+    armature: float
+    damping: float
+    frictionloss: float
+    delay: float
+    offset: float
+    zero: float
+    target_speed: float
+
+
+Joints = dict[str, ServoFacts]
 
 
 def simulator_facts(
     robot: RobotSpec, dt: float, payload_mass: float = 0.0, plain: RobotSpec | None = None
 ) -> dict[str, Any]:
-    """What another engine needs to be the simulator of `robot`; read from its compiled model.
+    """Return the content of facts.json, read from the compiled simulator of a robot.
 
     Args:
-        robot: The simulator, e.g. of a run, or an identified one.
+        robot: Simulator, e.g. of a run, or an identified robot.
         dt: Control period, s.
         payload_mass: In each hand, kg.
-        plain: The same robot as fitted without a servo law; default this one, its law left out.
+        plain: The robot as fitted without a servo model; default `robot`, its servo model ignored.
     """
     model = build_model(robot, payload_mass, dt=dt)
-    other = model if plain is None else build_model(plain, payload_mass, dt=dt)
+    plain_model = model if plain is None else build_model(plain, payload_mass, dt=dt)
+    joints: dict[str, Any] = {}
+    for i, name in enumerate(robot.joint_names):
+        law = {term: float(getattr(robot, term)[i]) for term in SERVO_TERMS} if robot.has_servo_model else {}
+        joints[name] = servo_facts(robot, model, i) | {"mujoco": joint_fields(model, name)} | law
     return {
         "format": 2, "robot": robot.name, "simulator": model_hash(robot), "units": UNITS, "meaning": MEANING,
         "versions": {"mujoco": mujoco.__version__}, "dt": dt, "decimation": robot.steps_per(dt),
         "payload_mass": payload_mass, "corrected": list(robot.operated), "options": solver_options(model),
         "dof_invweight0_factor": STIFF_MOBILITY, "law": [term for term in SERVO_TERMS if getattr(robot, term).any()],
-        "joints": {name: _joint(robot, model, i) for i, name in enumerate(robot.joint_names)},
-        "plain": {name: _numbers(plain or robot, other, i) for i, name in enumerate(robot.joint_names)},
+        "joints": joints,
+        "plain": {name: servo_facts(plain or robot, plain_model, i) for i, name in enumerate(robot.joint_names)},
+    }  # fmt: skip
+
+
+def servo_facts(robot: RobotSpec, model: mujoco.MjModel, i: int) -> ServoFacts:
+    """Return joint i of a robot as its compiled model has it."""
+    joint = model.joint(robot.joint_names[i])
+    dof = joint.dofadr[0]
+    return {
+        "home": float(robot.qpos_home[i]),
+        "range": model.jnt_range[joint.id].tolist() if model.jnt_limited[joint.id] else None,
+        "kp": float(robot.kp[i]), "kd": float(robot.kd[i]), "effort_limit": float(robot.effort_limit[i]),
+        "armature": float(model.dof_armature[dof]), "damping": float(np.ravel(model.dof_damping[dof])[0]),
+        "frictionloss": float(model.dof_frictionloss[dof]), "delay": float(robot.delay[i]),
+        "offset": float(robot.offset[i]), "zero": float(robot.zero[i]), "target_speed": float(robot.target_speed[i]),
     }  # fmt: skip
 
 
 def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
-    """The same simulator as one MJCF without files: joints, solver options and servos with their delays.
+    """Return the simulator as one MJCF without other files: joints, solver options and servos with their delays.
 
     Raises:
-        RobotError: A text cannot hold it.
+        RobotError: One file cannot express the simulator.
     """
     model = build_model(robot, payload_mass, dt=dt)
     root = ET.fromstring(self_contained_text(build_spec(robot, payload_mass, dt=dt), robot.mjcf))
@@ -93,21 +129,3 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
     if list(model_fingerprint(again)) != list(model_fingerprint(model)) or again.opt.timestep != model.opt.timestep:
         raise RobotError(f"{robot.mjcf}: with its servos it does not fit into one file that moves the same")
     return text
-
-
-def _joint(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
-    law = {term: float(getattr(robot, term)[i]) for term in SERVO_TERMS} if robot.has_servo_model else {}
-    return _numbers(robot, model, i) | {"mujoco": joint_fields(model, robot.joint_names[i])} | law
-
-
-def _numbers(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
-    name = robot.joint_names[i]
-    joint, dof = model.joint(name).id, model.joint(name).dofadr[0]
-    return {
-        "home": float(robot.qpos_home[i]),
-        "range": model.jnt_range[joint].tolist() if model.jnt_limited[joint] else None,
-        "kp": float(robot.kp[i]), "kd": float(robot.kd[i]), "effort_limit": float(robot.effort_limit[i]),
-        "armature": float(model.dof_armature[dof]), "damping": float(np.ravel(model.dof_damping[dof])[0]),
-        "frictionloss": float(model.dof_frictionloss[dof]), "delay": float(robot.delay[i]),
-        "offset": float(robot.offset[i]), "zero": float(robot.zero[i]), "target_speed": float(robot.target_speed[i]),
-    }  # fmt: skip

@@ -1,4 +1,7 @@
-"""Whether a compiled scene is the simulator of an export; copied beside it, it needs MuJoCo and numpy, not gaponet."""
+"""Compare a compiled scene with the simulator of an export.
+
+This file is copied into exports; it needs MuJoCo and numpy, not gaponet.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.export.mujoco_servos import read
+from gaponet.export.shipped.mujoco_servos import read
 
-CLOSE = 1e-5  # relative: facts of a scene that are the same
-OWN_FLAGS = {"contact", "island"}  # what a scene of your own may decide
+RELATIVE_TOLERANCE = 1e-5
+FREE_FLAGS = {"contact", "island"}  # flags in which a scene may differ
 FIELDS = (
     "dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp", "jnt_range", "jnt_stiffness",
     "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_delay", "actuator_history",
@@ -24,8 +27,12 @@ OPTIONS = (
 def require_scene(model: Any, prefix: str, folder: str | Path) -> None:
     """Refuse a compiled MjModel in which the robot's joints and servos are not those of training.
 
+    Args:
+        prefix: Text before each joint's name in the model.
+        folder: Export.
+
     Raises:
-        ValueError: Names what differs.
+        ValueError: The message names the fields that differ.
     """
     facts, wrong = read(Path(folder) / "facts.json"), []
     for name, joint in facts["joints"].items():
@@ -34,7 +41,7 @@ def require_scene(model: Any, prefix: str, folder: str | Path) -> None:
     here = solver_options(model)
     for field, value in facts["options"].items():
         if field.endswith("flags"):
-            now, then = sorted(set(here[field]) - OWN_FLAGS), sorted(set(value) - OWN_FLAGS)
+            now, then = sorted(set(here[field]) - FREE_FLAGS), sorted(set(value) - FREE_FLAGS)
             wrong += [] if now == then else [f"{field} {now} instead of {then}"]
         elif isinstance(value, str):
             wrong += [] if here[field] == value else [f"{field} {here[field]} instead of {value}"]
@@ -48,28 +55,29 @@ def require_scene(model: Any, prefix: str, folder: str | Path) -> None:
 
 
 def _differs(what: str, now: Any, wanted: Any) -> list[str]:
+    """Return a text on two values that differ, or nothing."""
     a, b = (np.array(x, float) for x in (now, wanted))
-    same = a.shape == b.shape and np.allclose(a, b, rtol=CLOSE, atol=1e-12)
+    same = a.shape == b.shape and np.allclose(a, b, rtol=RELATIVE_TOLERANCE, atol=1e-12)
     return [] if same else [f"{what} {now} instead of {wanted}"]
 
 
 def joint_fields(model: Any, name: str) -> dict[str, Any]:
-    """What an MjModel has of a joint and of the servo with its name; only the first three of a servo's parameters."""
+    """Return the fields of an MjModel for a joint and the servo of that name; three of each of a servo's parameters."""
     row = {"jnt": model.joint(name).id, "dof": model.joint(name).dofadr[0], "actuator": model.actuator(name).id}
     values = {field: getattr(model, field)[row[field.split("_")[0]]] for field in FIELDS}
     return {field: (x[:3] if field.endswith("prm") else x).tolist() for field, x in values.items()}
 
 
 def solver_options(model: Any) -> dict[str, Any]:
-    """The options of an MjModel that decide how it moves, with the names of MuJoCo and of mjlab's MujocoCfg."""
+    """Return the options of an MjModel that affect motion, with the names of MuJoCo and of mjlab's MujocoCfg."""
     import mujoco
 
-    found = {name: getattr(model.opt, name) for name in OPTIONS}
-    found = {name: x.tolist() if hasattr(x, "tolist") else x for name, x in found.items()}
+    values = {name: getattr(model.opt, name) for name in OPTIONS}
+    options = {name: x.tolist() if hasattr(x, "tolist") else x for name, x in values.items()}
     for name, kind in (("integrator", "Integrator"), ("cone", "Cone"), ("jacobian", "Jacobian"), ("solver", "Solver")):
-        found[name] = getattr(mujoco, f"mjt{kind}")(getattr(model.opt, name)).name.split("_", 1)[1].lower()
+        options[name] = getattr(mujoco, f"mjt{kind}")(getattr(model.opt, name)).name.split("_", 1)[1].lower()
     for name, kind in (("disableflags", "Disable"), ("enableflags", "Enable")):
         bits = getattr(mujoco, f"mjt{kind}Bit").__members__.items()
-        known = {key.split("BL_")[1].lower(): bit.value for key, bit in bits if "BL_" in key}
-        found[name] = sorted(key for key, bit in known.items() if getattr(model.opt, name) & bit)
-    return found
+        flags = {key.split("BL_")[1].lower(): bit.value for key, bit in bits if "BL_" in key}
+        options[name] = sorted(key for key, bit in flags.items() if getattr(model.opt, name) & bit)
+    return options

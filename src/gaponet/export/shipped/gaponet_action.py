@@ -1,4 +1,6 @@
-"""An action term that aligns, for mjlab and Isaac Lab: copied beside an export, it needs torch, not gaponet.
+"""Action terms for mjlab and Isaac Lab that align the simulation with the robot.
+
+This file is copied into exports; it needs torch, not gaponet.
 
 gaponet export RUN --to torch --out FOLDER     # FOLDER: gaponet_action.py (this file), delta.pt2, facts.json, …
 gaponet export ROBOT --to mjlab --out FOLDER   # the identified servos without a network (and --to isaaclab)
@@ -9,8 +11,8 @@ mjlab:      cfg.scene.entities["robot"] = mjlab_entity(FOLDER)
 Isaac Lab:  cfg.scene.robot.actuators = isaaclab_actuators(FOLDER)
             cfg.actions.joint_pos = isaaclab_action(FOLDER, asset_name="robot", joint_names=[".*"])
 
-Both call process_actions once per control period: what the policy asks for becomes what makes the simulator move like
-the robot. Options are those of JointPositionActionCfg.
+Both call process_actions once per control period. It replaces the targets of the policy by targets that make the
+simulator move like the robot. Options are those of JointPositionActionCfg.
 """
 
 from __future__ import annotations
@@ -23,22 +25,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaponet.export.mujoco_servos import LAW, delay_weights, read
-from gaponet.export.scene_facts import require_scene
+from gaponet.export.shipped.mujoco_servos import SERVO_TERMS, Check, delay_weights, read
+from gaponet.export.shipped.scene_facts import require_scene
 from gaponet.sim.servo import friction_limit, present, servo_torque
 
 PROGRAM, FACTS, ROBOT = "delta.pt2", "facts.json", "robot.xml"
-CLOSE = 1e-5  # relative: facts of a scene that are the same
-OWN_FLAGS = {"contact", "island"}  # what a scene of your own may decide
 
 
 def read_facts(folder: str | Path) -> dict[str, Any]:
-    """What gaponet wrote of the simulator."""
+    """Read the facts.json of an export."""
     return read(Path(folder) / FACTS)
 
 
+def tensor(values: Any) -> Tensor:
+    """Return a tensor of joint data; Isaac Lab 3 wraps tensors."""
+    return getattr(values, "torch", values)
+
+
 class Past:
-    """The past of num_envs worlds, and the program (export/step.py) that corrects their commands, if there is one."""
+    """History of num_envs worlds, and the program (export/torch_program.py) that corrects their commands, if any."""
 
     def __init__(self, program: Any, num_envs: int, depth: int, n: int, device: Any) -> None:
         self.program = program
@@ -46,8 +51,8 @@ class Past:
         self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
 
     def reset(self, ids: Any = None) -> None:
-        """These worlds (indices, a mask, a slice; None for all) begin anew with the next state."""
-        self.fresh = self.fresh.clone()  # what inference_mode made is not written to outside it
+        """Restart worlds (indices, a mask, a slice; None for all) with the next state."""
+        self.fresh = self.fresh.clone()  # inference tensors cannot be written to outside inference mode
         self.fresh[slice(None) if ids is None else ids] = True
 
     def delta(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor, payload_mass: Tensor) -> Tensor:
@@ -60,7 +65,7 @@ class Past:
 
 
 class Aligner:
-    """Targets of `joint_names`, in any order, → targets that make the simulator move like the robot.
+    """Replaces targets of `joint_names`, in any order, by targets that make the simulator move like the robot.
 
     Attributes:
         payload_mass: kg in each hand, (num_envs,); may be written.
@@ -94,9 +99,12 @@ class Aligner:
 
     @torch.no_grad()
     def __call__(self, qpos: Tensor, qvel: Tensor, target: Tensor) -> Tensor:
-        """State and targets now, (num_envs, joints) rad, rad/s, rad → what to send for this control period.
+        """Return the targets to send for this control period, (num_envs, joints) rad.
 
-        A target that is no finite number counts as what was sent last; in worlds that begin anew, as the state.
+        Args:
+            qpos, qvel: Present state, (num_envs, joints) rad and rad/s.
+            target: (num_envs, joints) rad. A target that is not finite counts as the one sent last, and in worlds that
+                restart as the present position.
         """
         last = torch.where(self.past.fresh[:, None], qpos, self.sent)
         target = torch.where(torch.isfinite(target), target, last)
@@ -108,19 +116,24 @@ class Aligner:
 
 
 class AlignedAction:
-    """What JointPositionAction of both engines becomes: before it among the base classes.
+    """Mix-in for JointPositionAction of both engines; it comes before that class among the base classes.
 
     Attributes:
-        told: What servos of worlds that begin anew were told until then, (num_envs, joints) rad; None: to stay there.
+        standing_command: Command in force before a world restarts, (num_envs, joints) rad; None for its position.
     """
 
     folder: Path
     payload_mass: float | None
-    told: Tensor | None = None
+    standing_command: Tensor | None = None
     _processed_actions: Tensor
 
     def align(self, entity: Any, ids: Any, names: list[str], offset: float = 0.0, form: str = "joints") -> None:
-        """Begin; offset: share of the servos' own offsets that the engine's actuators do not have."""
+        """Load the export for the joints `names` of an entity, at its columns `ids`.
+
+        Args:
+            offset: Share of the servos' own offsets that the engine's actuators lack.
+            form: Key of facts.json with the servos' numbers.
+        """
         me: Any = self
         facts = read_facts(self.folder)
         dt = me._env.step_dt
@@ -133,24 +146,65 @@ class AlignedAction:
     def process_actions(self, actions: Tensor) -> None:
         super().process_actions(actions)  # type: ignore[misc]
         data, ids = self._aligned.data, self._columns
-        q, v = (getattr(x, "torch", x)[:, ids] for x in (data.joint_pos, data.joint_vel))  # Isaac Lab 3 wraps tensors
-        bias = data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0  # mjlab takes it off again
-        self.begin(q, q if self.told is None else self.told)
+        q, v = (tensor(x)[:, ids] for x in (data.joint_pos, data.joint_vel))
+        bias = data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0  # mjlab subtracts it again
+        self.restart(q, q if self.standing_command is None else self.standing_command)
         self._processed_actions = self.aligner(q, v, self._processed_actions - bias) + bias + self.servo_offset
 
-    def begin(self, qpos: Tensor, told: Tensor) -> None:
-        """Worlds that are fresh now begin in this state, under this command."""
+    def restart(self, qpos: Tensor, command: Tensor) -> None:
+        """Restart the fresh worlds at a position, under a command that has been in force for long."""
 
     def reset(self, env_ids: Any = None, **other: Any) -> None:
         super().reset(env_ids, **other)  # type: ignore[misc]
         self.aligner.past.reset(env_ids)
 
 
+class CheckPlayer:
+    """Plays the motions of a `Check` in an environment of mjlab or Isaac Lab with one robot, "robot"."""
+
+    def __init__(self, check: Check) -> None:
+        self.check = check
+        self.start = torch.zeros(2, check.worlds, len(check.names))  # qpos and qvel in which worlds start
+
+    def reset_event(self) -> Any:
+        """Return the function of an event term in mode "reset"; a copy of it still reads this object."""
+
+        def reset(env: Any, env_ids: Any) -> None:
+            robot = env.scene["robot"]
+            order = [self.check.names.index(name) for name in robot.joint_names]
+            position, velocity = (x[env_ids][:, order] for x in self.start)
+            if hasattr(robot, "write_joint_state_to_sim_index"):  # Isaac Lab 3
+                robot.write_joint_state_to_sim_index(position=position, velocity=velocity, env_ids=env_ids)
+            else:
+                robot.write_joint_state_to_sim(position, velocity, env_ids=env_ids)
+
+        return reset
+
+    def run(self, env: Any, action_joints: list[str]) -> Any:
+        """Play all motions with action term "joint_pos"; return positions, (T, worlds, n) rad."""
+        robot, term = env.scene["robot"], env.action_manager.get_term("joint_pos")
+        columns = [self.check.names.index(name) for name in action_joints]
+        order = [list(robot.joint_names).index(name) for name in self.check.names]
+
+        def start(motions: dict[int, Any], ctrl: Any) -> None:
+            for world, motion in motions.items():
+                self.start[:, world] = torch.tensor([motion["qpos"][0], motion["qvel"][0]])
+            env.reset(env_ids=torch.tensor(list(motions)))
+
+        def step(ctrl: Any) -> Any:
+            target = torch.tensor(ctrl, dtype=torch.float)[:, columns]
+            term.standing_command = target  # check motions start under a command that has been in force for long
+            env.step(target)
+            return tensor(robot.data.joint_pos)[:, order].clone().numpy()
+
+        return self.check.run(start, step)
+
+
 # ---- mjlab
 
 
 def mjlab_action(folder: str | Path, payload_mass: float | None = None, check: bool = True, **options: Any) -> Any:
-    """A JointPositionActionCfg that aligns; check refuses a scene that is not the simulator of training."""
+    """Return a JointPositionActionCfg that aligns; `check` refuses a scene that is not the simulator of training."""
     from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
 
     class Term(AlignedAction, JointPositionAction):
@@ -161,17 +215,17 @@ def mjlab_action(folder: str | Path, payload_mass: float | None = None, check: b
             if check:
                 require_scene(env.sim.mj_model, f"{cfg.entity_name}/", self.folder)
             names = list(self._target_names)
-            self.late = LateServos(env.sim, cfg.entity_name, names)
-            self.law = ServoLaw(env.sim, self._entity, cfg.entity_name, names, read_facts(self.folder))
+            self.delays = DelayBuffers(env.sim, cfg.entity_name, names)
+            self.terms = ServoModel(env.sim, self._entity, cfg.entity_name, names, read_facts(self.folder))
             hold_friction(env.sim, cfg.entity_name, self.folder)
 
-        def begin(self, qpos: Tensor, told: Tensor) -> None:
-            self.late.begin(self.aligner.past.fresh, told)
-            self.law.begin(self.aligner.past.fresh, told - qpos)
+        def restart(self, qpos: Tensor, command: Tensor) -> None:
+            self.delays.restart(self.aligner.past.fresh, command)
+            self.terms.restart(self.aligner.past.fresh, command - qpos)
 
         def apply_actions(self) -> None:
             super().apply_actions()
-            self.law.before(self._processed_actions - self._entity.data.encoder_bias[:, self._target_ids])
+            self.terms.before(self._processed_actions - self._entity.data.encoder_bias[:, self._target_ids])
 
     class Cfg(JointPositionActionCfg):
         def build(self, env: Any) -> Any:
@@ -181,7 +235,7 @@ def mjlab_action(folder: str | Path, payload_mass: float | None = None, check: b
 
 
 def mjlab_entity(folder: str | Path, **options: Any) -> Any:
-    """The robot with its servos, as trained in, at its home; options are those of EntityCfg."""
+    """Return the robot with its servos, at its home position; options are those of EntityCfg."""
     import mujoco
     from mjlab.actuator import XmlActuatorCfg
     from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
@@ -193,8 +247,10 @@ def mjlab_entity(folder: str | Path, **options: Any) -> Any:
 
 
 def mjlab_options(folder: str | Path) -> tuple[Any, int]:
-    """MujocoCfg and decimation of the simulator trained in. Where links touched nothing in training, take "contact" out
-    of its disableflags for a scene with a floor; robot.xml says which geoms touch.
+    """Return MujocoCfg and decimation of the simulator of training.
+
+    If links touched nothing in training, remove "contact" from its disableflags for a scene with a floor; robot.xml
+    says which geoms touch.
     """
     from mjlab.sim import MujocoCfg
 
@@ -204,21 +260,24 @@ def mjlab_options(folder: str | Path) -> tuple[Any, int]:
 
 
 def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
-    """Make joint friction hold as in training, which no MJCF can say; again after events that recompute constants."""
+    """Make joint friction as stiff as in training, which no MJCF can express.
+
+    Call it again after events that recompute the constants of the model.
+    """
     facts = read_facts(folder)
-    sim.expand_model_fields(("dof_invweight0",))  # of its own in every world; before, all share one
+    sim.expand_model_fields(("dof_invweight0",))  # one per world; before, all worlds share one
     for name in facts["joints"]:
         dof = sim.mj_model.joint(f"{entity}/{name}").dofadr[0]
         sim.model.dof_invweight0[:, dof] = float(sim.mj_model.dof_invweight0[dof]) * facts["dof_invweight0_factor"]
 
 
-class LateServos:
-    """MuJoCo's buffers of commands under way to servos with a delay, which a reset leaves as they were."""
+class DelayBuffers:
+    """MuJoCo's buffers of delayed commands, which mjlab's reset does not clear."""
 
     def __init__(self, sim: Any, entity: str, names: list[str]) -> None:
         self.sim, model = sim, sim.mj_model
         size = model.nhistory
-        self.mine, self.timed, self.held = (torch.zeros(size, dtype=torch.bool) for _ in range(3))
+        self.mask, self.times, self.values = (torch.zeros(size, dtype=torch.bool) for _ in range(3))
         self.base, self.source = torch.zeros(size), torch.zeros(size, dtype=torch.long)
         for column, name in enumerate(names):
             servo = model.actuator(f"{entity}/{name}").id
@@ -226,89 +285,89 @@ class LateServos:
             if start < 0 or not count:
                 continue
             times, values = slice(start + 2, start + 2 + count), slice(start + 2 + count, start + 2 + 2 * count)
-            self.mine[start : values.stop] = self.timed[times] = self.held[values] = True
-            self.base[start + 1] = count - 1  # the newest sample's place; user data stand before it
+            self.mask[start : values.stop] = self.times[times] = self.values[values] = True
+            self.base[start + 1] = count - 1  # index of the newest sample; user data stand before it
             self.base[times] = -model.opt.timestep * torch.arange(count, 0, -1)
             self.source[values] = column
-        self.any = bool(self.mine.any())
+        self.any = bool(self.mask.any())
         vars(self).update({k: x.to(sim.device) for k, x in vars(self).items() if isinstance(x, Tensor)})
 
-    def begin(self, fresh: Tensor, told: Tensor) -> None:
-        """The command under way in fresh worlds, (num_envs, names) rad."""
+    def restart(self, fresh: Tensor, command: Tensor) -> None:
+        """Fill the buffers of fresh worlds with a command, (num_envs, names) rad."""
         if self.any:
             history, time = self.sim.data.history, self.sim.data.time
-            begun = self.base + self.timed * time[:, None] + self.held * told[:, self.source]
-            history[:] = torch.where(fresh[:, None] & self.mine, begun, history[:])
+            filled = self.base + self.times * time[:, None] + self.values * command[:, self.source]
+            history[:] = torch.where(fresh[:, None] & self.mask, filled, history[:])
 
 
-class ServoLaw:
-    """What servos do beyond PD, before every physics step of mjlab."""
+class ServoModel:
+    """Servo model beyond PD, applied before every physics step of mjlab."""
 
     def __init__(self, sim: Any, entity: Any, name: str, joints: list[str], facts: dict[str, Any]) -> None:
-        of = {f: torch.tensor([facts["joints"][j].get(f, 0.0) for j in joints], device=sim.device)
-              for f in ("kp", "offset", "frictionloss", *LAW)}  # fmt: skip
-        self.sim, self.law, model = sim, present({f: of[f] for f in LAW}), sim.mj_model
-        if not self.law:
+        column = {f: torch.tensor([facts["joints"][j].get(f, 0.0) for j in joints], device=sim.device)
+                  for f in ("kp", "offset", "frictionloss", *SERVO_TERMS)}  # fmt: skip
+        self.sim, self.terms, model = sim, present({f: column[f] for f in SERVO_TERMS}), sim.mj_model
+        if not self.terms:
             return
         sim.expand_model_fields(("dof_frictionloss", "actuator_biasprm"))
         self.dof = torch.tensor([model.joint(f"{name}/{j}").dofadr[0] for j in joints], device=sim.device)
         self.at = torch.tensor([model.joint(f"{name}/{j}").qposadr[0] for j in joints], device=sim.device)
         self.servo = torch.tensor([model.actuator(f"{name}/{j}").id for j in joints], device=sim.device)
-        self.kp, self.frictionloss, self.bias = of["kp"], of["frictionloss"], of["kp"] * of["offset"]
+        self.kp, self.frictionloss, self.bias = column["kp"], column["frictionloss"], column["kp"] * column["offset"]
         self.torque = torch.zeros(sim.num_envs, len(joints), device=sim.device)
         self.load, update = torch.zeros_like(self.torque), entity.update
 
-        def updated(dt: float) -> None:  # after each physics step, before forward() renews what it was
+        def updated(dt: float) -> None:  # after each physics step, before forward() overwrites these
             update(dt)
             self.torque, self.load = sim.data.actuator_force[:, self.servo], sim.data.qfrc_bias[:, self.dof]
 
         entity.update = updated
 
-    def begin(self, fresh: Tensor, apart: Tensor) -> None:
-        """Fresh worlds stand so far from what they were told, (num_envs, joints) rad."""
-        if self.law:
-            self.torque = torch.where(fresh[:, None], self.bias + self.kp * apart, self.torque)
+    def restart(self, fresh: Tensor, error: Tensor) -> None:
+        """Restart fresh worlds with a distance from position to command, (num_envs, joints) rad."""
+        if self.terms:
+            self.torque = torch.where(fresh[:, None], self.bias + self.kp * error, self.torque)
             self.load = torch.where(fresh[:, None], self.sim.data.qfrc_bias[:, self.dof], self.load)
 
     def before(self, ctrl: Tensor) -> None:
         """Set friction and bias for the next physics step, under targets (num_envs, joints) rad."""
-        if not self.law:
+        if not self.terms:
             return
         q, v = self.sim.data.qpos[:, self.at], self.sim.data.qvel[:, self.dof]
-        limit = friction_limit(self.law, self.frictionloss, v, self.torque, self.load)
+        limit = friction_limit(self.terms, self.frictionloss, v, self.torque, self.load)
         self.sim.model.dof_frictionloss[:, self.dof] = limit
-        asked = servo_torque(self.law, self.kp, ctrl + self.bias / self.kp, q)
-        self.sim.model.actuator_biasprm[:, self.servo, 0] = asked - self.kp * (ctrl - q)
+        wanted = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q)
+        self.sim.model.actuator_biasprm[:, self.servo, 0] = wanted - self.kp * (ctrl - q)
 
 
 # ---- Isaac Lab
 
 
 class DelayedAction:
-    """Commands on their way to late servos, in the term: worlds begin at rest, and no delay is rounded to a step."""
+    """Mix-in that delays commands in the action term: worlds start at rest, and no delay is rounded to a step."""
 
-    def late(self, delay: list[float], step: float) -> None:
-        """Delays of the term's joints, s, at the length of a physics step, s."""
+    def set_delays(self, delay: list[float], step: float) -> None:
+        """Set the delays of the term's joints, s, for a physics step, s."""
         me: Any = self
-        self.share = torch.tensor(delay_weights(delay, step), device=me.device, dtype=torch.float)[:, None]
-        self.under_way = torch.zeros(len(self.share), me.num_envs, len(delay), device=me.device)
+        self.weights = torch.tensor(delay_weights(delay, step), device=me.device, dtype=torch.float)[:, None]
+        self.commands = torch.zeros(len(self.weights), me.num_envs, len(delay), device=me.device)  # newest first
 
-    def begin(self, qpos: Tensor, told: Tensor) -> None:
-        """What is under way in fresh worlds."""
+    def restart(self, qpos: Tensor, command: Tensor) -> None:
+        """Fill the buffers of fresh worlds with a command, (num_envs, joints) rad."""
         me: Any = self
-        self.under_way = torch.where(me.aligner.past.fresh[:, None], told + me.servo_offset, self.under_way)
+        self.commands = torch.where(me.aligner.past.fresh[:, None], command + me.servo_offset, self.commands)
 
     def apply_actions(self) -> None:
         me: Any = self
-        asked = me._processed_actions
-        self.under_way = torch.cat([asked[None], self.under_way[:-1]])
-        me._processed_actions = (self.share * self.under_way).sum(0)
+        newest = me._processed_actions
+        self.commands = torch.cat([newest[None], self.commands[:-1]])
+        me._processed_actions = (self.weights * self.commands).sum(0)
         super().apply_actions()  # type: ignore[misc]
-        me._processed_actions = asked
+        me._processed_actions = newest
 
 
 def isaaclab_action(folder: str | Path, payload_mass: float | None = None, check: bool = True, **options: Any) -> Any:
-    """A JointPositionActionCfg that aligns; check refuses a network trained with servos that are not here."""
+    """Return a JointPositionActionCfg that aligns; `check` refuses a network trained with a servo model."""
     here: Any = sys.modules[__name__]
     own = {"class_type": here.IsaacLabTerm, "folder": str(folder), "payload_mass": payload_mass, "check": check}
     return here.IsaacLabActionCfg(**{"use_default_offset": False} | own | options)
@@ -343,40 +402,40 @@ def _isaaclab_term() -> Any:
                 raise ValueError(f"{cfg.folder}: trained with servos whose law ({law}) is not here; or check=False")
             self.align(self._asset, self._joint_ids, self._joint_names, offset=1.0, form=_isaaclab_form(facts))
             servos = facts[_isaaclab_form(facts)]
-            self.late([servos[name]["delay"] for name in self._joint_names], env.physics_dt)
-            if len(self.share) > 1 and getattr(env, "_physics_handles_decimation", False):
+            self.set_delays([servos[name]["delay"] for name in self._joint_names], env.physics_dt)
+            if len(self.weights) > 1 and getattr(env, "_physics_handles_decimation", False):
                 raise ValueError("servos are late by parts of a control period: cfg.sim.use_newton_actuators = False")
 
     return IsaacLabTerm
 
 
 def _isaaclab_form(facts: dict[str, Any]) -> str:
-    """Isaac Lab has no servo law: of a robot without a network the numbers that were fitted without it."""
+    """Return the key of facts.json for Isaac Lab, which has no servo model: a robot without a network is "plain"."""
     return "joints" if "model" in facts else "plain"
 
 
 def isaaclab_actuators(folder: str | Path) -> dict[str, Any]:
-    """An IdealPDActuatorCfg of the servos; their delays and offsets are the action term's (isaaclab_action)."""
+    """Return an IdealPDActuatorCfg of the servos; `isaaclab_action` has their delays and offsets."""
     from isaaclab.actuators import IdealPDActuatorCfg
 
     facts = read_facts(folder)
     joints = facts[_isaaclab_form(facts)]
-    of = lambda field: {name: joint[field] for name, joint in joints.items()}  # noqa: E731
+    column = lambda field: {name: joint[field] for name, joint in joints.items()}  # noqa: E731
     known = {field.name for field in dataclasses.fields(IdealPDActuatorCfg)}
     limit = "actuator_effort_limit" if "actuator_effort_limit" in known else "effort_limit"  # Isaac Lab 3 renamed it
     return {
         "servos": IdealPDActuatorCfg(
-            joint_names_expr=list(joints), stiffness=of("kp"), damping=of("kd"), armature=of("armature"),
-            friction=of("frictionloss"), viscous_friction=of("damping"), **{limit: of("effort_limit")},
+            joint_names_expr=list(joints), stiffness=column("kp"), damping=column("kd"), armature=column("armature"),
+            friction=column("frictionloss"), viscous_friction=column("damping"), **{limit: column("effort_limit")},
         )
     }  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    """Classes of Isaac Lab, which is imported when they are asked for: hydra looks them up here by name."""
-    made = {"IsaacLabTerm": _isaaclab_term, "IsaacLabActionCfg": _isaaclab_cfg}
-    if name not in made:
+    """Make the classes for Isaac Lab on first use; hydra finds them here by name."""
+    makers = {"IsaacLabTerm": _isaaclab_term, "IsaacLabActionCfg": _isaaclab_cfg}
+    if name not in makers:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    found = globals()[name] = made[name]()
-    found.__module__, found.__qualname__ = __name__, name
-    return found
+    new = globals()[name] = makers[name]()
+    new.__module__, new.__qualname__ = __name__, name
+    return new

@@ -1,4 +1,7 @@
-"""One unit of a robot in a MuJoCo model, without gaponet. python mujoco_randomization.py MODEL.xml tries it."""
+"""Set a MuJoCo model to one of the sampled units of a robot. This file is copied into exports; it needs no gaponet.
+
+python mujoco_randomization.py MODEL.xml     # tries three units
+"""
 
 from __future__ import annotations
 
@@ -14,18 +17,19 @@ HERE = Path(__file__).parent
 
 
 def units(file: Path = HERE / "randomization.json") -> dict[str, Any]:
-    """The file; "units": field → samples × joints, numbers that belong together in one row."""
+    """Read the file; "units" maps each field to samples × joints. A row is one unit."""
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
 def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> dict[str, dict[str, float]]:
-    """Set kp, damping, friction, armature and torque limit of every joint to a unit's; kd of the servos stays, and
-    servos without a limit have none.
+    """Set kp, damping, friction, armature and torque limit of every joint to those of a unit.
+
+    kd of the servos does not change, and servos without a torque limit get none.
 
     Returns:
-        Joint → what MuJoCo's model does not hold: offset (rad, added to every target), delay (s), terms of the law.
+        Joint → values without a field in the model: offset (rad, added to every target), delay (s), servo model.
     """
-    left: dict[str, dict[str, float]] = {}
+    rest: dict[str, dict[str, float]] = {}
     for i, name in enumerate(drawn["joints"]):
         unit = {field: float(values[row][i]) for field, values in drawn["units"].items()}
         joint = model.joint(name)
@@ -39,8 +43,8 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> dict[str, d
                 if model.actuator_forcelimited[servo]:
                     model.actuator_forcerange[servo] = -limit, limit
         del unit["kp"]
-        left[name] = unit
-    return left
+        rest[name] = unit
+    return rest
 
 
 if __name__ == "__main__":

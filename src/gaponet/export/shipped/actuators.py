@@ -1,22 +1,22 @@
-"""The actuator networks beside this file in other engines' classes; the scene has no servos of its own (robot.xml).
+"""Classes of mjlab and Isaac Lab for the actuator networks beside this file; robot.xml has no servos.
 
 mjlab:      EntityArticulationInfoCfg(actuators=mjlab_actuators(FOLDER))
 Isaac Lab:  ArticulationCfg(actuators=isaaclab_actuators(FOLDER), …)
 Newton:     builder.add_actuator(newton.actuators.DriveNeuralMLP, index=…, pos_index=…, model_path=FOLDER/JOINT.onnx)
 
-Targets are rad, and go to the actuator as they are. All are asked once per physics step of facts.json's length.
+Targets are in rad. Each network is evaluated once per physics step; facts.json has its length.
 """
 
 from pathlib import Path
 from typing import Any
 
-from gaponet.export.mujoco_servos import read
+from gaponet.export.shipped.mujoco_servos import read
 
-MOST = 1e6  # N·m, rad/s: torque is limited in the network
+NO_LIMIT = 1e6  # N·m, rad/s; the network itself limits its torque
 
 
 def mjlab_actuators(folder: Path) -> tuple[Any, ...]:
-    """One LearnedMlpActuatorCfg per joint; armature, damping and friction are the scene's."""
+    """Return one LearnedMlpActuatorCfg per joint; the scene has armature, damping and friction."""
     from mjlab.actuator import LearnedMlpActuatorCfg
 
     facts = read(folder / "facts.json")
@@ -24,14 +24,14 @@ def mjlab_actuators(folder: Path) -> tuple[Any, ...]:
         LearnedMlpActuatorCfg(
             target_names_expr=(name,), network_file=str(folder / f"{name}.pt"), pos_scale=1.0, vel_scale=1.0,
             torque_scale=1.0, history_length=facts["actuator_net"]["length"], effort_limit=joint["effort_limit"],
-            saturation_effort=MOST, velocity_limit=MOST,
+            saturation_effort=NO_LIMIT, velocity_limit=NO_LIMIT,
         )
         for name, joint in facts["joints"].items()
     )  # fmt: skip
 
 
 def isaaclab_actuators(folder: Path) -> dict[str, Any]:
-    """One ActuatorNetMLPCfg per joint, armature and friction with it."""
+    """Return one ActuatorNetMLPCfg per joint, with armature and friction."""
     from isaaclab.actuators import ActuatorNetMLPCfg
 
     facts = read(folder / "facts.json")
@@ -41,8 +41,8 @@ def isaaclab_actuators(folder: Path) -> dict[str, Any]:
         name: ActuatorNetMLPCfg(
             joint_names_expr=[name], network_file=str(folder / f"{name}.pt"), pos_scale=1.0, vel_scale=1.0,
             torque_scale=1.0, input_order="pos_vel", input_idx=list(range(facts["actuator_net"]["length"])),
-            saturation_effort=MOST, velocity_limit=MOST, armature=joint["armature"], friction=joint["frictionloss"],
-            viscous_friction=joint["damping"], **{limit: joint["effort_limit"]},
+            saturation_effort=NO_LIMIT, velocity_limit=NO_LIMIT, armature=joint["armature"],
+            friction=joint["frictionloss"], viscous_friction=joint["damping"], **{limit: joint["effort_limit"]},
         )
         for name, joint in facts["joints"].items()
     }  # fmt: skip

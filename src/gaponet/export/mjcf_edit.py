@@ -1,7 +1,8 @@
-"""Someone's MJCF with identified servos: a copy in which attributes of named joints and servos change, nothing else.
+"""Write a copy of a user's MJCF with identified servos.
 
-Edits are made in the text, so comments, includes, defaults, meshes, sensors, tendons and keyframes stay as they were
-written. What has no place in the file (a table, a payload) stands at its end or at the beginning of its body.
+Only attributes of named joints and servos change. Edits are made in the text, so comments, includes, defaults, meshes,
+sensors, tendons and keyframes stay as they were written. A table is added at the end of the file, a payload at the
+beginning of its body.
 """
 
 from __future__ import annotations
@@ -22,25 +23,32 @@ import numpy as np
 
 from gaponet.base.errors import RobotError
 from gaponet.base.files import lock_folder
-from gaponet.export.facts import PLAIN_FIELDS, Joints
+from gaponet.export.simulator_facts import Joints, ServoFacts
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import PAYLOAD_DENSITY, STIFF_SOLIMP, STIFF_SOLREF, TOLERANCE, build_model
 from gaponet.sim.table import TABLE
 
-KEPT_OF_SERVO = ("name", "class", "group", "user")
+SERVO_ATTRIBUTES = ("name", "class", "group", "user")  # that a servo keeps
+JOINT_ATTRIBUTES = ("armature", "damping", "frictionloss")  # that are identified
 START_TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")
-COUNTED = ("njnt", "nsite", "nsensor", "ntendon", "neq", "nkey", "ncam", "nlight", "nmesh", "nq")
+UNCHANGED_COUNTS = ("njnt", "nsite", "nsensor", "ntendon", "neq", "nkey", "ncam", "nlight", "nmesh", "nq")
 
 
 @dataclass
 class Tag:
-    """An element: where its start tag and where it ends, in bytes of its file."""
+    """An XML element.
+
+    Attributes:
+        parent: Name of the element around it.
+        start, open_end: Start and end of its start tag, bytes of the file.
+        end: End of the element, bytes of the file.
+    """
 
     file: Path
     name: str
     attributes: dict[str, str]
-    inside: str
+    parent: str
     start: int
     open_end: int
     end: int = 0
@@ -48,13 +56,18 @@ class Tag:
 
 @dataclass
 class Source:
-    """A file and those that it includes, as text, and what is to be changed in it."""
+    """Text of a file and of those that it includes, and the changes to make in it.
+
+    Attributes:
+        edits: File, start and end of the bytes to replace, new bytes.
+        sections: Name of a section → text to add in such a section at the end of the main file.
+    """
 
     main: Path
     text: dict[Path, bytes] = field(default_factory=dict)
     tags: list[Tag] = field(default_factory=list)
     edits: list[tuple[Path, int, int, bytes]] = field(default_factory=list)
-    last: dict[str, str] = field(default_factory=dict)
+    sections: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         inspect_mjcf(self.main)
@@ -67,10 +80,10 @@ class Source:
         parser, open_tags = expat.ParserCreate(), list[Tag]()
 
         def begin(name: str, attributes: dict[str, str]) -> None:
-            start, found = parser.CurrentByteIndex, START_TAG.match(text, parser.CurrentByteIndex)
-            assert found is not None
-            inside = open_tags[-1].name if open_tags else ""
-            open_tags.append(Tag(file, name, attributes, inside, start, found.end()))
+            start, match = parser.CurrentByteIndex, START_TAG.match(text, parser.CurrentByteIndex)
+            assert match is not None
+            parent = open_tags[-1].name if open_tags else ""
+            open_tags.append(Tag(file, name, attributes, parent, start, match.end()))
             self.tags.append(open_tags[-1])
 
         def end(name: str) -> None:
@@ -87,7 +100,7 @@ class Source:
             self._read(self.main.parent / tag.attributes["file"])
 
     def set(self, tag: Tag, **values: object) -> None:
-        """Change attributes of a start tag, and add those that it has not."""
+        """Change attributes of a start tag, and add missing ones."""
         text = self.text[tag.file][tag.start : tag.open_end]
         for name, value in values.items():
             own = re.compile(rb"""(\s%s\s*=\s*)("[^"]*"|'[^']*')""" % name.encode())
@@ -101,37 +114,45 @@ class Source:
         self.edits.append((tag.file, tag.start, tag.open_end, text))
 
     def replace(self, tag: Tag, text: str) -> None:
-        """Write another element in its place."""
+        """Replace an element."""
         self.edits.append((tag.file, tag.start, tag.end, text.encode()))
 
     def insert(self, at: Tag, text: str) -> None:
-        """Write something at the beginning of an element."""
+        """Insert text at the beginning of an element."""
         self.edits.append((at.file, at.open_end, at.open_end, f"\n{text}".encode()))
 
     def append(self, section: str, text: str) -> None:
-        """Write something into a section at the end of the main file."""
-        self.last[section] = self.last.get(section, "") + text
+        """Add text to a section at the end of the main file."""
+        self.sections[section] = self.sections.get(section, "") + text
 
     def edited(self) -> dict[Path, bytes]:
-        """The files with all changes."""
+        """Return the files with all changes."""
         out = dict(self.text)
         root = next(t for t in self.tags if t.file == self.main)
         place = self.text[self.main].rindex(b"</", 0, root.end)
         ends = "".join(
-            f"  <{name}>\n{text}  </{name}>\n" if text else f"  <{name}/>\n" for name, text in self.last.items()
+            f"  <{name}>\n{text}  </{name}>\n" if text else f"  <{name}/>\n" for name, text in self.sections.items()
         )
         edits = [*self.edits, (self.main, place, place, ends.encode())]
-        # From the back; where something is put right before an element that changes, the element comes first.
+        # From the back. Of an insertion right before an element that changes, the element comes first.
         for _, (file, start, end, new) in sorted(enumerate(edits), key=lambda e: (-e[1][1], e[1][1] == e[1][2], -e[0])):
             out[file] = out[file][:start] + new + out[file][end:]
         return out
 
-    def one(self, what: str, wanted: Callable[[Tag], bool]) -> Tag | None:
-        """The only element of that kind; None where there is none."""
-        found = [tag for tag in self.tags if wanted(tag)]
-        if len(found) > 1:
-            raise RobotError(f"{self.main}: has {len(found)} {what}; one is needed. Delete or rename the others")
-        return found[0] if found else None
+    def one(self, what: str, matches: Callable[[Tag], bool]) -> Tag | None:
+        """Return the only element that matches, None if there is none; refuse several."""
+        tags = [tag for tag in self.tags if matches(tag)]
+        if len(tags) > 1:
+            raise RobotError(f"{self.main}: has {len(tags)} {what}; one is needed. Delete or rename the others")
+        return tags[0] if tags else None
+
+    def difference(self) -> str:
+        """Return the changes as a unified diff."""
+        edited, lines = self.edited(), list[str]()
+        for file, old in self.text.items():
+            a, b = (text.decode("utf-8").splitlines(keepends=True) for text in (old, edited[file]))
+            lines += difflib.unified_diff(a, b, f"a/{file.name}", f"b/{file.name}", n=1)
+        return "".join(lines)
 
 
 def edit_mjcf(
@@ -139,7 +160,7 @@ def edit_mjcf(
     out: Path,
     robot: RobotSpec,
     joints: Joints,
-    longest: dict[str, float],
+    max_delay: dict[str, float],
     prefix: str = "",
     payload_mass: float = 0.0,
 ) -> tuple[Path, str, tuple[str, ...]]:
@@ -149,107 +170,117 @@ def edit_mjcf(
         path: The file.
         out: Folder for the copy.
         robot: The robot whose table and payload mounts are put in.
-        joints: Name → numbers of its servo (facts.json); joints that are not operated are changed only where the file
-            has no servo for them.
-        longest: Name → the longest delay that its servo is to hold, s.
-        prefix: What the file has before each joint's name, as where two robots stand in one scene.
+        joints: Servos by joint (facts.json). A joint that is not operated changes only if the file has no servo for it.
+        max_delay: Joint → longest delay that its servo must be able to hold, s.
+        prefix: Text before each joint's name in the file, e.g. of one of two robots in a scene.
         payload_mass: In each hand, kg.
 
     Returns:
-        The copied main file, what was changed as a unified diff, and joints whose targets were not in rad.
+        The copied main file, the changes as a unified diff, and joints whose targets were not in rad.
 
     Raises:
-        RobotError: A joint is not in the text, has several servos, or the result does not compile to what was wanted.
+        RobotError: A joint is not in the text or has several servos, or the compiled copy lacks the wanted servos.
     """
     path = path.resolve()
     before = compile_spec(spec := read_mjcf(path), path)
-    source, added, other = Source(path), list[str](), list[str]()
+    source, added, not_rad = Source(path), list[str](), list[str]()
     for name, servo in joints.items():
         full = prefix + name
         tag = source.one(f"joints '{full}'", partial(_is_joint, name=full))
         if tag is None:
-            known = ", ".join(before.joint(i).name for i in range(before.njnt))
+            names = ", ".join(before.joint(i).name for i in range(before.njnt))
             raise RobotError(
-                f"{path}: has no joint '{full}' in its text (--prefix says what stands before names); it has {known}"
+                f"{path}: has no joint '{full}' in its text (--prefix is the text before names); it has {names}"
             )
-        drives = source.one(f"servos of '{full}'", partial(_drives, joint=full))
-        if drives is not None and name not in robot.operated:
+        actuator = source.one(f"servos of '{full}'", partial(_drives, joint=full))
+        if actuator is not None and name not in robot.operated:
             continue
-        changed = {f: text_of(servo[f]) for f in PLAIN_FIELDS}
+        changed = {f: text_of(servo[f]) for f in JOINT_ATTRIBUTES}  # type: ignore[literal-required]
         if servo["zero"]:
             ref = before.qpos0[before.joint(full).qposadr[0]] - servo["zero"]
             changed["ref"] = text_of(math.degrees(ref) if spec.compiler.degree else ref)
         changed |= {"solreffriction": text_of(*STIFF_SOLREF), "solimpfriction": text_of(*STIFF_SOLIMP)}
         source.set(tag, **changed)
-        samples = math.ceil(longest[name] / before.opt.timestep - 1e-9) + 2 if longest[name] else 0
-        if drives is not None:
-            source.replace(drives, _servo(servo, samples, _kept(drives, before, full)))
-            other += [full] * (abs(_radians(before, full) - 1) > 1e-3)
+        samples = math.ceil(max_delay[name] / before.opt.timestep - 1e-9) + 2 if max_delay[name] else 0
+        if actuator is not None:
+            source.replace(actuator, _servo(servo, samples, _servo_attributes(actuator, before, full)))
+            not_rad += [full] * (abs(_radians_per_unit(before, full) - 1) > 1e-3)
         else:
             source.append("actuator", f"    {_servo(servo, samples, {'name': full, 'joint': full})}\n")
             added.append(text_of(servo["home"]))
     for key in source.tags if added else ():
         if key.name == "key" and "ctrl" in key.attributes:
             source.set(key, ctrl=" ".join([key.attributes["ctrl"], *added]))
-    _surroundings(source, robot, prefix, payload_mass, before)
+    _add_surroundings(source, robot, prefix, payload_mass, before)
     target = _write(source, out)
     _require(compile_spec(read_mjcf(target), target), before, joints, robot, prefix, target)
-    return target, difference(source), tuple(other)
+    return target, source.difference(), tuple(not_rad)
 
 
 def _is_joint(tag: Tag, name: str) -> bool:
-    return tag.name == "joint" and tag.attributes.get("name") == name and tag.inside != "equality"
+    return tag.name == "joint" and tag.attributes.get("name") == name and tag.parent != "equality"
 
 
 def _drives(tag: Tag, joint: str) -> bool:
-    return tag.inside == "actuator" and tag.attributes.get("joint") == joint
+    return tag.parent == "actuator" and tag.attributes.get("joint") == joint
 
 
-def _servo(servo: dict[str, float], samples: int, kept: dict[str, str]) -> str:
-    """A servo as MJCF says it: <position>, or <general> where it has an offset."""
+def _servo(servo: ServoFacts, samples: int, own: dict[str, str]) -> str:
+    """Return a servo as a <general> actuator.
+
+    Args:
+        samples: Length of its delay buffer, physics steps; 0 for no delay.
+        own: Attributes that stay as they are in the file.
+    """
     kp, kd, limit = servo["kp"], servo["kd"], servo["effort_limit"]
     bias = kp * servo["offset"]
-    attributes = kept | {
+    attributes = own | {
         "gear": "1", "dyntype": "none", "gaintype": "fixed", "gainprm": text_of(kp), "biastype": "affine",
         "biasprm": text_of(bias, -kp, -kd), "forcelimited": "true", "forcerange": text_of(-limit, limit),
     }  # fmt: skip
     if samples:
         attributes |= {"delay": text_of(servo["delay"]), "nsample": str(samples), "interp": "linear"}
-    return "<general " + " ".join(f'{k}="{v}"' for k, v in attributes.items()) + "/>"
+    return f"<general {_attributes(attributes)}/>"
 
 
-def _kept(tag: Tag, model: mujoco.MjModel, joint: str) -> dict[str, str]:
-    """What stays of someone's servo: its name and class, and the range of its targets where it takes targets."""
-    kept = {k: tag.attributes[k] for k in KEPT_OF_SERVO if k in tag.attributes} | {"joint": joint}
-    i = int(np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(joint).id)[0])
+def _servo_attributes(tag: Tag, model: mujoco.MjModel, joint: str) -> dict[str, str]:
+    """Return the attributes that a servo keeps: name, class, and the range of its targets if it is a position servo."""
+    own = {k: tag.attributes[k] for k in SERVO_ATTRIBUTES if k in tag.attributes} | {"joint": joint}
+    i = _actuator(model, joint)
     if model.actuator_ctrllimited[i] and model.actuator_biasprm[i, 1]:
-        limits = sorted(_radians(model, joint) * model.actuator_ctrlrange[i])
-        return kept | {"ctrllimited": "true", "ctrlrange": text_of(*limits)}
-    return kept | {"ctrllimited": "false"}
+        limits = sorted(_radians_per_unit(model, joint) * model.actuator_ctrlrange[i])
+        return own | {"ctrllimited": "true", "ctrlrange": text_of(*limits)}
+    return own | {"ctrllimited": "false"}
 
 
-def _radians(model: mujoco.MjModel, joint: str) -> float:
-    """Where a servo aims at a target of 1, rad: 0.0175 where it takes degrees; 1 where it takes no targets."""
-    i = int(np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(joint).id)[0])
+def _actuator(model: mujoco.MjModel, joint: str) -> int:
+    return int(np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(joint).id)[0])
+
+
+def _radians_per_unit(model: mujoco.MjModel, joint: str) -> float:
+    """Return the position of a servo for a target of 1, rad: 0.0175 if targets are degrees; 1 if it has no targets."""
+    i = _actuator(model, joint)
     stiffness = -float(model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0])
     return float(model.actuator_gainprm[i, 0]) / stiffness if stiffness > 0 else 1.0
 
 
-def _surroundings(source: Source, robot: RobotSpec, prefix: str, payload_mass: float, model: mujoco.MjModel) -> None:
-    """The solver's tolerance, the table and the payload."""
+def _add_surroundings(
+    source: Source, robot: RobotSpec, prefix: str, payload_mass: float, model: mujoco.MjModel
+) -> None:
+    """Add the solver's tolerance, the table and the payload."""
     option = {"tolerance": text_of(TOLERANCE)} if model.opt.tolerance > TOLERANCE else {}
 
     def body(name: str, what: str) -> Tag:
-        found = source.one(f"bodies '{name}'", lambda t: t.name == "body" and t.attributes.get("name") == name)
-        if found is None:
+        tag = source.one(f"bodies '{name}'", lambda t: t.name == "body" and t.attributes.get("name") == name)
+        if tag is None:
             raise RobotError(f"{source.main}: a [[{what}]] names body '{name}', which is not in its text")
-        return found
+        return tag
 
     off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
     if robot.table is not None and not (off and (model.geom_contype | model.geom_conaffinity).any()):
         own, table = build_model(robot), prefix + TABLE
         option["cone"] = "elliptic"  # a pyramid's stiffness depends on friction
-        if off:  # nothing in the file would touch anything but for the pairs below
+        if off:  # contacts are disabled in the file, and the pairs below are the only ones
             source.append("option", '    <flag contact="enable"/>\n')
         source.append("worldbody", f'    <geom name="{table}" type="plane" size="2 2 0.1" contype="0" conaffinity="0" '
                       f'pos="0 0 {text_of(robot.table.height)}" rgba="0.55 0.5 0.45 1"/>\n')  # fmt: skip
@@ -257,8 +288,7 @@ def _surroundings(source: Source, robot: RobotSpec, prefix: str, payload_mass: f
             name, size = f"{table}_tip_{i}", text_of(tip.radius)
             source.insert(body(prefix + tip.body, "tip"), f'<geom name="{name}" type="sphere" size="{size}"'
                           f' pos="{text_of(*tip.pos)}" mass="0" contype="0" conaffinity="0" group="3"/>')  # fmt: skip
-            figures = {f: text_of(*getattr(own, f"pair_{f}")[i]) for f in ("friction", "solref", "solimp")}
-            words = " ".join(f'{k}="{v}"' for k, v in figures.items())
+            words = _attributes({f: text_of(*getattr(own, f"pair_{f}")[i]) for f in ("friction", "solref", "solimp")})
             source.append("contact", f'    <pair geom1="{name}" geom2="{table}" condim="3" {words}/>\n')
     for mount in robot.payload_mounts:
         if mass := payload_mass + mount.mass:
@@ -267,19 +297,22 @@ def _surroundings(source: Source, robot: RobotSpec, prefix: str, payload_mass: f
             source.insert(body(prefix + mount.body, "payload_mount"), f'<body name="{prefix}payload_{mount.side}" '
                           f'pos="{text_of(*mount.pos)}">{ball}</body>')  # fmt: skip
     if option:
-        words = " ".join(f'{k}="{v}"' for k, v in option.items())
-        source.append(f"option {words}", "")
+        source.append(f"option {_attributes(option)}", "")
+
+
+def _attributes(values: dict[str, str]) -> str:
+    return " ".join(f'{name}="{value}"' for name, value in values.items())
 
 
 def _write(source: Source, out: Path) -> Path:
-    """The edited files and all that they name, where they lay to each other; returns the main one."""
+    """Write the edited files and all files that they name, in the same relative places; return the main one."""
     needed = {Path(os.path.abspath(f)) for f in mujoco.mju_getXMLDependencies(str(source.main))} | set(source.text)
     root = Path(os.path.commonpath([f.parent for f in needed]))
     with lock_folder(out, "engine"):
         for file in sorted(needed):
-            place = out / file.relative_to(root)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, place)
+            copy = out / file.relative_to(root)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, copy)
         for file, text in source.edited().items():
             (out / file.relative_to(root)).write_bytes(text)
     return out / source.main.relative_to(root)
@@ -288,30 +321,27 @@ def _write(source: Source, out: Path) -> Path:
 def _require(
     now: mujoco.MjModel, before: mujoco.MjModel, joints: Joints, robot: RobotSpec, prefix: str, path: Path
 ) -> None:
-    """Refuse a copy that does not have the servos that were wanted, or has lost something."""
-    wrong = [f"{f} {getattr(before, f)} → {getattr(now, f)}" for f in COUNTED if getattr(before, f) != getattr(now, f)]
+    """Refuse a copy that lacks the wanted servos, or another element of the original."""
+    wrong = [
+        f"{f} {getattr(before, f)} → {getattr(now, f)}"
+        for f in UNCHANGED_COUNTS
+        if getattr(before, f) != getattr(now, f)
+    ]
     for name in robot.operated:
         servo, joint = joints[name], now.joint(prefix + name)
-        i = int(np.flatnonzero(now.actuator_trnid[:, 0] == joint.id)[0])
-        found = [now.dof_armature[joint.dofadr[0]], np.ravel(now.dof_damping[joint.dofadr[0]])[0],
-                 now.dof_frictionloss[joint.dofadr[0]], now.actuator_gainprm[i, 0], *now.actuator_biasprm[i, :3],
-                 now.actuator_forcerange[i, 1]]  # fmt: skip
+        i = _actuator(now, prefix + name)
+        actual = [now.dof_armature[joint.dofadr[0]], np.ravel(now.dof_damping[joint.dofadr[0]])[0],
+                  now.dof_frictionloss[joint.dofadr[0]], now.actuator_gainprm[i, 0], *now.actuator_biasprm[i, :3],
+                  now.actuator_forcerange[i, 1]]  # fmt: skip
         kp = servo["kp"]
-        wanted = [*(servo[f] for f in ("armature", "damping", "frictionloss")), kp, kp * servo["offset"], -kp,
+        wanted = [servo["armature"], servo["damping"], servo["frictionloss"], kp, kp * servo["offset"], -kp,
                   -servo["kd"], servo["effort_limit"]]  # fmt: skip
-        if not np.allclose(found, wanted, rtol=1e-5, atol=1e-9):
-            wrong.append(f"{name}: {np.round(found, 6)} instead of {np.round(wanted, 6)}")
+        if not np.allclose(actual, wanted, rtol=1e-5, atol=1e-9):
+            wrong.append(f"{name}: {np.round(actual, 6)} instead of {np.round(wanted, 6)}")
     if wrong:
-        raise RobotError(f"{path}: the edited copy is not what was wanted: {'; '.join(wrong[:3])}")
+        raise RobotError(f"{path}: the edited copy differs from the robot: {'; '.join(wrong[:3])}")
 
 
-def difference(source: Source) -> str:
-    edited, lines = source.edited(), list[str]()
-    for file, old in source.text.items():
-        a, b = (text.decode("utf-8").splitlines(keepends=True) for text in (old, edited[file]))
-        lines += difflib.unified_diff(a, b, f"a/{file.name}", f"b/{file.name}", n=1)
-    return "".join(lines)
-
-
-def text_of(*figures: float) -> str:
-    return " ".join(f"{float(x):.9g}" for x in figures)
+def text_of(*numbers: float) -> str:
+    """Return numbers as an attribute of MJCF or URDF has them."""
+    return " ".join(f"{float(x):.9g}" for x in numbers)

@@ -1,0 +1,306 @@
+"""Export folders: a robot or a run's network for another program, with a check that needs no gaponet."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from gaponet.base.arrays import array_module
+from gaponet.base.errors import UsageError
+from gaponet.base.files import lock_folder, write_text
+from gaponet.data.sequence import Sequence
+from gaponet.export.engine_configs import engine_config
+from gaponet.export.mjcf_edit import edit_mjcf
+from gaponet.export.plain_servos import (
+    check_motions,
+    comparable,
+    fit_plain_servos,
+    mean_error,
+    own_motions,
+    rollout_error,
+)
+from gaponet.export.shipped import mujoco_servos
+from gaponet.export.simulator_facts import mjcf_text, simulator_facts
+from gaponet.export.urdf_edit import MISSING_FIELDS, edit_urdf, with_urdf_fields
+from gaponet.nn.artifact import GapModel
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim import servo
+
+FOLDER_KIND = "engine"
+FACTS, ROBOT, CHECK = "facts.json", "robot.xml", "check.npz"
+SHIPPED = Path(__file__).parent / "shipped"
+ACTION_TERM = {"scene_facts.py": "scene_facts.py", "gaponet_action.py": "gaponet_action.py"}
+# Engine → name in the export folder → file in SHIPPED; beside mujoco_servos.py and servo_law.py.
+FILES: dict[str, dict[str, str]] = {
+    "mjcf": {"check.py": "check_mjcf.py", "check_mjx.py": "check_mjx.py"},
+    "urdf": {},
+    "mjlab": ACTION_TERM | {"check.py": "check_mjlab.py"},
+    "isaaclab": ACTION_TERM | {"check.py": "check_isaaclab.py"},
+    "newton": {"check.py": "check_newton.py"},
+    "drake": {"check.py": "check_drake.py"},
+    "json": {},
+    "torch": ACTION_TERM,
+    "actuator-net": ACTION_TERM
+    | {"check.py": "check_mjlab.py", "check_newton.py": "check_newton.py", "actuators.py": "actuators.py"},
+}
+SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, least torque and friction; numpy or torch."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+Law = dict[str, Any]  # name of a term → values that broadcast to the joints
+'''
+SERVO_MODEL: tuple[Callable[..., Any], ...] = (
+    array_module, servo.present, servo.passing_friction, servo.resting_friction, servo.friction_limit,
+    servo.servo_torque,
+)  # fmt: skip
+OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts) import")
+ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
+DELAY_NOTES = {
+    "newton": "Newton has no delays: check.py has a buffer of five lines",
+    "drake": "Drake has no delays: check.py has a buffer of five lines; robot_cfg.py has the friction",
+    "mjcf": "delays need MuJoCo 3.5; MJX and Newton ignore them without a message: check_mjx.py has a buffer",
+    "isaaclab": "robot_cfg.py rounds delays to physics steps; the action term does not",
+    "mjlab": "robot_cfg.py rounds delays to physics steps; robot.xml does not",
+}
+
+
+@dataclass(frozen=True)
+class ExportedFolder:
+    """Files and errors of an export.
+
+    Attributes:
+        file: The MJCF or URDF; None for json.
+        errors: Form of the robot → mean |error| over the motions, rad.
+        motions: Number of validation motions.
+        virtual: True if the motions are simulated.
+        notes: Effects that the form lacks, and decisions for the user.
+    """
+
+    file: Path | None
+    errors: dict[str, float]
+    motions: int
+    virtual: bool
+    notes: tuple[str, ...] = ()
+
+
+def export_robot(
+    robot: RobotSpec,
+    to: str,
+    out: Path,
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None = None,
+    source: Path | None = None,
+    prefix: str = "",
+    payload_mass: float = 0.0,
+    progress: Callable[[float, float, str], None] = lambda done, total, note: None,
+) -> ExportedFolder:
+    """Write a robot for an engine.
+
+    Args:
+        robot: Identified, or nominal.
+        to: mjcf, urdf, mjlab, isaaclab, newton, drake or json.
+        out: Folder.
+        recordings: Training and validation motions; default: simulated motions of the robot itself.
+        source: For mjcf and urdf, a file of the user's of which an edited copy is written; for mjcf by default the
+            robot's.
+        prefix: Text before each joint's name in that file.
+        payload_mass: In each hand, kg.
+        progress: Progress of the fit without the servo model, as of `identify`.
+
+    Raises:
+        RobotError: The file cannot be edited.
+        UsageError: No recording was made with this payload and the robot's gains.
+    """
+    if to == "urdf" and source is None:
+        raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf, or .sdf")
+    if recordings is None:
+        motions = own_motions(robot, payload_mass, 24 if robot.has_servo_model else 2)
+        recordings = motions[::2], motions[1::2] or motions
+    train, validation = recordings[0], comparable(recordings[1], robot, payload_mass)
+    if not validation:
+        raise UsageError(f"no validation motion was made with {payload_mass:g} kg and the robot's own gains")
+    plain = fit_plain_servos(robot, train, progress=progress)
+    facts = simulator_facts(robot, robot.dt, payload_mass, plain)
+    motions = check_motions(validation, robot)
+    facts |= {"file": ROBOT, "prefix": prefix, "virtual": validation[0].meta.virtual}
+    facts["error_mrad"] = {form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))}
+    errors = {"in gaponet": rollout_error(validation, robot)}
+    if robot.has_servo_model:
+        errors["in gaponet, fitted without the law"] = rollout_error(validation, plain)
+    file, notes = None, _notes(robot, facts, to)
+    with lock_folder(out, FOLDER_KIND):
+        if to == "mjcf":
+            file, not_rad = _write_mjcf(robot, plain, out, facts, source or robot.mjcf, payload_mass)
+            for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
+                if form == "plain" or robot.has_servo_model:
+                    errors[f"{file.name} {what}"] = _error_in_mujoco(file, facts, validation, robot, form)
+            if not_rad:
+                text = f"targets of {', '.join(not_rad)} were not in rad before (degrees?)"
+                notes.append(f"{text}: now they are; ctrl of keyframes not")
+        elif to == "urdf":
+            assert source is not None
+            file, changes = edit_urdf(source, out, facts["plain"], robot.operated, prefix)
+            facts["file"] = file.name
+            write_text(out / "changes.diff", changes)
+            errors[f"{file.name} alone, all else as before"] = rollout_error(validation, with_urdf_fields(plain))
+        elif to != "json":
+            file = out / ROBOT
+            _write_scene(robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab")
+            write_text(out / "robot_cfg.py", engine_config(to, robot.name, facts))
+        _write_motions(out / CHECK, motions)
+        _write_shipped(out, to, facts)
+    return ExportedFolder(file, errors, len(validation), validation[0].meta.virtual, tuple(notes))
+
+
+def _write_mjcf(
+    robot: RobotSpec, plain: RobotSpec, out: Path, facts: dict[str, Any], source: Path, payload_mass: float
+) -> tuple[Path, tuple[str, ...]]:
+    """Write an edited copy of a user's MJCF; return it and the joints whose targets were not in rad."""
+    delays = {n: max(facts[form][n]["delay"] for form in ("joints", "plain")) for n in robot.joint_names}
+    file, changes, not_rad = edit_mjcf(source, out, plain, facts["plain"], delays, facts["prefix"], payload_mass)
+    facts["file"] = str(file.relative_to(out))
+    write_text(out / "changes.diff", changes)
+    return file, not_rad
+
+
+def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
+    """Return effects that an engine's form of a robot lacks."""
+    notes, servos, law = [], facts["plain"].values(), ", ".join(facts["law"])
+    if to == "mjcf":
+        for name, *stops in zip(robot.joint_names, robot.stop_low, robot.stop_high, strict=True):
+            if at := " and ".join(f"{x:.2f}" for x in stops if np.isfinite(x)):
+                notes.append(
+                    f"{name} met something at {at} rad in the recordings; the file keeps its range: was that a stop?"
+                )
+    if robot.target_speed.any():
+        ramps = ", ".join(f"{n} {v:.3g}" for n, v in zip(robot.joint_names, robot.target_speed, strict=True) if v)
+        notes.append(f"servos' own ramps ({ramps} rad/s) are in no engine: limit targets so, as in check.npz")
+    if to in DELAY_NOTES and any(s["delay"] for s in servos):
+        notes.append(DELAY_NOTES[to])
+    if to == "urdf":
+        missing = ", ".join(f for f in MISSING_FIELDS if any(s[f] for s in servos))
+        notes.append(
+            f"the file has no place for {missing}: they are in facts.json (plain), kp and kd for your controller; "
+            "files that it names stay where they were"
+        )
+    if law and to in ("isaaclab", "newton", "drake", "urdf"):
+        notes.append(f"the servo model ({law}) is not in {to}: the numbers were fitted without it")
+    return notes
+
+
+def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float = 0.0) -> float:
+    """Write a model's simulator for mjlab and Isaac Lab, and the model as a torch.export program.
+
+    Returns:
+        Largest difference between program and artifact, rad.
+
+    Raises:
+        ModelError: There is no simulator beside the model, the payload is larger than in training, `delta_step`
+            refuses the model, or the program differs by more than 1e-5 rad.
+    """
+    from gaponet.export.torch_program import export_program
+
+    model.require_payload(payload_mass)
+    robot = model.simulator()
+    rates = model.card.get("dt") or [robot.dt]
+    dt = robot.dt if any(abs(rate / robot.dt - 1) < 0.02 for rate in rates) else rates[0]
+    with lock_folder(folder, FOLDER_KIND):
+        difference = export_program(model, run, folder)
+        past = {"depth": (model.config.history - 1) * model.config.stride + 1, "parity_rad": difference}
+        facts = simulator_facts(robot, dt, payload_mass)
+        facts |= {"model": past, "payload_seen": model.card.get("payload_seen")}
+        _write_scene(robot, folder / ROBOT, payload_mass, dt=dt)
+        _write_scene(robot, folder / "robot_without_servos.xml", payload_mass, servos=False, dt=dt)
+        _write_shipped(folder, "torch", facts)
+    return difference
+
+
+def export_networks(
+    model: GapModel, run: Path, folder: Path, data: str | None = None, payload_mass: float = 0.0
+) -> ExportedFolder:
+    """Write a run as actuator networks, for every joint .onnx (Newton), .pt (mjlab, Isaac Lab), .pt2 (torch.export).
+
+    Args:
+        run: Run with the motions that the networks are fitted to and tested on.
+        data: Dataset with these motions; default the one in the run's configuration.
+        payload_mass: In each hand, kg; recordings with another payload are not used.
+
+    Raises:
+        UsageError: No recording was made with this payload and the robot's gains.
+    """
+    from gaponet.export.actuator_net import read_run_recordings, write_networks
+
+    model.require_payload(payload_mass)
+    robot = model.simulator()
+    train, val = read_run_recordings(run, data, robot, payload_mass)
+    motions, dt = check_motions(val, robot), train[0].dt
+    facts = simulator_facts(robot, dt, payload_mass) | {"file": ROBOT, "virtual": train[0].meta.virtual}
+    with lock_folder(folder, FOLDER_KIND):
+        _write_scene(robot, folder / ROBOT, payload_mass, servos=False, dt=dt)
+        errors = write_networks(train, motions, model.corrector(robot), robot, folder, facts)
+        facts["error_mrad"] = {form: 1e3 * error for form, error in errors.items()}
+        _write_motions(folder / CHECK, motions)
+        _write_shipped(folder, "actuator-net", facts)
+    notes = []
+    if not facts["actuator_net"]["gain"]:
+        notes.append(
+            "the run's correction depends on posture, which a joint's network does not get: these are the servos "
+            "alone; try torch"
+        )
+    if facts["law"]:
+        notes.append(f"the servo model ({', '.join(facts['law'])}) is not in actuator networks")
+    return ExportedFolder(folder / ROBOT, errors, len(motions), train[0].meta.virtual, tuple(notes))
+
+
+def _write_scene(
+    robot: RobotSpec, file: Path, payload_mass: float, servos: bool = True, dt: float | None = None
+) -> None:
+    """Write the simulator as one MJCF, without its servos for engines that add servos themselves."""
+    text = mjcf_text(robot, dt or robot.dt, payload_mass)
+    write_text(file, text if servos else ACTUATORS.sub("", text))
+
+
+def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
+    arrays: dict[str, Any] = {"count": np.array(len(motions)), "names": np.array([s.meta.motion for s in motions])}
+    for i, s in enumerate(motions):
+        arrays |= {f"ctrl_{i}": s.ctrl, f"qpos_{i}": s.qpos, f"qvel_{i}": s.qvel, f"dt_{i}": np.array(s.dt)}
+    with file.open("wb") as opened:
+        np.savez_compressed(opened, **arrays)
+
+
+def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
+    """Write facts.json and the files of SHIPPED for an engine, with imports that need no gaponet."""
+    limits = f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
+    write_text(
+        folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + limits, *(inspect.getsource(f) for f in SERVO_MODEL)])
+    )
+    for name, file in ({"mujoco_servos.py": "mujoco_servos.py"} | FILES[to]).items():
+        text = OWN_IMPORTS.sub(r"from \1 import", (SHIPPED / file).read_text(encoding="utf-8"))
+        write_text(folder / name, text.replace("from servo import", "from servo_law import"))
+    write_text(folder / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
+
+
+def _error_in_mujoco(
+    file: Path, facts: dict[str, Any], motions: ListOf[Sequence], robot: RobotSpec, form: str
+) -> float:
+    """Return the mean |error| of the written file in plain MuJoCo, rad."""
+    op, low, high = robot.operated_index, *robot.qpos_range.T
+    errors = []
+    for s in motions:
+        motion = {"ctrl": np.clip(s.ctrl, low, high), "qpos": s.qpos, "qvel": s.qvel, "dt": s.dt}
+        played = mujoco_servos.play(mujoco.MjModel.from_xml_path(str(file)), facts, motion, facts["prefix"], form)
+        errors.append(mean_error(s.qpos[:, op], played[:, op]))
+    return float(np.mean(errors))

@@ -1,0 +1,160 @@
+"""PD servos nearest to an identified robot with a servo model, and errors of a robot's forms on recordings."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from typing_extensions import TypedDict
+
+from gaponet import __version__
+from gaponet.base.errors import FolderError, RobotError
+from gaponet.base.files import lock_folder, write_json
+from gaponet.base.structure import read_json
+from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.split import split_entries
+from gaponet.report.candidate import read_origin
+from gaponet.robot.spec import SERVO_FIELDS, SERVO_TERMS, RobotSpec
+from gaponet.share.reading import load_dataset
+from gaponet.sim.batch import Condition, ramped
+from gaponet.sim.model import model_hash
+from gaponet.sim.replay import replay
+from gaponet.sysid.identify import identify
+
+CACHE = "plain_servos.json"  # in the robot folder
+MAX_CHECK_MOTIONS = 5
+MAX_CHECK_MOTION_S = 30.0
+OWN_MOTION_S = 10.0
+
+
+class _Cache(TypedDict):
+    """Content of CACHE: hash of the inputs of a fit, and the fitted values by joint (SERVO_FIELDS)."""
+
+    key: str
+    servos: dict[str, dict[str, float]]
+
+
+def read_recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[list[Sequence], list[Sequence]] | None:
+    """Read training and validation motions of a dataset, by default those that the robot was identified from.
+
+    Returns:
+        None if there is no dataset, or if its robot was driven by torque, so that no motion can be commanded again.
+    """
+    origin = read_origin(folder)
+    if data is None and origin is not None:
+        data = origin["dataset"]
+        if "://" not in data:
+            data = str(folder / data) if (folder / data).is_dir() else None  # it may have moved away
+    if data is None:
+        return None
+    dataset = load_dataset(data)
+    dataset.require_robot(robot)
+    first = dataset.read(dataset.entries[0])
+    if np.array_equal(first.ctrl, first.qpos):
+        return None
+    splits = split_entries(dataset, ())
+    if origin is not None:
+        hashes = {split: set(origin["parts"][split].values()) for split in ("train", "val")}
+        own = {split: [e for e in dataset.entries if e.hash in hashes[split]] for split in hashes}
+        splits |= own if all(own.values()) else {}
+    return dataset.sequences(splits["train"]), dataset.sequences(splits["val"])
+
+
+def fit_plain_servos(
+    robot: RobotSpec,
+    recordings: ListOf[Sequence],
+    progress: Callable[[float, float, str], None] = lambda done, total, note: None,
+) -> RobotSpec:
+    """Fit the parameters of PD servos, without a servo model, to recordings.
+
+    The result is stored in the robot folder, and read from there if nothing changed.
+
+    Args:
+        robot: Identified; its table, zeros and stops are kept. Returned as it is if it has no servo model.
+        recordings: Motions that it was fitted to, or its own (`own_motions`).
+        progress: As of `identify`.
+    """
+    if not robot.has_servo_model:
+        return robot
+    without: dict[str, Any] = dict.fromkeys(SERVO_TERMS, np.array(0.0))
+    start = replace(robot, **without)
+    key, cache = _fit_key(start, recordings), robot.folder / CACHE
+    with suppress(RobotError):  # missing or damaged
+        stored = read_json(_Cache, cache, RobotError)
+        if stored["key"] == key:
+            return start.with_servos(stored["servos"])
+    fitted = identify(recordings, start, terms=(), table=False, progress=progress).robot
+    servos = {
+        joint: {name: float(v) for name in SERVO_FIELDS if np.isfinite(v := getattr(fitted, name)[i])}
+        for i, joint in enumerate(robot.joint_names)
+    }
+    with suppress(FolderError, OSError), lock_folder(robot.folder, "robot"):  # not of gaponet, or not writable
+        write_json(cache, {"key": key, "servos": servos})
+    return fitted
+
+
+def _fit_key(robot: RobotSpec, recordings: ListOf[Sequence]) -> str:
+    """Return the hash of everything that the fit depends on."""
+    key = hashlib.sha256(f"{__version__} {mujoco.__version__} {model_hash(robot)} {robot.operated}".encode())
+    for one in (robot, robot.before_identification):
+        for name in SERVO_FIELDS:
+            key.update(getattr(one, name).tobytes())
+    for s in recordings:
+        meta = (s.dt, s.meta.kp, s.meta.kd, s.meta.payload_mass, s.meta.payload_side)
+        key.update(json.dumps(meta).encode())
+        for channel in (s.ctrl, s.qpos, s.qvel):
+            key.update(np.ascontiguousarray(channel).tobytes())
+    return key.hexdigest()
+
+
+def own_motions(robot: RobotSpec, payload_mass: float = 0.0, count: int = 24) -> list[Sequence]:
+    """Simulate motions of the robot itself, for use without recordings: all joints swing about home and pause."""
+    rng, op = np.random.default_rng(0), robot.operated_index
+    t = np.arange(0.0, OWN_MOTION_S, robot.dt)[:, None]
+    home = robot.qpos_home[op]
+    low, high = (np.clip(x, home - np.pi, home + np.pi) for x in robot.qpos_range[op].T)
+    motions = []
+    for i in range(count):
+        turn = 2 * np.pi * (rng.uniform(0.1, 0.6, len(op)) * t + rng.uniform(0, 1, len(op)))
+        swing = np.clip(1.5 * np.sin(turn), -1, 1) * rng.uniform(0.1, 0.8, len(op)) * np.minimum(1, t)
+        ctrl = np.tile(robot.qpos_home, (len(t), 1))
+        ctrl[:, op] += np.where(swing > 0, high - home, home - low) * swing / 2
+        meta = SequenceMeta(robot.name, "itself", f"swing-{i}", payload_mass, virtual=True)
+        rest = np.tile(robot.qpos_home, (len(t), 1))
+        motions.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, rest, 0 * ctrl))
+    rollouts = replay(motions, robot, lock_idle=True)
+    return [replace(s, qpos=r.qpos, qvel=r.qvel) for s, r in zip(motions, rollouts, strict=True)]
+
+
+def comparable(recordings: ListOf[Sequence], robot: RobotSpec, payload_mass: float) -> list[Sequence]:
+    """Return the recordings made with this payload, kg, and with the robot's own gains."""
+    return [s for s in recordings if Condition.of(s, robot).kp is None and s.meta.payload_mass == payload_mass]
+
+
+def rollout_error(recordings: ListOf[Sequence], robot: RobotSpec) -> float:
+    """Return the mean |error| of the operated joints over rollouts of recordings in gaponet, rad."""
+    op = robot.operated_index
+    rollouts = replay(recordings, robot, lock_idle=True)
+    return float(np.mean([mean_error(s.qpos[:, op], r.qpos[:, op]) for s, r in zip(recordings, rollouts, strict=True)]))
+
+
+def mean_error(recorded: np.ndarray, played: np.ndarray) -> float:
+    """Return the mean |difference| over all rows but the first, which is given; (T, n) rad."""
+    return float(np.abs(np.asarray(played, float) - recorded)[1:].mean())
+
+
+def check_motions(recordings: ListOf[Sequence], robot: RobotSpec) -> list[Sequence]:
+    """Return the first motions by name, cut in length, for check.npz; targets are ramped as the servos ramp them."""
+    first = {s.meta.motion: s for s in reversed(recordings)}
+    low, high = robot.qpos_range.T
+    cut = [s.rows(slice(0, round(MAX_CHECK_MOTION_S / s.dt))) for s in list(first.values())[:MAX_CHECK_MOTIONS]]
+    speed = np.where(robot.target_speed > 0, robot.target_speed, np.inf)
+    return [replace(s, ctrl=ramped(np.clip(s.ctrl, low, high), s.qpos[0], speed, s.dt)) for s in cut]

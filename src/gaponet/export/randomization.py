@@ -1,0 +1,243 @@
+"""Randomisation for training: units sampled from the uncertainty of a robot, and a range for each number.
+
+Scope "today" uses the errors of this robot's values, "any-day" also the differences between its sessions on several
+days, "any-robot" the differences between several robots of its type. Days and robots are sampled whole, so that numbers
+which change together (a cold day) stay together; numbers sampled one by one give robots that do not exist. Motions show
+torques over kp: if kp of a unit is wrong, its torque limit is wrong by the same factor.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+from pathlib import Path
+from string import Template
+from typing import Any, Literal
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.base.files import lock_folder, write_json, write_text
+from gaponet.export.shipped import mujoco_randomization
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, prior_std, to_axes
+
+Scope = Literal["today", "any-day", "any-robot"]
+Engine = Literal["json", "mujoco", "mjlab", "isaaclab"]
+
+FOLDER_KIND = "engine"
+FILE = "randomization.json"
+RANGE_SAMPLES, RANGE_PERCENT = 4096, (5, 95)
+UNDETERMINED_STD = 0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
+SIGNED = ("offset",)
+MIN_ROBOTS = 3  # of a type
+
+
+@dataclass(frozen=True)
+class Randomization:
+    """Sampled units of a robot.
+
+    Attributes:
+        units: Field → (samples, n), SI units; a row is one unit.
+        ranges: Joint → field → low, value, high; 9 of 10 units lie between.
+        unknown: "joint: field" of the numbers that no log determines.
+    """
+
+    robot: str
+    scope: Scope
+    units: dict[str, Array]
+    ranges: dict[str, dict[str, tuple[float, float, float]]]
+    unknown: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def sample_units(
+    robot: RobotSpec | Path, scope: Scope = "today", others: ListOf[Path] = (), samples: int = 256, seed: int = 0
+) -> Randomization:
+    """Sample units of a robot.
+
+    Args:
+        robot: Robot folder that gaponet identify or gaponet adapt wrote.
+        scope: "today": errors of the values of this robot. "any-day": also differences between its sessions on
+            different days. "any-robot": differences between robots of its type.
+        others: Robot folders of the type, each identified from its own logs.
+        samples: Number of units.
+
+    Raises:
+        UsageError: Data for the scope are missing; the message says which.
+    """
+    spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
+    uncertainty = ParameterUncertainty.require(spec)
+    fields, joints = uncertainty.fields, spec.operated
+    now = np.stack([uncertainty.array(j, "values") for j in joints])
+    covariance = np.stack([uncertainty.array(j, "covariance") for j in joints])
+    mean, deviations, notes = now, np.zeros((0, *now.shape)), list[str]()
+    if scope != "today":
+        each = _days(uncertainty, joints) if scope == "any-day" else _robots(spec, fields, others)
+        mean = each.mean(axis=0)
+        deviations = (each - mean) * np.sqrt((1 + 1 / len(each)) / (len(each) - 1))
+        what, factor = "days" if scope == "any-day" else "robots", _std_factor(len(each))
+        notes.append(f"from {len(each)} {what}: how far they differ is known to a factor of {factor:.1f}")
+    unknown = np.sqrt(np.einsum("njj->nj", covariance)) > UNDETERMINED_STD * prior_std(fields, now)
+    rng, count, single = np.random.default_rng(seed), max(RANGE_SAMPLES, samples), _uncorrelated_share(deviations)
+    weights = rng.standard_normal((count, len(deviations)))
+    x = mean + np.sqrt(1 - single) * np.einsum("sd,dnp->snp", weights, deviations)
+    x = x + np.sqrt(single * np.square(deviations).sum(axis=0)) * rng.standard_normal(x.shape)
+    limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
+    for i in range(len(joints)):
+        error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
+        x[:, i] += error
+        limit[:, i] *= np.exp(error[:, fields.index("kp")])
+    bounded = [f not in SIGNED and f not in ("kp", "stribeck_speed") for f in fields]
+    x = np.where(bounded, np.maximum(x, 0.0), x)
+    sampled, value = from_axes(fields, x), from_axes(fields, mean)
+    ranges: dict[str, dict[str, tuple[float, float, float]]] = {j: {} for j in joints}
+    for i, joint in enumerate(joints):
+        for field in fields:
+            low, high = np.percentile(sampled[field][:, i], RANGE_PERCENT)
+            ranges[joint][field] = float(low), float(value[field][i]), float(high)
+    names = tuple(f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k])
+    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit}).items()}
+    return Randomization(spec.name, scope, units, ranges, names, tuple(notes))
+
+
+def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
+    """Return the values of each day's session, (days, n, P); of several sessions on one day, the last."""
+    units = {s["unit"] for s in uncertainty.sources}
+    if len(units) > 1:
+        raise UsageError(
+            f"any-day: these sessions are of units {', '.join(sorted(units))}; days of one unit are needed, or --scope "
+            "any-robot with --units"
+        )
+    days = {s["days"] or (f"session {i}",): s for i, s in enumerate(uncertainty.sources)}
+    if len(days) < 2:
+        raise UsageError(
+            "any-day: this robot is known from one day; adapt it with logs of another one (gaponet adapt ROBOT "
+            "LOGS --out ROBOT_2) and export that"
+        )
+    return np.array([[s["values"][j] for j in joints] for s in days.values()])
+
+
+def _robots(spec: RobotSpec, fields: tuple[str, ...], others: ListOf[Path]) -> Array:
+    """Return the values of this robot and of others, (robots, n, P)."""
+    robots = [spec, *(load_robot(folder) for folder in others)]
+    if len(robots) < MIN_ROBOTS:
+        raise UsageError(
+            f"any-robot: {len(robots)} robot(s) do not show how robots of this type differ; give --units with at least "
+            f"{MIN_ROBOTS - 1} more robot folders, each identified from its own logs"
+        )
+    for robot in robots:
+        if robot.operated != spec.operated:
+            raise UsageError(
+                f"{robot.folder}: operates {', '.join(robot.operated)}; this robot {', '.join(spec.operated)}"
+            )
+    return np.stack([np.stack(list(to_axes(robot, fields).values())) for robot in robots])
+
+
+def _uncorrelated_share(deviations: Array) -> float:
+    """Return the share of the variance between k days or robots, (k, n, P), that is sampled number by number.
+
+    In few days or robots, numbers change together by chance (shrinkage of correlations, Schäfer and Strimmer 2005).
+    """
+    if len(deviations) < MIN_ROBOTS:
+        return 0.0
+    flat = deviations.reshape(len(deviations), -1)
+    flat = flat[:, np.square(flat).sum(axis=0) > 0]
+    r = np.corrcoef(flat.T)[np.triu_indices(flat.shape[1], 1)]
+    return float(min(1.0, ((1 - r**2) ** 2).sum() / (len(flat) - 1) / np.square(r).sum()))
+
+
+def _std_factor(count: int) -> float:
+    """Return the factor by which a standard deviation of `count` values may be too small, 9 of 10 times."""
+    from scipy.stats import chi2
+
+    return float(np.sqrt((count - 1) / chi2.ppf(0.1, count - 1)))
+
+
+def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Path:
+    """Write units and ranges as JSON, and the file of an engine beside it; return the engine's file."""
+    with lock_folder(folder, FOLDER_KIND):
+        write_json(folder / FILE, {
+            "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
+            "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}
+                       for j, by in made.ranges.items()},
+            "units": {f: np.round(v, 9) for f, v in made.units.items()}, "unknown": made.unknown, "notes": made.notes,
+        })  # fmt: skip
+        if engine == "json":
+            return folder / FILE
+        file = folder / f"{engine}_randomization.py"
+        write_text(file, inspect.getsource(mujoco_randomization) if engine == "mujoco" else _events(made, engine))
+    return file
+
+
+HEAD = Template('''"""Ranges of $robot ($scope) for $engine, 9 of 10 units inside. Sampled one by one they are wider
+than the robot; whole units, in which numbers go together, are in randomization.json."""
+
+$imports
+
+EVENTS = {  # $place
+$terms}
+$note# s: delays of the actuators; rad: what a servo adds to its target
+DELAYS = $delay
+OFFSETS = $offset
+''')
+MJLAB_JOINT = Template("""\
+    "${joint}_damping": EventTermCfg(mode="startup", func=dr.dof_damping, params={"ranges": $damping, $joint_cfg}),
+    "${joint}_frictionloss": EventTermCfg(mode="startup", func=dr.dof_frictionloss, params={
+        "ranges": $frictionloss, $joint_cfg}),
+    "${joint}_armature": EventTermCfg(mode="startup", func=dr.dof_armature, params={"ranges": $armature, $joint_cfg}),
+    "${joint}_kp": EventTermCfg(mode="startup", func=dr.pd_gains, params={"kp_range": $kp, "kd_range": (1.0, 1.0),
+        "asset_cfg": SceneEntityCfg("robot", actuator_names=("$joint",))}),
+""")
+ISAACLAB_JOINT = Template("""\
+    "${joint}_gains": EventTermCfg(mode="startup", func=mdp.randomize_actuator_gains, params={
+        "stiffness_distribution_params": $kp, $joint_cfg}),
+    "${joint}_joint": EventTermCfg(mode="startup", func=mdp.randomize_joint_parameters, params={
+        "friction_distribution_params": $frictionloss, "armature_distribution_params": $armature, $joint_cfg}),
+""")
+
+
+def _events(made: Randomization, engine: Engine) -> str:
+    """Return event terms of mjlab 1.6, or of Isaac Lab 2 and 3, for each joint."""
+    mjlab = engine == "mjlab"
+    terms, columns = "", {field: dict[str, tuple[float, float]]() for field in ("damping", "delay", "offset")}
+    for joint, by_field in made.ranges.items():
+        ranges = {f: _rounded(*by_field.get(f, (0.0, 0.0, 0.0))) for f in (*columns, "frictionloss", "armature", "kp")}
+        for field, values in columns.items():
+            values[joint] = ranges[field]
+        if mjlab:  # its gains are randomised by a factor
+            low, high = (x / by_field["kp"][1] for x in ranges["kp"])
+            ranges["kp"] = round(low, 5), round(high, 5)
+        names = f'("{joint}",)' if mjlab else f'["{joint}"]'
+        cfg = f'"operation": "abs", "asset_cfg": SceneEntityCfg("robot", joint_names={names})'
+        terms += (MJLAB_JOINT if mjlab else ISAACLAB_JOINT).substitute(ranges, joint=joint, joint_cfg=cfg)
+    managers = "from mjlab.managers" if mjlab else "from isaaclab.managers"
+    functions = "from mjlab.envs.mdp import dr" if mjlab else "import isaaclab.envs.mdp as mdp"
+    note = f"# N·m·s/rad, viscous: no term of Isaac Lab randomises it alone\nDAMPING = {columns['damping']!r}\n"
+    text = {
+        "engine": "mjlab 1.6" if mjlab else "Isaac Lab",
+        "place": "of ManagerBasedRlEnvCfg(events=…)" if mjlab else "attributes of your EventCfg",
+        "imports": f"{functions}\n{managers} import EventTermCfg, SceneEntityCfg",
+        "note": "" if mjlab else note,
+    }
+    return HEAD.substitute(columns, robot=made.robot, scope=made.scope, terms=terms, **text)
+
+
+def _rounded(low: float, value: float, high: float) -> tuple[float, float]:
+    return float(f"{low:.6g}"), float(f"{high:.6g}")
+
+
+def table_rows(made: Randomization, scales: dict[str, tuple[str, float]]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows: joint, and low … high of each number that is not zero everywhere.
+
+    Args:
+        scales: Field → heading, factor from SI.
+    """
+    fields = [f for f in next(iter(made.ranges.values())) if any(by[f][2] for by in made.ranges.values())]
+    rows: list[list[Any]] = [
+        [j, *(f"{by[f][0] * scales[f][1]:.3g} … {by[f][2] * scales[f][1]:.3g}" for f in fields)]
+        for j, by in made.ranges.items()
+    ]
+    return ["joint", *(scales[f][0] for f in fields)], rows

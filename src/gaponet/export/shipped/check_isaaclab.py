@@ -1,0 +1,65 @@
+"""Play the motions of check.npz in Isaac Lab 3 on Newton's MuJoCo-Warp, in a few worlds, and print the error beside
+gaponet's: python check.py. The USD is made by mujoco-usd-converter.
+"""
+
+from pathlib import Path
+
+import gaponet_action as gaponet
+import isaaclab.sim as sim_utils
+import mujoco_usd_converter
+from isaaclab.assets import ArticulationCfg
+from isaaclab.envs import ManagerBasedEnv, ManagerBasedEnvCfg, mdp
+from isaaclab.managers import EventTermCfg, ObservationGroupCfg, ObservationTermCfg
+from isaaclab.scene import InteractiveSceneCfg
+from isaaclab.utils import configclass
+from isaaclab_newton.physics import MJWarpSolverCfg, NewtonCfg
+
+from gaponet.export.shipped.mujoco_servos import Check
+
+HERE = Path(__file__).parent
+check = Check(HERE)
+player = gaponet.CheckPlayer(check)
+reset = player.reset_event()
+usd = mujoco_usd_converter.Converter().convert(str(HERE / "robot.xml"), str(HERE / "usd"))
+
+
+@configclass
+class Scene(InteractiveSceneCfg):
+    robot: ArticulationCfg = ArticulationCfg(
+        prim_path="{ENV_REGEX_NS}/Robot",
+        spawn=sim_utils.UsdFileCfg(usd_path=usd.path),
+        init_state=ArticulationCfg.InitialStateCfg(joint_pos={n: j["home"] for n, j in check.facts["plain"].items()}),
+        actuators=gaponet.isaaclab_actuators(HERE),
+    )
+
+
+@configclass
+class Observations:
+    @configclass
+    class Policy(ObservationGroupCfg):
+        q = ObservationTermCfg(func=mdp.joint_pos)
+
+    policy: Policy = Policy()
+
+
+@configclass
+class Actions:
+    joint_pos = gaponet.isaaclab_action(HERE, asset_name="robot", joint_names=[".*"])
+
+
+@configclass
+class Events:
+    start = EventTermCfg(func=reset, mode="reset")
+
+
+fields = ("integrator", "tolerance", "iterations", "ls_iterations")
+solver = MJWarpSolverCfg(disable_contacts=True, **{field: check.facts["options"][field] for field in fields})
+cfg = ManagerBasedEnvCfg(
+    decimation=check.facts["decimation"], scene=Scene(num_envs=check.worlds, env_spacing=2.0),
+    sim=sim_utils.SimulationCfg(
+        dt=check.step, use_newton_actuators=False, device="cpu", physics=NewtonCfg(solver_cfg=solver)
+    ),
+    observations=Observations(), actions=Actions(), events=Events(),
+)  # fmt: skip
+env = ManagerBasedEnv(cfg)
+check.report("Isaac Lab", player.run(env, env.action_manager.get_term("joint_pos")._joint_names))

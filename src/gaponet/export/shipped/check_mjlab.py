@@ -1,0 +1,45 @@
+"""Play the motions of check.npz in mjlab, in a few worlds, and print the error beside gaponet's: python check.py
+
+In an export of actuator networks mjlab's learned actuators play them.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import gaponet_action as gaponet
+from mjlab.entity import EntityArticulationInfoCfg
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from mjlab.envs.mdp.actions import JointPositionActionCfg
+from mjlab.managers.event_manager import EventTermCfg
+from mjlab.scene import SceneCfg
+from mjlab.sim import SimulationCfg
+
+from gaponet.export.shipped.mujoco_servos import Check
+
+HERE = Path(__file__).parent
+check = Check(HERE)
+networks = "actuator_net" in check.facts
+joints = {"entity_name": "robot", "actuator_names": (".*",)}
+if networks:
+    from actuators import mjlab_actuators
+
+    entity = gaponet.mjlab_entity(HERE, articulation=EntityArticulationInfoCfg(actuators=mjlab_actuators(HERE)))
+    action = JointPositionActionCfg(**joints, use_default_offset=False)
+else:
+    entity, action = gaponet.mjlab_entity(HERE), gaponet.mjlab_action(HERE, check=False, **joints)
+options, decimation = gaponet.mjlab_options(HERE)
+step = check.facts["actuator_net"]["step"] if networks else check.step
+player = gaponet.CheckPlayer(check)
+cfg = ManagerBasedRlEnvCfg(
+    decimation=decimation,
+    scene=SceneCfg(num_envs=check.worlds, entities={"robot": entity}),
+    actions={"joint_pos": action},
+    events={"start": EventTermCfg(func=player.reset_event(), mode="reset")},
+    sim=SimulationCfg(mujoco=dataclasses.replace(options, timestep=step)),
+)
+env = ManagerBasedRlEnv(cfg, device="cpu")
+if networks:
+    gaponet.hold_friction(env.sim, "robot", HERE)
+path = player.run(env, env.action_manager.get_term("joint_pos").target_names)
+form, what = ("actuator networks", "'s learned actuators") if networks else ("joints", "")
+check.report(f"mjlab{what}", path, form)

@@ -1,0 +1,193 @@
+"""Identified servos in plain MuJoCo. This file is copied into exports; it needs MuJoCo and numpy, not gaponet.
+
+servos = Servos(model, read("facts.json"))     # once; prefix="left/" where the robot was attached to a scene
+data.ctrl[...] = …; servos.before(data); mujoco.mj_step(model, data)     # mj_forward after a change of state
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.sim.servo import friction_limit, present, servo_torque
+
+SERVO_TERMS = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
+CHECK_WORLDS = 3
+Motion = dict[str, Any]  # one of check.npz: ctrl, qpos, qvel (T, n) in rad and rad/s, dt in s
+
+
+def read(path: str | Path) -> dict[str, Any]:
+    """Read the facts.json of an export."""
+    facts: dict[str, Any] = json.loads(Path(path).read_text(encoding="utf-8"))
+    if facts["format"] != 2:
+        raise ValueError(f"{path}: written by another version of gaponet; export the robot again")
+    return facts
+
+
+class Servos:
+    """Servos of a compiled model: sets the identified numbers once, and the servo model before each step."""
+
+    def __init__(self, model: Any, facts: dict[str, Any], prefix: str = "", form: str = "joints") -> None:
+        """
+        Args:
+            prefix: Text before each joint's name in the model.
+            form: "joints", or "plain" for the numbers that were fitted without the servo model.
+        """
+        import mujoco
+
+        joints = facts[form]
+        numbers = [f for f, value in next(iter(joints.values())).items() if isinstance(value, int | float)]
+        column = {f: np.array([j.get(f, 0.0) for j in joints.values()]) for f in numbers}
+        self.model = model
+        self.dof, self.qpos, self.servo = addresses(model, list(joints), prefix)
+        self.kp, self.frictionloss = column["kp"], column["frictionloss"]
+        self.bias = self.kp * column["offset"]
+        model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = column["armature"], column["damping"]
+        model.actuator_gainprm[self.servo, 0], model.actuator_biasprm[self.servo, 0] = self.kp, self.bias
+        model.actuator_biasprm[self.servo, 1], model.actuator_biasprm[self.servo, 2] = -self.kp, -column["kd"]
+        model.dof_frictionloss[self.dof] = self.frictionloss
+        model.qpos0[self.qpos] += np.array([facts["plain"][name]["zero"] for name in joints]) - column["zero"]
+        if model.nhistory:
+            model.actuator_delay[self.servo] = column["delay"]
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        model.dof_invweight0[self.dof] *= facts["dof_invweight0_factor"]  # stiff friction, which no MJCF can express
+        self.terms = present({name: column[name] for name in SERVO_TERMS if name in column})
+
+    def before(self, data: Any) -> None:
+        """Set bias and friction for the next physics step, under data.ctrl."""
+        if not self.terms:
+            return
+        model, torque, load = self.model, data.actuator_force[self.servo], data.qfrc_bias[self.dof]
+        model.dof_frictionloss[self.dof] = friction_limit(
+            self.terms, self.frictionloss, data.qvel[self.dof], torque, load
+        )
+        if "encoder_step" in self.terms or "min_torque" in self.terms:
+            q, ctrl = data.qpos[self.qpos], data.ctrl[self.servo]
+            wanted = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q)
+            model.actuator_biasprm[self.servo, 0] = wanted - self.kp * (ctrl - q)
+
+
+def addresses(model: Any, joints: list[str], prefix: str = "") -> tuple[Any, Any, Any]:
+    """Return the indices of joints in qvel and in qpos, and of the actuators that drive them."""
+    ids = [model.joint(prefix + name).id for name in joints]
+    servos = np.array([np.flatnonzero(model.actuator_trnid[:, 0] == joint)[0] for joint in ids])
+    return model.jnt_dofadr[ids], model.jnt_qposadr[ids], servos
+
+
+def play(model: Any, facts: dict[str, Any], motion: Motion, prefix: str = "", form: str = "joints") -> Any:
+    """Play a motion in plain MuJoCo from its first state, as if its first command had always been in force.
+
+    Args:
+        model: Compiled; its physics step is changed to divide the motion's period.
+        prefix: Text before each joint's name in the model.
+        form: "joints" applies the servo model; "plain" leaves the model as it is.
+
+    Returns:
+        Positions of the recorded joints, (T, n) rad.
+    """
+    import mujoco
+
+    names, ctrl, qpos = list(facts["joints"]), motion["ctrl"], np.array(motion["qpos"])
+    steps = max(1, round(float(motion["dt"]) / model.opt.timestep))
+    model.opt.timestep = float(motion["dt"]) / steps
+    servos, data = Servos(model, facts, prefix) if form == "joints" else None, mujoco.MjData(model)
+    dof, at, servo = addresses(model, names, prefix)
+    data.qpos[at], data.qvel[dof], data.ctrl[servo] = qpos[0], motion["qvel"][0], ctrl[0]
+    for i, value in zip(servo, ctrl[0], strict=True):
+        if model.nhistory and model.actuator_history[i, 0]:
+            mujoco.mj_initCtrlHistory(model, data, i, None, np.full(model.actuator_history[i, 0], float(value)))
+    mujoco.mj_forward(model, data)
+    for t in range(len(ctrl) - 1):
+        data.ctrl[servo] = ctrl[t]
+        for _ in range(steps):
+            if servos is not None:
+                servos.before(data)
+            mujoco.mj_step(model, data)
+        qpos[t + 1] = data.qpos[at]
+    return qpos
+
+
+def delay_weights(delay: Any, step: float) -> Any:
+    """Return weights of past commands, for engines whose actuators have no delay.
+
+    past = np.concatenate([ctrl[None], past[:-1]])   # (depth, n), newest first; at the start the first command repeated
+    target = (weights * past).sum(0)                 # same as MuJoCo's delay with interp="linear"
+
+    Args:
+        delay: (n,) s.
+        step: Physics step, s.
+
+    Returns:
+        (depth, n), the newest command first.
+    """
+    steps = np.asarray(delay, float) / step
+    age = np.arange(int(np.ceil(steps.max(initial=0.0) - 1e-9)) + 1)[:, None]
+    return np.maximum(0.0, 1.0 - abs(age - steps))
+
+
+class Check:
+    """The motions of an export's check.npz, arranged in a few worlds, so that worlds restart while others go on.
+
+    Attributes:
+        facts: facts.json.
+        names: Joints, in the order of all arrays.
+        motions: The motions.
+        step: Physics step, s.
+        ctrl: (T, worlds, n) rad; the last command stays in force in a world without another motion.
+        starts: Period → world → motion that starts there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.facts, stored = read(folder / "facts.json"), np.load(folder / "check.npz")
+        self.names = list(self.facts["joints"])
+        fields = ("ctrl", "qpos", "qvel", "dt")
+        self.motions: list[Motion] = [
+            {name: stored[f"{name}_{i}"] for name in fields} for i in range(int(stored["count"]))
+        ]
+        self.step = float(np.median([m["dt"] for m in self.motions])) / self.facts["decimation"]
+        self.worlds = min(CHECK_WORLDS, len(self.motions))
+        free = [0] * self.worlds  # period in which each world ends its last motion
+        self._places: list[tuple[int, int]] = []
+        self.starts: dict[int, dict[int, Motion]] = {}
+        for motion in self.motions:
+            world = int(np.argmin(free))
+            self._places.append((free[world], world))
+            self.starts.setdefault(free[world], {})[world] = motion
+            free[world] += len(motion["ctrl"]) - 1
+        self.ctrl = np.zeros((max(free), self.worlds, len(self.names)))
+        for (row, world), motion in zip(self._places, self.motions, strict=True):
+            self.ctrl[row:, world] = motion["ctrl"][-1]
+            self.ctrl[row : row + len(motion["ctrl"]) - 1, world] = motion["ctrl"][:-1]
+
+    def run(self, start: Callable[[dict[int, Motion], Any], None], step: Callable[[Any], Any]) -> Any:
+        """Play all motions; return positions after each period, (T, worlds, n) rad.
+
+        Args:
+            start: Puts worlds into the first states of motions, under commands (worlds, n) rad.
+            step: Simulates one control period under commands (worlds, n) rad; returns positions (worlds, n) rad.
+        """
+        path = []
+        for row, ctrl in enumerate(self.ctrl):
+            if row in self.starts:
+                start(self.starts[row], ctrl)
+            path.append(step(ctrl))
+        return np.array(path)
+
+    def report(self, engine: str, path: Any, form: str = "plain") -> None:
+        """Print the mean error of corrected joints beside gaponet's.
+
+        Args:
+            path: Positions after each period, (T, worlds, n) rad.
+            form: Form of the robot that was played, a key of error_mrad in facts.json.
+        """
+        columns = [self.names.index(name) for name in self.facts["corrected"]]
+        errors = []
+        for (row, world), motion in zip(self._places, self.motions, strict=True):
+            qpos = motion["qpos"][1:]
+            errors.append(np.abs(np.asarray(path)[row : row + len(qpos), world] - qpos)[:, columns].mean())
+        expected = self.facts["error_mrad"][form]
+        print(f"{engine}, {self.worlds} worlds: {1e3 * np.mean(errors):.2f} mrad; in gaponet {expected:.2f}")

@@ -1,0 +1,144 @@
+"""One control period of a model (nn/loop.DeltaLoop) as a torch.export program (.pt2), which plain torch loads.
+
+step = torch.export.load("delta.pt2").module()
+delta, frames = step(qpos, qvel, ctrl, payload_mass, frames, fresh)   # as DeltaStep.forward
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gaponet.base.errors import ModelError
+from gaponet.base.files import atomic_write
+from gaponet.export.shipped.gaponet_action import PROGRAM, Past
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, trained_network
+
+CHECK_PERIODS = 12  # control periods
+CHECK_WORLDS = 3
+
+
+class DeltaStep(nn.Module):
+    """A model as a function: state, command and past of B worlds → Δa and the new past.
+
+    Attributes:
+        depth: Frames in the past; a frame is [q | q̇ | applied target], 3n numbers.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, net: nn.Module, model: GapModel) -> None:
+        super().__init__()
+        config = model.config
+        self.net = net.requires_grad_(False)
+        self.n: int = len(model.card["joint_names"])
+        self.depth: int = (config.history - 1) * config.stride + 1
+        self.stride: int = config.stride
+        self.payload_input: bool = config.payload_input
+        self.payload_max: float = config.payload_max
+        low, high = torch.from_numpy(model.qpos_range.T.copy()).float()
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
+
+    def forward(
+        self, qpos: Tensor, qvel: Tensor, ctrl: Tensor, payload_mass: Tensor, frames: Tensor, fresh: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return Δa, (B, n) rad, within the joint limits, and the new past. Gradients do not reach earlier periods.
+
+        Args:
+            qpos, qvel, ctrl: (B, n) rad, rad/s, rad; a target that is not finite counts as the last applied one.
+            payload_mass: (B,) kg.
+            frames: The past, newest first, (B, depth, 3n).
+            fresh: Worlds without a past, (B,) bool; their past is the present frame, repeated.
+        """
+        last = torch.where(fresh[:, None], qpos, frames[:, 0, 2 * self.n :])
+        ctrl = torch.where(torch.isfinite(ctrl), ctrl, last)  # otherwise NaN would stay in the past
+        state = torch.cat([qpos, qvel], dim=1)
+        now = torch.cat([state, ctrl], dim=1).detach()
+        frames = torch.where(fresh[:, None, None], now[:, None], frames)
+        inputs = [state, frames[:, :: self.stride].flatten(1)]
+        if self.payload_input:
+            inputs.append((payload_mass / self.payload_max)[:, None])
+        inputs.append(ctrl)
+        delta = self.net(torch.cat(inputs, dim=1))
+        applied = torch.minimum(torch.maximum(ctrl + delta, self.low), self.high)
+        newest = torch.cat([state, applied], dim=1).detach()
+        return applied - ctrl, torch.cat([newest[:, None], frames[:, :-1]], dim=1)
+
+
+def delta_step(model: GapModel, run: Path) -> DeltaStep:
+    """Load the step of a run's network from its checkpoint.
+
+    Raises:
+        ModelError: There is no checkpoint, or the model holds corrections, has sensors or reads the recorded state.
+    """
+    if model.config.holds:
+        raise ModelError(f"{model.path}: holds corrections or sensors, which torch exports do not; train without")
+    if model.config.real_state:
+        raise ModelError(f"{model.path}: real_state is an input that torch exports lack; train without")
+    return DeltaStep(trained_network(run, model.config, len(model.card["joint_names"])), model)
+
+
+def program(step: DeltaStep) -> torch.export.ExportedProgram:
+    """Return the program of a step for any number of worlds, B ≥ 1."""
+    worlds = torch.export.Dim("worlds", min=1, max=2**31)  # torch 2.7 needs a maximum
+    rows = [torch.zeros(2, step.n) for _ in range(3)]
+    past = [torch.zeros(2, step.depth, 3 * step.n), torch.ones(2, dtype=torch.bool)]
+    with torch.no_grad():
+        return torch.export.export(step, (*rows, torch.zeros(2), *past), dynamic_shapes=({0: worlds},) * 6)
+
+
+def export_program(model: GapModel, run: Path, folder: Path) -> float:
+    """Write delta.pt2, load it again and compare it with the artifact over some control periods.
+
+    Returns:
+        Largest difference, rad.
+
+    Raises:
+        ModelError: The difference is above 1e-5 rad, or `delta_step` refuses the model; nothing is written.
+    """
+    step, path = delta_step(model, run), folder / PROGRAM
+    content = io.BytesIO()  # torch ends the process if it writes to a full disk itself
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch about its own storages
+        torch.export.save(program(step), content)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content.getvalue())
+        content.seek(0)
+        difference = _largest_difference(torch.export.load(content).module(), step, model)
+        if not difference <= MAX_DIFFERENCE_RAD:
+            raise ModelError(
+                f"{path}: torch.export and {model.path} differ by {difference:.2e} rad; not written. "
+                "Write the artifact again with gaponet export RUN"
+            )
+    return difference
+
+
+def _largest_difference(program: Any, step: DeltaStep, model: GapModel) -> float:
+    """Return the largest |program − artifact| on random motions, rad; one world restarts half-way."""
+    rng = np.random.default_rng(0)
+    loop, past = model.loop(CHECK_WORLDS), Past(program, CHECK_WORLDS, step.depth, step.n, "cpu")
+    payload = rng.uniform(0, model.config.payload_max, CHECK_WORLDS).astype(np.float32)
+    low, high = np.clip(model.qpos_range.T, -1.0, 1.0)
+    ctrl = rng.uniform(low, high, (CHECK_WORLDS, step.n))
+    qpos, largest = ctrl.copy(), 0.0
+    with torch.inference_mode():
+        for t in range(CHECK_PERIODS):
+            if t == CHECK_PERIODS // 2:
+                past.reset(torch.tensor([1]))
+                loop.reset(np.array([1]))
+            ctrl = ctrl + rng.normal(0, 0.02, ctrl.shape)
+            qvel = rng.normal(0, 0.3, ctrl.shape)
+            qpos = qpos + 0.3 * (ctrl - qpos)
+            q, v, a = (x.astype(np.float32) for x in (qpos, qvel, ctrl))
+            delta = past.delta(*(torch.from_numpy(x) for x in (q, v, a, payload))).numpy()
+            largest = max(largest, float(np.abs(delta - loop.delta(q, v, a, payload)).max()))
+    return largest
