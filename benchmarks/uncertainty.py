@@ -36,9 +36,9 @@ from gaponet.sysid.fit import Clock, Fit
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.uncertainty import ParameterUncertainty
-from gaponet.testing.fleet import draw, load_fleet
+from gaponet.testing.fleet import load_fleet, sample_unit
 from gaponet.testing.physics import Physics
-from gaponet.testing.unit import VirtualRobot
+from gaponet.testing.virtual_robot import VirtualRobot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from arm import write_arm
@@ -112,7 +112,7 @@ def virtual(work: Path, robots: int, form: str) -> None:
     done = len(file.read_text().splitlines()) if file.is_file() else 0
     for first in range(done, robots, GROUP):
         last = min(first + GROUP, robots)
-        units = [draw(robot, fleet.distributions, fleet.seed, 1 + k) for k in range(first, last)]
+        units = [sample_unit(robot, fleet.distributions, fleet.seed, 1 + k) for k in range(first, last)]
         if form == "right":
             units = [replace(u.only(RIGHT), friction_asymmetry=0 * u.friction) for u in units]
         days = [play(robot, [changed(u, what) for u in units], first, d) for d, what in enumerate(DAYS)]

@@ -6,7 +6,7 @@ import pytest
 
 from gaponet.sim.batch import OneByOne
 from gaponet.testing.fleet import load_fleet
-from gaponet.testing.unit import VirtualRobot
+from gaponet.testing.virtual_robot import VirtualRobot
 
 MECHANICAL = ["gain", "torque_constant", "friction", "load_friction", "damping", "cable", "mass", "tilt", "cogging"]
 

@@ -17,12 +17,14 @@ from gaponet.base.errors import DatasetError, FolderError, UsageError
 from gaponet.base.files import lock_folder
 from gaponet.data.store import Dataset
 from gaponet.robot.spec import load_robot
-from gaponet.sim.model import model_hash
+from gaponet.sim.dynamics import static_torque
+from gaponet.sim.model import build_model, model_hash
 from gaponet.sysid.motion.library import Library
 from gaponet.sysid.motion.recipe import takes
 from gaponet.testing.collect import Recipe, collect, load_recipe
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.physics import Physics
+from gaponet.testing.play import equivalent_torque
 
 RECIPE = Recipe(
     "test",
@@ -132,7 +134,7 @@ from gaponet.testing.collect import Recipe, collect
 from gaponet.robot.spec import load_robot
 from gaponet.testing.fleet import load_fleet
 if __name__ == "__main__":
-    gaponet.testing.collect.ROWS = (4, 4)  # four jobs: two are still being played when two are written
+    gaponet.testing.collect.TAKES_PER_JOB = (4, 4)  # four jobs: two are still being played when two are written
     robot = load_robot(sys.argv[1])
     recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 100.0), 2)
     collect(robot, load_fleet("easy", robot), recipe, sys.argv[2], seed=5, nproc=2)
@@ -239,6 +241,14 @@ def test_the_whole_simlifter_recipe_is_as_large_as_the_paper_says():
     assert {t.rate for t in wanted} == {50.0, 100.0}
     levels = {"all" in t.motion.split("-") for t in wanted}
     assert levels == {True, False}
+
+
+def test_a_still_recording_needs_its_static_torque(spec):
+    model = build_model(spec, 0.2)
+    qpos = np.repeat(np.array([[0.4, -0.2]]), 80, axis=0)
+    tau, qacc = equivalent_torque(model, qpos, 0.02)
+    assert np.allclose(tau, static_torque(model, qpos), atol=1e-6)
+    assert np.abs(qacc).max() < 1e-6
 
 
 def test_the_demo_recipe_can_be_played_by_h1_2():

@@ -7,10 +7,9 @@ import pytest
 from gaponet.base.errors import UsageError
 from gaponet.experiments.virtual.goals import GoalPlanner
 from gaponet.robot.spec import load_robot
-from gaponet.testing.draw import MARK
-from gaponet.testing.fleet import FLEETS, draw, load_fleet, to_toml
+from gaponet.testing.fleet import FLEETS, UNITS_MARKER, load_fleet, sample_unit, to_toml
 from gaponet.testing.physics import EFFECTS, Physics, neutral
-from gaponet.testing.unit import VirtualRobot
+from gaponet.testing.virtual_robot import VirtualRobot
 
 NAMES = ("easy", "hard", "shifted")
 
@@ -21,7 +20,7 @@ def test_the_saved_units_are_what_the_distributions_and_the_seed_give(name):
     fleet = load_fleet(name, robot)
     assert list(fleet.units) == ["virtual-1", "virtual-2", "virtual-3", "virtual-4"]
     for k, unit in enumerate(fleet.units.values(), 1):
-        again = draw(robot, fleet.distributions, fleet.seed, k)
+        again = sample_unit(robot, fleet.distributions, fleet.seed, k)
         for f in fields(Physics):
             assert np.array_equal(getattr(unit, f.name), getattr(again, f.name)), f.name
 
@@ -151,7 +150,7 @@ def test_a_unit_that_cannot_be_is_refused(arm, tmp_path, parameter, value):
     drawn = load_fleet("easy", arm)
     units = {u: replace(p, **{parameter: np.array([value])}) for u, p in drawn.units.items()}
     file = tmp_path / "mine.toml"
-    head = (FLEETS / "easy.toml").read_text(encoding="utf-8").split(MARK)[0]
-    file.write_text(head + MARK + to_toml(arm, units, drawn.distributions), encoding="utf-8")
+    head = (FLEETS / "easy.toml").read_text(encoding="utf-8").split(UNITS_MARKER)[0]
+    file.write_text(head + UNITS_MARKER + to_toml(arm, units, drawn.distributions), encoding="utf-8")
     with pytest.raises(UsageError, match=rf"mine\.toml: unit 'virtual-1': {parameter} is \[{value}\]"):
         load_fleet(file, arm)

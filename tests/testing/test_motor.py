@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from gaponet.testing.motor import (
-    COPPER,
+    COPPER_COEFFICIENT,
     Backlash,
     Bristles,
     CommandLink,
     Thermal,
     cogging_torque,
     friction_limit,
-    supply_share,
-    torque_share,
+    speed_factor,
+    supply_factor,
 )
 from gaponet.testing.physics import Physics, neutral, stack
 
@@ -60,7 +60,7 @@ def test_warmth_takes_from_dry_friction_and_not_from_the_gears_part():
     assert float(value[0, 0]) == pytest.approx(0.5 * 1.2 + 2.0)
     thermal = Thermal(one(thinning=0.01))
     thermal.reset(np.array([[45.0]]))
-    assert float(thermal.thinned()[0, 0]) == pytest.approx(np.exp(-0.2))  # 20 K: 82 % is left
+    assert float(thermal.thinning_factor()[0, 0]) == pytest.approx(np.exp(-0.2))  # 20 K: 82 % is left
 
 
 def slide(bristles, path, g=1.2, h=1e-3):
@@ -92,10 +92,10 @@ def test_bristles_keep_their_torque_at_rest_and_start_with_what_they_are_given()
 
 def test_torque_falls_from_the_corner_to_the_no_load_speed():
     p = one(no_load_speed=10.0, corner=0.6)
-    share = lambda v: float(torque_share(p, np.array([[v]]))[0, 0])  # noqa: E731
+    share = lambda v: float(speed_factor(p, np.array([[v]]))[0, 0])  # noqa: E731
     assert [share(v) for v in (-20.0, 0.0, 6.0, 10.0, 12.0)] == pytest.approx([1.0, 1.0, 1.0, 0.0, 0.0])
     assert share(8.0) == pytest.approx(0.5)
-    assert float(torque_share(one(), np.array([[1e3]]))[0, 0]) == 1.0
+    assert float(speed_factor(one(), np.array([[1e3]]))[0, 0]) == 1.0
 
 
 def test_backlash_is_crossed_in_the_time_of_a_free_rotor():
@@ -123,7 +123,7 @@ def test_heating_curve_has_the_winding_time_constant():
     for _ in range(1000):
         thermal.step(np.array([[16.0]]), 0.02)
     rise = float(thermal.winding[0, 0]) - 25.0
-    assert rise == pytest.approx(12.0 * (1 - np.exp(-1)), rel=COPPER * 12.0)
+    assert rise == pytest.approx(12.0 * (1 - np.exp(-1)), rel=COPPER_COEFFICIENT * 12.0)
     for _ in range(1000):
         thermal.step(np.array([[0.0]]), 0.02)
     assert float(thermal.winding[0, 0]) - 25.0 == pytest.approx(rise * np.exp(-1), rel=0.01)
@@ -148,8 +148,8 @@ def test_torque_constant_falls_with_temperature():
 
 def test_a_loaded_battery_sags_by_ohms_law():
     p = one(supply_voltage=50.0, supply_resistance=0.5)
-    assert float(supply_share(p, np.array([[200.0]]))[0, 0]) == pytest.approx(1 - 4.0 * 0.5 / 50.0)
-    assert float(supply_share(one(), np.array([[200.0]]))[0, 0]) == 1.0
+    assert float(supply_factor(p, np.array([[200.0]]))[0, 0]) == pytest.approx(1 - 4.0 * 0.5 / 50.0)
+    assert float(supply_factor(one(), np.array([[200.0]]))[0, 0]) == 1.0
 
 
 def test_cogging_repeats_over_the_turn():

@@ -1,8 +1,7 @@
-"""The hidden laws, each on (N, n) arrays for N simulations at once; parameters come from Physics.
+"""Effects of the motors of virtual robots, on (N, n) arrays for N simulations at once; parameters are in Physics.
 
-MuJoCo integrates the joints: these laws only set, every law period, what its actuators and friction constraints are
-allowed to do. So friction sticks as MuJoCo's does, and with neutral parameters nothing differs from the nominal
-simulator.
+MuJoCo integrates the joints. The effects only change the gains and limits of its actuators and friction constraints,
+once per effect period. So friction sticks as in MuJoCo, and with neutral parameters the robot is the nominal simulator.
 """
 
 from __future__ import annotations
@@ -15,44 +14,44 @@ from gaponet.testing.physics import Physics
 
 Array = np.ndarray
 
-DERATED = 40.0  # °C from which a drive takes gain back
-STILL = 1e-3  # rad/s: below this a joint counts as stuck
-KT_TEMPERATURE = 25.0  # °C at which kt_scale holds
-COPPER = 0.00393  # 1/K: resistance of copper, IEC 60028
+DERATING_TEMPERATURE = 40.0  # °C above which a drive reduces its gain
+STUCK_SPEED = 1e-3  # rad/s below which a joint counts as stuck
+KT_TEMPERATURE = 25.0  # °C at which kt_scale is stated
+COPPER_COEFFICIENT = 0.00393  # 1/K, of the resistance, IEC 60028
 
 
 def friction_limit(
-    physics: Physics, nominal: Array, qvel: Array, torque: Array, push: Array, thinned: Array | float = 1.0
+    physics: Physics, nominal: Array, qvel: Array, torque: Array, push: Array, thinning: Array | float = 1.0
 ) -> Array:
-    """The largest torque that friction can take, (N, n), N·m.
+    """Return the largest torque of friction, (N, n), N·m.
 
-    Coulomb friction with a Lorentzian Stribeck peak (Hess & Soom 1990, J. Tribology 112), more of it in one direction,
-    and a part that grows with the transmitted torque: a gear of efficiency η loses (1 − η)|τ| when the motor drives the
-    load and (1/η − 1)|τ| when the load drives the motor, so a joint sags less than it was pushed.
+    Coulomb friction with a Lorentzian Stribeck peak (Hess & Soom 1990, J. Tribology 112) differs by direction. A part
+    grows with the transmitted torque: a gear of efficiency η loses (1 − η)|τ| if the motor drives the load, and
+    (1/η − 1)|τ| if the load drives the motor. So a joint sags less than it was pushed.
 
     Args:
         physics: Stacked parameters.
-        nominal: The nominal model's friction, N·m.
+        nominal: Friction of the nominal model, N·m.
         qvel: rad/s.
         torque: Motor torque at the joint, N·m.
-        push: Torque that friction held back in the last step, N·m: the way a stuck joint would go.
-        thinned: What warmth leaves of friction, apart from the gear's part.
+        push: Torque that friction balanced in the last step, N·m; a stuck joint would move in its direction.
+        thinning: Factor of friction in a warm joint; the gear's part does not have it.
     """
-    still = np.abs(qvel) < STILL
-    way = np.sign(np.where(still, push, qvel))
+    stuck = np.abs(qvel) < STUCK_SPEED
+    direction = np.sign(np.where(stuck, push, qvel))
     slip = qvel / physics.stribeck_speed
-    dry = physics.friction * (1.0 + physics.friction_asymmetry * way + physics.stribeck / (1.0 + slip * slip))
+    dry = physics.friction * (1.0 + physics.friction_asymmetry * direction + physics.stribeck / (1.0 + slip * slip))
     loss = 1.0 - physics.efficiency
-    backdriven = torque * way < 0
-    return (nominal + dry) * thinned + loss * np.abs(torque) / np.where(backdriven, physics.efficiency, 1.0)
+    backdriven = torque * direction < 0
+    return (nominal + dry) * thinning + loss * np.abs(torque) / np.where(backdriven, physics.efficiency, 1.0)
 
 
 class Bristles:
-    """Pre-sliding: friction is a spring of bristles that bend, and slip as they near its limit g.
+    """Pre-sliding friction: bristles bend like a spring, and slip near the friction limit g.
 
-    The model of LuGre (Canudas de Wit, Olsson, Åström & Lischinsky 1995, IEEE Trans. Automatic Control 40) without
-    damping of its own; at a constant g Dahl's (1968): Ḟ = σ·v − σ·|v|·F/g. σ lets the friction of an unloaded joint
-    build up over physics.presliding. Where that is zero, MuJoCo's rigid friction stays.
+    This is the LuGre model (Canudas de Wit, Olsson, Åström & Lischinsky 1995, IEEE Trans. Automatic Control 40) without
+    damping. At a constant g it is Dahl's model (1968): Ḟ = σ·v − σ·|v|·F/g. The friction of an unloaded joint builds up
+    over physics.presliding. If that is zero, MuJoCo's rigid friction is used.
     """
 
     def __init__(self, physics: Physics, nominal: Array) -> None:
@@ -62,105 +61,115 @@ class Bristles:
         self.stiffness = np.where(self.soft, rest / np.where(self.soft, physics.presliding, 1.0), 0.0)
         self.torque = np.zeros_like(rest)  # against the motion, N·m
 
-    def reset(self, held: Array, limit: Array) -> None:
-        """A joint at rest: its bristles hold this torque (N, n) N·m, as far as they can."""
-        self.torque = np.where(self.soft, np.clip(held, -limit, limit), 0.0)
+    def reset(self, torque: Array, limit: Array) -> None:
+        """Start at rest: the bristles hold a torque (N, n) N·m, up to the limit."""
+        self.torque = np.where(self.soft, np.clip(torque, -limit, limit), 0.0)
 
     def step(self, limit: Array, qvel: Array, h: float) -> Array:
-        """Advance h s at a speed and a limit; returns the torque, (N, n) N·m. Exact where both are constant."""
+        """Advance by h s and return the torque, (N, n) N·m; exact for constant speed and limit."""
         end = np.copysign(limit, qvel)
-        slipped = np.exp(-self.stiffness * np.abs(qvel) * h / np.maximum(limit, 1e-9))
-        self.torque = np.where(self.soft, end + (self.torque - end) * slipped, 0.0)
+        remaining = np.exp(-self.stiffness * np.abs(qvel) * h / np.maximum(limit, 1e-9))
+        self.torque = np.where(self.soft, end + (self.torque - end) * remaining, 0.0)
         return self.torque
 
 
-def torque_share(physics: Physics, speed: Array) -> Array:
-    """What the voltage leaves of the torque limit at a speed (N, n) rad/s in the torque's direction, 0 to 1."""
+def speed_factor(physics: Physics, speed: Array) -> Array:
+    """Return the factor of the torque limit, 0 to 1, at a speed (N, n) rad/s in the direction of the torque."""
     return np.clip((1.0 - speed / physics.no_load_speed) / (1.0 - physics.corner), 0.0, 1.0)
 
 
 def cogging_torque(physics: Physics, qpos: Array) -> Array:
-    """Torque ripple at joint angles (N, n) rad, N·m."""
+    """Return the torque ripple at joint angles (N, n) rad, N·m."""
     return physics.cogging * np.sin(physics.cogging_count * qpos + physics.cogging_phase)
 
 
 class Couplings:
-    """What one joint does to another, through cables, a limb's supply and the base.
+    """Effects between joints: cables, the supply of a kinematic chain, and the base.
 
-    A cable bundle bent by the joint before (of a limb's first, after) presses on the joint and drags. What the motors
-    of a limb ask for together beyond a budget costs all of them gain. The moving links' weight makes the base lean,
-    after a first-order lag, and what a leaning base feels is gravity from elsewhere.
+    The joint before (for the first joint of a chain, the joint after) bends a cable bundle, which then adds friction.
+    If the motors of a chain together need more torque than a budget, all of them lose gain. The weight of the moving
+    links tilts the base with a first-order lag; a tilted base changes the direction of gravity.
     """
 
     def __init__(self, physics: Physics, model: mujoco.MjModel, batch: Batch, effort: Array) -> None:
-        """batch: Whose gravity is turned; effort: (n) torque limits, N·m."""
+        """
+        Args:
+            batch: Simulations in which gravity changes its direction.
+            effort: Torque limits, (n) N·m.
+        """
         self.p, self.effort = physics, effort
         parent = model.dof_parentid
         after = [next((i for i in range(model.nv) if parent[i] == j), j) for j in range(model.nv)]
         self.neighbour = np.where(parent >= 0, parent, after)
-        limb = np.cumsum(parent != np.arange(model.nv) - 1) - 1  # a limb begins where a chain branches off
-        self.together = (limb[:, None] == limb).astype(float)
+        chain = np.cumsum(parent != np.arange(model.nv) - 1) - 1  # a chain starts at each branch
+        self.same_chain = (chain[:, None] == chain).astype(float)
         self.drags, self.limits = bool((physics.drag > 0).any()), bool((physics.limb_loss > 0).any())
         self.flexes = bool((physics.flex > 0).any())
         if self.flexes:
             self._gravity, self._com = batch.expand("opt.gravity"), batch.bind("subtree_com")
-            self._level, self._weight = self._gravity.copy(), batch.expand("body_subtreemass")
-            self._pull = np.linalg.norm(self._level, axis=1, keepdims=True)
-        self.lean = np.zeros((len(physics.flex), 2))
+            self._level_gravity, self._weight = self._gravity.copy(), batch.expand("body_subtreemass")
+            self._g = np.linalg.norm(self._level_gravity, axis=1, keepdims=True)
+        self.tilt = np.zeros((len(physics.flex), 2))
 
     def reset(self) -> None:
-        """Stand as the weight at rest leaves it."""
+        """Start with the tilt of a robot at rest."""
         if self.flexes:
             self.flex(np.inf)
 
     def drag(self, qpos: Array) -> Array:
-        """Friction added at joint angles (N, n) rad, N·m."""
+        """Return the friction of the cables at joint angles (N, n) rad, N·m."""
         return self.p.drag * 0.5 * (1.0 - np.cos(qpos[:, self.neighbour] - self.p.drag_angle))
 
-    def share(self, torque: Array) -> Array:
-        """What the limbs' supplies leave of the gain under motor torques, (N, n)."""
-        asked = (np.abs(torque) / self.effort) @ self.together
-        return 1.0 / (1.0 + self.p.limb_loss * np.maximum(asked - self.p.limb_budget, 0.0))
+    def gain_factor(self, torque: Array) -> Array:
+        """Return the factor of the gain that the supplies of the chains allow under motor torques, (N, n)."""
+        load = (np.abs(torque) / self.effort) @ self.same_chain
+        return 1.0 / (1.0 + self.p.limb_loss * np.maximum(load - self.p.limb_budget, 0.0))
 
     def flex(self, h: float) -> None:
-        """Lean on for h s."""
-        moment = self._com[:, 0, :2] * self._weight[:, :1] * self._pull
-        caught_up = -np.expm1(-h / self.p.flex_time)
-        self.lean = self.lean + caught_up * (self.p.flex * moment - self.lean)
-        self._gravity[:] = self._level
-        self._gravity[:, :2] += self.lean * self._pull
+        """Advance the tilt of the base by h s."""
+        moment = self._com[:, 0, :2] * self._weight[:, :1] * self._g
+        progress = -np.expm1(-h / self.p.flex_time)
+        self.tilt = self.tilt + progress * (self.p.flex * moment - self.tilt)
+        self._gravity[:] = self._level_gravity
+        self._gravity[:, :2] += self.tilt * self._g
 
 
 class Firmware:
-    """Targets in steps, smoothed by a first-order filter that hurries when it has fallen behind."""
+    """Firmware that rounds targets and smooths them; the filter is faster at a larger lag."""
 
     def __init__(self, physics: Physics) -> None:
         self.p, self.any = physics, bool((physics.smoothing > 0).any() or (physics.target_step > 0).any())
+        self.smoothed = np.zeros_like(physics.smoothing)
 
     def reset(self, target: Array) -> None:
-        """Has long been at a target, (N, n) rad."""
-        self.at = target.copy()
+        """Start at a target that has been in force for long, (N, n) rad."""
+        self.smoothed = target.copy()
 
     def step(self, target: Array, h: float) -> Array:
-        """The target that the servo follows h s later, (N, n) rad."""
-        step = np.where(self.p.target_step > 0, self.p.target_step, 1.0)
-        lag = np.where(self.p.target_step > 0, np.round(target / step) * step, target) - self.at
+        """Advance by h s and return the target of the servo, (N, n) rad."""
+        lag = quantised(target, self.p.target_step) - self.smoothed
         rate = (1.0 + np.abs(lag) / self.p.smoothing_lag) / np.maximum(self.p.smoothing, 1e-9)
-        self.at = self.at - lag * np.expm1(-h * rate)
-        return self.at
+        self.smoothed = self.smoothed - lag * np.expm1(-h * rate)
+        return self.smoothed
 
 
-def derated(physics: Physics, winding: Array) -> Array:
-    """What a hot drive leaves of the gain at winding temperatures (N, n) °C."""
-    return 1.0 / (1.0 + physics.derating * np.maximum(winding - DERATED, 0.0))
+def quantised(values: Array, step: Array) -> Array:
+    """Return values rounded to multiples of a step; a step of 0 changes nothing."""
+    nonzero = np.where(step > 0, step, 1.0)
+    return np.where(step > 0, np.round(values / nonzero) * nonzero, values)
+
+
+def derating_factor(physics: Physics, winding: Array) -> Array:
+    """Return the factor of the gain of a drive at winding temperatures (N, n) °C."""
+    return 1.0 / (1.0 + physics.derating * np.maximum(winding - DERATING_TEMPERATURE, 0.0))
 
 
 class Backlash:
-    """Play between motor and link: when the torque changes sign the motor first has to cross the gap.
+    """Play between motor and link: if the torque changes its sign, the motor first crosses the gap.
 
-    While it crosses, the link feels no torque. The motor is a free rotor there: its inertia is the joint's armature,
-    and it arrives after √(2·gap·J/τ) under a constant torque (the dead zone of Nordin & Gutman 2002, Automatica 38,
-    with a rigid, plastic contact).
+    In the gap the link gets no torque. The motor is a free rotor with the joint's armature as inertia; under a constant
+    torque it crosses in √(2·gap·J/τ). This is the dead zone of Nordin & Gutman (2002, Automatica 38) with a rigid,
+    plastic contact.
     """
 
     def __init__(self, physics: Physics, armature: Array) -> None:
@@ -172,15 +181,14 @@ class Backlash:
         self.speed = np.zeros_like(self.half)
 
     def reset(self, torque: Array) -> None:
-        """Lie against the side that carries the torque."""
+        """Start at the side that carries the torque."""
         self.gap = np.where(torque < 0, -self.half, self.half)
         self.speed = np.zeros_like(self.half)
 
     def step(self, torque: Array, h: float) -> Array:
-        """Advance h s under the motor torque (N, n); returns 1 where it reaches the link, 0 in the gap."""
-        at_side = np.abs(self.gap) >= self.half
-        held = at_side & (self.gap * torque >= 0)
-        speed = np.where(held, 0.0, self.speed + torque / self.armature * h)
+        """Advance by h s under the motor torque (N, n); return 1 where it reaches the link, 0 in the gap."""
+        pressed = (np.abs(self.gap) >= self.half) & (self.gap * torque >= 0)
+        speed = np.where(pressed, 0.0, self.speed + torque / self.armature * h)
         gap = self.gap + speed * h
         self.gap = np.clip(gap, -self.half, self.half)
         arrived = np.abs(gap) >= self.half
@@ -189,30 +197,29 @@ class Backlash:
 
 
 class Thermal:
-    """Two nodes, winding and housing; the winding is heated by current, the housing by the winding.
+    """Thermal model with two nodes: current heats the winding, and the winding heats the housing.
 
-    Torque and current are measured in motor torque at the rated torque constant; τ²/K_m² watts become heat, more as
-    copper warms. Structure and parameters as motor makers publish them (e.g. maxon catalogue: two resistances, two time
+    Torque and current are stated as motor torque at the rated torque constant. τ²/K_m² watts become heat, and more in
+    warm copper. The structure is that of motor makers' data (e.g. maxon catalogue: two resistances, two time
     constants).
     """
 
     def __init__(self, physics: Physics) -> None:
         self.p = physics
-        self.winding = np.full_like(physics.kt_drift, KT_TEMPERATURE)
-        self.housing = self.winding.copy()
+        self.ambient = np.full_like(physics.kt_drift, KT_TEMPERATURE)
+        self.winding, self.housing = self.ambient.copy(), self.ambient.copy()
 
     def reset(self, temperature: Array) -> None:
-        """Both nodes at a temperature, (N, n) °C: a robot that has been standing."""
+        """Start with both nodes at a temperature, (N, n) °C, as after a pause."""
         self.winding = np.array(temperature, float)
         self.housing = self.winding.copy()
-        self.ambient = np.full_like(self.winding, KT_TEMPERATURE)
 
     def heat(self, torque_squared: Array) -> Array:
-        """Copper loss, (N, n) W."""
-        return torque_squared / self.p.motor_constant**2 * (1.0 + COPPER * (self.winding - KT_TEMPERATURE))
+        """Return the copper loss, (N, n) W."""
+        return torque_squared / self.p.motor_constant**2 * (1.0 + COPPER_COEFFICIENT * (self.winding - KT_TEMPERATURE))
 
     def step(self, torque_squared: Array, dt: float) -> None:
-        """Advance dt s with a mean squared motor torque (N, n), (N·m)²."""
+        """Advance by dt s with a mean squared motor torque (N, n), (N·m)²."""
         inward = (self.winding - self.housing) / self.p.winding_resistance  # W
         outward = (self.housing - self.ambient) / self.p.housing_resistance
         winding_capacity = self.p.winding_time / self.p.winding_resistance  # J/K
@@ -221,49 +228,52 @@ class Thermal:
         self.housing = self.housing + dt * (inward - outward) / housing_capacity
 
     def kt(self) -> Array:
-        """Torque per rated current over the datasheet's, (N, n)."""
+        """Return the torque constant over that of the datasheet, (N, n)."""
         return self.p.kt_scale * (1.0 - self.p.kt_drift * (self.winding - KT_TEMPERATURE))
 
-    def thinned(self) -> Array:
-        """What the housing's warmth leaves of friction and damping, (N, n)."""
+    def thinning_factor(self) -> Array:
+        """Return the factor of friction and damping at the temperature of the housing, (N, n)."""
         return np.exp(-self.p.thinning * (self.housing - KT_TEMPERATURE))
 
 
-def supply_share(physics: Physics, power: Array) -> Array:
-    """Battery voltage over nominal, (N, 1), when the unit draws `power` (N, 1) W: Ohm's law, one resistance."""
+def supply_factor(physics: Physics, power: Array) -> Array:
+    """Return the battery voltage over the nominal one, (N, 1), for a power (N, 1) W: one resistance."""
     current = power / physics.supply_voltage
     return 1.0 - current * physics.supply_resistance / physics.supply_voltage
 
 
 class CommandLink:
-    """Commands travel: each packet arrives after delay + jitter, or never; the newest arrived one is in force."""
+    """Delayed commands: each packet arrives after delay + jitter, or is lost; the newest arrived one is in force."""
 
     def __init__(self, physics: Physics, dt: float) -> None:
-        """Packets are sent every dt s; as many are kept as can be on the way at once, and the one in force."""
+        """
+        Args:
+            dt: Time between two packets, s.
+        """
         self.p = physics
-        self.slots = int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2
+        self.slots = int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2  # packets under way, one in force
+        count, n = physics.kp_scale.shape
+        self.packets, self.arrival = np.zeros((count, self.slots, n)), np.full((count, self.slots), -np.inf)
+        self.sent, self.newest = np.full(self.slots, -1), np.full(count, -1)
+        self.current, self.count = np.zeros((count, n)), 0
 
     def reset(self, ctrl: Array) -> None:
-        """Begin as if all packets so far had asked for ctrl, (N, n) rad."""
-        count = len(ctrl)
-        self.packets = np.repeat(ctrl[:, None], self.slots, axis=1)
-        self.arrival = np.full((count, self.slots), -np.inf)
-        self.sent = np.full(self.slots, -1)
-        self.count = 0
-        self.newest = np.full(count, -1)
+        """Start as if all earlier packets had been ctrl, (N, n) rad."""
+        self.packets[:] = ctrl[:, None]
+        self.arrival[:], self.sent[:], self.newest[:], self.count = -np.inf, -1, -1, 0
         self.current = ctrl.copy()
 
     def send(self, ctrl: Array, time: float, chance: Array) -> None:
-        """Put a packet on the way at `time` s; chance (N, 2) is uniform in [0, 1): jitter, loss."""
+        """Send a packet at `time` s; chance (N, 2) is uniform in [0, 1): jitter, loss."""
         slot = self.count % self.slots
         self.packets[:, slot] = ctrl
-        late = self.p.delay[:, 0] + self.p.jitter[:, 0] * chance[:, 0]
-        self.arrival[:, slot] = np.where(chance[:, 1] < self.p.drop[:, 0], np.inf, time + late)
+        delay = self.p.delay[:, 0] + self.p.jitter[:, 0] * chance[:, 0]
+        self.arrival[:, slot] = np.where(chance[:, 1] < self.p.drop[:, 0], np.inf, time + delay)
         self.sent[slot] = self.count
         self.count += 1
 
     def read(self, time: float) -> Array:
-        """The command in force at `time` s, (N, n) rad."""
+        """Return the command in force at `time` s, (N, n) rad."""
         arrived = np.where(self.arrival <= time + 1e-9, self.sent, -1)
         slot = arrived.argmax(axis=1)
         number = arrived[np.arange(len(slot)), slot]

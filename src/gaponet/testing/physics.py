@@ -1,6 +1,6 @@
-"""What is hidden in a virtual robot: its parameters, the effect each belongs to, and the value for "no effect".
+"""Hidden parameters of a virtual robot: the effect of each, its unit, and its value for "no effect".
 
-The numbers themselves, with their sources, stand in fleets/*.toml.
+The numbers and their sources are in fleets/*.toml.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ def _unit(effect: str, neutral: float, unit: str) -> dict[str, Any]:
 class Physics:
     """One unit's hidden parameters: (n,) arrays in the robot's joint order, or one number for the whole unit.
 
-    `stack` makes (N, n) and (N, 1) arrays of it, one row per simulation; all laws of motor.py take those.
+    `stack` makes (N, n) and (N, 1) arrays of it, one row per simulation, for the effects in motor.py.
     """
 
-    # Gain: the stiffness and damping that the drive delivers over those it is told.
+    # Gain: stiffness and damping of the drive over those it was set to.
     kp_scale: Array = field(metadata=_joint("gain", 1.0, "1"))
     kd_scale: Array = field(metadata=_joint("gain", 1.0, "1"))
     # Torque constant: torque per ampere over the datasheet's, at 25 °C.
@@ -42,15 +42,15 @@ class Physics:
     winding_time: Array = field(metadata=_joint("thermal", 30.0, "s"))
     housing_resistance: Array = field(metadata=_joint("thermal", 1.0, "K/W"))
     housing_time: Array = field(metadata=_joint("thermal", 600.0, "s"))
-    # Above ambient when a recording starts, after those before it: mean, and spread from recording to recording.
+    # Temperature above ambient at the start of a recording: mean and standard deviation between recordings.
     warmth: Array = field(metadata=_unit("thermal", 0.0, "K"))
     warmth_spread: Array = field(metadata=_unit("thermal", 0.0, "K"))
-    # Friction beyond the nominal model's, and how much more it is one way than the other; Stribeck peak over it.
+    # Friction beyond that of the nominal model, and its difference between directions; Stribeck peak over it.
     friction: Array = field(metadata=_joint("friction", 0.0, "N·m"))
     friction_asymmetry: Array = field(metadata=_joint("friction", 0.0, "1"))
     stribeck: Array = field(metadata=_joint("stribeck", 0.0, "1"))
     stribeck_speed: Array = field(metadata=_joint("stribeck", 0.1, "rad/s"))
-    # Pre-sliding: the angle that an unloaded joint turns while its friction builds up.
+    # Pre-sliding: angle over which the friction of an unloaded joint builds up.
     presliding: Array = field(metadata=_joint("presliding", 0.0, "rad"))
     # Friction and damping lost per kelvin of the housing.
     thinning: Array = field(metadata=_joint("thinning", 0.0, "1/K"))
@@ -60,22 +60,22 @@ class Physics:
     damping: Array = field(metadata=_joint("damping", 0.0, "N·m·s/rad"))
     # Backlash between motor and link.
     backlash: Array = field(metadata=_joint("backlash", 0.0, "rad"))
-    # Compliance of gear and link behind the encoder: how far they twist at the torque limit.
+    # Compliance of gear and link behind the encoder: twist at the torque limit.
     windup: Array = field(metadata=_joint("compliance", 0.0, "rad"))
     # Current loop: time constant of the torque.
     current_time: Array = field(metadata=_joint("current_loop", 0.0, "s"))
-    # Torque against speed: no-load speed, and the share of it up to which the whole torque is there.
+    # Torque against speed: no-load speed, and the share of it up to which the torque limit is constant.
     no_load_speed: Array = field(metadata=_joint("torque_speed", np.inf, "rad/s"))
     corner: Array = field(metadata=_joint("torque_speed", 0.0, "1"))
     # Command link: constant delay; jitter (uniform up to this) and lost packets.
     delay: Array = field(metadata=_unit("delay", 0.0, "s"))
     jitter: Array = field(metadata=_unit("jitter", 0.0, "s"))
     drop: Array = field(metadata=_unit("jitter", 0.0, "1"))
-    # Supply: resistance of battery and leads, nominal voltage, and how much of the drive's gain follows the voltage.
+    # Supply: nominal voltage, resistance of battery and leads, and share of the gain that follows the voltage.
     supply_voltage: Array = field(metadata=_unit("supply", np.inf, "V"))
     supply_resistance: Array = field(metadata=_unit("supply", 0.0, "Ω"))
     supply_gain: Array = field(metadata=_unit("supply", 0.0, "1"))
-    # Cables along the joint: a weak spring about some angle.
+    # Cables along the joint: a weak spring about an angle.
     cable_stiffness: Array = field(metadata=_joint("cable", 0.0, "N·m/rad"))
     cable_angle: Array = field(metadata=_joint("cable", 0.0, "rad"))
     # Cogging: torque ripple over the joint angle.
@@ -85,27 +85,27 @@ class Physics:
     # Tilt: the base is not level.
     tilt_roll: Array = field(metadata=_unit("tilt", 0.0, "rad"))
     tilt_pitch: Array = field(metadata=_unit("tilt", 0.0, "rad"))
-    # Drag: friction that a cable bundle adds when the neighbouring joint has bent it away from an angle; at most.
+    # Drag: largest friction of a cable bundle that the neighbouring joint bends away from an angle.
     drag: Array = field(metadata=_joint("drag", 0.0, "N·m"))
     drag_angle: Array = field(metadata=_joint("drag", 0.0, "rad"))
-    # Churning: grease that resists with the square of the speed.
+    # Churning: resistance of grease with the square of the speed.
     churning: Array = field(metadata=_joint("churning", 0.0, "N·m·s²/rad²"))
-    # Limb current: gain lost per unit that a limb's torques, each over its limit, sum to beyond a budget.
+    # Limb current: loss of gain per unit of the sum of a chain's torques, each over its limit, beyond a budget.
     limb_loss: Array = field(metadata=_unit("limb_current", 0.0, "1"))
     limb_budget: Array = field(metadata=_unit("limb_current", 0.0, "1"))
-    # Derating: gain that the drive takes back per kelvin of its winding above 40 °C.
+    # Derating: loss of gain per kelvin of the winding above 40 °C.
     derating: Array = field(metadata=_joint("derating", 0.0, "1/K"))
-    # Firmware: targets are rounded, then smoothed, by a time that falls to half at a lag, and on.
+    # Firmware: targets are rounded, then smoothed; at `smoothing_lag` the time constant is half.
     target_step: Array = field(metadata=_unit("smoothing", 0.0, "rad"))
     smoothing: Array = field(metadata=_joint("smoothing", 0.0, "s"))
     smoothing_lag: Array = field(metadata=_unit("smoothing", 1.0, "rad"))
-    # Flex: how far the base leans for a moment of the moving links' weight, after a while.
+    # Flex: tilt of the base per moment of the moving links' weight, and its time constant.
     flex: Array = field(metadata=_unit("flex", 0.0, "rad/(N·m)"))
     flex_time: Array = field(metadata=_unit("flex", 0.1, "s"))
-    # Grip: the payload's centre beside where the hand should hold it.
+    # Grip: offset of the payload's centre from the nominal place in the hand.
     grip_x: Array = field(metadata=_unit("grip", 0.0, "m"))
     grip_z: Array = field(metadata=_unit("grip", 0.0, "m"))
-    # Links: mass over the published one, and centre of mass beside it.
+    # Links: mass over the published one, and offset of the centre of mass.
     mass_scale: Array = field(metadata=_joint("mass", 1.0, "1"))
     com_x: Array = field(metadata=_joint("mass", 0.0, "m"))
     com_y: Array = field(metadata=_joint("mass", 0.0, "m"))
@@ -120,10 +120,9 @@ class Physics:
     current_offset: Array = field(metadata=_joint("current_sensor", 0.0, "N·m"))
 
     def only(self, effects: tuple[str, ...] | list[str]) -> Physics:
-        """The same unit with all other effects switched off."""
-        for effect in effects:
-            if effect not in EFFECTS:
-                raise UsageError(f"effect '{effect}' is unknown; effects are {', '.join(EFFECTS)}")
+        """Return the unit with all other effects switched off."""
+        if unknown := sorted(set(effects) - set(EFFECTS)):
+            raise UsageError(f"effect '{unknown[0]}' is unknown; effects are {', '.join(EFFECTS)}")
         off = {
             f.name: np.full_like(getattr(self, f.name), f.metadata["neutral"])
             for f in fields(self)
@@ -132,10 +131,8 @@ class Physics:
         return replace(self, **off)
 
     def without(self, *effects: str) -> Physics:
-        """The same unit with these effects switched off."""
-        for effect in effects:
-            if effect not in EFFECTS:
-                raise UsageError(f"effect '{effect}' is unknown; effects are {', '.join(EFFECTS)}")
+        """Return the unit with these effects switched off."""
+        self.only(effects)  # raises an error for an unknown effect
         return self.only([e for e in EFFECTS if e not in effects])
 
 
@@ -143,13 +140,13 @@ EFFECTS: tuple[str, ...] = tuple(dict.fromkeys(f.metadata["effect"] for f in fie
 
 
 def neutral(n: int) -> Physics:
-    """No hidden physics at all: the nominal simulator, n joints."""
+    """Return the physics of the nominal simulator, without any effect, for n joints."""
     size = {"joint": (n,), "unit": (1,)}
     return Physics(**{f.name: np.full(size[f.metadata["scope"]], f.metadata["neutral"]) for f in fields(Physics)})
 
 
 def stack(units: list[Physics], columns: Array) -> Physics:
-    """One row per simulation, (N, len(columns)) or (N, 1); joints cut to `columns`."""
+    """Return one row per simulation, (N, len(columns)) or (N, 1), with the joints `columns`."""
     rows = {}
     for f in fields(Physics):
         table = np.stack([np.atleast_1d(getattr(u, f.name)) for u in units])

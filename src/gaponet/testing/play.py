@@ -1,4 +1,4 @@
-"""Play takes on virtual robots and record what their sensors report: takes in, Sequences out, nothing else."""
+"""Record takes on virtual robots: takes in, sequences of sensor readings out."""
 
 from __future__ import annotations
 
@@ -18,29 +18,32 @@ from gaponet.sysid.motion.motion import Motion
 from gaponet.sysid.motion.recipe import Recipe, Take
 from gaponet.testing.fleet import Fleet
 from gaponet.testing.physics import Physics
-from gaponet.testing.unit import UnitEvent, VirtualRobot
+from gaponet.testing.virtual_robot import UnitEvent, VirtualRobot
 
 Array = np.ndarray
 
 
 @dataclass(frozen=True)
 class Job:
-    """Takes to be recorded together, all at one rate. A take's result does not depend on its company."""
+    """Takes to be recorded together, all at one rate. The result of a take does not depend on the others.
+
+    Attributes:
+        files: Motions of the recipe's files.
+    """
 
     robot: RobotSpec
     fleet: Fleet
     recipe: Recipe
     files: tuple[Motion, ...]
-    """The motions of the recipe's files."""
     seed: int
     takes: tuple[Take, ...]
 
 
-_LIBRARIES: dict[tuple[str, int, float, tuple[str, ...]], Library] = {}  # of this process: what they found is kept
+_LIBRARIES: dict[tuple[str, int, float, tuple[str, ...]], Library] = {}  # of this process
 
 
 def library(robot: RobotSpec, seed: int, recipe: Recipe, files: tuple[Motion, ...]) -> Library:
-    """The motions that a recipe chooses from."""
+    """Return the motions that a recipe chooses from, made once per process."""
     key = (str(robot.mjcf), seed, max(recipe.payloads), recipe.files)
     if key not in _LIBRARIES:
         motions = Library(robot, seed, max(recipe.payloads))
@@ -54,23 +57,23 @@ def play(job: Job) -> list[Sequence]:
     """Record the takes of a job, in order."""
     source = library(job.robot, job.seed, job.recipe, job.files)
     motions = {name: source.make(name) for name in dict.fromkeys(t.motion for t in job.takes)}
-    locked = {name: _standing(job.robot, motion) for name, motion in motions.items()}
+    locked = {name: _resting_joints(job.robot, motion) for name, motion in motions.items()}
     done: dict[Take, Sequence] = {}
-    for limbs in dict.fromkeys(locked.values()):
-        group = [t for t in job.takes if locked[t.motion] == limbs]
+    for joints in dict.fromkeys(locked.values()):
+        group = [t for t in job.takes if locked[t.motion] == joints]
         group.sort(key=lambda t: -len(motions[t.motion].ctrl))
-        done |= zip(group, _together(job, group, motions, limbs), strict=True)
+        done |= zip(group, _record(job, group, motions, joints), strict=True)
     return [done[t] for t in job.takes]
 
 
-def _standing(robot: RobotSpec, motion: Motion) -> tuple[str, ...]:
-    """Joints of the limbs that are told to stand at home all the time."""
+def _resting_joints(robot: RobotSpec, motion: Motion) -> tuple[str, ...]:
+    """Return the joints of kinematic chains that stay at home during a motion."""
     away = np.abs(motion.ctrl - robot.qpos_home).max(axis=0) > 1e-9
     return idle_joints(robot, tuple(name for name, a in zip(robot.joint_names, away, strict=True) if a))
 
 
-def _together(job: Job, group: list[Take], motions: dict[str, Motion], locked: tuple[str, ...]) -> list[Sequence]:
-    """Record takes side by side, in order of falling length: those still running are always a prefix."""
+def _record(job: Job, group: list[Take], motions: dict[str, Motion], locked: tuple[str, ...]) -> list[Sequence]:
+    """Record takes in parallel, longest first, so that the running ones are always the first rows."""
     dt = 1.0 / group[0].rate
     ctrl = [motions[t.motion].sample(dt) for t in group]
     lengths, longest = np.array([len(c) for c in ctrl]), len(ctrl[0])
@@ -80,15 +83,15 @@ def _together(job: Job, group: list[Take], motions: dict[str, Motion], locked: t
     seeds = [t.seed(job.seed) for t in group]
     warmth = np.array([_warmth(job.fleet.unit(t.unit), s) for t, s in zip(group, seeds, strict=True)])
     robots.reset(targets[0], seeds, warmth)
-    seen = np.empty((4, *targets.shape), np.float32)
+    readings = np.empty((4, *targets.shape), np.float32)
     for t in range(longest):  # row t: the state at t·dt, then the command of [t·dt, (t+1)·dt)
         reading = robots.read()
-        seen[:, t] = reading.qpos, reading.qvel, reading.tau, reading.temperature
-        robots.step(targets[t], np.arange(int((lengths > t).sum())))
+        readings[:, t] = reading.qpos, reading.qvel, reading.tau, reading.temperature
+        robots.step(targets[t], rows=np.arange(int((lengths > t).sum())))
     models = {p: build_model(job.robot, *p, dt, bare=True) for p in dict.fromkeys(payloads)}
     sequences = []
     for i, (take, c) in enumerate(zip(group, ctrl, strict=True)):
-        qpos, qvel, tau, temperature = seen[:, : len(c), i]
+        qpos, qvel, tau, temperature = readings[:, : len(c), i]
         torque, qacc = equivalent_torque(models[payloads[i]], qpos, dt)
         notes = {
             "rate_hz": take.rate,
@@ -102,14 +105,14 @@ def _together(job: Job, group: list[Take], motions: dict[str, Motion], locked: t
 
 
 def _warmth(unit: Physics, seed: int) -> float:
-    """K above ambient at the start of a recording."""
-    drawn = np.random.default_rng([seed, 1]).standard_normal()
-    return max(0.0, float(unit.warmth[0] + unit.warmth_spread[0] * drawn))
+    """Return the temperature above ambient at the start of a recording, K."""
+    deviation = np.random.default_rng([seed, 1]).standard_normal()
+    return max(0.0, float(unit.warmth[0] + unit.warmth_spread[0] * deviation))
 
 
-def _events(seen: list[UnitEvent], end: float) -> list[dict[str, Any]]:
-    """Start, what happened, end: each with its time in the recording, s."""
-    middle = [{k: v for k, v in asdict(e).items() if v != ""} for e in seen if e.time < end]
+def _events(reported: list[UnitEvent], end: float) -> list[dict[str, Any]]:
+    """Return start, reported events and end, each with its time in the recording, s."""
+    middle = [{k: v for k, v in asdict(e).items() if v != ""} for e in reported if e.time < end]
     return [{"time": 0.0, "kind": "motion_start"}, *middle, {"time": round(end, 4), "kind": "motion_end"}]
 
 
@@ -131,7 +134,7 @@ def _meta(job: Job, take: Take, level: str, notes: dict[str, Any]) -> SequenceMe
 
 
 def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF) -> tuple[Array, Array]:
-    """What the nominal, payload-carrying model would have needed to move as recorded.
+    """Return the torque that the nominal model with the payload needs for a recorded motion.
 
     Args:
         model: Nominal simulator with the recording's payload (sim.model.build_model).
@@ -140,7 +143,7 @@ def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: flo
         cutoff: Cut-off of the zero-phase filter before differentiating, Hz.
 
     Returns:
-        Torque (T, n) N·m and the accelerations (T, n) rad/s² that it belongs to.
+        Torque (T, n) N·m, and the accelerations (T, n) rad/s² in it.
     """
     smooth = lowpass(qpos.astype(float), dt, cutoff)
     qvel = differentiate(smooth, dt)

@@ -1,7 +1,7 @@
-"""A VIRTUAL SO-101: servos that answer like STS3215, hidden physics behind them, on a pseudo-terminal in real time.
+"""A VIRTUAL SO-101: servos that answer like STS3215 with hidden physics, on a pseudo-terminal in real time.
 
-Registers that act: torque enable, goal, P (stiffness), position limits, torque limit. The others are kept and read
-back. Its calibration is the one that LeRobot would have written into the servos of an arm with the MJCF's limits.
+Registers with an effect: torque enable, goal, P (stiffness), position limits, torque limit. The others are only stored.
+The calibration is that of LeRobot for an arm with the limits of the MJCF.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from gaponet.testing.physics import Physics
 from gaponet.testing.virtual_driver import LiveUnit
 
 PERIOD = 0.005  # s between two steps of the physics
-BEHIND = 0.5  # s of arrears that are dropped: an interrupted process does not hurry afterwards
-CATCH_UP = 4  # steps
-FREE_DAMPING = 0.3  # N·m·s/rad that the gears brake with when the torque is off (assumed)
+MAX_LAG_S = 0.5  # behind real time; a longer lag, as of an interrupted process, is dropped
+MAX_CATCH_UP_STEPS = 4  # between two looks at the bus
+FREE_DAMPING = 0.3  # N·m·s/rad of the gears while the torque is off (assumed)
 
 
 class VirtualSO101:
-    """The servos' side of the bus; `port` is what a driver opens."""
+    """The servos on the bus; a driver opens `port`."""
 
     def __init__(
         self,
@@ -52,10 +52,10 @@ class VirtualSO101:
         """
         Args:
             payload: kg, and mount.
-            link: Another name for the port, a symbolic link; replaced if it is one.
-            frame: s that pass with every goal position; default: real time passes.
+            link: Symbolic link to the port; an existing link is replaced.
+            frame: Simulated time per goal position, s; default: real time.
         """
-        robot = replace(robot, table=robot.table or Table(height=0.0))  # on which it rests while its torque is off
+        robot = replace(robot, table=robot.table or Table(height=0.0))  # the arm rests on it while its torque is off
         self.robot, self._frame = robot, None if frame is None else round(frame / PERIOD)
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
         self._order = robot.index(JOINTS)  # servo number − 1 → joint
@@ -77,29 +77,29 @@ class VirtualSO101:
                 (reg.P, 32), (reg.D, 32), (reg.PROTECTION_CURRENT, 500), (reg.PRESENT_VOLTAGE, 120),
             ):  # fmt: skip
                 _put(memory, register, value)
-        self.deaf: set[int] = set()  # servos that do not answer
+        self.silent: set[int] = set()  # servos that do not answer
         self.damaged = False  # replies have a wrong checksum
         self.status = [0] * len(JOINTS)  # error bits in replies
-        self._buffer = self._said = b""
+        self._buffer = self._replies = b""
         self._apply()
 
     @no_garbage_collection()
     def run(self, seconds: float = np.inf) -> None:
-        """Live and answer in real time."""
+        """Simulate and answer in real time."""
         began = time.monotonic()
         start = began - self.live.steps * PERIOD
         while time.monotonic() - began < seconds:
             due = start + self.live.steps * PERIOD
-            wait = min(max(0.0, due - time.monotonic()), PERIOD) if self._frame is None else BEHIND
+            wait = min(max(0.0, due - time.monotonic()), PERIOD) if self._frame is None else MAX_LAG_S
             readable, _, _ = select.select([self._master], [], [], wait)
             if readable:
-                os.write(self._master, self.hear(os.read(self._master, 4096)))
+                os.write(self._master, self.receive(os.read(self._master, 4096)))
             if self._frame is not None:
                 continue
             now = time.monotonic()
-            if now - due > BEHIND:
+            if now - due > MAX_LAG_S:
                 start += now - due
-            for _ in range(CATCH_UP):  # then look at the bus again, however far behind
+            for _ in range(MAX_CATCH_UP_STEPS):
                 if start + self.live.steps * PERIOD <= time.monotonic():
                     self.live.step()
 
@@ -109,22 +109,22 @@ class VirtualSO101:
         if self._link is not None and self._link.is_symlink():
             self._link.unlink()
 
-    def hear(self, data: bytes) -> bytes:
-        """What the bus carries to the servos; returns what they answer."""
-        self._buffer, self._said = self._buffer + data, b""
+    def receive(self, data: bytes) -> bytes:
+        """Handle bytes from the bus and return the replies."""
+        self._buffer, self._replies = self._buffer + data, b""
         while (start := self._buffer.find(b"\xff\xff")) >= 0:
             packet = self._buffer[start:]
             if len(packet) < 4 or len(packet) < 4 + packet[3]:
                 self._buffer = packet
-                return self._said
+                return self._replies
             end = 4 + packet[3]
             body, self._buffer = packet[2:end], packet[end:]
             if reg.checksum(body[:-1]) == body[-1]:
-                self._do(body[0], body[2], body[3:-1])
+                self._execute(body[0], body[2], body[3:-1])
         self._buffer = self._buffer[-1:] if self._buffer.endswith(b"\xff") else b""
-        return self._said
+        return self._replies
 
-    def _do(self, servo: int, instruction: int, parameters: bytes) -> None:
+    def _execute(self, servo: int, instruction: int, parameters: bytes) -> None:
         if instruction == reg.PING:
             self._answer(servo, b"")
         elif instruction == reg.READ:
@@ -148,10 +148,10 @@ class VirtualSO101:
                 self.live.step()
 
     def _answer(self, servo: int, data: bytes) -> None:
-        if not 1 <= servo <= len(JOINTS) or servo in self.deaf:
+        if not 1 <= servo <= len(JOINTS) or servo in self.silent:
             return
         reply = reg.packet(servo, self.status[servo - 1], data)
-        self._said += reply[:-1] + bytes([reply[-1] ^ self.damaged])
+        self._replies += reply[:-1] + bytes([reply[-1] ^ self.damaged])
 
     def _bytes(self, servo: int, address: int, size: int) -> bytes:
         return bytes(self.memory[servo - 1][address : address + size]) if 1 <= servo <= len(JOINTS) else b""
@@ -161,10 +161,12 @@ class VirtualSO101:
             self.memory[servo - 1][address : address + len(data)] = data
 
     def _refresh(self) -> None:
-        """Readings into the registers."""
+        """Write readings into the registers."""
         order = self._order
         qpos, qvel, tau, temperature = self.live.read()
-        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[order]  # unlimited
+        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[
+            order
+        ]  # also beyond the limits
         share = (tau / self.robot.effort_limit)[order]
         values = {
             reg.PRESENT_POSITION: np.clip(steps, 0, STEPS_PER_TURN - 1),
@@ -178,7 +180,7 @@ class VirtualSO101:
                 _put(memory, register, int(value))
 
     def _apply(self) -> None:
-        """Registers into targets, gains and torque limits."""
+        """Set targets, gains and torque limits from the registers."""
         kp, kd, effort = self.robot.kp.copy(), self.robot.kd.copy(), self.robot.effort_limit.copy()
         goals = self.calibration.steps(self.live.ctrl)
         for joint, memory in zip(self._order, self.memory, strict=True):
@@ -195,7 +197,7 @@ class VirtualSO101:
 
 
 def _as_calibrated(robot: RobotSpec) -> dict[str, ServoRow]:
-    """What LeRobot's calibration finds on an arm whose joints stop where the MJCF's do."""
+    """Return LeRobot's calibration of an arm with the joint limits of the MJCF."""
     rows = {}
     for number, joint in enumerate(JOINTS, 1):
         low, high = robot.qpos_range[robot.index([joint])[0]]

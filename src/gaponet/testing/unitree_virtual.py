@@ -1,8 +1,8 @@
 """A VIRTUAL H1-2 behind the real DDS topics: hidden physics in real time, LowState out, arm_sdk and lowcmd in.
 
-It holds its home posture until somebody speaks, hands its arms over by the weight of rt/arm_sdk, obeys the gains that
-it is sent, ignores messages with a wrong checksum, and keeps the last command when commands cease: the worst a robot
-can do. It can also be told to fail, for rehearsing what a controller does then.
+It holds its home posture until the first command, hands its arms over by the weight of rt/arm_sdk, uses the gains in
+the commands, and ignores messages with a wrong checksum. When commands stop it keeps the last one, which is the worst
+case. It can also simulate faults, to test the reaction of a controller.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ FaultKind = Literal[
     "encoder", "motor", "remote", "fall", "machine",
 ]  # fmt: skip
 
-LATE = 0.3  # s by which messages of the fault "late" are held back
-CLOCK_STEP = 10.0  # s by which the robot's clock is ahead while the fault "clock" holds
-ARMS = 12  # motors from here on belong to rt/arm_sdk
+LATE_S = 0.3  # delay of messages in the fault "late"
+CLOCK_STEP_S = 10.0  # by which the robot's clock is ahead in the fault "clock"
+FIRST_ARM_MOTOR = 12  # rt/arm_sdk commands this motor and all after it
 
 
 @dataclass
-class Heard:
-    """What arrived: time (s), topic, targets, gains, weight, and where the joints were; (n) in motor order."""
+class CommandLog:
+    """Received commands: time (s), topic, targets, gains, weight, and joint states then; (n) in motor order."""
 
     time: list[float] = field(default_factory=list)
     topic: list[str] = field(default_factory=list)
@@ -48,13 +48,13 @@ class Heard:
     qvel: list[Array] = field(default_factory=list)
 
     def save(self, path: Path) -> None:
-        """Write what was heard as npz."""
+        """Write the log as npz."""
         with atomic_write(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **{name: np.array(values) for name, values in vars(self).items()})  # type: ignore[arg-type]
 
 
 class VirtualH12:
-    """The robot's side of the bus."""
+    """The robot on the bus."""
 
     def __init__(
         self,
@@ -83,29 +83,29 @@ class VirtualH12:
         self._writer = bus.writer("rt/lowstate", dds.LowState)
         self._readers = {name: bus.reader(f"rt/{name}", dds.LowCmd) for name in ("arm_sdk", "lowcmd")}
         self.live = LiveUnit(robot, physics, payload, seed=seed, period=1.0 / rate)
-        self.clock, self.heard = MonotonicClock(), Heard()
+        self.clock, self.heard = MonotonicClock(), CommandLog()
         self.first_command: float | None = None
         self.refused = self.missed = 0
         self._message = hg.LowState.new()
         hg.LowState.view(self._message, "reserve")[0] = VIRTUAL_MARK
-        self.machine = 6  # what an H1-2 is said to be; no document of Unitree's names it
-        self._held: deque[tuple[float, Array]] = deque()
+        self.machine = 6  # mode_machine of an H1-2, by reports; no document of Unitree states it
+        self._delayed: deque[tuple[float, Array]] = deque()
         self._frozen: tuple[Array, ...] | None = None
 
     @no_garbage_collection()
     def run(self, seconds: float = np.inf) -> None:
-        """Live in real time, until interrupted."""
+        """Simulate in real time, until interrupted."""
         start, k = self.clock.now(), 0
         while (passed := k / self.rate) < seconds:
             now = self.clock.wait_until(start + passed)
-            self._obey(now)
+            self._receive(now)
             self.live.step()
-            self._speak(k, now)
+            self._send_state(k, now)
             behind = int((self.clock.now() - start) * self.rate) - k
             self.missed += max(behind - 1, 0)
             k += max(1, behind)
 
-    def _obey(self, now: float) -> None:
+    def _receive(self, now: float) -> None:
         for topic, reader in self._readers.items():
             for data in reader.receive():
                 if len(data) != hg.LowCmd.wire_size or not hg.LowCmd.intact(data):
@@ -121,10 +121,10 @@ class VirtualH12:
             self.refused += 1
             return
         weight = 1.0 if topic == "lowcmd" else float(np.clip(q[WEIGHT_MOTOR], 0.0, 1.0))
-        self._note(topic, q, kp, kd, mode, weight, now)
+        self._log(topic, q, kp, kd, mode, weight, now)
         robot, motors = self.robot, len(MOTOR_NAMES)
         share = np.zeros(motors)
-        share[0 if topic == "lowcmd" else ARMS :] = weight
+        share[0 if topic == "lowcmd" else FIRST_ARM_MOTOR :] = weight
         enabled = (mode[:motors] == 1) | (topic == "arm_sdk")
         gains, dampers, torque = robot.kp.copy(), robot.kd.copy(), np.zeros_like(robot.kp)
         forward = tau[:motors] + kd[:motors] * dq[:motors]
@@ -137,18 +137,18 @@ class VirtualH12:
             out[self._order] = (1 - share) * mine[self._order] + share * theirs
         self.live.set_gains(gains, dampers, torque=torque)
 
-    def _note(self, topic: str, q: Array, kp: Array, kd: Array, mode: Array, weight: float, now: float) -> None:
+    def _log(self, topic: str, q: Array, kp: Array, kd: Array, mode: Array, weight: float, now: float) -> None:
         qpos, qvel, *_ = self.live.read()
-        heard, motors = self.heard, len(MOTOR_NAMES)
-        heard.time.append(now)
-        heard.topic.append(topic)
-        heard.weight.append(weight)
-        for log, values in ((heard.ctrl, q), (heard.kp, kp), (heard.kd, kd), (heard.mode, mode)):
-            log.append(values[:motors])
-        heard.qpos.append(qpos[self._order])
-        heard.qvel.append(qvel[self._order])
+        log, motors = self.heard, len(MOTOR_NAMES)
+        log.time.append(now)
+        log.topic.append(topic)
+        log.weight.append(weight)
+        for column, values in ((log.ctrl, q), (log.kp, kp), (log.kd, kd), (log.mode, mode)):
+            column.append(values[:motors])
+        log.qpos.append(qpos[self._order])
+        log.qvel.append(qvel[self._order])
 
-    def _speak(self, k: int, now: float) -> None:
+    def _send_state(self, k: int, now: float) -> None:
         wrong = self.first_command is not None and now - self.first_command >= self.fault_at
         fault = self.fault if wrong else "none"
         if fault == "stop":
@@ -156,9 +156,9 @@ class VirtualH12:
         readings = self._readings(fault)
         message, data = hg.LowState, self._message
         if fault != "repeat":
-            ahead = CLOCK_STEP if fault == "clock" else 0.0
+            ahead = CLOCK_STEP_S if fault == "clock" else 0.0
             message.view(data, "tick")[0] = round(1000 * (k / self.rate + ahead)) % 2**32
-        self._tell(fault)
+        self._set_status(fault)
         for name, values in zip(("q", "dq", "tau_est", "temperature"), readings, strict=True):
             column = np.zeros((hg.MOTORS, 2) if name == "temperature" else hg.MOTORS)
             column[: len(MOTOR_NAMES)] = values[self._order, None] if name == "temperature" else values[self._order]
@@ -166,14 +166,14 @@ class VirtualH12:
         message.seal(data)
         if fault == "checksum":
             message.view(data, "crc")[0] ^= 1
-        self._held.append((now + (LATE if fault == "late" else 0.0), data.copy()))
-        while self._held and self._held[0][0] <= now:
-            self._writer.send(self._held.popleft()[1])
+        self._delayed.append((now + (LATE_S if fault == "late" else 0.0), data.copy()))
+        while self._delayed and self._delayed[0][0] <= now:
+            self._writer.send(self._delayed.popleft()[1])
 
-    def _tell(self, fault: str) -> None:
-        """What the robot says about itself, honest or not."""
+    def _set_status(self, fault: str) -> None:
+        """Set the status fields of the message, with a fault."""
         message, data = hg.LowState, self._message
-        half = 0.5 if fault == "fall" else 0.0  # half the angle by which it leans forward
+        half = 0.5 if fault == "fall" else 0.0  # half of the angle by which it leans forward
         message.view(data, "imu_state.quaternion")[:] = (np.cos(half), 0.0, np.sin(half), 0.0)
         message.view(data, "wireless_remote")[2:4] = (0x20, 0x02) if fault == "remote" else 0  # L2 + B
         message.view(data, "mode_machine")[0] = 5 if fault == "machine" else self.machine
@@ -182,7 +182,7 @@ class VirtualH12:
         message.set_motors(data, "motorstate", errors)
 
     def _readings(self, fault: str) -> tuple[Array, ...]:
-        """qpos, qvel, tau, temperature (n), honest or not."""
+        """Return qpos, qvel, tau, temperature, (n) each, with a fault."""
         if fault in ("freeze", "repeat") and self._frozen is not None:
             return self._frozen
         qpos, qvel, tau, temperature = (values.copy() for values in self.live.read())

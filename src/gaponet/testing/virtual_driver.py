@@ -1,4 +1,4 @@
-"""VirtualDriver: a virtual robot in this process, in real time or as fast as the loop asks."""
+"""VirtualDriver: a virtual robot in this process, in real time or as fast as the control loop runs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from gaponet.hw.control.driver import DriverError, EndAction, State
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
 from gaponet.testing.physics import Physics
-from gaponet.testing.unit import VirtualRobot
+from gaponet.testing.virtual_robot import VirtualRobot
 
-STATE_PERIOD = 0.002  # s: a virtual robot speaks at 500 Hz, as the H1-2 does
-DAMPING = 4.0  # times the robot's kd while damping; see drivers.unitree
-LAG = 0.5  # s of real time that it may be behind before it gives up
+STATE_PERIOD_S = 0.002  # 500 Hz, as the H1-2
+DAMPING_FACTOR = 4.0  # of the robot's kd while damping; see drivers.unitree
+MAX_LAG_S = 0.5  # behind real time
 
 
 class LiveUnit:
-    """One virtual unit stepped in equal periods: what every virtual bus is built on. Knows no clock."""
+    """One virtual unit, stepped in equal periods without a clock; base of every virtual bus and driver."""
 
     def __init__(
         self,
@@ -29,42 +29,48 @@ class LiveUnit:
         physics: Physics,
         payload: tuple[float, str],
         seed: int = 0,
-        period: float = STATE_PERIOD,
+        period: float = STATE_PERIOD_S,
     ) -> None:
         """
         Args:
             payload: kg per hand, and side.
-            period: Between two states, s.
+            period: Time between two states, s.
         """
         self.robot, self.period = robot, period
         locked = idle_joints(robot, robot.operated) if len(robot.operated) < len(robot.joint_names) else ()
         self.unit = VirtualRobot(robot, [physics], [payload], dt=period, locked=locked)
         self.ctrl = robot.qpos_home.copy()
         self.unit.reset(self.ctrl[None], [seed])
-        self._law = np.array([robot.kp, robot.kd, robot.effort_limit, np.zeros_like(robot.kp)])
+        self._gains = np.array([robot.kp, robot.kd, robot.effort_limit, np.zeros_like(robot.kp)])
         self.steps = 0
 
     def set_gains(self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0) -> None:
-        """N·m/rad, N·m·s/rad, torque limits (default the robot's) and added torque in N·m, if they are not in force."""
+        """Set gains, if they change.
+
+        Args:
+            kp, kd: N·m/rad, N·m·s/rad.
+            effort: Torque limits, N·m; default the robot's.
+            torque: Added torque, N·m.
+        """
         limit = self.robot.effort_limit if effort is None else effort
-        law = np.array([kp, kd, limit, np.broadcast_to(torque, len(kp))], float)
-        if not np.array_equal(law, self._law):
-            self._law = law
-            self.unit.set_gains(*law)
+        gains = np.array([kp, kd, limit, np.broadcast_to(torque, len(kp))], float)
+        if not np.array_equal(gains, self._gains):
+            self._gains = gains
+            self.unit.set_gains(*gains)
 
     def step(self) -> None:
-        """Let one period pass under the present command and gains."""
+        """Simulate one period under the present command and gains."""
         self.unit.step(self.ctrl[None])
         self.steps += 1
 
     def read(self) -> tuple[Array, Array, Array, Array]:
-        """qpos, qvel, tau, temperature as the sensors say, (n) each."""
+        """Return the readings of the sensors: qpos, qvel, tau, temperature, (n) each."""
         reading = self.unit.read()
         return reading.qpos[0], reading.qvel[0], reading.tau[0], reading.temperature[0]
 
 
 class VirtualDriver:
-    """A `Driver` whose robot lives in this process and ages with the controller's clock."""
+    """A `Driver` of a virtual robot in this process; its time is the controller's clock."""
 
     virtual = True
     noisy = True
@@ -81,14 +87,14 @@ class VirtualDriver:
         payload: tuple[float, str] = (0.0, "both"),
         name: str = "unit",
         seed: int = 0,
-        period: float = STATE_PERIOD,
+        period: float = STATE_PERIOD_S,
     ) -> None:
         """
         Args:
-            physics: Hidden parameters (virtual.fleet).
-            clock: The controller's.
+            physics: Hidden parameters (testing.fleet).
+            clock: Clock of the controller.
             payload: kg per hand, and side.
-            period: Between two states, s.
+            period: Time between two states, s.
         """
         robot = robot.nominal or robot  # the hidden physics replaces what was identified
         self.kp, self.kd = robot.kp, robot.kd
@@ -103,42 +109,42 @@ class VirtualDriver:
     def connect(self) -> None:
         self.live = LiveUnit(*self._given)
         self._begun = self.clock.now()
-        self._state = self._sense()
+        self._state = self._measure()
 
     def read(self) -> State:
-        """Let it live until now."""
+        """Simulate until now and return the state."""
         due = int((self.clock.now() - self._begun) / self.period + 1e-6)
-        if (due - self.live.steps) * self.period > LAG:
+        if (due - self.live.steps) * self.period > MAX_LAG_S:
             raise DriverError(f"{self.address}: this machine cannot simulate it in real time; run without real time")
         if due > self.live.steps:
             while self.live.steps < due:
                 self.live.step()
-            self._state = self._sense()
+            self._state = self._measure()
         return self._state
 
-    def _sense(self) -> State:
+    def _measure(self) -> State:
         return State(self._begun + self.live.steps * self.period, *self.live.read())
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
-        """Takes effect after the unit's own command delay."""
+        """Send a command; it takes effect after the unit's own delay."""
         self.live.set_gains(self.kp, self.kd)
         self.live.ctrl[self._at] = ctrl[self._at]
 
     def verify(self) -> None:
-        """It does what it is told."""
+        """Do nothing: a virtual robot always has the right settings."""
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
         """Stiffness zero, damping four times the robot's, on the commanded joints."""
         kp, kd = self.kp.copy(), self.kd.copy()
-        kp[self._at], kd[self._at] = 0.0, DAMPING * kd[self._at]
+        kp[self._at], kd[self._at] = 0.0, DAMPING_FACTOR * kd[self._at]
         self.live.set_gains(kp, kd)
 
     def confirm(self) -> str:
         return "damped and let go"
 
     def close(self, hold: bool = False) -> None:
-        """Nothing is left: the robot ends with the process."""
+        """Do nothing: the robot ends with the process."""
 
     def watchdog(self) -> None:
-        """It dies with the controller's process."""
+        """Return None: the robot ends with the controller's process."""
         return None

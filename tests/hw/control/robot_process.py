@@ -42,7 +42,7 @@ class RobotProcess:
 def main(domain: int) -> None:
     from gaponet.robot.spec import load_robot
     from gaponet.testing.fleet import load_fleet
-    from gaponet.testing.unitree_virtual import Heard, VirtualH12
+    from gaponet.testing.unitree_virtual import CommandLog, VirtualH12
 
     robot = load_robot("h1_2")
     served = VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE)
@@ -56,7 +56,7 @@ def main(domain: int) -> None:
             served.machine = int(rest)
         if word == "clear":
             time.sleep(0.2)  # what the last controller sent is still on its way
-            served.fault, served.machine, served.heard, served.refused = "none", 6, Heard(), 0
+            served.fault, served.machine, served.heard, served.refused = "none", 6, CommandLog(), 0
         if word == "heard":
             heard = served.heard
             k = len(heard.time)

@@ -76,7 +76,7 @@ class Bus:
         if wrong and not self.done:
             self.done = True
             self._go_wrong()
-        out = self.arm.hear(data if not wrong or self.way != "ignores" or data[4] == reg.SYNC_READ else b"")
+        out = self.arm.receive(data if not wrong or self.way != "ignores" or data[4] == reg.SYNC_READ else b"")
         if wrong and self.way == "crossed" and data[4] == reg.SYNC_WRITE and data[5] == reg.GOAL_POSITION.address:
             elbow, roll = (bytes(self.arm.memory[servo - 1][42:44]) for servo in (ELBOW, ROLL))
             self.arm.memory[ELBOW - 1][42:44], self.arm.memory[ROLL - 1][42:44] = roll, elbow
@@ -103,7 +103,7 @@ class Bus:
         elif self.way == "hot":
             self.arm.status[2] = 1 << 2
         elif self.way == "silent":
-            self.arm.deaf = {4}
+            self.arm.silent = {4}
         self.arm._apply()
 
     def read(self, size: int = 1) -> bytes:
@@ -283,7 +283,7 @@ def test_an_adapter_that_echoes_is_understood(so101, clock, bus):
 
 def test_a_lost_packet_is_no_disobedience(so101, clock, bus):
     """Every seventh packet that writes gets lost, the first among them."""
-    heard, hear = [0], bus.arm.hear
+    heard, hear = [0], bus.arm.receive
 
     def lossy(data: bytes) -> bytes:
         if data and data[4] == reg.SYNC_WRITE:
@@ -291,7 +291,7 @@ def test_a_lost_packet_is_no_disobedience(so101, clock, bus):
             data = b"" if heard[0] % 7 in (1, 2) else data
         return hear(data)
 
-    bus.arm.hear = lossy
+    bus.arm.receive = lossy
     assert play(so101, clock).fault is None
 
 

@@ -394,7 +394,7 @@ class Alive(Wire):
 
     def answer(self, data: bytes) -> bytes:
         self.arm.live.step()
-        return self.arm.hear(data)
+        return self.arm.receive(data)
 
 
 @pytest.fixture
@@ -475,7 +475,7 @@ def test_it_speaks_over_a_pseudo_terminal_in_another_thread(so101, arm):
 
 def test_a_bus_on_which_frames_pass_stands_still_until_a_goal_is_written(so101):
     arm = VirtualSO101(so101, load_fleet("easy", so101).unit("virtual-1"), frame=0.04)
-    bus = reg.ServoBus(Wire(SimpleNamespace(answer=arm.hear)), SILENCE)  # type: ignore[arg-type]
+    bus = reg.ServoBus(Wire(SimpleNamespace(answer=arm.receive)), SILENCE)  # type: ignore[arg-type]
     try:
         before = bus.sync_read([1, 2], reg.RUNNING)
         assert arm.live.steps == 0

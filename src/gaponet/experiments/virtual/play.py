@@ -16,7 +16,7 @@ from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
 from gaponet.testing.physics import Physics
-from gaponet.testing.unit import VirtualRobot
+from gaponet.testing.virtual_robot import VirtualRobot
 
 PLANNED = CompensatorConfig(dynamics=True)  # targets of planned motions are smooth
 START_WARMING_K = 12.0  # above ambient: a robot that has been working (testing/play.py)

@@ -21,7 +21,7 @@ from gaponet.experiments.virtual.play import Progress
 from gaponet.experiments.virtual.trained_models import TrainedModel, load_trained
 from gaponet.report.provenance import describe_provenance
 from gaponet.robot.spec import RobotSpec
-from gaponet.testing.collect import fleet_of
+from gaponet.testing.collect import fleet_name
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.physics import Physics
 
@@ -95,7 +95,7 @@ class Session:
     @property
     def fleet(self) -> str:
         """Name or file of the fleet."""
-        return self.experiment.fleet or fleet_of(self.data)
+        return self.experiment.fleet or fleet_name(self.data)
 
     @cached_property
     def trained_units(self) -> set[str]:

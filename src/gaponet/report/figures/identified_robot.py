@@ -129,7 +129,7 @@ def _rollout(rollout: Any, joints: ListOf[str]) -> Figure:
     fig = figure(7.0, 1.0 + 1.1 * len(joints))
     axes = np.atleast_1d(fig.subplots(len(joints), sharex=True))
     for j, (ax, joint) in enumerate(zip(axes, joints, strict=True)):
-        low, high = (rollout.robot[:, j] + sign * rollout.half[:, j] for sign in (-1, 1))
+        low, high = (rollout.robot[:, j] + sign * rollout.half_width[:, j] for sign in (-1, 1))
         ax.fill_between(time, low, high, color=colour("identified"), alpha=0.25, lw=0, label="its band")
         ax.plot(time, rollout.robot[:, j], color=colour("identified"), label="robot would do")
         ax.plot(time, rollout.rollout[:, j], color=colour("nominal"), label="simulator did")
