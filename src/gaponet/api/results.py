@@ -18,7 +18,7 @@ from gaponet.base.arrays import Array
 if TYPE_CHECKING:
     from gaponet.data.offsets import UnitOffsets
     from gaponet.data.store import Dataset, Entry
-    from gaponet.export.rollout import Prediction
+    from gaponet.export.rollout import RolloutPrediction
     from gaponet.nn.artifact import GapModel
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.finding import Finding
@@ -364,7 +364,7 @@ class ReplayResult:
     robot: RobotSpec
     joints: Mapping[str, Mapping[str, Any]]
     differ: tuple[str, ...]
-    rollouts: tuple[Prediction, ...] = field(repr=False)
+    rollouts: tuple[RolloutPrediction, ...] = field(repr=False)
     share: float
     drawn: int
     band_from_recordings: bool

@@ -80,7 +80,7 @@ def fit_plain_servos(
     Args:
         robot: Identified; its table, zeros and stops are kept. Returned as it is if it has no servo model.
         recordings: Motions that it was fitted to, or its own (`own_motions`).
-        progress: As of `identify`.
+        progress: Called with done, total and a note, as by `identify`.
     """
     if not robot.has_servo_model:
         return robot

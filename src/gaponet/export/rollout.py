@@ -20,7 +20,7 @@ SAMPLED_ROBOTS = 16
 
 
 @dataclass(frozen=True)
-class Prediction:
+class RolloutPrediction:
     """One rollout, (T, n) rad over the operated joints.
 
     Attributes:
@@ -71,7 +71,7 @@ def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:
 
 def predict(
     robot: RobotSpec, rollouts: ListOf[Sequence], error: Array, sampled: ListOf[RobotSpec] = ()
-) -> list[Prediction]:
+) -> list[RolloutPrediction]:
     """Play the targets of rollouts on the robot from their first states.
 
     Args:
@@ -90,12 +90,12 @@ def predict(
             for k, q in enumerate(played)
         ]
     return [
-        Prediction(s.meta.motion, s.dt, s.ctrl[:, op], s.qpos[:, op], q, np.sqrt(error**2 + std**2))
+        RolloutPrediction(s.meta.motion, s.dt, s.ctrl[:, op], s.qpos[:, op], q, np.sqrt(error**2 + std**2))
         for s, q, std in zip(rollouts, played, spread, strict=True)
     ]
 
 
-def summary(predictions: ListOf[Prediction], joints: ListOf[str]) -> dict[str, dict[str, Any]]:
+def summary(predictions: ListOf[RolloutPrediction], joints: ListOf[str]) -> dict[str, dict[str, Any]]:
     """Return mean and largest differences of each joint over all rollouts, rad and shares of time."""
 
     def rows(values: Any) -> Array:

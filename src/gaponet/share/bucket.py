@@ -34,7 +34,8 @@ from gaponet.share.remote import (
 MODULES = {"s3": "s3fs", "gs": "gcsfs", "file": "fsspec"}  # scheme → library
 OBJECTS = "sha256"
 TRANSFERS = 8  # at a time
-SERVER_TIMEOUT_S = 11  # for the next byte; s3fs makes 10 attempts and gcsfs 6 with longer pauses: 2 minutes
+SERVER_TIMEOUT_S = {"s3": 28, "gs": 12}  # for the first byte of an answer, per attempt: two minutes in all
+S3_ATTEMPTS = 2  # of s3fs, each with two attempts of botocore; gcsfs makes six attempts with pauses
 MIN_PRUNE_AGE_S = 24 * 3600  # a younger object may belong to a push that is running
 
 
@@ -59,6 +60,8 @@ class Bucket:
             self.fs, self.root = fsspec.url_to_fs(
                 address.rstrip("/"), use_listings_cache=False, **_options(self.scheme)
             )
+        if self.scheme == "s3":
+            self.fs.retries = S3_ATTEMPTS
         self._index_path = f"{self.root}/{INDEX}"
         self._index: bytes | None = None  # as read last
         self._index_info: dict[str, Any] = {}
@@ -195,12 +198,14 @@ def _options(scheme: str) -> dict[str, Any]:
     if scheme == "file":
         return {"auto_mkdir": True}
     if scheme == "s3":
-        timeouts = {"connect_timeout": SERVER_TIMEOUT_S, "read_timeout": SERVER_TIMEOUT_S}
+        timeouts = dict.fromkeys(("connect_timeout", "read_timeout"), SERVER_TIMEOUT_S[scheme])
         return {"config_kwargs": timeouts | {"retries": {"max_attempts": 1}}}
     from aiohttp import ClientTimeout
 
     logging.getLogger(MODULES[scheme]).addHandler(logging.NullHandler())  # gcsfs logs what it raises, too
-    return {"requests_timeout": ClientTimeout(sock_connect=SERVER_TIMEOUT_S, sock_read=SERVER_TIMEOUT_S)}
+    return {
+        "requests_timeout": ClientTimeout(sock_connect=SERVER_TIMEOUT_S[scheme], sock_read=SERVER_TIMEOUT_S[scheme])
+    }
 
 
 def _digests(index: bytes | None) -> set[str]:

@@ -32,7 +32,7 @@ from gaponet.sysid.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.testing.fleet import Fleet
 from gaponet.testing.play import Job, library, play
 
-__all__ = ["CollectResult", "Recipe", "collect", "load_recipe"]
+__all__ = ["Collection", "Recipe", "collect", "load_recipe"]
 
 COLLECT_FILE = "collect.json"  # fleet, seed and payloads of a collected dataset
 DEFAULT_FLEET = "hard"
@@ -40,7 +40,7 @@ TAKES_PER_JOB = (36, 144)  # least and most; more lose more when killed, fewer s
 
 
 @dataclass(frozen=True)
-class CollectResult:
+class Collection:
     """Result of a collection.
 
     Attributes:
@@ -72,7 +72,7 @@ def collect(
     progress: Progress = no_progress,
     twins: bool = True,
     executor: str | Executor = LOCAL,
-) -> CollectResult:
+) -> Collection:
     """Record every take of a recipe that the dataset at `out` lacks, with the gains of the fleet.
 
     Args:
@@ -117,7 +117,7 @@ def collect(
             written += 1
             seconds += sequence.duration
             progress(written, len(missing), f"{written} of {len(missing)}, {seconds / 3600:.2f} h recorded")
-    return CollectResult(str(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start)
+    return Collection(str(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start)
 
 
 def fleet_name(dataset: Dataset) -> str:
