@@ -1,8 +1,7 @@
-"""Compensation over a real DDS bus, as a user would run it: python benchmarks/compensate_dds.py RUN
+"""Compensation of a VIRTUAL H1-2 over a real DDS bus, by commands: python benchmarks/compensate_dds.py RUN
 
-For each of two runs, without and with the model, a VIRTUAL H1-2 is served anew in a process of its own and
-`gaponet run --driver unitree` plays the motion on it in another, watchdog included. RUN: a run of gaponet train on
-virtual units other than this one.
+One process serves the robot, and `gaponet run --driver unitree` plays the motion on it in another, with the watchdog:
+once without and once with the model. RUN: a run of gaponet train on other virtual units.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ def main(
 
     Args:
         run: Folder of gaponet train.
-        motions: Names; variants 0 and 1 are in the packaged recipes, so others were not trained on.
-        unit: Of the fleet `hard`.
-        payload_mass: kg in each hand.
+        motions: Names of motions; the packaged recipes contain variants 0 and 1 only.
+        unit: Unit of the fleet `hard`.
+        payload_mass: Payload in each hand, kg.
         state_rate: States per second.
         domain: DDS domain.
     """
@@ -57,13 +56,13 @@ def main(
 
 
 def play(domain: int, served: list[str], options: list[str]) -> dict[str, Any]:
-    """Serve a robot, run the motion, and give what gaponet run says."""
+    """Serve a robot, run the motion, and return the result of gaponet run."""
     bus = ["--domain", str(domain)]
     command = [*GAPONET, "virtual", "serve", "--robot", "h1_2", *bus, *served]
     robot = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert robot.stdout is not None
-        robot.stdout.readline()  # it says when it is there
+        robot.stdout.readline()  # printed when the robot is ready
         command = [*GAPONET, "run", "--driver", "unitree", *bus, "--yes", "--json", *options]
         said = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     finally:

@@ -1,12 +1,12 @@
-"""An identified robot in other people's engines: what its exports leave there, beside what it leaves here.
+"""Errors of an identified robot in other physics engines, beside those in gaponet: docs/results/engines.md.
 
     make engines                                         # once: environments of their own in ~/.cache/gaponet
     python benchmarks/engines.py ROBOT WORK [--data DATASET] [--test]
 
-Exports the robot for each engine, once fitted without its law, and runs the check.py
-beside each export in that engine's environment, without gaponet. Prints a row per engine: mean |error| on the
-validation motions that travel (five of 30 s at most), there and in gaponet, and what the export says that it leaves
-out; --test adds what the MJCF leaves on the test motions, all of their length. What is found in WORK is kept.
+Exports the robot for each engine, also with a fit without servo terms, and runs the check.py of each export in that
+engine's environment, without gaponet. Prints a row per engine: mean |error| on the exported validation motions (at
+most five of 30 s), there and in gaponet, and what the export omits. --test adds the error of the MJCF on whole test
+motions. Existing results in WORK are kept.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ VERSION = "import sys, importlib.metadata as m; print(m.version(sys.argv[1]))"
 
 
 def nearest(robot: RobotSpec, train: list, folder: Path) -> RobotSpec:
-    """The robot fitted without its law, once."""
+    """Fit the robot without servo terms, unless the folder holds it."""
     if not (folder / "robot.toml").is_file():
         save_robot(fit_plain_servos(robot, train), folder)
     return load_robot(folder)
 
 
 def checked(python: Path, check: str, package: str, folder: Path) -> dict[str, str | float]:
-    """What a check prints, and how long it took, once."""
+    """Run a check, unless its result is stored; returns its output, version and duration."""
     kept = folder / f"{python.parents[1].name}.json"
     if not kept.is_file():
         start = time.monotonic()
@@ -59,7 +59,7 @@ def checked(python: Path, check: str, package: str, folder: Path) -> dict[str, s
 
 
 def tested(spec: RobotSpec, plain: RobotSpec, robot: Path, exported: Path) -> None:
-    """Print what each form leaves of the test motions that the robot's own folder names."""
+    """Print the error of each form on the test motions that the robot's folder names."""
     origin = read_origin(robot)
     assert origin is not None
     dataset = load_dataset(str(robot / origin["dataset"]))
@@ -84,9 +84,9 @@ def main(
     Args:
         robot: Folder that gaponet identify wrote.
         work: Folder for the exports.
-        data: Dataset; default the one that the robot was identified from.
-        environments: Where each engine's environment lies.
-        test: Also ask the test motions.
+        data: Dataset; default: that of the identification.
+        environments: Folder of the engines' environments.
+        test: Also measure the test motions.
     """
     spec, recordings = load_robot(robot), read_recordings(robot, data, load_robot(robot))
     assert recordings is not None, "no recordings: give --data"

@@ -1,12 +1,12 @@
-"""Control steps per second of a robot on a GPU: bare mujoco_warp, gaponet's simulations, and those with resets.
+"""Control steps per second on a GPU: bare mujoco_warp, gaponet's simulations, and those with resets.
 
     python benchmarks/gpu.py [--device cuda] [--robot so101] [--seconds 5] 1024 4096 16384
     python benchmarks/gpu.py --reached RUN OTHER
 
-For each number of simulations, of a servo as stated and of one with a law (Stribeck friction, friction by load). "bare"
-is the CUDA graph of one control period, the law's kernel in it where there is one, launched again and again; in
-"resets" one simulation in a hundred begins anew in every period. --reached: how long each of two trainings took to be
-as good on validation as RUN ever was. benchmarks/gpu.sh runs both.
+Measured for each number of simulations, with the plain servo and with servo terms (Stribeck friction, friction by
+load). "bare" launches the CUDA graph of one control period, with the kernel of the servo terms. In "resets", one
+simulation in a hundred is reset in every period. --reached prints how long each of two trainings took to reach the best
+validation error of RUN. benchmarks/gpu.sh runs both.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import torch
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 
-LAW = {"stribeck": 0.02, "stribeck_speed": 0.05, "friction_motor": 0.1, "friction_external": 0.1}
+SERVO_TERMS = {"stribeck": 0.02, "stribeck_speed": 0.05, "friction_motor": 0.1, "friction_external": 0.1}
 
 
 def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
@@ -66,7 +66,7 @@ def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dic
 
 
 def reached(runs: list[Path]) -> None:
-    """Print when each run first was as good on validation as the first of them ever was; labels and sensors count."""
+    """Print when each run reached the best validation error of the first; the time includes labels and sensors."""
     lines = [[json.loads(x) for x in (run / "progress.jsonl").read_text("utf-8").splitlines()] for run in runs]
     best = min(line["val_mpjae"] for line in lines[0])
     for run, rows in zip(runs, lines, strict=True):
@@ -78,7 +78,7 @@ def reached(runs: list[Path]) -> None:
 
 
 def main() -> None:
-    """Measure and print one JSON line for each size and servo."""
+    """Measure and print one JSON line per size and servo."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sizes", type=int, nargs="*")
     parser.add_argument("--reached", type=Path, nargs=2, metavar=("RUN", "OTHER"))
@@ -90,7 +90,10 @@ def main() -> None:
         reached(args.reached)
     stated = load_robot(args.robot)
     for size in args.sizes:
-        for servo, robot in (("stated", stated), ("law", stated.with_servos(dict.fromkeys(stated.operated, LAW)))):
+        for servo, robot in (
+            ("stated", stated),
+            ("law", stated.with_servos(dict.fromkeys(stated.operated, SERVO_TERMS))),
+        ):
             found = {k: round(v) for k, v in measure(robot, size, args.device, args.seconds).items()}
             memory = torch.cuda.max_memory_reserved() >> 20 if args.device == "cuda" else 0
             print(json.dumps({"num_envs": size, "servo": servo, "torch_mb": memory} | found), flush=True)

@@ -1,11 +1,11 @@
 #!/bin/sh
-# What a GPU makes of gaponet, meant for ten minutes (never timed on one), and without a network: pip install
-# "gaponet[warp,robots]" and a CUDA build of torch are there already.
+# Speed of gaponet on a GPU, in about ten minutes (never run on one), without a network. Install gaponet[warp] and a CUDA
+# build of torch before.
 #     benchmarks/gpu.sh OUT
-# Steps a second beside bare mujoco_warp; then one training on the CPU and one on the GPU, each with simulations of its
-# own number, the GPU's with ten times the steps; when the GPU had reached the CPU's best on validation; both on motions
-# that they never saw. Send OUT/speed.txt, OUT/reached.txt and OUT/eval.txt. Called again it goes on where it stopped.
-# Dry, without a GPU: DEVICE=warp-cpu SIZES="8 16" SECONDS_EACH=1 STEPS=10500 DEVICE_STEPS=10500 ENVS=8.
+# Measures control steps per second beside bare mujoco_warp. Then trains once on the CPU and once on the GPU, which gets
+# ten times the steps, and evaluates both on test motions. Results: OUT/speed.txt, OUT/reached.txt, OUT/eval.txt. The same
+# command resumes after an interrupt.
+# Test without a GPU: DEVICE=warp-cpu SIZES="8 16" SECONDS_EACH=1 STEPS=10500 DEVICE_STEPS=10500 ENVS=8.
 set -eu
 OUT=${1:?give a folder for the results}
 DEVICE=${DEVICE:-cuda} SIZES=${SIZES:-"1024 4096 16384"} SECONDS_EACH=${SECONDS_EACH:-5}

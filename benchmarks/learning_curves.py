@@ -22,7 +22,7 @@ TICKS = (0.1, 0.3, 1, 3, 10)  # millions
 
 @styled
 def curves(runs: list[Path]) -> Figure:
-    """All curves in one pair of axes."""
+    """Draw all curves into one pair of axes."""
     fig = figure(5.2, 3.2)
     ax = fig.subplots()
     nominal = 0.0

@@ -2,8 +2,8 @@
 
     python benchmarks/loopback.py --minutes 10 --rate 50
 
-Prints what share of control periods started more than one period late or not at all, and the age of states. Watchdogs
-stay on; with --no-stop a stalled machine is counted instead of stopping the robot.
+Prints the fraction of control periods that started more than one period late or never, and the age of states. Watchdogs
+are on. With --no-stop, a stalled machine is counted and does not stop the robot.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ def main(
     domain: int = 42,
     no_stop: bool = False,
 ) -> None:
-    """Swing both arms gently and count.
+    """Swing both arms slowly and count late periods.
 
     Args:
         minutes: Duration of the run.
         rate: Commands per second.
         state_rate: States per second.
-        payload_mass: kg per hand; with 3 the elbows are too hot after less than two minutes.
+        payload_mass: Payload per hand, kg; with 3 kg the elbows overheat within two minutes.
         domain: DDS domain.
-        no_stop: Let a late loop and an old state pass, and count them.
+        no_stop: Count late periods and old states instead of stopping.
     """
     robot = load_robot("h1_2")
     command = [sys.executable, "-m", "gaponet", "virtual", "serve", "--payload-mass", str(payload_mass)]
@@ -68,7 +68,7 @@ def main(
 
 
 def swing(home: np.ndarray, seconds: float, rate: float):
-    """Elbows and shoulder pitch, 0.25 Hz, as a policy."""
+    """Return a policy that moves elbows and shoulder pitch at 0.25 Hz."""
 
     def policy(k: int, state: object) -> np.ndarray | None:
         if k >= seconds * rate:

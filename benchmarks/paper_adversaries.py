@@ -1,4 +1,4 @@
-"""Is it the sensors, the payload, and PPO that reduce the error? Adversaries of the paper's network: docs/paper.md.
+"""Control tests of the paper's network without sensors, payload or PPO: docs/paper.md.
 
     python benchmarks/paper_adversaries.py DATASET WORK [--budget 1000000] [--unit virtual-4]
 

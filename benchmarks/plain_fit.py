@@ -1,9 +1,9 @@
-"""The plain rival of gaponet identify: scipy's least squares over free runs of the whole robot in MuJoCo.
+"""Plain alternative to gaponet identify: least squares of scipy over rollouts of the whole robot in MuJoCo.
 
     python benchmarks/plain_fit.py DATASET [--robot ROBOT] [--out FOLDER]
 
-What an engineer writes in an afternoon: kp, total damping, dry friction, armature, delay and zero offset of each joint,
-finite differences over windows of the training motions, started at the robot's file; then whole validation motions.
+It fits kp, total damping, dry friction, armature, delay and offset of each joint, by finite differences over windows of
+the training motions, starting from the robot's file. The error is that of whole validation motions.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from gaponet.share.reading import open_dataset
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 
-WINDOW, COUNT, SETTLE = 5.0, 8, 0.1  # s of a window, windows, s that do not count
+WINDOW, COUNT, SETTLE = 5.0, 8, 0.1  # length of a window, s; number of windows; ignored start, s
 LOW, HIGH, STEP = (0.1, 0.0, 0.0, 0.0, 0.0, -10.0), (10.0, 10.0, 50.0, 50.0, 5.0, 10.0), 0.02
 
 
 def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, evaluations: int = 25) -> RobotSpec:
-    """The robot that follows the windows best; recordings at one period, gains and payload of robot.toml's kind."""
+    """Fit the robot to windows of recordings with one control period and the gains of robot.toml."""
     length = round(WINDOW / sequences[0].dt)
     cuts = [s.rows(slice(a, a + length)) for s in sequences for a in range(0, len(s), length)]
     cuts = [c for c in cuts if c.duration > 0.9 * WINDOW] or list(sequences)
@@ -41,14 +41,16 @@ def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, eva
     models = [build_model(robot, c.meta.payload_mass, c.meta.payload_side, c.dt, bare=True) for c in cuts]
     own, h, count = models[0], models[0].opt.timestep, robot.steps_per(cuts[0].dt)
     damping = own.dof_damping[op] + kd
-    armature = np.maximum(own.dof_armature[op], 2.5e-5 * robot.kp[op])  # with less, stiff joints chatter at this step
+    armature = np.maximum(
+        own.dof_armature[op], 2.5e-5 * robot.kp[op]
+    )  # stiff joints are unstable with less at this step
     late, zero = np.full(n, 0.02), np.zeros(n)
     scale = np.stack(
         [robot.kp[op], np.maximum(damping, 0.05 * robot.kp[op]), 1e-3 * robot.kp[op], armature, late, late / 2]
     )
     low, high = (np.repeat(b, n) for b in (LOW, HIGH))
     start = np.stack([robot.kp[op], damping, own.dof_frictionloss[op], armature, late, zero]) / scale
-    start = np.clip(start.ravel(), low + 0.2, high - 0.2)  # trust regions creep at bounds
+    start = np.clip(start.ravel(), low + 0.2, high - 0.2)  # the trust region is slow at bounds
     state = np.concatenate([[[0.0, *c.qpos[0], *c.qvel[0]]] for c in cuts]).astype(float)
     real = np.stack([c.qpos[1:rows, op] for c in cuts])
     time_of = np.arange((rows - 1) * count) * h
@@ -65,7 +67,7 @@ def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, eva
             one.dof_damping[op], one.dof_frictionloss[op] = np.maximum(total - kd, 0), friction
             one.dof_armature[op] = armature
             ctrl = c.ctrl[np.arange(len(time_of)) // count].astype(float)
-            for i, j in enumerate(op):  # held commands; linear between them, so that a delay has a slope
+            for i, j in enumerate(op):  # linear between commands, so that a delay has a gradient
                 ctrl[:, j] = np.interp(time_of - delay[i], time_of, ctrl[:, j])
             late.append(one)
             controls.append(ctrl)
@@ -90,7 +92,7 @@ def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, eva
 
 
 def main() -> None:
-    """Fit on training motions, judge on whole validation motions."""
+    """Fit on training motions, measure on whole validation motions."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset")
     parser.add_argument("--robot")

@@ -82,7 +82,7 @@ def drives(
             f"{file} has no position gain for {abbreviate(without_gain)}: give those of the controller that recorded "
             "the "
             "logs, "
-            "--kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); where nobody knows them a guess is enough, "
+            "--kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); if they are unknown, a guess is enough, "
             "gaponet identify corrects it within a factor of 50"
         )
     return tuple(result)

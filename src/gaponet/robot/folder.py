@@ -98,7 +98,7 @@ def stored_robot_holder(artifact: Path) -> Path:
 def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     values = {name: float(getattr(robot, name)[i]) for name in SERVO_FIELDS}
-    none = (*SERVO_TERMS, "target_speed")  # where they are 0
-    told = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in none)}
-    lines = [f"{name} = {value!r}\n" for name, value in told.items()]
+    optional = (*SERVO_TERMS, "target_speed")  # 0 if absent
+    stated = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in optional)}
+    lines = [f"{name} = {value!r}\n" for name, value in stated.items()]
     return f'[identified."{joint}"]\n' + "".join(lines)
