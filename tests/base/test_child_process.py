@@ -111,7 +111,7 @@ def test_a_command_started_by_m_or_pythonpath_imports_none_of_them(poisoned, how
     for name in library.union(loaded):
         (poisoned / f"{name}.py").unlink(missing_ok=True)
     if how == "-m":
-        words = [sys.executable, "-m", "gaponet", "formats"]
+        words = [sys.executable, "-m", "gaponet", "import", "--formats"]
         said = subprocess.run(words, cwd=poisoned, capture_output=True, text=True).stdout
     else:
         said = python(poisoned, SCRIPT, "import", "--formats", PYTHONPATH=f":{os.environ.get('PYTHONPATH', '')}")
