@@ -219,7 +219,8 @@ def test_a_late_reply_is_not_taken_for_the_next_registers(wire, servos):
 
     servos.adversary = late
     for _ in range(5):
-        assert [bus.read(1, r) for r in (reg.P, reg.D, reg.I, reg.MODE)] == [16, 32, 0, 0]
+        found = [r.decode(bus.sync_read([1], r)[1]) for r in (reg.P, reg.D, reg.I, reg.MODE)]
+        assert found == [16, 32, 0, 0]
 
 
 def test_a_bus_that_never_stops_talking_is_not_listened_to_for_ever(driver, servos):

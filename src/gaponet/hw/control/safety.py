@@ -148,12 +148,10 @@ class LimitedCommand(NamedTuple):
     Attributes:
         ctrl: The command to send where feasible, rad; else the previous one within range, which must not be sent.
         feasible: A command within all three limits exists.
-        cut: The request was changed.
     """
 
     ctrl: Array
     feasible: Array
-    cut: Array
 
 
 def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Array:
@@ -188,7 +186,7 @@ def limit_command(
         finite = np.isfinite(target) & np.isfinite(previous) & np.isfinite(qpos) & np.isfinite(qvel)
         feasible = finite & (low <= high)
         ctrl = np.where(feasible, np.minimum(np.maximum(target, low), high), before)
-    return LimitedCommand(ctrl, feasible, ctrl != target)
+    return LimitedCommand(ctrl, feasible)
 
 
 def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:

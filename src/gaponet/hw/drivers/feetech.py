@@ -12,8 +12,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from gaponet.hw.control.driver import DriverError
-
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST = 0xFE
 ERRORS = ("voltage", "angle sensor", "overheat", "overcurrent", "", "overload")  # status bits; bit 4: torque is on
@@ -122,20 +120,26 @@ class ServoBus:
         self.errors: dict[int, int] = {}
         self._tag = 0
 
-    def read(self, servo: int, register: Register) -> int:
-        """Return the value of one register of a servo.
-
-        Raises:
-            DriverError: No answer, or damaged ones only.
-        """
-        replies = self._request(READ, [servo], register.address, register.size)
-        if not replies:
-            raise DriverError(f"servo {servo} does not answer; is it powered and is its number {servo}?")
-        return register.decode(replies[servo])
-
     def sync_read(self, servos: Iterable[int], block: Register, retries: int | None = None) -> dict[int, bytes]:
-        """Return a block of each of several servos, in one exchange; servos without an intact reply are missing."""
-        return self._request(SYNC_READ, list(servos), block.address, block.size, retries)
+        """Return a block of each of several servos; servos without an intact reply are missing.
+
+        What is missing after a silence is requested again. A reply does not name its request. So successive requests
+        are for 0 to 7 bytes more than needed: the length of a reply shows which request it answers, and a late reply to
+        an earlier call is not taken for it.
+        """
+        missing, replies, sizes = list(servos), dict[int, bytes](), set[int]()
+        for _ in range(1 + (self.retries if retries is None else retries)):
+            self._tag = (self._tag + 1) % REQUEST_TAGS
+            size = block.size + self._tag
+            sizes.add(size)
+            request = packet(BROADCAST, SYNC_READ, bytes([block.address, size, *missing]))
+            self.stream.reset_input_buffer()
+            self.stream.write(request)
+            replies |= self._replies(missing, size, sizes, request)
+            missing = [servo for servo in missing if servo not in replies]
+            if not missing:
+                break
+        return {servo: data[: block.size] for servo, data in replies.items()}
 
     def sync_write(self, register: Register, values: dict[int, int]) -> None:
         """Write one register of several servos; they do not acknowledge it."""
@@ -145,33 +149,6 @@ class ServoBus:
     def broadcast(self, register: Register, value: int) -> None:
         """Write one register of all servos on the bus; they do not acknowledge it."""
         self.stream.write(packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value)))
-
-    def _request(
-        self, instruction: int, servos: list[int], address: int, size: int, retries: int | None = None
-    ) -> dict[int, bytes]:
-        """Return the replies by servo; those that are missing after a silence are requested again.
-
-        A reply does not name its request. So successive requests are for 0 to 7 bytes more than needed: the length of a
-        reply shows which request it answers, and a late reply to an earlier call is not taken for it.
-        """
-        replies: dict[int, bytes] = {}
-        sizes: set[int] = set()
-        for _ in range(1 + (self.retries if retries is None else retries)):
-            missing = [servo for servo in servos if servo not in replies]
-            if missing:
-                self._tag = (self._tag + 1) % REQUEST_TAGS
-                tagged_size = size + self._tag
-                sizes.add(tagged_size)
-                words = bytes([address, tagged_size])
-                several = instruction == SYNC_READ
-                self.stream.reset_input_buffer()
-                request = (
-                    packet(BROADCAST, instruction, words + bytes(missing)) if several
-                    else packet(missing[0], instruction, words)
-                )  # fmt: skip
-                self.stream.write(request)
-                replies |= self._replies(missing, tagged_size, sizes, request)
-        return {servo: data[:size] for servo, data in replies.items()}
 
     def _replies(self, servos: list[int], expected: int, sizes: set[int], request: bytes) -> dict[int, bytes]:
         """Return intact replies of these servos, in any order, until all have come or nothing more comes.
