@@ -47,14 +47,9 @@ class FaultyArm(NotedArm):
         wrong = np.eye(2)[0]
         return {
             "stops": lambda: self.last,
-            "late": lambda: dataclasses.replace(honest, time=honest.time - 0.1),
-            "freezes": lambda: dataclasses.replace(self.last, time=honest.time),
             "nan": lambda: dataclasses.replace(honest, qpos=honest.qpos + np.nan * wrong),
-            "jumps": lambda: dataclasses.replace(honest, qpos=honest.qpos + 0.8 * wrong),
             "hot": lambda: dataclasses.replace(honest, temperature=honest.temperature + 70 * wrong),
             "bus": self._fail,
-            "encoder": lambda: dataclasses.replace(honest, qpos=np.where(wrong, self.last.qpos, honest.qpos)),
-            "leans": lambda: dataclasses.replace(honest, tilt=0.8),
             "error": lambda: dataclasses.replace(honest, fault=Fault("robot", "a motor reports an error")),
             "remote": lambda: dataclasses.replace(honest, fault=Fault("stop", "the operator's remote")),
         }[self.kind]()
@@ -125,12 +120,11 @@ def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "reason", "periods"),
     [
-        ("stops", "stale", 3), ("late", "stale", 1), ("freezes", "frozen", 2), ("nan", "nan", 1), ("jumps", "jump", 1),
-        ("hot", "temperature", 1), ("bus", "driver", 1), ("encoder", "frozen", 25), ("leans", "tilt", 1),
+        ("stops", "stale", 3), ("nan", "nan", 1), ("hot", "temperature", 1), ("bus", "driver", 1),
         ("error", "robot", 1), ("remote", "stop", 1),
     ],
 )  # fmt: skip
-def test_every_fault_ends_in_damp_with_its_reason(arm, kind, reason, periods):
+def test_a_fault_of_state_driver_or_operator_ends_in_damp_with_its_reason(arm, kind, reason, periods):
     driver = FaultyArm(arm, FAULT_S, kind)
     recording = run(arm, driver)
     assert phases(recording) == ["idle", "blend_in", "run", "damp", "stopped"]
