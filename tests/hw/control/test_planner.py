@@ -214,13 +214,18 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
     assert 2 < still < 100, "it looks for a share of each period"
 
 
-@pytest.mark.parametrize(("beyond", "kind"), [(0.03, None), (0.2, "plan")])
-def test_the_first_command_is_where_it_was_found_or_none_leaves(so101, beyond, kind):
+@pytest.mark.parametrize(
+    ("beyond", "cuts_goals", "kind"),
+    [(0.03, False, None), (0.2, False, "plan"), (0.015, True, None), (0.03, True, "plan")],
+)
+def test_the_first_command_is_where_it_was_found_or_none_leaves(so101, beyond, cuts_goals, kind):
+    """Servos that know their own range cut goals beyond it, so that less is admitted."""
     found = so101.qpos_home.copy()
     found[0] = so101.qpos_range[0, 1] + beyond
     controller, sent = virtual(so101, found)
     honest = controller.driver.read
     controller.driver.read = lambda: honest() if sent else dataclasses.replace(honest(), qpos=found.copy())
+    controller.driver.qpos_range = so101.qpos_range if cuts_goals else None
     recording = controller.run(lambda k, state: so101.qpos_home if k < 5 else None)
     assert (recording.fault.kind if recording.fault else None) == kind, recording.fault
     assert [c[0] for c in sent[:1]] == ([] if kind else [pytest.approx(found[0], abs=2e-3)])
