@@ -6,6 +6,7 @@ PLACE/gaponet.json    the index: paths, sizes and hashes of the files; written l
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
@@ -143,9 +144,13 @@ class Bucket:
             self.fs.pipe_file(self._index_path, text.encode(), **condition)
         elif self.scheme == "gs":
             bucket, name = self._index_path.split("/", 1)
-            url = f"{self.fs._location}/upload/storage/v1/b/{bucket}/o"
-            generation = self._index_info.get("generation", "0")
-            self.fs.call("POST", url, uploadType="media", name=name, ifGenerationMatch=generation, data=text.encode())
+            head, types = json.dumps({"name": name}), ("application/json; charset=UTF-8", "application/json")
+            parts = "".join(f"--{INDEX}\nContent-Type: {t}\n\n{x}\n" for t, x in zip(types, (head, text), strict=True))
+            self.fs.call(  # gcsfs has conditions for new objects only
+                "POST", f"{self.fs._location}/upload/storage/v1/b/{bucket}/o", uploadType="multipart",
+                ifGenerationMatch=self._index_info.get("generation", "0"), data=f"{parts}--{INDEX}--".encode(),
+                headers={"Content-Type": f'multipart/related; boundary="{INDEX}"'},
+            )  # fmt: skip
         else:
             descriptor = lock_file(Path(self.root) / f"{FOLDER_MARKER}-lock")
             if descriptor is None:
