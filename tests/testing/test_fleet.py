@@ -1,3 +1,4 @@
+import shutil
 import tomllib
 from dataclasses import fields, replace
 
@@ -7,6 +8,7 @@ import pytest
 from gaponet.base.errors import UsageError
 from gaponet.experiments.virtual.goals import GoalPlanner
 from gaponet.robot.spec import load_robot
+from gaponet.testing import fleet as fleets
 from gaponet.testing.fleet import FLEETS, UNITS_MARKER, load_fleet, sample_unit, to_toml
 from gaponet.testing.physics import EFFECTS, Physics, neutral
 from gaponet.testing.virtual_robot import VirtualRobot
@@ -109,6 +111,13 @@ def test_a_fleet_can_be_written_and_read(arm, tmp_path):
         encoding="utf-8",
     )
     assert load_fleet(file, arm).digest() == fleet.digest()
+
+
+def test_units_that_are_sampled_again_are_the_stored_ones(tmp_path, monkeypatch):
+    shutil.copyfile(FLEETS / "easy.toml", tmp_path / "easy.toml")
+    monkeypatch.setattr(fleets, "FLEETS", tmp_path)
+    fleets.main("easy", "h1_2")
+    assert (tmp_path / "easy.toml").read_text() == (FLEETS / "easy.toml").read_text()
 
 
 def test_errors_say_what_there_is(arm, tmp_path):
