@@ -36,7 +36,7 @@ from gaponet.data.split import split_entries
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
-from gaponet.sim.replay import whole_errors
+from gaponet.sim.replay import rollout_errors
 
 FIELDS = ("kp", "damping", "frictionloss", "armature", "delay", "offset")
 WORSE, WORSE_THAN_PLAIN = 1.01, 1.10
@@ -148,7 +148,7 @@ def play(
 
 def errors_of(whole: list[Sequence], robot: RobotSpec) -> list[float]:
     """Return the mean |error| of each motion, rad."""
-    return [float(f"{e:.6g}") for e in whole_errors(whole, robot)]
+    return [float(f"{e:.6g}") for e in rollout_errors(whole, robot)]
 
 
 def inside(

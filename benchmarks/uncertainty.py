@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.base.progress import no_progress
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
@@ -32,8 +31,8 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.drift import drift
 from gaponet.sysid.evidence import estimate_uncertainty
-from gaponet.sysid.fit import Clock, Fit
 from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.problem import JointFit, standard_errors
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.uncertainty import ParameterUncertainty
 from gaponet.testing.fleet import load_fleet, sample_unit
@@ -129,11 +128,10 @@ def _evaluated(
     """Identify one arm and check it on every day."""
     train, val, began = days[0], days[1][:3], time.monotonic()
     bounds = Bounds(robot, train)
-    fit = Fit(JointRollouts(cut(train, 12), robot, nthread=1), robot, bounds)
-    values = fit.search(CLASSIC, bounds.start, Clock(None, 0, no_progress), "")
-    fit.uncertainty(values)
-    right = fit.robot(values)
-    mine = estimate_uncertainty(right, train, val, fit.covariance, nthread=1)
+    fit = JointFit(JointRollouts(cut(train, 12), robot, nthread=1), robot, bounds)
+    values = fit.search(CLASSIC, bounds.start)
+    right = fit.robot_with(values)
+    mine = estimate_uncertainty(right, train, val, standard_errors(fit, values).covariance, nthread=1)
     op = robot.operated_index
     truth = {
         "kp": robot.kp[op] * unit.kp_scale * unit.kt_scale, "damping": 0.5 + unit.damping,

@@ -10,7 +10,7 @@ from gaponet.experiments.study import TRAINING
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import TrainConfig
 from gaponet.nn.training.validation import GAINS
-from gaponet.sysid.refit import PRIOR, TOGETHER
+from gaponet.sysid.adapt import PRIOR_RAD, SHARED_PRIOR_RATIO
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "gaponet"
@@ -40,7 +40,7 @@ def widths(layers: tuple[int, ...]) -> str:
         ("algorithm.md", f"Δ_max = {MODEL.delta_max} rad"),
         ("algorithm.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
         ("algorithm.md", f"Oracle answers at {TRAIN.pretraining.sensor_states} states"),
-        ("algorithm.md", f"{PRIOR} rad per unit of scale"),
+        ("algorithm.md", f"{PRIOR_RAD} rad per unit of scale"),
         ("experiments.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
     ],
 )  # fmt: skip
@@ -51,7 +51,7 @@ def test_a_default_that_a_page_states_is_that_of_the_code(page, said):
 def test_words_for_fractions_are_the_code_s_too():
     assert GAINS == (3 / 4, 1 / 2, 1 / 4)
     assert "(1, ¾, ½ or ¼)" in text("docs/algorithm.md")
-    assert TOGETHER == 1 / 20
+    assert SHARED_PRIOR_RATIO == 1 / 20
     assert "a twentieth of that" in text("docs/algorithm.md")
 
 

@@ -24,8 +24,7 @@ from gaponet.base.structure import read_json
 from gaponet.report.page import render
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.drift import drift
-from gaponet.sysid.uncertainty import ParameterUncertainty
-from gaponet.sysid.uncertainty_table import format_change
+from gaponet.sysid.uncertainty import ParameterUncertainty, format_change
 
 KIND = "fleet"
 SAME, FAILED = "same", "not checked"

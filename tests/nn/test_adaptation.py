@@ -17,7 +17,7 @@ from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay
-from gaponet.sysid.refit import refit
+from gaponet.sysid.adapt import adapt
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_one_short_command_adapts_nothing_and_windows_of_several_are_judged_by_m
     with pytest.raises(NoGainError, match="no joint has a motion that the fit does not see"):
         api.adapt_robot(robot, data, out=tmp_path / "one")
     several = [record(robot, commands(450, seed), f"m{seed}", kp=0.7) for seed in range(3)]
-    found = refit(several, robot, judge=True)
-    assert (len(found.judged[0]), found.kept) == (3, True)
+    found = adapt(several, robot, judge=True)
+    assert (len(found.judged[0]), found.accepted) == (3, True)
     assert (found.judged[1] < 0.5 * found.judged[0]).all()
-    assert not refit([record(robot, commands(450, seed), f"m{seed}") for seed in range(3)], robot, judge=True).kept
+    assert not adapt([record(robot, commands(450, seed), f"m{seed}") for seed in range(3)], robot, judge=True).accepted

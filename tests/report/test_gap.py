@@ -19,7 +19,7 @@ from gaponet.report.run_files import read_gap
 from gaponet.report.verdict import LEARNED
 from gaponet.sim.metrics import Run
 from gaponet.sim.model import model_hash
-from gaponet.sim.replay import replay, whole_errors
+from gaponet.sim.replay import replay, rollout_errors
 
 
 def test_the_encoder_step_is_estimated_from_recordings():
@@ -146,5 +146,5 @@ def test_a_joint_that_nobody_recorded_has_no_bar_and_dilutes_nothing(tmp_path):
     found = gap_by_step(Candidate(stiffer.folder, stiffer, None), data)
     assert list(found["by_joint"]) == ["shoulder"]
     assert found["removed"]["gain"] == pytest.approx(found["by_joint"]["shoulder"]["removed"]["gain"])
-    both = whole_errors(data.sequences(data.entries), robot)
+    both = rollout_errors(data.sequences(data.entries), robot)
     assert both.mean() == pytest.approx(found["methods"]["nominal"]["by_joint"]["shoulder"]["mpjae"], rel=1e-3)

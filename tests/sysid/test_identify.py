@@ -8,9 +8,11 @@ from arm import TOML, recordings, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import load_robot
+from gaponet.sysid.acceptance import Comparison, Judge
 from gaponet.sysid.axes import Bounds
-from gaponet.sysid.fit import Tried, _Judge, _Limbs, with_stops
 from gaponet.sysid.identify import identify
+from gaponet.sysid.motion_limits import with_stops
+from gaponet.sysid.problem import KinematicChains
 from gaponet.sysid.robot_rollouts import cut
 
 
@@ -35,14 +37,14 @@ def test_damping_ends_below_a_kd_that_no_recording_states_and_what_is_sent_stays
     damping = np.nan_to_num(fit.robot.damping)
     np.testing.assert_allclose(fit.robot.kd + damping, 0.5, rtol=0.05)
     np.testing.assert_array_equal(fit.robot.nominal.kd, robot.kd)
-    assert fit.better
+    assert fit.improved
 
 
 def test_the_nominal_robot_stays_what_it_is(tmp_path):
     robot = write_arm(tmp_path)
     fit = identify(recordings(robot, 4, rows=150), robot, windows=4)
     assert fit.robot is robot
-    assert not fit.better
+    assert not fit.improved
 
 
 def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
@@ -88,16 +90,16 @@ def test_a_soft_joint_that_sticks_where_its_command_turned_has_met_no_stop(tmp_p
 
 
 def test_what_is_told_of_limbs_is_told_of_their_joints():
-    limbs = _Limbs(load_robot("so101"))
-    assert limbs.at.tolist() == [[0, 1, 2, 3, 4]]
-    limbs.at = np.array([[0, 2, 4], [1, 3, -1]])  # of two limbs, one shorter
+    limbs = KinematicChains(load_robot("so101"))
+    assert limbs.joints.tolist() == [[0, 1, 2, 3, 4]]
+    limbs.joints = np.array([[0, 2, 4], [1, 3, -1]])  # of two limbs, one shorter
     x = np.arange(30.0).reshape(2, 5, 3)
     assert limbs.pack(x).shape == (2, 2, 9)
     np.testing.assert_array_equal(limbs.unpack(limbs.pack(x)), x)
 
 
 @pytest.mark.parametrize(
-    ("falls", "kept"),
+    ("falls", "accepted"),
     [
         ((0.09,), False),  # of one motion, of an error of 1
         ((0.12,), True),
@@ -109,15 +111,15 @@ def test_what_is_told_of_limbs_is_told_of_their_joints():
         ((0.3, -0.2, 0.05, 0.02, -0.1, 0.06), False),
     ],
 )
-def test_a_term_is_kept_where_motions_are_surely_followed_better(falls, kept):
+def test_a_term_is_kept_where_motions_are_surely_followed_better(falls, accepted):
     before = np.arange(len(falls)) ** 2 + 1.0  # some motions are followed worse than others by far
-    assert Tried("load", before, before * (1 - np.array(falls))).kept is kept
+    assert Comparison("load", before, before * (1 - np.array(falls))).accepted is accepted
 
 
 def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
     robot, logs = write_arm(tmp_path), recordings(load_robot(tmp_path))[:3]
     again = [*logs, replace(logs[0], meta=replace(logs[0].meta, repetition=1, kp=(18.0, 18.0)))]
     values = Bounds(robot, logs).first
-    once, twice = (_Judge(x, robot, -np.inf, 1).errors(values) for x in (logs, again))
+    once, twice = (Judge(x, robot, -np.inf, 1).errors(values) for x in (logs, again))
     assert len(once) == len(twice) == 3
     np.testing.assert_allclose(twice[1:], once[1:])

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from arm import TOML, commands, recordings, write_arm
 
-from gaponet.base.progress import no_progress
 from gaponet.robot.spec import SERVO_TERMS, Table
 from gaponet.sim.replay import replay
 from gaponet.sysid import table_contact
 from gaponet.sysid.axes import CLASSIC, Bounds
-from gaponet.sysid.fit import Clock, Fit
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.problem import JointFit, standard_errors
 
 SERVO = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.06, "offset": 0.0, "delay": 0.0}
 
@@ -37,11 +36,11 @@ def played(robot, acting, count, rows):
 def test_a_term_of_the_law_comes_back(tmp_path, law):
     robot = write_arm(tmp_path / "arm")
     parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
-    fit = Fit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
+    fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
     start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.bounds.guess[f] for f in SERVO_TERMS if f in law}
-    found = fit.search(tuple(law), start, Clock(None, 0, no_progress), "law")
+    found = fit.search(tuple(law), start)
     assert set(CLASSIC) < set(found)
-    std, _ = fit.uncertainty(found)
+    std = standard_errors(fit, found).std
     for field, value in law.items():
         for i, joint in enumerate(robot.joint_names):  # within 5 %, or two standard errors
             assert abs(found[field][i] - value) < max(0.05 * value, 2 * std[joint][field])
@@ -55,7 +54,7 @@ def test_motors_of_half_the_torque_that_the_file_says_come_back(tmp_path):
     weak = robot.with_servos({joint: {"effort_limit": 2.5} for joint in robot.joint_names})
     parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replay(asked, weak), strict=True)]
     found = identify(parts[:2], robot, parts[2:], windows=2, terms=("limit",), table=False)
-    assert [t.name for t in found.tried if t.kept] == ["limit"]
+    assert [c.name for c in found.comparisons if c.accepted] == ["limit"]
     np.testing.assert_allclose(found.robot.effort_limit, 2.5, rtol=0.05)
     assert found.after < 0.1 * found.before
 
@@ -67,7 +66,7 @@ def test_a_joint_that_stands_while_another_swings_gives_way_as_it_did(tmp_path):
     true, told = (robot.with_servos({"shoulder": {"damping": d, "kp": 20.0}}) for d in (0.2, 2.0))
     parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(swung, replay(swung, true), strict=True)]
     found = identify(parts[:2], told, parts[2:], windows=2, terms=(), table=False)
-    assert found.better
+    assert found.improved
     assert found.after < 0.1 * found.before
     assert any("shoulder: not determined" in text for text in found.warnings)
 
@@ -80,17 +79,17 @@ def test_a_table_comes_back(tmp_path):
     parts = played(robot, replace(robot, table=Table(-0.02, 0.3, 2000.0)), 3, 100)
     heights = table_contact.tip_heights(parts, robot)
     found = table_contact.fit_table(parts, robot, min(h.min() for h in heights), 1, lambda error: None)
-    assert found.kept
+    assert found.accepted
     assert found.after.mean() < 0.2 * found.before.mean()
     assert found.robot.table.height == pytest.approx(-0.02, abs=0.004)
     assert np.abs(found.robot.zero).max() < 0.02
     free = played(robot, robot, 2, 100)
-    assert not table_contact.fit_table(free, robot, -0.1, 1, lambda error: None).kept
+    assert not table_contact.fit_table(free, robot, -0.1, 1, lambda error: None).accepted
 
 
 def test_an_arm_that_stays_within_a_hand_of_its_lowest_point_keeps_rows_to_fit(tmp_path):
     robot = write_arm(tmp_path, toml=TOML + TIP)
     heights = [np.linspace(0.30, 0.33, 50), np.full(40, 0.32)]
-    below = table_contact.touching_below(robot, heights)
+    below = table_contact.contact_height(robot, heights)
     assert np.mean(np.concatenate(heights) >= below) >= 0.5
-    assert table_contact.touching_below(robot, [np.r_[0.0, np.full(50, 0.4)]]) == table_contact.CLEARANCE
+    assert table_contact.contact_height(robot, [np.r_[0.0, np.full(50, 0.4)]]) == table_contact.CLEARANCE

@@ -28,7 +28,7 @@ def own(robot, parts):
 def test_the_robot_as_it_is_errs_as_in_a_replay_and_each_candidate_on_its_own(robot, parts):
     runs, values = RobotRollouts(parts, robot), own(robot, parts)
     both = {f: np.concatenate([x, x * (1.3 if f == "kp" else 1.0)]) for f, x in values.items()}
-    errors = runs.run(both)
+    errors = runs.flat_errors(both)
     assert np.abs(errors[1] - errors[0]).max() > 1e-3
     for window, (part, twin) in enumerate(zip(parts, replay(parts, robot), strict=True)):
         expected = (twin.qpos - part.qpos)[1:][runs.counted[: len(part) - 1, window]].T
@@ -38,7 +38,7 @@ def test_the_robot_as_it_is_errs_as_in_a_replay_and_each_candidate_on_its_own(ro
 def test_joints_on_their_own_answer_for_themselves_nearly_as_in_company(robot, parts):
     runs, values = RobotRollouts(parts, robot), own(robot, parts)
     stiffer = np.array([[1.0, 1.0], [1.02, 1.02], [1.02, 1.0], [1.0, 1.02]])
-    errors = runs.run({f: x * stiffer if f == "kp" else np.repeat(x, 4, axis=0) for f, x in values.items()})
+    errors = runs.flat_errors({f: x * stiffer if f == "kp" else np.repeat(x, 4, axis=0) for f, x in values.items()})
     together = errors[1] - errors[0]
     for joint in range(2):
         alone = errors[2 + joint, joint] - errors[0, joint]
@@ -52,10 +52,10 @@ def test_a_run_goes_on_from_the_recording_where_something_may_be_touched(robot, 
     assert free.counted[29, 0]
     assert not held.counted[29, 0]
     assert held.counted[29, 1]
-    one, other = ([runs.run(values)[0][:, runs.window == w] for w in (0, 1)] for runs in (free, held))
+    one, other = ([runs.flat_errors(values)[0][:, runs.window == w] for w in (0, 1)] for runs in (free, held))
     np.testing.assert_array_equal(one[1], other[1])
     late = RobotRollouts([parts[0].rows(slice(30, 60))], robot)
-    afresh = late.run(values)[0][:, 1:]  # the first rows after it do not count
+    afresh = late.flat_errors(values)[0][:, 1:]  # the first rows after it do not count
     np.testing.assert_allclose(other[0][:, -afresh.shape[1] :], afresh, atol=1e-6)
 
 
@@ -63,8 +63,8 @@ def test_damping_below_zero_is_taken_from_the_servo(robot, parts):
     less, softer = (replace(robot, kd=np.array([kd, kd])) for kd in (0.4, 0.1))
     values = own(less, parts)
     np.testing.assert_allclose(
-        RobotRollouts(parts, less).run(values | {"damping": np.full((1, 2), -0.3)}),
-        RobotRollouts(parts, softer).run(values | {"damping": np.zeros((1, 2))}), atol=1e-6,
+        RobotRollouts(parts, less).flat_errors(values | {"damping": np.full((1, 2), -0.3)}),
+        RobotRollouts(parts, softer).flat_errors(values | {"damping": np.zeros((1, 2))}), atol=1e-6,
     )  # fmt: skip
     written = less.with_servos({"elbow": {"damping": -0.3}})
     assert written.kd.tolist() == pytest.approx([0.4, 0.1])

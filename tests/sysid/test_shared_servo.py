@@ -28,7 +28,7 @@ def test_two_equal_servos_are_given_the_law_that_they_have(tmp_path):
     runs = JointRollouts(recordings(acting, 2, rows=80), robot)
     start = {f: np.array([0.7, 1.3]) * v for f, v in true.items()}  # what each joint's own fit may end at
     before = np.abs(runs.errors({f: v[None] for f, v in start.items()})).mean()
-    found = share(runs, start, [0, 1], 0.02, lambda error: None)
+    found = share(runs, start, [0, 1], 0.02)
     assert np.abs(runs.errors({f: v[None] for f, v in found.items()})).mean() < 0.1 * before
     for f in ("kp", "damping", "frictionloss", "armature"):
         assert found[f][0] == pytest.approx(found[f][1])

@@ -88,14 +88,14 @@ def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_p
     robot = write_arm(tmp_path / "arm")
     windows = loaded(robot)
     found = identify(windows[:12], robot, windows[12:], terms=())
-    (tried,) = found.tried
-    assert (found.chosen, tried.name, tried.kept, len(tried.before)) == ("torque", "torque", True, 2)
+    (tried,) = found.comparisons
+    assert (found.chosen, tried.name, tried.accepted, len(tried.before)) == ("torque", "torque", True, 2)
     assert found.robot.kp == pytest.approx([12.0, 12.0], rel=0.03)
     assert found.robot.payload_mounts[0].mass == pytest.approx(0.3, abs=0.05)
-    assert found.judged is not None
-    assert not (found.judged.kp == found.robot.kp).all()  # fitted once more, to the motions that judged it
+    assert found.judged_robot is not None
+    assert not (found.judged_robot.kp == found.robot.kp).all()  # fitted once more, to the motions that judged it
     silent = identify([replace(s, tau=None) for s in windows[:12]], robot, windows[12:], terms=())
-    assert (silent.judged, silent.tried) == (None, ())
+    assert (silent.judged_robot, silent.comparisons) == (None, ())
     assert found.after < silent.after
 
 
@@ -109,7 +109,7 @@ def test_a_fit_from_torque_that_comes_to_follow_its_judges_worse_stays_as_they_j
 
     monkeypatch.setattr(TorqueFit, "fit", astray)
     found = identify(windows[:12], robot, windows[12:], terms=())
-    assert (found.chosen, found.judged) == ("torque", None)
+    assert (found.chosen, found.judged_robot) == ("torque", None)
     assert abs(found.robot.offset).max() < 0.05
 
 

@@ -97,7 +97,7 @@ def test_what_is_left_of_a_joint_is_of_recordings_that_hold_it_and_of_the_robot_
     assert one["elbow"].residual_rms > 0.5 * both["elbow"].residual_rms  # rows that do not hold it are no zeros
     assert none["elbow"].residual_p90 == none["shoulder"].residual_p90 > 0.0
     off = robot.with_servos({"elbow": {"offset": 0.05}})
-    judged = estimate_uncertainty(robot, judges, judges, judged=off, nthread=1).joints["elbow"]
+    judged = estimate_uncertainty(robot, judges, judges, judged_robot=off, nthread=1).joints["elbow"]
     assert judged.residual_rms > 10 * both["elbow"].residual_rms
     assert judged.values == both["elbow"].values
 
@@ -228,7 +228,7 @@ def test_another_arm_that_no_number_explains_is_not_the_same(arm, folder, monkey
     mine = ParameterUncertainty.load(robot)
     fresh = drift(robot, mine, played(arm, 70, 6), 1)
     assert (fresh.verdict, fresh.far) == ("same", {})
-    monkeypatch.setattr("gaponet.sysid.drift.FELT", 1e9)
+    monkeypatch.setattr("gaponet.sysid.drift.MIN_EFFECT_RATIO", 1e9)
     found = drift(robot, mine, played(heavy, 70, 6), 1)
     assert found.verdict == "drifted"
     assert "no number explains how far these logs are from the model" in found.advice

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.config import Kind
     from gaponet.nn.training.config import TrainConfig
-    from gaponet.sysid.fit import Covariance
+    from gaponet.sysid.acceptance import Covariance
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
 Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"]
@@ -80,8 +80,8 @@ def identify(
     from gaponet.data.split import split_entries
     from gaponet.nn.training.budget import Budget
     from gaponet.robot.folder import save_robot
-    from gaponet.sim.replay import whole_errors
-    from gaponet.sysid.fit import BETTER
+    from gaponet.sim.replay import rollout_errors
+    from gaponet.sysid.acceptance import MIN_RELATIVE_GAIN
     from gaponet.sysid.identify import identify as fit
 
     data, spec = as_dataset(dataset, robot)
@@ -100,14 +100,14 @@ def identify(
         fitted = fit(
             data.sequences(split["train"]), spec, val, windows, terms, table, shared, threads, progress, seconds, stops
         )
-        given, after = (whole_errors(val, one, threads) for one in (spec, fitted.judged or fitted.robot))
-        if not fitted.better or after.mean() > (1 - BETTER) * given.mean():
-            raise NoGainError(fitted.no_gain(spec, given, after))
+        given, after = (rollout_errors(val, one, threads) for one in (spec, fitted.judged_robot or fitted.robot))
+        if not fitted.improved or after.mean() > (1 - MIN_RELATIVE_GAIN) * given.mean():
+            raise NoGainError(fitted.no_gain_message(spec, given, after))
         save_robot(fitted.robot, folder)
-        nominal = given if spec.nominal is None else whole_errors(val, spec.nominal, threads)
+        nominal = given if spec.nominal is None else rollout_errors(val, spec.nominal, threads)
         errors = {"nominal": nominal, "identified": after}
         _save_origin(folder, data, split, {name: float(e.mean()) for name, e in errors.items()})
-        _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, fitted.judged)
+        _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, fitted.judged_robot)
     return IdentifyResult(
         robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began
     )  # fmt: skip
@@ -135,7 +135,7 @@ def identify_torque(
     from gaponet.base.files import lock_folder
     from gaponet.data.split import split_entries
     from gaponet.robot.folder import save_robot
-    from gaponet.sysid.torque_motors import driven
+    from gaponet.sysid.torque_motors import fit_torque_driven
 
     data, spec = as_dataset(dataset, robot)
     data.require_robot(spec)
@@ -143,7 +143,7 @@ def identify_torque(
     split = {"train": data.entries, "val": data.entries, "test": []} if few else split_entries(data, ())
     folder, train_set = Path(out), data.sequences(split["train"])
     with lock_folder(folder, "robot"):
-        fitted = driven(train_set, train_set if few else data.sequences(split["val"]), spec, current)
+        fitted = fit_torque_driven(train_set, train_set if few else data.sequences(split["val"]), spec, current)
         before, after = (float(np.mean(x)) for x in fitted.angle[0.5])
         if not after < before:
             raise NoGainError(
@@ -327,9 +327,9 @@ def adapt_robot(
     """
     from gaponet.base.files import lock_folder
     from gaponet.robot.folder import save_robot
-    from gaponet.sim.replay import whole_errors
-    from gaponet.sysid.fit import BETTER
-    from gaponet.sysid.refit import FIELDS, refit
+    from gaponet.sim.replay import rollout_errors
+    from gaponet.sysid.acceptance import MIN_RELATIVE_GAIN
+    from gaponet.sysid.adapt import FIELDS, adapt
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
     folder, spec = Path(out), as_robot(Path(robot) if isinstance(robot, str) and "/" in robot else robot)
@@ -339,11 +339,11 @@ def adapt_robot(
         unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
     ):
         gains_stated = all(s.meta.known_gains[1] is not None for s in sequences)
-        fitted = refit(
+        fitted = adapt(
             sequences, spec, seconds, unknown_payload, None, _window_rms(progress), gains_stated,
             judge=not unknown_payload,
         )  # fmt: skip
-        if not fitted.kept:
+        if not fitted.accepted:
             before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
             why = (
                 f"the error of motions that the fit does not see is {after:.2f} mrad, and {before:.2f} without the fit"
@@ -356,8 +356,8 @@ def adapt_robot(
         if fitted.payload_mass is not None:
             mass = float(fitted.payload_mass)
             sequences = [replace(s, meta=replace(s.meta, payload_mass=mass)) for s in sequences]
-        before, after = (float(whole_errors(sequences, r).mean()) for r in (spec, fitted.robot))
-        if after > (1 - BETTER) * before:
+        before, after = (float(rollout_errors(sequences, r).mean()) for r in (spec, fitted.robot))
+        if after > (1 - MIN_RELATIVE_GAIN) * before:
             raise NoGainError(
                 f"nothing is written: over all {len(sequences)} recording(s) the error is {1e3 * after:.2f} mrad with "
                 f"the fit and {1e3 * before:.2f} mrad with {spec.name}; give longer logs (--seconds), or keep the robot"
@@ -375,5 +375,5 @@ def adapt_robot(
 
 
 def _window_rms(progress: Progress) -> Callable[[int, int, float], None]:
-    """Return a callback of refit, whose third argument is the RMS error of the windows, rad."""
+    """Return a callback of adapt, whose third argument is the RMS error of the windows, rad."""
     return lambda done, total, rms: progress(done, total, f"window RMS {rms * 1e3:.2f} mrad")

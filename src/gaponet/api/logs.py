@@ -257,17 +257,22 @@ def _further_motions(
     spec: RobotSpec, seconds: float, payloads: tuple[float, ...], seed: int, progress: Progress
 ) -> tuple[Plan, Prediction]:
     """Choose the motions that reduce the standard errors most."""
-    from gaponet.sysid.motion.experiment_design import ExperimentDesign, candidates, expected, open_gains
+    from gaponet.sysid.motion.experiment_design import (
+        ExperimentDesign,
+        candidate_motions,
+        simulated_recordings,
+        undetermined_gains,
+    )  # fmt: skip
     from gaponet.sysid.motion.library import Library
     from gaponet.sysid.motion.plan import Plan
 
     uncertainty = ParameterUncertainty.require(spec)
     if payloads[0] < 0 or (payloads[-1] > 0 and not spec.payload_mounts):
         raise UsageError(f"--payloads {payloads}: give kg ≥ 0; {spec.name} has {len(spec.payload_mounts)} mounts")
-    motions = candidates(Library(spec, seed, payloads[-1]), progress)
+    motions = candidate_motions(Library(spec, seed, payloads[-1]), progress)
     pairs = [(mass, motion) for mass in payloads for motion in motions]
     design = ExperimentDesign.from_recordings(
-        spec, uncertainty, [s for mass in payloads for s in expected(spec, motions, mass)]
+        spec, uncertainty, [s for mass in payloads for s in simulated_recordings(spec, motions, mass)]
     )
     picks = sorted(design.choose(seconds), key=lambda i: pairs[i][0])
     if not picks:
@@ -276,7 +281,7 @@ def _further_motions(
     chosen = tuple(pairs[i] for i in picks)
     return Plan(chosen), Prediction(
         before=before, after=after, useful_seconds=design.worth(),
-        undetermined=open_gains(spec, uncertainty, design, motions, payloads),
+        undetermined=undetermined_gains(spec, uncertainty, design, motions, payloads),
         played=tuple((mass, motion.name) for mass, motion in chosen),
     )  # fmt: skip
 

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.finding import Finding
     from gaponet.robot.spec import RobotSpec
-    from gaponet.sysid.drift import Drift, Moved
-    from gaponet.sysid.fit import Identified
-    from gaponet.sysid.torque_motors import Driven
+    from gaponet.sysid.acceptance import Identified
+    from gaponet.sysid.drift import Drift, ParameterChange
+    from gaponet.sysid.torque_motors import TorqueDrivenFit
 
 Metrics = dict[str, Any]  # mpjae rad, q_dis rad·s, …, and by_joint, by_payload, by_unit, by_motion, by_horizon
 
@@ -199,7 +199,7 @@ class IdentifyResult:
 
     def values(self) -> dict[str, dict[str, float]]:
         """Operated joint → servo field → value, SI; fields without information are left out."""
-        from gaponet.sysid.uncertainty_table import FIELD_UNITS
+        from gaponet.sysid.uncertainty import FIELD_UNITS
 
         robot = self.robot
         return {
@@ -219,12 +219,14 @@ class IdentifyResult:
         return {
             "chosen": fit.chosen, "joints": self.values(), "std": fit.std, "val_mpjae": self.val_mpjae,
             "val_standard_error": {name: standard_error(errors) for name, errors in self.errors.items()},
-            "terms": {t.name: {"gain": t.gain[0], "standard_error": t.gain[1], "kept": t.kept} for t in fit.tried},
+            "terms": {
+                c.name: {"gain": c.gain[0], "standard_error": c.gain[1], "kept": c.accepted} for c in fit.comparisons
+            },
             "shared": {
                 t.name: {"own": t.before.mean(), "one": t.after.mean(), "standard_error": t.gain[1]} for t in fit.shared
             },
             "table": vars(self.robot.table) if self.robot.table else None,
-            "touching": list(fit.touch.motions) if fit.touch else [],
+            "touching": list(fit.table_fit.motions) if fit.table_fit else [],
             "warnings": list(fit.warnings), "undetermined": fit.undetermined,
             "seconds": self.seconds, "robot": str(self.folder),
         }  # fmt: skip
@@ -245,15 +247,15 @@ class TorqueResult:
     before: float
     after: float
     virtual: bool
-    fit: Driven = field(repr=False)
+    fit: TorqueDrivenFit = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain data."""
-        from gaponet.sysid.torque_motors import TERMS
+        from gaponet.sysid.torque_motors import PASSIVE_FIELDS
 
         fit, robot = self.fit, self.robot
         joints = {
-            joint: {f: float(getattr(robot, f)[i]) for f in (*TERMS, "delay")}
+            joint: {f: float(getattr(robot, f)[i]) for f in (*PASSIVE_FIELDS, "delay")}
             | {"bias": float(fit.bias[j]), "constant": float(fit.constant[j])}
             for j, (joint, i) in enumerate(zip(robot.operated, robot.operated_index, strict=True))
         }
@@ -338,7 +340,7 @@ class CheckResult:
         """The result as plain data."""
         d = self.drift
 
-        def plain(moved: Moved) -> dict[str, Any]:
+        def plain(moved: ParameterChange) -> dict[str, Any]:
             return {**vars(moved), "sigmas": moved.sigmas}
 
         return {

@@ -87,8 +87,8 @@ def adapt(
 
 def _show(screen: Out, made: AdaptResult) -> None:
     """Print a unit's servos and its payload."""
-    from gaponet.sysid.refit import FIELDS
-    from gaponet.sysid.uncertainty_table import FIELD_UNITS
+    from gaponet.sysid.adapt import FIELDS
+    from gaponet.sysid.uncertainty import FIELD_UNITS
 
     screen.table(f"Unit {made.unit_id}", ["joint", *(FIELD_UNITS[f][0] for f in FIELDS)], [
         [j, *(f"{v[f] * FIELD_UNITS[f][1]:.3g}" for f in FIELDS)] for j, v in made.servos.items()

@@ -17,7 +17,7 @@ from gaponet.robot.spec import load_robot
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 if TYPE_CHECKING:
-    from gaponet.sysid.drift import Moved
+    from gaponet.sysid.drift import ParameterChange
 
 Robot = Annotated[
     Folder,
@@ -119,8 +119,8 @@ def _check_fleet(
         raise SystemExit(1)
 
 
-def _row(m: Moved, known: ParameterUncertainty, counts: bool) -> list[str]:
-    from gaponet.sysid.uncertainty_table import format_change
+def _row(m: ParameterChange, known: ParameterUncertainty, counts: bool) -> list[str]:
+    from gaponet.sysid.uncertainty import format_change
 
     mine = [k.residual_rms for j, k in known.joints.items() if m.joint == j or m.joint not in known.joints]
     left = sum(mine) / len(mine)

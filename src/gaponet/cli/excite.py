@@ -14,7 +14,7 @@ from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.uncertainty_table import FIELD_UNITS
+from gaponet.sysid.uncertainty import FIELD_UNITS
 
 MAX_COLUMNS = 4  # of a table
 

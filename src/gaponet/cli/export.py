@@ -14,7 +14,7 @@ from gaponet.cli.attach import attach
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
-from gaponet.sysid.uncertainty_table import FIELD_UNITS
+from gaponet.sysid.uncertainty import FIELD_UNITS
 
 if TYPE_CHECKING:
     from gaponet.export.randomization import Engine, Scope

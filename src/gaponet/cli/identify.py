@@ -16,7 +16,7 @@ from gaponet.report.tables import mrad
 from gaponet.robot.spec import robot_argument
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
-from gaponet.sysid.uncertainty_table import FIELD_UNITS
+from gaponet.sysid.uncertainty import FIELD_UNITS
 
 WIDE = 4  # columns of a table
 UNDETERMINED = "not determined by these logs"
@@ -91,13 +91,12 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
             rows += [[f"published for {servo.name}, {servo.source}", *known]] * any(known)
         title = "Identified servos" if start == 0 else "The same"
         screen.table(f"{title}, ± standard error", ["joint", *(FIELD_UNITS[f][0] for f in part)], rows)
-    for term in found.tried:
+    for term in found.comparisons:
         fell, error = (mrad(x) for x in term.gain)
-        told = (
-            f"{len(term.before)} {'motions' if term.name == 'torque' else 'recordings'}; {'not ' * (not term.kept)}kept"
-        )
+        judges = "motions" if term.name == "torque" else "recordings"
+        told = f"{len(term.before)} {judges}; {'not ' * (not term.accepted)}kept"
         screen.say(f"{term.name}: validation error falls by {fell} ± {error} mrad over {told}")
-    if found.judged:
+    if found.judged_robot:
         screen.say("from torque, then fitted to the validation motions, too: the numbers are from before that")
         for m in found.robot.payload_mounts:
             screen.say(
@@ -107,10 +106,10 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         own, one = (mrad(e.mean()) for e in (law.before, law.after))
         costs = f"{mrad(-law.gain[0])} ± {mrad(law.gain[1])}"
         screen.say(f"one law for every {law.name}: {own} → {one} mrad over {len(law.before)} recordings, costs {costs}")
-    if found.touch is not None and found.touch.motions:
-        touch, table = found.touch, found.robot.table
+    if found.table_fit is not None and found.table_fit.motions:
+        touch, table = found.table_fit, found.robot.table
         what = "none that explains them"
-        if touch.kept and table is not None:
+        if touch.accepted and table is not None:
             what = f"height {table.height:.4f} m, friction {table.friction:.2f}, {table.stiffness:.0f} N/m"
         screen.say(
             f"table: {what}; where tips are low {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "

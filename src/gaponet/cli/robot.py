@@ -216,8 +216,7 @@ def show(
         out: Picture to write, .png or .svg.
     """
     from gaponet.report.figures.identified_robot import draw_uncertainty
-    from gaponet.sysid.uncertainty import ParameterUncertainty
-    from gaponet.sysid.uncertainty_table import FIELD_UNITS, sentences, summarize, table_rows
+    from gaponet.sysid.uncertainty import FIELD_UNITS, ParameterUncertainty, sentences, summarize, table_rows
 
     screen = Out(json)
     if not (robot / "robot.toml").is_file():

@@ -6,7 +6,7 @@ from gaponet.api.results import TorqueResult
 from gaponet.base.text import format_uncertainty
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
-from gaponet.sysid.torque_motors import TERMS
+from gaponet.sysid.torque_motors import PASSIVE_FIELDS
 
 UNITS = {
     "armature": ("armature, g·m²", 1e3),
@@ -21,7 +21,7 @@ def show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
     rows = []
     for j, name in enumerate(spec.operated):
         i = spec.operated_index[j]
-        values = {f: float(getattr(found.robot, f)[i]) for f in TERMS}
+        values = {f: float(getattr(found.robot, f)[i]) for f in PASSIVE_FIELDS}
         cells = [
             format_uncertainty(k * values[f], k * found.std[name][f]) if values[f] else "0"
             for f, (_, k) in UNITS.items()
@@ -31,7 +31,7 @@ def show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
                      *(f"{x[j]:.3g}" for x in found.torque)])  # fmt: skip
     columns = ["joint", *(title for title, _ in UNITS.values()), "delay, ms", "bias, N·m"]
     columns += ["N·m per unit"] * current + ["torque apart before, N·m", "after"]
-    screen.table("Driven joints, ± standard error; medians on recordings that were not fitted", columns, rows)
+    screen.table("TorqueDrivenFit joints, ± standard error; medians on recordings that were not fitted", columns, rows)
     ahead = (
         f"Angle apart from the {virtual}robot, so long after its state, mrad: before → after, {found.windows} starts"
     )

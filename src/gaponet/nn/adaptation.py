@@ -1,7 +1,7 @@
 """What is particular to one unit, beside a model: a small file per unit in RUN/adaptation/.
 
 No model can know a unit's gain, damping, friction, zero offsets and delay before it has seen the unit. They are fitted
-to half a minute of its log, as servo parameters of the simulator under the trained correction (sysid/refit.py); the
+to half a minute of its log, as servo parameters of the simulator under the trained correction (sysid/adapt.py); the
 network stays as it is. If nobody weighed what the unit carried, its mass is fitted with them.
 """
 
@@ -23,7 +23,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.refit import FIELDS, Field, refit
+from gaponet.sysid.adapt import FIELDS, Field, adapt
 
 FOLDERS = ("calibration", "adaptation")  # the former name, and the one that is written
 
@@ -79,10 +79,10 @@ class Adaptation:
             model: Its correction is applied while fitting.
             sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
             unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
-            progress: The same as refit's.
+            progress: The same as adapt's.
         """
         unit = _one_unit(sequences)
-        found = refit(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)
+        found = adapt(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)
         servos = {
             j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
             for j in simulator.operated

@@ -31,6 +31,11 @@ def standard_error(values: Array) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
+def exceeds_standard_error(gains: Array) -> bool:
+    """Return whether the mean of gains (motions,) exceeds its standard error; whether a single gain is positive."""
+    return bool(gains.mean() > np.nan_to_num(standard_error(gains)))
+
+
 @dataclass(frozen=True)
 class Run:
     """One simulated sequence beside its recording: real and sim positions of the operated joints, (T, n) rad."""

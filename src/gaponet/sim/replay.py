@@ -80,12 +80,18 @@ def replay(
     return [twins[i] for i in range(len(sequences))]
 
 
-def whole_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> Array:
-    """Mean |error| of each whole motion in free run, operated joints that it holds, (motions,) rad."""
+def rollout_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> Array:
+    """Return the mean |error| of each sequence's rollout, of the operated joints that it holds, (sequences,) rad."""
     twins = replay(sequences, robot, nthread=nthread, lock_idle=True)
     held = [[i for i in robot.operated_index if robot.joint_names[i] not in s.meta.unrecorded] for s in sequences]
     errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t, op in zip(sequences, twins, held, strict=True)]
     return np.nan_to_num(np.array(errors), nan=np.pi)
+
+
+def motion_errors(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
+    """Return `rollout_errors` averaged over the sequences of each motion, (motions,) rad."""
+    each, motions = rollout_errors(sequences, robot), np.array([s.meta.motion for s in sequences])
+    return np.array([each[motions == motion].mean() for motion in dict.fromkeys(motions.tolist())])
 
 
 def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
-"""A servo's parameters as a search sees them: in units in which a change of one is large, inside their bounds.
+"""Axes of a search: servo parameters in units in which a change of one is large, inside their bounds.
 
-What a motion shows is a torque over kp, whatever kp is: so torques are searched as multiples of kp, damping as a time,
-armature as a time squared, in bounds that hold for any motor. A robot file's gains are where a search starts, no more.
+A motion shows torques divided by kp, whatever kp is. So torques are searched as multiples of kp, damping as a time, and
+armature as a time squared, with bounds that hold for any motor. The gains of a robot file only start a search.
 """
 
 from __future__ import annotations
@@ -20,17 +20,28 @@ from gaponet.sim.model import build_model
 Values = dict[str, Array]  # field → (…, n) of the operated joints
 
 CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
+SINGLE_JOINT_FIELDS = ("effort_limit", "encoder_step")  # only joints by themselves are searched for these
 LOGARITHM = ("kp", "stribeck_speed")
 OVER_KP = ("damping", "frictionloss", "armature", "stribeck", "min_torque", "effort_limit")
-FIRST_DELAY, MAX_DELAY = 0.02, 0.15  # s: a delay of zero hides what it does
-RESOLVED = 5.0  # physics steps in a radian of the stiffest oscillation that a search starts from
-WIDE_KP, SLOW, HEAVY, ZERO = 5.0, 1.0, 0.3, 0.2  # logarithm of kp, s of damping/kp, s of √(armature/kp), rad of offset
-STILL = 0.01  # rad: commands that differ by less ask nothing of a joint
-STANDING = ("kp", "offset", "damping", "frictionloss")  # of a joint that is never moved: how it gives way to others
+START_DELAY_S, MAX_DELAY_S = 0.02, 0.15  # a start without delay has no slope over it
+MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
+MAX_KP_LOG_CHANGE, MAX_DAMPING_TIME_S, MAX_ARMATURE_TIME_S, MAX_OFFSET_RAD = 5.0, 1.0, 0.3, 0.2
+MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
+UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")  # of an unexcited joint, fitted as others move it
+BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
+ADVICE = {
+    "kp": "check its unit (N·m/rad) and the stated payload",
+    "damping": "check kp's unit, and that commands are positions",
+    "frictionloss": "check kp's unit, and that nothing held the joint",
+    "armature": "check the masses in the MJCF and kp's unit",
+    "offset": "check the joint's zero and its sign",
+    "delay": "check that commands and states have one clock",
+    "effort_limit": "check effort_limit in robot.toml",
+}
 
 
 def first_values(robot: RobotSpec) -> Values:
-    """The given robot's own, (n,) each. Damping is the MJCF's: what is below zero is taken from the servo's kd."""
+    """Return the robot's own values, (n,) each. Damping is the MJCF's; below zero it is taken from the servo's kd."""
     model, op = build_model(replace(robot, table=None)), robot.operated_index
     dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
     passive = {f: np.array(getattr(model, f"dof_{f}")[dof]) for f in ("damping", "frictionloss", "armature")}
@@ -38,44 +49,47 @@ def first_values(robot: RobotSpec) -> Values:
 
 
 class Bounds:
-    """What the parameters of a robot's operated joints may be.
+    """Bounds of the parameters of a robot's n operated joints.
 
     Attributes:
         first: The given robot's own values.
-        start: Where a search starts: a little late, and with as much armature as the physics step resolves.
-        spare: kd that may be lacking, (n,) N·m·s/rad: the servos', where no recording states it.
-        still: Joints that no recording moves, (n,).
-        limits: Field → lowest, highest, a large change, (n,) each, on the search's axes.
-        guess: A first value for a field of the law.
+        start: Start of a search: with a delay, and with as much armature as the physics step resolves.
+        stated: Whether all recordings state their kp.
+        kd_slack: kd that damping may take from the servos, (n,) N·m·s/rad; 0 if all recordings state it.
+        unexcited: Joints that no command moves, (n,).
+        limits: Field → lowest, highest, a large change, (n,) each, in the axes' units.
+        guess: First value of a field of the servo model.
     """
 
     def __init__(self, robot: RobotSpec, sequences: ListOf[Sequence]) -> None:
         op, self.n = robot.operated_index, len(robot.operated)
+        self._joints, self._kd = robot.operated, robot.kd[op]
         model = build_model(replace(robot, table=None))
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
-        kp, kd, limit = robot.kp[op], robot.kd[op], robot.effort_limit[op]
+        kp, limit = robot.kp[op], robot.effort_limit[op]
         self.first = first_values(robot)
-        stated = all(s.meta.known_gains[1] is not None for s in sequences)
         self.stated = all(s.meta.known_gains[0] is not None for s in sequences)
-        self.spare = np.zeros(self.n) if stated else kd.copy()
-        moved = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
-        self.still = moved < STILL
-        resolved = kp * (RESOLVED * model.opt.timestep) ** 2 - (model.dof_M0[dof] - model.dof_armature[dof])
+        kd_stated = all(s.meta.known_gains[1] is not None for s in sequences)
+        self.kd_slack = np.zeros(self.n) if kd_stated else self._kd.copy()
+        excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
+        self.unexcited = excitation < MIN_EXCITATION_RAD
+        least_inertia = kp * (MIN_STEPS_PER_RADIAN * model.opt.timestep) ** 2
+        resolved = least_inertia - (model.dof_M0[dof] - model.dof_armature[dof])
         self.start: Values = {f: self.first[f] for f in CLASSIC} | {
-            "delay": np.maximum(self.first["delay"], FIRST_DELAY),
+            "delay": np.maximum(self.first["delay"], START_DELAY_S),
             "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),
         }
-        self.start |= {f: np.where(self.still, self.first[f], self.start[f]) for f in ("delay", "armature")}
+        self.start |= {f: np.where(self.unexcited, self.first[f], self.start[f]) for f in ("delay", "armature")}
         self.start |= {f: self.first[f] for f in SERVO_TERMS if self.first[f].any()}
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)
         self.limits: dict[str, tuple[Array, Array, Array]] = {
-            "kp": (np.log(kp) - WIDE_KP, np.log(kp) + WIDE_KP, 0.3 * one),
-            "damping": (0 * one, SLOW * one, 0.015 * one),
+            "kp": (np.log(kp) - MAX_KP_LOG_CHANGE, np.log(kp) + MAX_KP_LOG_CHANGE, 0.3 * one),
+            "damping": (0 * one, MAX_DAMPING_TIME_S * one, 0.015 * one),
             "frictionloss": (0 * one, 0.2 * one, 0.005 * one),
-            "armature": (0 * one, HEAVY**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
-            "offset": (-ZERO * one, ZERO * one, 0.01 * one),
-            "delay": (0 * one, MAX_DELAY * one, 0.005 * one),
+            "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
+            "offset": (-MAX_OFFSET_RAD * one, MAX_OFFSET_RAD * one, 0.01 * one),
+            "delay": (0 * one, MAX_DELAY_S * one, 0.005 * one),
             "stribeck": (0 * one, 0.1 * one, 0.002 * one),
             "stribeck_speed": (np.log(0.005) * one, 0 * one, 0.3 * one),
             "friction_motor": (0 * one, 0.8 * one, 0.05 * one),
@@ -85,38 +99,62 @@ class Bounds:
             "encoder_step": (counts, counts, one),
         }
         self.guess = {"stribeck": 0.003 * kp, "stribeck_speed": 0.05 * one, "friction_motor": 0.05 * one,
-                      "friction_external": 0.02 * one, "effort_limit": 0.6 * limit,  # one that is too high is not felt
+                      "friction_external": 0.02 * one, "effort_limit": 0.6 * limit,  # one that is too high has no slope
                       "min_torque": 0.003 * kp, "encoder_step": counts}  # fmt: skip
+
+    def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
+        """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
+        axes, found = Axes(self, names, values), []
+        x = axes.normalize(values)
+        for i, joint in enumerate(self._joints):
+            for k, f in enumerate(names):
+                fixed = axes.low[i, k] == axes.high[i, k] or (f == "stribeck_speed" and not values["stribeck"][i])
+                below = x[i, k] - axes.low[i, k] < BOUND_TOLERANCE and (f == "damping" or axes.low[i, k] != 0)
+                if fixed or not (below or axes.high[i, k] - x[i, k] < BOUND_TOLERANCE):
+                    continue
+                if f == "damping" and below and not self.kd_slack[i] and self._kd[i]:
+                    what = "0 beside the kd that the recordings state; less would fit better: check that kd"
+                elif f == "damping" and below:
+                    what = "none at all; check that commands are what the servo was given, and their clock"
+                else:
+                    end, advice = "least" if below else "most", ADVICE.get(f, "the servo model does not fit")
+                    what = f"{values[f][i]:.4g}, the {end} that is tried; {advice}"
+                found.append(f"{joint}: {f} ended at its bound: {what}")
+        return tuple(found)
 
 
 class Axes:
-    """Fields as the search sees them, (…, n, P). Those that are not searched stay, as do those of joints that stand."""
+    """Fields on the axes of a search, (…, n, P).
+
+    Attributes:
+        names: The P fields.
+        rest: Values of the fields that are not searched.
+        unit: A large change, (n, P).
+        low, high: Bounds, (n, P); equal where a field of an unexcited joint is fixed.
+    """
 
     def __init__(self, bounds: Bounds, fields: ListOf[str], rest: Values) -> None:
-        self.names, self.rest, self.spare = list(dict.fromkeys(fields)), rest, bounds.spare
+        self.names, self.rest, self._kd_slack = list(dict.fromkeys(fields)), rest, bounds.kd_slack
         low, high, self.unit = (np.stack([bounds.limits[f][i] for f in self.names], axis=1) for i in range(3))
         self.low, self.high = low / self.unit, high / self.unit
-        here = self._seen(rest)
-        held = bounds.still[:, None] & ~np.isin(self.names, STANDING)
-        self.low, self.high = np.where(held, here, self.low), np.where(held, here, self.high)
+        here = self._unclipped(rest)
+        fixed = bounds.unexcited[:, None] & ~np.isin(self.names, UNEXCITED_FIELDS)
+        self.low, self.high = np.where(fixed, here, self.low), np.where(fixed, here, self.high)
 
-    def of(self, values: Values) -> Array:
-        """From values, inside the bounds."""
-        return np.clip(self._seen(values), self.low, self.high)
+    def normalize(self, values: Values) -> Array:
+        """Return values (…, n) on the axes, inside the bounds."""
+        return np.clip(self._unclipped(values), self.low, self.high)
 
-    def _seen(self, values: Values) -> Array:
+    def _unclipped(self, values: Values) -> Array:
         kp = values["kp"]
-        seen = {f: values[f] + self.spare if f == "damping" else values[f] for f in self.names}
-        return (
-            np.stack([
-                np.log(np.maximum(x, 1e-9)) if f in LOGARITHM else x / kp ** (f in OVER_KP) for f, x in seen.items()
-            ], axis=-1) / self.unit
-        )  # fmt: skip
+        own = {f: values[f] + self._kd_slack if f == "damping" else values[f] for f in self.names}
+        columns = [np.log(np.maximum(x, 1e-9)) if f in LOGARITHM else x / kp ** (f in OVER_KP) for f, x in own.items()]
+        return np.stack(columns, axis=-1) / self.unit
 
     def values(self, x: Array) -> Values:
-        """To values; fields that are not searched stay."""
+        """Return values of x on the axes; fields that are not searched stay."""
         own = dict(zip(self.names, np.moveaxis(x * self.unit, -1, 0), strict=True))
-        found = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()} | own
-        found |= {f: np.exp(own[f]) for f in LOGARITHM if f in own}
-        found |= {f: own[f] * found["kp"] for f in OVER_KP if f in own}
-        return found | {"damping": found["damping"] - self.spare} if "damping" in own else found
+        values = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()} | own
+        values |= {f: np.exp(own[f]) for f in LOGARITHM if f in own}
+        values |= {f: own[f] * values["kp"] for f in OVER_KP if f in own}
+        return values | {"damping": values["damping"] - self._kd_slack} if "damping" in own else values

@@ -1,8 +1,8 @@
-"""Whether later recordings are still of the robot that was identified: by joint, which number moved, and by how much.
+"""Drift of a robot since its identification: which parameters changed, joint by joint, and by how much.
 
-At the robot's own values every cluster of the recordings pulls at the parameters. On the day of the identification
-these pulls all but balanced; what they lack of it now, beyond what recordings scatter, is a change. It is put down to
-as few numbers as explain it, the one that explains most first: to a joint's fields, or to play that was not there.
+At the robot's own values every cluster of the recordings has a gradient of the cost. On the day of the identification
+these gradients balanced, but for the stored Gauss-Newton step. A remaining gradient beyond the scatter of recordings is
+a change. As few parameters as possible explain it, the one that explains most first: a joint's fields, or play.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.stats import t as student
@@ -19,33 +20,34 @@ from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.axes import OVER_KP
-from gaponet.sysid.evidence import PLAY, Evidence, evidence, inverted, spread_of
-from gaponet.sysid.joint_rollouts import SOFT
+from gaponet.sysid.evidence import PLAY, Evidence, evidence, gradient_covariance, inverted, widened
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
-ALARM = 0.003  # of a robot that did not change: how often any of its numbers is said to have moved
-AGAINST = 1e-4  # the same of a recording that is said to contradict the others
-FELT = 0.15  # of what the model leaves anyway: a change that moves a joint by less is none that matters
-MOST = 3  # numbers of a joint that are named
-TRUSTED = 40  # the most clusters that what was known counts as
-MINORITY = 0.4  # of the recordings: so many that say something else are set aside, more contradict the others
-SHARED = ("delay",)  # of one bus: all joints' move together
-EVERY = "every joint"
-WARM = ("damping", "frictionloss", "stribeck")
-FAR = 2.5  # times what the model left when it was identified, in half of the windows: no longer this robot
-ELSE = 0.4  # of all joints: so many with kp or several numbers moved are another robot's
+FALSE_ALARM_RATE = 0.003  # of a robot that did not change, for all its parameters together
+FALSE_CONTRADICTION_RATE = 1e-4  # of recordings that agree
+MIN_EFFECT_RATIO = 0.15  # of a change's effect on the joint's path, over the residual
+MAX_CHANGES_PER_JOINT = 3
+MAX_PRIOR_CLUSTERS = 40  # that the identification's overdispersion counts as
+MAX_SET_ASIDE = 0.4  # of the recordings; more of them contradict the others
+COMMON_FIELDS = ("delay",)  # of one bus: those of all joints change together
+EVERY_JOINT = "every joint"
+FRICTION_FIELDS = ("damping", "frictionloss", "stribeck")
+FAR_RATIO = 2.5  # of half of the windows' errors over the residual of the identification: another robot
+MAX_CHANGED_JOINTS = 0.4  # of all joints: more with another kp or several changes are another robot's
 
-Verdict = str  # same, drifted, contradictory
+Verdict = Literal["same", "drifted", "contradictory"]
 
 
 @dataclass(frozen=True)
-class Moved:
-    """A number of a joint that is another one now.
+class ParameterChange:
+    """Change of one parameter of a joint.
 
     Attributes:
+        joint: Its name, or EVERY_JOINT.
         field: The servo's field, or play (rad).
-        by, error: Change on the axes of sysid/uncertainty.py and its standard error.
-        moves: How far that moves the joint along these recordings, RMS, rad.
+        by, error: Change on the axes of sysid/uncertainty.py, and its standard error.
+        moves: RMS effect on the joint's path in these recordings, rad.
     """
 
     joint: str
@@ -56,13 +58,13 @@ class Moved:
 
     @property
     def sigmas(self) -> float:
-        """Standard deviations: noise, the model's errors and how far recordings scatter together."""
+        """Change over its standard error, which includes noise, model errors and the overdispersion of recordings."""
         return self.by / self.error
 
 
 @dataclass(frozen=True)
-class Against:
-    """A recording that says something else than the others: joint, field, by how much, in standard deviations."""
+class Contradiction:
+    """Recording that contradicts the others: a joint's field, the difference on its axis, in standard errors."""
 
     recording: str
     joint: str
@@ -73,206 +75,228 @@ class Against:
 
 @dataclass(frozen=True)
 class Drift:
-    """What was found; the largest change of every joint, whether it counts or not; recordings that were set aside since
-    they differ from the others; joints that are FAR from the model, and how many times what it left."""
+    """Result of a drift check.
+
+    Attributes:
+        verdict: same, drifted or contradictory.
+        moved: Significant changes.
+        largest: Joint → its largest change, significant or not.
+        against: Recordings that were set aside since they contradict the others.
+        advice: What to do.
+        threshold: Standard errors from which a change is significant.
+        seconds: Duration of the recordings.
+        far: Joint → error over the identification's residual, where it exceeds FAR_RATIO.
+    """
 
     verdict: Verdict
-    moved: tuple[Moved, ...]
-    largest: Mapping[str, Moved]
-    against: tuple[Against, ...]
+    moved: tuple[ParameterChange, ...]
+    largest: Mapping[str, ParameterChange]
+    against: tuple[Contradiction, ...]
     advice: str
     threshold: float
     seconds: float
     far: Mapping[str, float]
 
 
-def drift(robot: RobotSpec, known: ParameterUncertainty, sequences: ListOf[Sequence], nthread: int = 0) -> Drift:
-    """Compare recordings with what is known of a robot.
+def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf[Sequence], nthread: int = 0) -> Drift:
+    """Compare recordings with the stored uncertainty of a robot.
 
     Args:
-        robot: The robot of the folder that keeps the knowledge.
-        sequences: Recordings of the robot that is said to be the same.
+        robot: Identified robot.
+        uncertainty: Its uncertainty.
+        sequences: Recordings of a robot that should be the same.
+        nthread: Threads, 0 for all cores.
 
     Raises:
         UsageError: The recordings are too short, or move no joint.
     """
-    says = evidence(robot, sequences, known.fields, nthread=nthread)
-    if not says.rows.any():
+    own = evidence(robot, sequences, uncertainty.fields, nthread=nthread)
+    if not own.rows.any():
         raise UsageError("no recording moves an operated joint away from what it may touch; record gaponet excite's")
-    fields, joints = (*known.fields, PLAY), robot.operated
+    fields, joints = (*uncertainty.fields, PLAY), robot.operated
     times = {
-        j: float(np.median(e)) / max(known.joints[j].residual_rms, 1e-9) for j, e in zip(joints, says.left, strict=True)
+        j: float(np.median(e)) / max(uncertainty.joints[j].residual_rms, 1e-9)
+        for j, e in zip(joints, own.window_rms, strict=True)
     }
-    far = {j: by for j, by in times.items() if by > FAR}
-    scatter = np.stack([np.maximum(known.array(j, "overdispersion"), 1.0) for j in joints])
-    against = _contradictions(says.by_recording(), scatter, known, joints, fields)
+    far = {j: by for j, by in times.items() if by > FAR_RATIO}
+    overdispersion = np.stack([np.maximum(uncertainty.array(j, "overdispersion"), 1.0) for j in joints])
+    against = _contradictions(own.by_recording(), overdispersion, uncertainty, joints, fields)
     aside = {a.recording for a in against}
-    contradictory = len(aside) > MINORITY * len(says.names)
-    says = says if contradictory else says.without(aside)
-    grouped = says.by_recording() if len(says.names) > 1 else says
-    clusters, trusted = grouped.pulls.shape[1], min(known.clusters, TRUSTED)
-    tests = len(joints) * len(fields) + len(SHARED)
-    threshold = float(student.isf(ALARM / tests / 2, trusted + clusters - 1))
-    normal = grouped.normals.sum(axis=1)
-    spread = trusted * widened(normal, scatter) + (clusters - 1) * spread_of(grouped.pulls)
+    contradictory = len(aside) > MAX_SET_ASIDE * len(own.names)
+    own = own if contradictory else own.without(aside)
+    grouped = own.by_recording() if len(own.names) > 1 else own
+    clusters, trusted = grouped.gradients.shape[1], min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)
+    tests = len(joints) * len(fields) + len(COMMON_FIELDS)
+    threshold = float(student.isf(FALSE_ALARM_RATE / tests / 2, trusted + clusters - 1))
+    information, freedom = grouped.information.sum(axis=1), trusted + clusters - 1
+    scatter = trusted * widened(information, overdispersion) + (clusters - 1) * gradient_covariance(grouped.gradients)
+    gradients, rows = grouped.gradients.sum(axis=1), own.rows.astype(int).tolist()
     each = [
-        _Joint.of(j, fields, known, normal[i], grouped.pulls[i].sum(axis=0), spread[i] / (trusted + clusters - 1),
-                  int(says.rows[i]))
+        _Joint.of(j, fields, uncertainty, information[i], gradients[i], scatter[i] / freedom, rows[i])
         for i, j in enumerate(joints)
-    ]  # fmt: skip
-    moved = [m for f in SHARED if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))]
-    largest: dict[str, Moved] = {m.joint: m for m in moved}
+    ]
+    moved = [m for f in COMMON_FIELDS if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))]
+    largest: dict[str, ParameterChange] = {m.joint: m for m in moved}
     for one in each:
         found, first = one.explained(threshold)
         moved += found
         largest |= {one.name: first} if first else {}
-    verdict = "contradictory" if contradictory else "drifted" if moved or far else "same"
+    verdict: Verdict = "contradictory" if contradictory else "drifted" if moved or far else "same"
     seconds = float(sum(s.duration for s in sequences))
     return Drift(
         verdict, tuple(moved), largest, against, _advice(verdict, moved, against, joints, far), threshold, seconds, far
     )
 
 
-def widened(normal: Array, scatter: Array) -> Array:
-    """Covariance of the sum of pulls, (n, Q, Q), that scatter so much farther than independent rows."""
-    root = np.sqrt(scatter)
-    return np.asarray(root[..., :, None] * normal * root[..., None, :])
+def directions(uncertainty: ParameterUncertainty, joint: str) -> Array:
+    """Return the change of the axes and play by each parameter alone in SI units, column by column, (Q, Q).
 
-
-def directions(known: ParameterUncertainty, joint: str) -> Array:
-    """How the axes and play move when one number alone does, in SI: column by column, (Q, Q). A softer motor has the
-    friction that it had, so over its gain it has more."""
-    found = np.eye(len(known.fields) + 1)
-    for i, (field, value) in enumerate(zip(known.fields, known.joints[joint].values, strict=True)):
-        found[i, known.fields.index("kp")] -= value * (field in OVER_KP)
+    A softer motor has the friction that it had, so its friction over kp is larger.
+    """
+    found = np.eye(len(uncertainty.fields) + 1)
+    for i, (field, value) in enumerate(zip(uncertainty.fields, uncertainty.joints[joint].values, strict=True)):
+        found[i, uncertainty.fields.index("kp")] -= value * (field in OVER_KP)
     return found
 
 
 @dataclass
 class _Joint:
-    """One joint's pull (Q), what a change of each number pulls (Q, Q), the inverse of the pull's covariance (Q, Q), by
-    how much a change of one moves the joint, RMS (Q) rad, and what is felt, rad."""
+    """Gradient of one joint that changes are to explain.
+
+    Attributes:
+        gradient: (Q,).
+        columns: Gradient by a change of each parameter, (Q, Q).
+        weight: Inverse of the gradient's covariance, (Q, Q).
+        effect: RMS effect of a change of one on the joint's path, (Q,) rad.
+        min_effect: Least effect that counts, rad.
+    """
 
     name: str
     fields: tuple[str, ...]
-    pull: Array
+    gradient: Array
     columns: Array
     weight: Array
-    length: Array
-    felt: float
+    effect: Array
+    min_effect: float
 
     @classmethod
     def of(
         cls,
         joint: str,
         fields: tuple[str, ...],
-        known: ParameterUncertainty,
-        normal: Array,
-        pulls: Array,
-        spread: Array,
+        uncertainty: ParameterUncertainty,
+        information: Array,
+        gradient: Array,
+        scatter: Array,
         rows: int,
     ) -> _Joint:
-        """What is left of the pulls that the robot had when it was identified."""
-        step, about, way = (
-            known.array(joint, "gauss_newton_step"),
-            known.array(joint, "gauss_newton_covariance"),
-            directions(known, joint),
-        )
-        variance = spread + normal @ about @ normal
+        """Make the gradient that remains beyond that of the identification."""
+        step = uncertainty.array(joint, "gauss_newton_step")
+        step_covariance = uncertainty.array(joint, "gauss_newton_covariance")
+        way = directions(uncertainty, joint)
+        variance = scatter + information @ step_covariance @ information
         size = np.sqrt(np.maximum(np.diag(variance), 1e-30))
         weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
-        length = SOFT * np.sqrt(np.maximum(np.diag(way.T @ normal @ way), 0.0) / max(rows, 1))
-        felt = FELT * known.joints[joint].residual_rms
-        return cls(joint, fields, -pulls - normal @ step, normal @ way, weight, length, felt)
+        effect = ERROR_SCALE_RAD * np.sqrt(np.maximum(np.diag(way.T @ information @ way), 0.0) / max(rows, 1))
+        min_effect = MIN_EFFECT_RATIO * uncertainty.joints[joint].residual_rms
+        rest = -gradient - information @ step
+        return cls(joint, fields, rest, information @ way, weight, effect, min_effect)
 
-    def explained(self, threshold: float) -> tuple[list[Moved], Moved | None]:
-        """The numbers that moved, and the largest change of one alone; each is worth naming where it also is felt."""
-        told: list[Moved] = []
-        first: Moved | None = None
-        while len(told) < MOST:
-            chosen, what = [self.fields.index(m.field) for m in told], list[Moved]()
-            for k in np.flatnonzero(self.length > 0).tolist():
+    def explained(self, threshold: float) -> tuple[list[ParameterChange], ParameterChange | None]:
+        """Return the significant changes with enough effect, and the largest change of one parameter alone."""
+        changes: list[ParameterChange] = []
+        first: ParameterChange | None = None
+        while len(changes) < MAX_CHANGES_PER_JOINT:
+            chosen, what = [self.fields.index(m.field) for m in changes], list[ParameterChange]()
+            for k in np.flatnonzero(self.effect > 0).tolist():
                 if k not in chosen:
                     tried = self._moved([*chosen, k])
                     what = tried if not what or abs(tried[-1].sigmas) > abs(what[-1].sigmas) else what
             first = first or (what[-1] if what else None)
-            if not what or abs(what[-1].sigmas) < threshold or what[-1].moves < self.felt:
+            if not what or abs(what[-1].sigmas) < threshold or what[-1].moves < self.min_effect:
                 break
-            told = what
-        return told, first
+            changes = what
+        return changes, first
 
-    def _moved(self, numbers: list[int]) -> list[Moved]:
-        by, error = _solved(self.columns[:, numbers], self.weight, self.pull)
+    def _moved(self, numbers: list[int]) -> list[ParameterChange]:
+        by, error = _solved(self.columns[:, numbers], self.weight, self.gradient)
         return [
-            Moved(self.name, self.fields[i], float(b), float(e), float(abs(b) * self.length[i]))
+            ParameterChange(self.name, self.fields[i], float(b), float(e), float(abs(b) * self.effect[i]))
             for i, b, e in zip(numbers, by, error, strict=True)
         ]
 
 
-def _together(joints: ListOf[_Joint], number: int, threshold: float) -> Moved | None:
-    """A number that moved in every joint by the same, if that says more than the joints do alone; it is taken out."""
-    known = np.array([j.columns[:, number] @ j.weight @ j.columns[:, number] for j in joints])
-    says = np.array([j.columns[:, number] @ j.weight @ j.pull for j in joints])
-    by, error = float(says.sum() / max(known.sum(), 1e-300)), float(max(known.sum(), 1e-300) ** -0.5)
-    moves = float(np.sqrt(np.mean([(by * j.length[number]) ** 2 for j in joints])))
-    found = Moved(EVERY, joints[0].fields[number], by, error, moves)
+def _together(joints: ListOf[_Joint], number: int, threshold: float) -> ParameterChange | None:
+    """Return a parameter that changed in every joint by the same, if that is more significant than the joints' own
+    changes; it is then taken out of their gradients."""
+    information = np.array([j.columns[:, number] @ j.weight @ j.columns[:, number] for j in joints])
+    pulls = np.array([j.columns[:, number] @ j.weight @ j.gradient for j in joints])
+    total = max(information.sum(), 1e-300)
+    by, error = float(pulls.sum() / total), float(total**-0.5)
+    moves = float(np.sqrt(np.mean([(by * j.effect[number]) ** 2 for j in joints])))
+    found = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
     alone = max((abs(m.sigmas) for j in joints if (m := j.explained(np.inf)[1])), default=0.0)
-    if abs(found.sigmas) < max(threshold, alone) or moves < np.mean([j.felt for j in joints]):
+    if abs(found.sigmas) < max(threshold, alone) or moves < np.mean([j.min_effect for j in joints]):
         return None
     for j in joints:
-        j.pull = j.pull - by * j.columns[:, number]
+        j.gradient = j.gradient - by * j.columns[:, number]
     return found
 
 
 def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
-    """Changes of some fields that explain pulls best, and their standard errors."""
+    """Return the changes of some fields that explain a gradient best, and their standard errors."""
     covariance = np.linalg.pinv(columns.T @ weight @ columns, hermitian=True)
     return covariance @ columns.T @ weight @ pull, np.sqrt(np.maximum(np.diag(covariance), 1e-300))
 
 
 def _contradictions(
-    says: Evidence, scatter: Array, known: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
-) -> tuple[Against, ...]:
-    """Recordings that differ from the rest of them by more than recordings do, the farthest first, which is then left
-    out of the rest; of each its farthest number."""
-    found: list[Against] = []
-    while len(says.names) > 1 and (worst := _farthest(says, scatter, known, joints, fields)):
+    own: Evidence, overdispersion: Array, uncertainty: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
+) -> tuple[Contradiction, ...]:
+    """Return the recordings that differ from the others by more than recordings scatter, the farthest first.
+
+    Each is then left out of the others; its farthest parameter is named.
+    """
+    found: list[Contradiction] = []
+    while len(own.names) > 1 and (worst := _farthest(own, overdispersion, uncertainty, joints, fields)):
         found.append(worst)
-        says = says.without({worst.recording})
+        own = own.without({worst.recording})
     return tuple(found)
 
 
 def _farthest(
-    says: Evidence, scatter: Array, known: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
-) -> Against | None:
-    count, worst = len(says.names), None
-    limit = float(student.isf(AGAINST / (count * len(joints) * len(fields)) / 2, min(known.clusters, TRUSTED)))
+    own: Evidence, overdispersion: Array, uncertainty: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
+) -> Contradiction | None:
+    count, worst = len(own.names), None
+    rate = FALSE_CONTRADICTION_RATE / (count * len(joints) * len(fields))
+    limit = float(student.isf(rate / 2, min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)))
     for i, joint in enumerate(joints):
-        total, pulls = says.normals[i].sum(axis=0), says.pulls[i].sum(axis=0)
+        information, gradient = own.information[i].sum(axis=0), own.gradients[i].sum(axis=0)
         for r in range(count):
-            mine, rest = says.normals[i, r], total - says.normals[i, r]
+            mine, rest = own.information[i, r], information - own.information[i, r]
             carried = mine @ inverted(rest[None])[0]
-            left = carried @ (pulls - says.pulls[i, r]) - says.pulls[i, r]
-            variance = widened(mine, scatter[i]) + carried @ widened(rest, scatter[i]) @ carried.T
+            difference = carried @ (gradient - own.gradients[i, r]) - own.gradients[i, r]
+            variance = widened(mine, overdispersion[i]) + carried @ widened(rest, overdispersion[i]) @ carried.T
             weight = np.linalg.pinv(variance, rcond=1e-9, hermitian=True)
             for k in range(len(fields)):
                 if mine[k, k] <= 0 or rest[k, k] < 0.5 * mine[k, k]:
                     continue
-                by, error = _solved(mine[:, [k]], weight, left)
+                by, error = _solved(mine[:, [k]], weight, difference)
                 sigmas = float(by[0] / error[0])
-                felt = SOFT * abs(by[0]) * np.sqrt(mine[k, k] * count / max(float(says.rows[i]), 1))
-                if (
-                    abs(sigmas) > max(limit, abs(worst.sigmas) if worst else 0)
-                    and felt > known.joints[joint].residual_rms
-                ):
-                    worst = Against(says.names[r], joint, fields[k], float(by[0]), sigmas)
+                effect = ERROR_SCALE_RAD * abs(by[0]) * np.sqrt(mine[k, k] * count / max(float(own.rows[i]), 1))
+                farther = abs(sigmas) > max(limit, abs(worst.sigmas) if worst else 0)
+                if farther and effect > uncertainty.joints[joint].residual_rms:
+                    worst = Contradiction(own.names[r], joint, fields[k], float(by[0]), sigmas)
     return worst
 
 
 def _advice(
-    verdict: Verdict, moved: ListOf[Moved], against: ListOf[Against], joints: ListOf[str], far: Mapping[str, float]
+    verdict: Verdict,
+    moved: ListOf[ParameterChange],
+    against: ListOf[Contradiction],
+    joints: ListOf[str],
+    far: Mapping[str, float],
 ) -> str:
-    """What to do."""
+    """Return what to do."""
     if verdict == "same":
         return "nothing to do"
     if verdict == "contradictory":
@@ -289,7 +313,7 @@ def _advice(
         )
     by = {j: [m for m in moved if m.joint == j] for j in joints}
     odd = [j for j, ms in by.items() if len(ms) > 1 or any(m.field == "kp" for m in ms)]
-    if len(odd) > ELSE * len(joints) and len(odd) > 1:
+    if len(odd) > MAX_CHANGED_JOINTS * len(joints) and len(odd) > 1:
         return (
             f"{len(odd)} of {len(joints)} joints have another stiffness or several other numbers: is this the same "
             "robot, with the same gains and payload? If so, identify again; an adaptation is not enough"
@@ -297,7 +321,7 @@ def _advice(
     play = sorted({m.joint for m in moved if m.field == PLAY and m.by > 0})
     if play:
         return f"look at the gearbox and the screws of {', '.join(play)}: play that was not there; then identify again"
-    eased = [m for m in moved if m.field in WARM]
+    eased = [m for m in moved if m.field in FRICTION_FIELDS]
     ways = {np.sign(m.by) for m in eased}
     if len({m.joint for m in eased}) > len(joints) / 2 and len(ways) == 1:
         how = "more easily: warmer" if ways == {-1.0} else "harder: colder, or dry"

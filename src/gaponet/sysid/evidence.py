@@ -1,4 +1,4 @@
-"""What recordings say near a robot's values, and what is known of it then."""
+"""Evidence of recordings about a robot's parameters: gradients and information near its values."""
 
 from __future__ import annotations
 
@@ -15,122 +15,136 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import replay
+from gaponet.sysid.acceptance import CONFIDENCE
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
-from gaponet.sysid.fit import SURE
-from gaponet.sysid.joint_rollouts import SOFT, JointRollouts
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import slopes
+from gaponet.sysid.problem import MIN_CLUSTERS, cluster_of_rows
 from gaponet.sysid.robot_rollouts import cut
-from gaponet.sysid.table_contact import tip_heights, touching_below
+from gaponet.sysid.table_contact import contact_height, tip_heights
 from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, Provenance, prior_std, to_axes
 
-WINDOWS, CLUSTERS = (
-    40,
-    24,
-)  # windows of 8 s; parts of the recordings that are thought independent of each other, at least
-SLACK = 0.002  # rad of a servo's error at which play has changed sides
-SMALL = 1e-6  # of a parameter's own information: less is none
-BAND = 0.9  # of all samples
-PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but what later recordings may show
+WINDOWS = 40  # of 8 s
+PLAY_TURN_RAD = 0.002  # servo error at which play has changed sides
+MIN_RELATIVE_INFORMATION = 1e-6  # of a parameter; less counts as none
+BOUND_QUANTILE = 0.9  # of all samples
+PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What recordings say near a robot's values, of n joints, C clusters, Q fields and play: pulls (n, C, Q) and slopes
-    squared (n, C, Q, Q) on the axes; rows that count (n); of which recording a cluster is (C), and their names; the RMS
-    error of each of W windows (n, W), rad."""
+    """Evidence of recordings of n joints about Q numbers: the fields of the axes, then play.
 
-    pulls: Array
-    normals: Array
+    Attributes:
+        gradients: Gradient of the cost in each of C clusters, (n, C, Q).
+        information: Gauss-Newton information in each cluster, (n, C, Q, Q).
+        rows: Number of rows that count, (n,).
+        recording: Recording of each cluster, (C,).
+        names: Names of the recordings.
+        window_rms: RMS error of each of W windows, (n, W) rad.
+    """
+
+    gradients: Array
+    information: Array
     rows: Array
     recording: Array
     names: tuple[str, ...]
-    left: Array
+    window_rms: Array
 
     def by_recording(self) -> Evidence:
-        """The same with one cluster of each recording."""
+        """Return the evidence with one cluster of each recording."""
         order = np.arange(len(self.names))
         pick = (self.recording == order[:, None]).astype(float)
-        pulls, normals = np.einsum("rc,ncq->nrq", pick, self.pulls), np.einsum("rc,ncqp->nrqp", pick, self.normals)
-        return Evidence(pulls, normals, self.rows, order, self.names, self.left)
+        gradients = np.einsum("rc,ncq->nrq", pick, self.gradients)
+        information = np.einsum("rc,ncqp->nrqp", pick, self.information)
+        return Evidence(gradients, information, self.rows, order, self.names, self.window_rms)
 
     def without(self, names: Collection[str]) -> Evidence:
-        """The same without these recordings."""
+        """Return the evidence without these recordings."""
         if not names:
             return self
         keep = np.array([self.names[r] not in names for r in self.recording])
-        left = tuple(name for name in self.names if name not in names)
-        order = np.array([left.index(self.names[r]) for r in self.recording[keep]])
+        rest = tuple(name for name in self.names if name not in names)
+        order = np.array([rest.index(self.names[r]) for r in self.recording[keep]])
         rows = self.rows * keep.mean()  # windows are as long as each other
-        return Evidence(self.pulls[:, keep], self.normals[:, keep], rows, order, left, self.left)
+        return Evidence(self.gradients[:, keep], self.information[:, keep], rows, order, rest, self.window_rms)
 
-    def scatter(self) -> Array:
-        """Variance of the clusters' sum of pulls over that of independent rows, (n, Q)."""
-        own = np.einsum("nckk->nk", self.normals)
-        spread = np.einsum("nkk->nk", spread_of(self.pulls))
-        return np.asarray(np.divide(spread, own, out=np.zeros_like(own), where=own > 0))
+    def overdispersion(self) -> Array:
+        """Return the variance of the clusters' summed gradients over that of independent rows, (n, Q)."""
+        own = np.einsum("nckk->nk", self.information)
+        scatter = np.einsum("nkk->nk", gradient_covariance(self.gradients))
+        return np.asarray(np.divide(scatter, own, out=np.zeros_like(own), where=own > 0))
 
-    def step(self, scatter: Array) -> tuple[Array, Array]:
-        """How far these recordings move the values by themselves, (n, Q), and the covariance of that."""
-        normal = self.normals.sum(axis=1)
-        inverse = inverted(normal)
-        root = np.sqrt(scatter)
-        spread = root[:, :, None] * normal * root[:, None, :]
-        return -(inverse @ self.pulls.sum(axis=1)[..., None])[..., 0], inverse @ spread @ inverse
+    def gauss_newton_step(self, overdispersion: Array) -> tuple[Array, Array]:
+        """Return the step that these recordings ask for by themselves, (n, Q), and its covariance."""
+        information = self.information.sum(axis=1)
+        inverse = inverted(information)
+        scatter = widened(information, overdispersion)
+        return -(inverse @ self.gradients.sum(axis=1)[..., None])[..., 0], inverse @ scatter @ inverse
 
 
-def clustered(pull: Array, window: Array) -> tuple[Array, Array]:
-    """Sums over clusters of rows (n, rows, …) → (n, C, …), and the window of each: windows, or parts of few."""
-    parts = max(1, -(-CLUSTERS // (int(window.max()) + 1)))
-    order, turn = np.argsort(window, kind="stable"), np.zeros(len(window), int)
-    count = np.diff(np.append(np.flatnonzero(np.diff(window[order], prepend=-1)), len(window)))
-    turn[order] = np.concatenate([np.arange(c) * parts // c for c in count])
-    cluster = window * parts + turn
-    each = np.zeros((len(pull), int(cluster.max()) + 1, *pull.shape[2:]))
-    np.add.at(each, (slice(None), cluster), pull)  # type: ignore[arg-type]
+def widened(information: Array, overdispersion: Array) -> Array:
+    """Return the covariance of summed gradients with this overdispersion, (…, Q, Q)."""
+    root = np.sqrt(overdispersion)
+    return np.asarray(root[..., :, None] * information * root[..., None, :])
+
+
+def clustered(x: Array, window: Array) -> tuple[Array, Array]:
+    """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster, (C,)."""
+    cluster, parts = cluster_of_rows(window)
+    each = np.zeros((len(x), int(cluster.max()) + 1, *x.shape[2:]))
+    np.add.at(each, (slice(None), cluster), x)  # type: ignore[arg-type]
     return each, np.arange(each.shape[1]) // parts
 
 
-def spread_of(pulls: Array) -> Array:
-    """Covariance of the sum of clusters' pulls (n, C, Q), from how far they are apart, (n, Q, Q)."""
-    each = pulls - pulls.mean(axis=1, keepdims=True)
-    return np.asarray(np.swapaxes(each, -1, -2) @ each * (pulls.shape[1] / max(pulls.shape[1] - 1, 1)))
+def gradient_covariance(gradients: Array) -> Array:
+    """Return the covariance of the sum of gradients (n, C, Q) from their scatter over clusters, (n, Q, Q)."""
+    each = gradients - gradients.mean(axis=1, keepdims=True)
+    return np.asarray(np.swapaxes(each, -1, -2) @ each * (gradients.shape[1] / max(gradients.shape[1] - 1, 1)))
 
 
-def inverted(normal: Array) -> Array:
-    """Inverse of (n, Q, Q), directions without information held."""
-    size = np.sqrt(np.maximum(np.einsum("...kk->...k", normal), 1e-12))
+def inverted(information: Array) -> Array:
+    """Return inverses of (n, Q, Q); directions without information get a little."""
+    size = np.sqrt(np.maximum(np.einsum("...kk->...k", information), 1e-12))
     both = size[..., :, None] * size[..., None, :]
-    return np.asarray(np.linalg.inv(normal / both + SMALL * np.eye(normal.shape[-1])) / both)
+    return np.asarray(
+        np.linalg.inv(information / both + MIN_RELATIVE_INFORMATION * np.eye(information.shape[-1])) / both
+    )
 
 
 def evidence(
     robot: RobotSpec, sequences: ListOf[Sequence], fields: ListOf[str], windows: int = WINDOWS, nthread: int = 0
 ) -> Evidence:
-    """Free runs of windows of recordings, every joint on its own beside them, at the robot's own values."""
-    below = touching_below(robot, tip_heights(sequences, robot))
+    """Compute the evidence of recordings by rollouts of every joint by itself, at the robot's own values."""
+    contact = contact_height(robot, tip_heights(sequences, robot))
     parts = cut(sequences, windows)
-    runs, bounds = JointRollouts(parts, robot, below, nthread), Bounds(robot, sequences)
+    rollouts, bounds = JointRollouts(parts, robot, contact, nthread), Bounds(robot, sequences)
     axes = Axes(bounds, fields, bounds.first)
-    x = axes.of(bounds.first)
-    flat = lambda xs: runs.errors(axes.values(xs)).reshape(len(xs), bounds.n, -1) / np.float32(SOFT)  # noqa: E731
-    here, jac = (y[0] for y in slopes(x[None], axes.high, flat))
+    x = axes.normalize(bounds.first)
+    here, jac = (
+        y[0]
+        for y in slopes(
+            x[None], axes.high, lambda xs: rollouts.flat_errors(axes.values(xs)) / np.float32(ERROR_SCALE_RAD)
+        )
+    )
     jac = jac / axes.unit[:, None] * (axes.low < axes.high)[:, None]
-    ends = slice(None, None, runs.thin)
-    late = np.round(bounds.first["delay"][:, None] / runs.periods).astype(int)
-    aim = np.array([[np.roll(c, d) for c, d in zip(*j, strict=True)] for j in zip(runs.ctrl, late, strict=True)])
-    asked = aim + bounds.first["offset"][:, None, None].astype(np.float32) - runs.qpos
-    play = 0.5 / SOFT * np.tanh(asked / SLACK)[..., ends] * (runs.counted & runs.recorded[..., None])
+    late = np.round(bounds.first["delay"][:, None] / rollouts.periods).astype(int)
+    aim = np.array([[np.roll(c, d) for c, d in zip(*j, strict=True)] for j in zip(rollouts.ctrl, late, strict=True)])
+    servo_error = aim + bounds.first["offset"][:, None, None].astype(np.float32) - rollouts.qpos
+    side = np.tanh(servo_error / PLAY_TURN_RAD)[..., :: rollouts.thin]
+    play = 0.5 / ERROR_SCALE_RAD * side * (rollouts.counted & rollouts.recorded[..., None])
     jac = np.concatenate([jac, play.reshape(bounds.n, -1, 1)], axis=-1)
     weight = 1 / np.sqrt(1 + here**2)
-    pulls, window = clustered(jac * (weight * here)[..., None], runs.window)
+    gradients, window = clustered(jac * (weight * here)[..., None], rollouts.window)
     each = ((j[None, :, :, None], (w[:, None] * j)[None, :, None, :]) for j, w in zip(jac, weight, strict=True))
-    normals = np.concatenate([clustered(a * b, runs.window)[0] for a, b in each])  # a joint at a time, for memory
+    # A joint at a time, for memory.
+    information = np.concatenate([clustered(a * b, rollouts.window)[0] for a, b in each])
     names = [f"{p.meta.motion}{f' ({p.meta.repetition})' * bool(p.meta.repetition)}" for p in parts]
-    own = dict.fromkeys(names)
-    of = np.array([list(own).index(name) for name in names])
-    error = SOFT * here.reshape(bounds.n, *runs.counted.shape)
-    far = np.sqrt(np.square(error).sum(axis=-1) / np.maximum(runs.counted.sum(axis=-1), 1))
-    return Evidence(pulls, normals, runs.rows, of[window], tuple(own), far)
+    unique = list(dict.fromkeys(names))
+    recording = np.array([unique.index(name) for name in names])
+    error = ERROR_SCALE_RAD * here.reshape(bounds.n, *rollouts.counted.shape)
+    rms = np.sqrt(np.square(error).sum(axis=-1) / np.maximum(rollouts.counted.sum(axis=-1), 1))
+    return Evidence(gradients, information, rollouts.rows, recording[window], tuple(unique), rms)
 
 
 def estimate_uncertainty(
@@ -139,52 +153,54 @@ def estimate_uncertainty(
     judges: ListOf[Sequence],
     covariances: Mapping[str, tuple[list[str], Array]] = {},
     before: ParameterUncertainty | None = None,
-    judged: RobotSpec | None = None,
+    judged_robot: RobotSpec | None = None,
     nthread: int = 0,
 ) -> ParameterUncertainty:
-    """What is known of a robot after it was fitted to recordings.
+    """Estimate the parameter uncertainty of a robot that was fitted to recordings.
 
     Args:
         robot: The robot with the fitted values.
         sequences: Recordings of one robot that it was fitted to.
-        judges: Recordings that were not; without any those that were.
-        covariances: Joint → fields and their covariance on the axes; where one is not given, recordings and what was
-            known before give it.
-        before: What was known of the robot that the fit began from. What these recordings deny of it is forgotten: its
-            variance grows by how far the values moved beyond their own.
-        judged: The robot that the judges say something of, where `robot` was fitted to them, too, afterwards.
+        judges: Recordings that were not fitted, for the residual; without any, the fitted ones.
+        covariances: Joint → fields and their covariance on the axes; of other joints it follows from the recordings and
+            from `before`.
+        before: Uncertainty of the robot that the fit began from. Its variance grows by how far the values moved beyond
+            what both uncertainties explain.
+        judged_robot: The robot that the judges apply to, if `robot` was fitted to them as well afterwards.
         nthread: Threads, 0 for all cores.
     """
     first = first_values(robot)
     fields = before.fields if before else (*CLASSIC, *(f for f in SERVO_TERMS[:-1] if first[f].any()))
-    says, values = evidence(robot, sequences, fields, nthread=nthread), to_axes(robot, fields)
-    grouped = says.by_recording() if len(says.names) >= CLUSTERS // 4 else says
-    scatter, clusters = grouped.scatter(), grouped.pulls.shape[1]
+    own, values = evidence(robot, sequences, fields, nthread=nthread), to_axes(robot, fields)
+    grouped = own.by_recording() if len(own.names) >= MIN_CLUSTERS // 4 else own
+    overdispersion, clusters = grouped.overdispersion(), grouped.gradients.shape[1]
     if before:
         old = np.stack([before.array(j, "overdispersion") for j in robot.operated])
-        scatter = (before.clusters * old + clusters * scatter) / (before.clusters + clusters)
-    step, step_covariance = says.step(np.maximum(scatter, 1.0))
-    left, joints = _left(judges or sequences, judged or robot, nthread), {}
+        overdispersion = (before.clusters * old + clusters * overdispersion) / (before.clusters + clusters)
+    step, step_covariance = own.gauss_newton_step(np.maximum(overdispersion, 1.0))
+    errors, joints = _errors_by_joint(judges or sequences, judged_robot or robot, nthread), {}
     for i, joint in enumerate(robot.operated):
-        own = step_covariance[i, :-1, :-1]
+        covariance = step_covariance[i, :-1, :-1]
         if before:
             was, at = before.array(joint, "covariance"), before.array(joint, "values")
-            moved = np.square(values[joint] - at) - np.diag(own) - np.diag(was)
-            own = inverted(inverted(was + np.diag(np.maximum(moved, 0.0))) + inverted(own))
+            moved = np.square(values[joint] - at) - np.diag(covariance) - np.diag(was)
+            covariance = inverted(inverted(was + np.diag(np.maximum(moved, 0.0))) + inverted(covariance))
         if joint in covariances:
             names, whole = covariances[joint]
             at = np.array([names.index(f) for f in fields])
-            own = whole[np.ix_(at, at)]
+            covariance = whole[np.ix_(at, at)]
         if not before:
-            own = inverted(inverted(own) + np.diag(prior_std(fields, values[joint]) ** -2))
-        normal = says.normals[i].sum(axis=0)[:-1, :-1]
-        predicted = SOFT * float(np.sqrt(max(np.trace(own @ normal), 0.0) / max(says.rows[i], 1)))
-        error = np.concatenate(left[joint])
-        rest = before and not judges and before.joints[joint]
+            covariance = inverted(inverted(covariance) + np.diag(prior_std(fields, values[joint]) ** -2))
+        information = own.information[i].sum(axis=0)[:-1, :-1]
+        variance = max(np.trace(covariance @ information), 0.0) / max(own.rows[i], 1)
+        rms = float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2)))
+        old_joint = before.joints[joint] if before and not judges else None
         joints[joint] = JointUncertainty(
-            _plain(values[joint]), _plain(own), _plain(step[i]), _plain(step_covariance[i]), _plain(scatter[i]),
-            predicted, max(float(np.sqrt(np.mean(error**2))), rest.residual_rms if rest else 0.0),
-            max(_band(left[joint]), rest.residual_p90 if rest else 0.0),
+            values=_nested(values[joint]), covariance=_nested(covariance), gauss_newton_step=_nested(step[i]),
+            gauss_newton_covariance=_nested(step_covariance[i]), overdispersion=_nested(overdispersion[i]),
+            parameter_rms=ERROR_SCALE_RAD * float(np.sqrt(variance)),
+            residual_rms=max(rms, old_joint.residual_rms if old_joint else 0.0),
+            residual_p90=max(_error_bound(errors[joint]), old_joint.residual_p90 if old_joint else 0.0),
         )  # fmt: skip
     source: Provenance = {
         "made_by": "identify" if judges or covariances else "adapt",
@@ -197,26 +213,31 @@ def estimate_uncertainty(
     return ParameterUncertainty(fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges))
 
 
-def _left(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int) -> dict[str, list[Array]]:
-    """Joint → |error| of every motion that holds it, in free run, rad; where none does, the worst joint's."""
+def _errors_by_joint(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int) -> dict[str, list[Array]]:
+    """Return joint → |error| of each rollout that holds it, rad; the worst joint's for joints that none holds."""
     twins = replay(sequences, robot, nthread=nthread, lock_idle=True)
     pairs = [(s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:]) for s, t in zip(sequences, twins, strict=True)]
-    found = {}
+    errors = {}
     for j, i in zip(robot.operated, robot.operated_index, strict=True):
-        if mine := [error[:, i] for silent, error in pairs if j not in silent]:
-            found[j] = mine
-    worst = max(found.values(), key=lambda each: float(np.square(np.concatenate(each)).mean()), default=[np.zeros(1)])
-    return {j: found.get(j, worst) for j in robot.operated}
+        if mine := [error[:, i] for unrecorded, error in pairs if j not in unrecorded]:
+            errors[j] = mine
+    mean_square = lambda each: float(np.square(np.concatenate(each)).mean())  # noqa: E731
+    worst = max(errors.values(), key=mean_square, default=[np.zeros(1)])
+    return {j: errors.get(j, worst) for j in robot.operated}
 
 
-def _band(motions: ListOf[Array]) -> float:
-    """What 9 of 10 samples of other motions should be within, from |error| of some: wider than of these by one standard
-    error (Student's) of the mean of their RMS."""
-    rms, few = np.array([np.sqrt(np.square(error).mean()) for error in motions]), len(motions) - 1
-    wider = float(stdtrit(few, SURE)) * standard_error(rms) / max(float(rms.mean()), 1e-12) if few else 0.0
-    return float(np.quantile(np.concatenate(motions), BAND)) * (1 + wider)
+def _error_bound(motions: ListOf[Array]) -> float:
+    """Return the bound of 90 % of other motions' samples, from |error| of some, rad.
+
+    It is wider than the bound of these by one standard error (Student's t) of the mean of their RMS errors.
+    """
+    rms, freedom = np.array([np.sqrt(np.square(error).mean()) for error in motions]), len(motions) - 1
+    wider = 0.0
+    if freedom:
+        wider = float(stdtrit(freedom, CONFIDENCE)) * standard_error(rms) / max(float(rms.mean()), 1e-12)
+    return float(np.quantile(np.concatenate(motions), BOUND_QUANTILE)) * (1 + wider)
 
 
-def _plain(x: Array) -> Any:
-    """An array as nested tuples."""
-    return tuple(_plain(y) for y in x) if x.ndim else float(x)
+def _nested(x: Array) -> Any:
+    """Return an array as nested tuples."""
+    return tuple(_nested(y) for y in x) if x.ndim else float(x)

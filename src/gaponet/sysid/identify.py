@@ -1,15 +1,103 @@
-"""Identification: the fit to positions (fit.py), and what competes with it on validation motions: the ramps of servos
-that move their targets themselves (target_speed.py), and recorded torque (torque.py)."""
+"""Identification: the servo parameters with which rollouts of the simulator follow the recordings best.
+
+Per operated joint these are kp, total damping, dry friction, armature, zero offset and command delay, then the terms of
+the servo model (sim/servo.py) that validation motions accept. Steps:
+
+1. Fit every joint by itself beside the recording, from several starts (joint_rollouts.py).
+2. Fit all joints together in the simulator of the robot, from there and from the robot's file (robot_rollouts.py).
+3. Choose among the given robot and these fits by validation motions (acceptance.py); add terms one by one.
+4. Fit the table under the tips (table_contact.py).
+5. Compare with a fit that begins with recorded torque (torque.py), and with speed-limited targets (motion_limits.py).
+"""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from collections.abc import Sequence as ListOf
+from dataclasses import replace
 
+import numpy as np
+
+from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.fit import DEFAULT_TERMS, WINDOWS, Identified, Progress, fit_robot
-from gaponet.sysid.target_speed import with_ramps
-from gaponet.sysid.torque import rival
+from gaponet.sysid.acceptance import Comparison, Identified, Judge
+from gaponet.sysid.axes import CLASSIC, SINGLE_JOINT_FIELDS, Bounds, Values
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
+from gaponet.sysid.motion_limits import stop_questions, with_speed_limits, with_stops
+from gaponet.sysid.problem import (
+    CHAIN_ITERATIONS,
+    SEARCH_ITERATIONS,
+    JointFit,
+    RobotFit,
+    fitted_fields,
+    robot_fields,
+    standard_errors,
+    undetermined,
+)  # fmt: skip
+from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.shared_servo import far_from_published, same_servos, share
+from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
+from gaponet.sysid.torque import with_torque
+
+WINDOWS = 40  # of joints by themselves
+ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
+POLISH_ITERATIONS = 2  # of the whole robot with a term of the servo model
+JOINTS_TIME_SHARE, ROBOT_TIME_SHARE = 0.3, 0.4  # of a time budget; terms share the rest
+TERMS: dict[str, tuple[str, ...]] = {
+    "stribeck": ("stribeck", "stribeck_speed"),
+    "load": ("friction_motor",),
+    "limit": ("effort_limit",),
+    "external": ("friction_external",),
+    "min_torque": ("min_torque",),
+    "encoder": ("encoder_step",),
+}
+DEFAULT_TERMS = ("stribeck", "load")
+
+Progress = Callable[[float, float, str], None]  # iterations done, in all, what is fitted and its error
+
+
+class SearchProgress:
+    """Progress of the searches; and the time that each may take, where the time is limited."""
+
+    def __init__(self, seconds: float | None, terms: int, progress: Progress) -> None:
+        """Begin the time of all searches, s; None for no limit."""
+        robot = sum(ROBOT_ITERATIONS) + CHAIN_ITERATIONS
+        each = [sum(SEARCH_ITERATIONS), robot, *[sum(SEARCH_ITERATIONS) + POLISH_ITERATIONS] * terms]
+        self._began, self._seconds, self._progress = time.monotonic(), seconds, progress
+        self._last_of = np.cumsum(each).tolist()  # number of each search's last iteration
+        self._total, self._done, self._end = self._last_of[-1], 0, np.inf
+        self.tell(0, "inertias along the recordings")
+
+    def tell(self, done: int, what: str) -> None:
+        """Report iterations done, and what comes next."""
+        self._progress(min(done, self._total), self._total, what)
+
+    def finish(self, what: str) -> None:
+        """Report what is done after the last search; no time limit counts it."""
+        self.tell(self._total, what)
+
+    def begin(self, search: int, time_share: float) -> None:
+        """Begin the search of this number, which may take this share of the time that is left."""
+        elapsed = time.monotonic() - self._began
+        left = np.inf if self._seconds is None else max(self._seconds - elapsed, 0.0)
+        self._end = elapsed + time_share * left
+        self._done = self._last_of[search - 1] if search else 0
+
+    def expired(self) -> bool:
+        """Return whether the time of the present search is over."""
+        return time.monotonic() - self._began > self._end
+
+    def report(self, what: str, joints: tuple[str, ...], rows: Array) -> Callable[[Array], None]:
+        """Return a function that is called in each iteration with the costs (n,) of problems of so many rows (n,)."""
+
+        def tell(cost: Array) -> None:
+            each = 1e3 * ERROR_SCALE_RAD * np.sqrt(2 * cost / np.maximum(rows, 1))
+            self._done += 1
+            self.tell(self._done, f"{what}: {each.mean():.2f} mrad, {joints[int(each.argmax())]} {each.max():.2f}")
+
+        return tell
 
 
 def identify(
@@ -28,22 +116,110 @@ def identify(
     """Fit the parameters of all operated joints.
 
     Args:
-        sequences: Recordings to fit on; validation and test motions stay out.
-        robot: Where to start from; its payloads' masses are taken as true, its gains where recordings state them.
-        validation: Recordings that judge; without them the fitted windows do.
-        windows: Free runs of 8 s, taken evenly from the recordings.
-        terms: Which terms of the servo's law, from TERMS, in the order in which they are tried.
-        table: Look for a table under the robot's tips.
-        shared: In the end give joints with one type of servo (robot.servos) one law.
+        sequences: Recordings to fit; validation and test motions stay out.
+        robot: Start of the fit; its payload masses are taken as true, its gains where recordings state them.
+        validation: Recordings that choose among candidates; without them the fitted windows do.
+        windows: Number of rollouts of 8 s, taken evenly from the recordings.
+        terms: Terms of the servo model, from TERMS, in the order in which they are fitted.
+        table: Fit a table under the robot's tips.
+        shared: Fit one servo model for the joints with one type of servo (robot.servos).
         nthread: Threads, 0 for all cores.
         progress: Called in each iteration.
-        budget: s that the searches may take, the table's apart; without one results are the same on every machine.
+        budget: Time of the searches, s, without the table's; results are the same on every machine only without it.
         stops: Give joints that stayed behind several commands a stop there.
     """
     options = (validation, windows, terms, table, shared, nthread, progress, stops)
 
     def fit(one: RobotSpec, seconds: float | None) -> Identified:
-        made = fit_robot(sequences, one, *options, seconds)
-        return rival(made, sequences, validation, one, nthread) if validation else made
+        fitted = fit_robot(sequences, one, *options, seconds)
+        return with_torque(fitted, sequences, validation, one, nthread) if validation else fitted
 
-    return with_ramps(fit, sequences, robot, validation, budget) if validation else fit(robot, budget)
+    return with_speed_limits(fit, sequences, robot, validation, budget) if validation else fit(robot, budget)
+
+
+def fit_robot(
+    sequences: ListOf[Sequence], robot: RobotSpec, validation: ListOf[Sequence], windows: int, terms: tuple[str, ...],
+    table: bool, shared: bool, nthread: int, progress: Progress, stops: bool, budget: float | None,
+) -> Identified:  # fmt: skip
+    """Fit to positions, with the speed limits that the robot's servos have; arguments as of `identify`."""
+    searches = SearchProgress(budget, len(terms), progress)
+    given, robot = robot, with_stops(robot, sequences)  # stops that nobody confirmed are taken back in the end
+    heights = tip_heights(sequences, robot)
+    contact, parts = contact_height(robot, heights), cut(sequences, windows)
+    joints = JointFit(JointRollouts(parts, robot, contact, nthread), robot, Bounds(robot, sequences))
+    judge, first = Judge(list(validation) or parts, robot, contact, nthread), joints.bounds.first
+    whole, candidates = _classic_candidates(joints, searches, nthread)
+    chosen, values = judge.best(candidates)
+    base = values if chosen != "given" else candidates["limbs"]
+    comparisons, values = _with_terms(joints, whole, judge, terms, values, base, searches)
+    chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
+    errors, common = standard_errors(whole, values), []
+    for servo, places in (same_servos(robot) if shared else {}).items():
+        mine = share(joints.rollouts, values, places, joints.bounds.start["armature"][places].mean())
+        common.append(judge.compare(servo, values, mine))
+        values, chosen = mine, "whole"
+        errors.std |= {robot.operated[i]: {} for i in places}
+
+    fitted, table_fit = joints.robot_with(values) if chosen != "given" else robot, None
+    if table and robot.tips:
+        low, lowest = low_windows(sequences, heights, contact), min(h.min() for h in heights)
+        tell = lambda error: searches.finish(f"table {error * 1e3:.2f} mrad")  # noqa: E731
+        table_fit = fit_table(low, fitted, lowest, nthread, tell, validation)
+        fitted = table_fit.robot
+    if not stops:
+        fitted = replace(fitted, stop_low=given.stop_low, stop_high=given.stop_high)
+        fitted = given if chosen == "given" and not (table_fit and table_fit.accepted) else fitted
+    unknown = undetermined(whole, values, errors)
+    warnings = (
+        *joints.bounds.warnings(values, fitted_fields(values)), *stop_questions(given, robot),
+        *far_from_published(fitted), *(text for _, text in unknown.values()),
+    )  # fmt: skip
+    before, after = (float(judge.errors(v).mean()) for v in (first, values))
+    by_joint = zip(*(judge.errors_by_joint(v).tolist() for v in (first, values)), strict=True)
+    searches.finish("the fitted robot, and recorded torque")
+    return Identified(
+        fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit, tuple(common),
+        dict(zip(robot.operated, by_joint, strict=True)),
+        {j: errors.covariance[j] for j in robot.operated if errors.std[j]},
+        {joint: fields for joint, (fields, _) in unknown.items()},
+    )  # fmt: skip
+
+
+def _classic_candidates(joints: JointFit, searches: SearchProgress, nthread: int) -> tuple[RobotFit, dict[str, Values]]:
+    """Fit the classic fields, joints by themselves and then together; return the whole robot's fit and candidates."""
+    bounds, names = joints.bounds, joints.robot.operated
+    searches.begin(0, JOINTS_TIME_SHARE)
+    report = searches.report("joints, each on its own", names, joints.rollouts.rows)
+    alone = joints.search(CLASSIC, bounds.start, joints.regressed(), report=report, expired=searches.expired)
+    joints.prior.update_correlation_time(joints.rollouts, alone)
+    whole = joints.robot_fit(nthread)
+    searches.begin(1, ROBOT_TIME_SHARE / (1 - JOINTS_TIME_SHARE))
+    report = searches.report("whole robot", names, whole.rollouts.rows)
+    together = whole.descend(
+        CLASSIC, bounds.start, (alone, bounds.start), ROBOT_ITERATIONS, report=report, expired=searches.expired
+    )
+    chains = whole.descend_chains(together, lambda names, rows: searches.report("limbs", names, rows), searches.expired)
+    return whole, {"given": bounds.first, "limbs": chains, "joints": alone, "whole": together}
+
+
+def _with_terms(
+    joints: JointFit, whole: RobotFit, judge: Judge, terms: tuple[str, ...], values: Values, base: Values,
+    searches: SearchProgress,
+) -> tuple[tuple[Comparison, ...], Values]:  # fmt: skip
+    """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted."""
+    comparisons, names = list[Comparison](), joints.robot.operated
+    for i, term in enumerate(terms):
+        searches.begin(2 + i, 1 / (len(terms) - i + 1))
+        report = searches.report(term, names, joints.rollouts.rows)
+        start = base | {f: joints.bounds.guess[f] for f in TERMS[term]}
+        richer = joints.search(TERMS[term], start, report=report, expired=searches.expired)
+        if not set(TERMS[term]) & set(SINGLE_JOINT_FIELDS):
+            report = searches.report(f"{term}, whole robot", names, whole.rollouts.rows)
+            polished = whole.descend(
+                robot_fields(richer), richer, (richer,), (POLISH_ITERATIONS,), report=report, expired=searches.expired
+            )
+            richer = min(richer, polished, key=lambda v: float(judge.errors(v).mean()))
+        comparisons.append(judge.compare(term, values, richer))
+        if comparisons[-1].accepted:  # a term that is zero in every joint only gave the others more iterations
+            values = base = {f: v for f, v in richer.items() if f not in TERMS[term] or richer[TERMS[term][0]].any()}
+    return tuple(comparisons), values

@@ -1,4 +1,4 @@
-"""Free runs of many candidates for a robot's servos beside recordings, the whole robot in one batch: their errors."""
+"""Rollouts of many candidates for a robot's servos beside recordings, the whole robot in one batch."""
 
 from __future__ import annotations
 
@@ -15,35 +15,34 @@ from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import Corrector, idle_limbs, rollout
 
-WINDOW = 8.0  # s; what is fitted on a second or two does not hold over whole motions
-SHORTEST = 0.8  # s
-THIN = 0.01  # s between rows that count
-SETTLE = 0.1  # s: velocities at a window's start are measured ones
-IMMOVABLE = 1e6  # kg·m²: the armature of a joint that stands
-FAR = np.pi  # rad: an error beyond, of a simulation that flew away, counts as this
-
-NO_LAW = {name: np.array(0.0) for name in SERVO_TERMS}
+WINDOW_S = 8.0  # what is fitted to a second or two does not hold over whole motions
+MIN_WINDOW_S = 0.8
+ROW_PERIOD_S = 0.01  # between rows that count
+SETTLE_S = 0.1  # after a window's start, where velocities are measured ones
+IMMOVABLE_ARMATURE = 1e6  # kg·m², of a joint that stands
+MAX_ERROR_RAD = np.pi  # of a simulation that diverged
 
 
 def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
-    """Windows of WINDOW seconds (shorter where a recording is), evenly picked."""
+    """Return `count` evenly picked windows of WINDOW_S, shorter where a recording is."""
     parts = []
     for s in sequences:
-        rows = min(round(WINDOW / s.dt), len(s))
+        rows = min(round(WINDOW_S / s.dt), len(s))
         parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
-    parts = [p for p in parts if p.duration >= SHORTEST]
+    parts = [p for p in parts if p.duration >= MIN_WINDOW_S]
     if not parts:
-        raise UsageError(f"no recording is as long as {SHORTEST:g} s; identification needs longer ones")
-    return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
+        raise UsageError(f"no recording is as long as {MIN_WINDOW_S:g} s; identification needs longer ones")
+    count = min(count, len(parts))
+    return [parts[i * len(parts) // count] for i in range(count)]
 
 
 class RobotRollouts:
-    """Windows of recordings, n operated joints of a robot; rows in which something may be touched are passed over.
+    """Rollouts of windows of recordings, n operated joints; rows in which a tip may touch something do not count.
 
     Attributes:
-        window: Which window each row that counts is of, (rows,).
-        recorded: Whether a row says something of a joint, (n, rows).
-        rows: How many do, of each joint, (n,).
+        window: Window of each row that counts, (rows,).
+        recorded: Whether a row holds a joint, (n, rows).
+        rows: Number of rows that hold a joint, (n,).
     """
 
     def __init__(
@@ -57,10 +56,10 @@ class RobotRollouts:
         """
         Args:
             parts: Windows of recordings.
-            robot: What is not given a candidate's values is its own.
+            robot: Its own values hold where candidates give none.
             nthread: Threads, 0 for all cores.
-            corrector: Corrects the targets on the way, as in replay.
-            touch: Rows in which something may be touched, (windows, rows): runs go on from the recording there.
+            corrector: Corrects the targets, as in replay.
+            touch: Rows in which a tip may touch something, (windows, rows): rollouts go on from the recording there.
         """
         self.parts, self.robot, self.nthread, self.corrector = parts, robot, nthread, corrector
         self.locked, self.op, self.n = idle_limbs(parts, robot), robot.operated_index, len(robot.operated)
@@ -69,39 +68,40 @@ class RobotRollouts:
         self.real = np.zeros((rows, len(parts), self.n))
         for i, s in enumerate(parts):
             self.real[: len(s), i] = s.qpos[:, self.op]
-        thin = [max(1, round(THIN / s.dt)) for s in parts]
+        thin = [max(1, round(ROW_PERIOD_S / s.dt)) for s in parts]
         self.touch = np.zeros((rows, len(parts)), bool) if touch is None else touch.T[:rows]
-        after = max(1, round(SETTLE / max(s.dt for s in parts)))
+        after = max(1, round(SETTLE_S / max(s.dt for s in parts)))
         near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
         self.counted = ~near[1:] & np.array([
-            [t >= SETTLE / s.dt and t < len(s) and t % k == 0 for s, k in zip(parts, thin, strict=True)]
+            [t >= SETTLE_S / s.dt and t < len(s) and t % k == 0 for s, k in zip(parts, thin, strict=True)]
             for t in range(1, rows)
         ])  # fmt: skip
         self.window = np.broadcast_to(np.arange(len(parts)), self.counted.shape)[self.counted]
-        # Joints of which a window holds nothing stand where it says.
+        # Joints that a window does not hold stand where it says.
         self.recorded = np.array([[j not in p.meta.unrecorded for p in parts] for j in robot.operated])[:, self.window]
         self.standing = [(w, i) for w, p in enumerate(parts) for i, j in enumerate(free) if j in p.meta.unrecorded]
         self.rows = self.recorded.sum(axis=1)
 
-    def run(self, values: dict[str, Array], parts: list[Sequence] | None = None) -> Array:
-        """Errors q_sim − q_real of rows that count, (k, n, rows) rad, of k candidates.
+    def flat_errors(self, values: dict[str, Array], parts: list[Sequence] | None = None) -> Array:
+        """Return q_sim − q_real of k candidates in the rows that count, (k, n, rows) rad.
 
         Args:
             values: (k, n) each, as BatchSim.set_servos takes them.
-            parts: The windows of each candidate in turn, where they do not all have the same; then k times as many.
+            parts: The windows of each candidate in turn, k times as many, where candidates have windows of their own.
         """
         k, m = len(values["kp"]), len(self.parts)
-        late = np.array(self.robot.delay)
-        late[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
+        delay = np.array(self.robot.delay)
+        delay[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
         parts = self.parts * k if parts is None else parts
-        law = any(values[f].any() for f in SERVO_TERMS if f in values)
-        known: dict[str, Any] = {} if law else NO_LAW
-        acting = replace(self.robot, delay=late, **known)
-        sim = BatchSim(acting, [Condition.of(s, self.robot) for s in parts], self.nthread, self.locked, servo_model=law)
+        terms = any(values[f].any() for f in SERVO_TERMS if f in values)
+        plain: dict[str, Any] = {} if terms else dict.fromkeys(SERVO_TERMS, np.array(0.0))
+        acting = replace(self.robot, delay=delay, **plain)
+        conditions = [Condition.of(s, self.robot) for s in parts]
+        sim = BatchSim(acting, conditions, self.nthread, self.locked, servo_model=terms)
         sim.set_servos(self.robot.operated, {f: np.repeat(x, m, axis=0) for f, x in values.items()})
         for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
-            sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE
+            sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
         qpos = rollout(sim, parts, self.corrector, touch=np.tile(self.touch, k))[0, 1:][..., self.op]
         error = (qpos.reshape(len(qpos), k, m, self.n) - self.real[1:, None]).astype(np.float32)
         errors = error.transpose(1, 3, 0, 2)[:, :, self.counted]
-        return np.clip(np.nan_to_num(errors, nan=FAR), -FAR, FAR) * self.recorded
+        return np.clip(np.nan_to_num(errors, nan=MAX_ERROR_RAD), -MAX_ERROR_RAD, MAX_ERROR_RAD) * self.recorded

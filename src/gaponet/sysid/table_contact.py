@@ -1,6 +1,6 @@
-"""Where a robot's tips touch a table: heights by forward kinematics, and the table that explains the recordings best.
+"""Table under a robot's tips: heights by forward kinematics, and the table that explains the recordings best.
 
-A zero of every joint's encoder is fitted with it, near none: zeros, the tip's place and the table's height trade
+A zero offset of every joint's encoder is fitted with it, near zero. Zeros, the tip's place and the table's height trade
 against each other, so give a measured height ([table] in robot.toml) where there is one.
 """
 
@@ -13,82 +13,85 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 
+from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import tips_of
-from gaponet.sim.metrics import standard_error
-from gaponet.sim.replay import idle_limbs, rollout, whole_errors
+from gaponet.sim.metrics import exceeds_standard_error
+from gaponet.sim.replay import idle_limbs, rollout, rollout_errors
 from gaponet.sim.table import write_table
-from gaponet.sysid.joint_rollouts import SETTLE, SOFT
-from gaponet.sysid.least_squares import soft
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SETTLE_S
+from gaponet.sysid.least_squares import soft_l1
 
-Array = np.ndarray
-
-CLEARANCE = 0.045  # m above the lowest tip, or the table, in which a joint's zero may hide a contact
-WINDOW = 5.0  # s
-WINDOWS, PER_MOTION = 14, 2
-HEIGHTS, STEP = 10, 0.005  # tried first, from the lowest tip upwards, and m between them
-CANDIDATES, GENERATIONS, AROUND = 16, 10, 1.5  # of the search, and how wide it begins, in large changes
-EARLY = 3  # generations after which a start goes on only if no other one cost less by then
-ZERO, PRICE = 0.02, 2e-3  # rad: an ordinary zero, and what it costs (soft square of one for a row)
-# Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
+CONTACT_CLEARANCE_M = 0.045  # above the lowest tip, or the table, in which a joint's zero may hide a contact
+WINDOW_S = 5.0
+MAX_WINDOWS, MAX_WINDOWS_PER_MOTION = 14, 2
+START_HEIGHTS, START_HEIGHT_STEP_M = 10, 0.005  # from below the lowest tip upwards
+CANDIDATES, GENERATIONS, START_STD = 16, 10, 1.5  # of the search; standard deviation of its start in large changes
+FIRST_COMPARISON = 3  # generations after which a start goes on only if no other start cost less by then
+ZERO_STD_RAD, ZERO_PRICE = 0.02, 2e-3  # of a usual zero; cost of a zero that large, per row
+# Table's friction, and logarithm of its stiffness in N/m: lowest, highest, a large change, first guess.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
 STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
-STARTS = tuple(np.log((500.0, 8000.0)))  # stiffness from which the search begins, each by itself
+START_LOG_STIFFNESS = tuple(np.log((500.0, 8000.0)))  # of searches by themselves
 
 
 @dataclass(frozen=True)
-class Touch:
-    """What was found about the table.
+class TableFit:
+    """Result of the fit of a table.
 
     Attributes:
-        robot: The robot with the table and the zeros, where they explain the recordings better than none; else without.
-        kept: Whether they do.
-        before, after: Mean |error| without and with, rad, of the windows, (windows,).
+        robot: The robot, with the table and the zeros if they are accepted.
+        accepted: Whether they explain the windows better than no table, by more than the standard error.
+        before, after: Mean |error| of the windows without and with table, (windows,) rad.
         motions: Motions in which a tip comes near.
     """
 
     robot: RobotSpec
-    kept: bool
+    accepted: bool
     before: Array
     after: Array
     motions: tuple[str, ...]
 
 
 def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
-    """Lowest point of any tip in every row, (rows,) m; none where robot.toml names no tip."""
+    """Return the height of the lowest tip in every row, (rows,) m each; nothing if robot.toml names no tip."""
     heights = tips_of(robot)
     return [heights(s.qpos) for s in sequences] if heights else []
 
 
-def touching_below(robot: RobotSpec, heights: ListOf[Array]) -> float:
-    """Height under which a tip may touch, m: of half of the rows at most, so that motions close to the table, or to
-    nothing at all, leave rows to be fitted."""
+def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
+    """Return the height under which a tip may touch something, m.
+
+    At most half of the rows are lower, so that rows to fit remain for motions close to the table or to nothing.
+    """
     if not robot.tips or not heights:
         return -np.inf
     rows = np.concatenate(heights)
-    return float(min((rows.min() if robot.table is None else robot.table.height) + CLEARANCE, np.median(rows)))
+    return float(
+        min((rows.min() if robot.table is None else robot.table.height) + CONTACT_CLEARANCE_M, np.median(rows))
+    )
 
 
 def low_windows(sequences: ListOf[Sequence], heights: ListOf[Array], below: float) -> list[Sequence]:
-    """The windows in which a tip comes below a height, longest first."""
+    """Return the windows in which a tip comes below a height, m, the longest first."""
     found = []
     for s, height in zip(sequences, heights, strict=True):
-        rows = min(round(WINDOW / s.dt), len(s))
+        rows = min(round(WINDOW_S / s.dt), len(s))
         starts = range(0, len(s) - rows + 1, rows)
         found += [s.rows(slice(a, a + rows)) for a in starts if (height[a : a + rows] < below).any()]
     return sorted(found, key=lambda s: -len(s))
 
 
 def _most_wrong(scene: _Scene, away: Array) -> list[Sequence]:
-    """At most WINDOWS, PER_MOTION of a motion, whose free runs without a table (1, 3 + n) are worst."""
+    """Return at most MAX_WINDOWS, MAX_WINDOWS_PER_MOTION of a motion, whose rollouts with a table `away` are worst."""
     order = np.argsort(-scene.mean(scene.errors(away))[0])
     taken: dict[str, list[int]] = {}
     for i in order.tolist():
         taken.setdefault(scene.parts[i].meta.motion, []).append(i)
-    best = {i for mine in taken.values() for i in mine[:PER_MOTION]}
-    return [scene.parts[i] for i in sorted([i for i in order.tolist() if i in best][:WINDOWS])]
+    best = {i for mine in taken.values() for i in mine[:MAX_WINDOWS_PER_MOTION]}
+    return [scene.parts[i] for i in sorted([i for i in order.tolist() if i in best][:MAX_WINDOWS])]
 
 
 def fit_table(
@@ -98,19 +101,19 @@ def fit_table(
     nthread: int,
     progress: Callable[[float], None],
     validation: ListOf[Sequence] = (),
-) -> Touch:
-    """Fit height, friction and stiffness of the table, and the zeros, from several starts.
+) -> TableFit:
+    """Fit height, friction and stiffness of the table and the zeros, from several starts.
 
     Args:
-        parts: Windows in which a tip is low; those that fit worst without a table are fitted.
-        robot: Servos and all; with a table its height is taken as measured.
-        lowest: Tip height in them, m.
+        parts: Windows in which a tip is low; those with the largest errors without a table are fitted.
+        robot: The robot with fitted servos; if it has a table, the height is taken as measured.
+        lowest: Least height of a tip in the windows, m.
         nthread: Threads, 0 for all cores.
         progress: Called in each iteration with the root mean square error, rad.
-        validation: Recordings, whole, that say which start's table is taken; without them the windows do.
+        validation: Whole recordings that choose among the starts' results; without them the windows do.
     """
     if not parts:
-        return Touch(robot, False, np.zeros(0), np.zeros(0), ())
+        return TableFit(robot, False, np.zeros(0), np.zeros(0), ())
     n, measured = len(robot.operated), robot.table
     with_table = replace(robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3]))))
     away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
@@ -118,45 +121,56 @@ def fit_table(
     scene = _Scene(_most_wrong(scene, away), with_table, nthread)
     motions = tuple(dict.fromkeys(s.meta.motion for s in scene.parts))
     before = scene.errors(away)
-    heights = lowest + STEP * np.arange(-2, HEIGHTS - 2) if measured is None else np.array([measured.height])
-    guesses = np.repeat(away, len(STARTS) * len(heights), axis=0)
-    guesses[:, 0], guesses[:, 2] = np.tile(heights, len(STARTS)), np.repeat(STARTS, len(heights))
-    costs = soft(scene.soft_errors(guesses)).reshape(len(STARTS), -1)
-    starts = guesses.reshape(*costs.shape, -1)[np.arange(len(STARTS)), costs.argmin(axis=1)]
+    heights = (
+        lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
+        if measured is None
+        else np.array([measured.height])
+    )
+    guesses = np.repeat(away, len(START_LOG_STIFFNESS) * len(heights), axis=0)
+    guesses[:, 0], guesses[:, 2] = (
+        np.tile(heights, len(START_LOG_STIFFNESS)),
+        np.repeat(START_LOG_STIFFNESS, len(heights)),
+    )
+    costs = soft_l1(scene.soft_errors(guesses)).reshape(len(START_LOG_STIFFNESS), -1)
+    starts = guesses.reshape(*costs.shape, -1)[np.arange(len(START_LOG_STIFFNESS)), costs.argmin(axis=1)]
     pace, best_first = [np.inf], starts[costs.min(axis=1).argsort()]
     found = [_searched(scene, start, measured is not None, progress, pace) for start in best_first]
     tables = [_with_table(robot, x) for x, _ in found]
-    errors = [whole_errors(validation, one, nthread).mean() for one in tables] if validation else [x[1] for x in found]
+    errors = (
+        [rollout_errors(validation, one, nthread).mean() for one in tables] if validation else [x[1] for x in found]
+    )
     best = int(np.argmin(errors))
     without, within = (scene.mean(e)[0] for e in (before, scene.errors(found[best][0][None])))
-    kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
-    return Touch(tables[best] if kept else robot, kept, without, within, motions)
+    accepted = exceeds_standard_error(without - within)
+    return TableFit(tables[best] if accepted else robot, accepted, without, within, motions)
 
 
 def _searched(
     scene: _Scene, start: Array, measured: bool, progress: Callable[[float], None], pace: list[float]
 ) -> tuple[Array, float]:
-    """Table and zeros (3 + n,) near a start that fit best, and their cost; its height stays where it was measured, and
-    it ends after EARLY generations where another start cost less by then (`pace`)."""
+    """Return the best table and zeros (3 + n,) near a start, and their cost. A measured height stays.
+
+    The search ends after FIRST_COMPARISON generations if another start cost less by then; `pace` lists such costs.
+    """
     n, rows = len(scene.op), scene.counted.sum() * len(scene.op)
-    unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO)])
-    low = np.array([start[0] - 0.03 * (not measured), FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
-    high = np.array([start[0] + 0.03 * (not measured), FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
+    unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO_STD_RAD)])
+    low = np.array([start[0] - 0.03 * (not measured), FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO_STD_RAD)])
+    high = np.array([start[0] + 0.03 * (not measured), FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO_STD_RAD)])
 
     def cost(xs: Array) -> Array:
-        """Costs of tables and zeros, one to a column."""
-        return soft(scene.soft_errors(xs.T)) + PRICE * rows * np.square(xs[3:] / ZERO).sum(axis=0)
+        """Return the costs of tables and zeros, (3 + n, k)."""
+        return soft_l1(scene.soft_errors(xs.T)) + ZERO_PRICE * rows * np.square(xs[3:] / ZERO_STD_RAD).sum(axis=0)
 
     def tell(intermediate_result: OptimizeResult) -> None:
-        progress(SOFT * float(np.sqrt(2 * intermediate_result.fun / rows)))
-        if intermediate_result.nit == EARLY:
+        progress(ERROR_SCALE_RAD * float(np.sqrt(2 * intermediate_result.fun / rows)))
+        if intermediate_result.nit == FIRST_COMPARISON:
             if intermediate_result.fun > min(pace):
                 raise StopIteration
             pace.append(intermediate_result.fun)
 
-    # Contacts come and go: the surface has no slopes to follow, and its valley of heights and zeros has walls.
+    # Contacts come and go, so the cost has no useful derivatives.
     rng = np.random.default_rng(0)
-    population = start + AROUND * unit * rng.standard_normal((CANDIDATES, len(unit)))
+    population = start + START_STD * unit * rng.standard_normal((CANDIDATES, len(unit)))
     population[0] = start
     found = differential_evolution(
         cost, Bounds(low, high), init=np.clip(population, low, high), maxiter=GENERATIONS, tol=0, polish=False,
@@ -166,7 +180,7 @@ def _searched(
 
 
 def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
-    """The robot with a table and zeros (3 + n,)."""
+    """Return the robot with a table and zeros (3 + n,)."""
     zeros = robot.zero[robot.operated_index] + x[3:]
     servos = {j: {"zero": float(f"{z:.4g}")} for j, z in zip(robot.operated, zeros, strict=True)}
     height, friction, stiffness = (float(f"{v:.4g}") for v in (x[0], x[1], np.exp(x[2])))
@@ -174,7 +188,7 @@ def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
 
 
 class _Scene:
-    """Windows beside tables and zeros of many kinds: rows of [height m, friction, log stiffness, zeros rad]."""
+    """Rollouts of windows with candidates of the table: rows of [height m, friction, log stiffness, zeros rad]."""
 
     def __init__(self, parts: list[Sequence], robot: RobotSpec, nthread: int) -> None:
         self.parts, self.robot, self.nthread, self.op = parts, robot, nthread, robot.operated_index
@@ -183,10 +197,10 @@ class _Scene:
         for i, s in enumerate(parts):
             self.real[: len(s), i] = s.qpos[:, self.op]
         time = np.arange(1, lengths.max())[:, None]
-        self.counted = (time >= SETTLE / parts[0].dt) & (time < lengths)
+        self.counted = (time >= SETTLE_S / parts[0].dt) & (time < lengths)
 
     def errors(self, xs: Array) -> Array:
-        """q_sim − q_real, (rows − 1, k, windows, n) rad, of tables and zeros (k, 3 + n)."""
+        """Return q_sim − q_real of candidates (k, 3 + n), (rows − 1, k, windows, n) rad."""
         k, m = len(xs), len(self.parts)
         conditions = [Condition.of(s, self.robot) for s in self.parts] * k
         sim = BatchSim(self.robot, conditions, self.nthread, self.locked)
@@ -200,9 +214,9 @@ class _Scene:
         return np.asarray(error * self.counted[:, None, :, None], np.float32)
 
     def soft_errors(self, xs: Array) -> Array:
-        """The same in SOFT, (k, rows)."""
-        return np.asarray(np.moveaxis(self.errors(xs), 1, 0).reshape(len(xs), -1) / np.float32(SOFT))
+        """Return the errors of candidates in ERROR_SCALE_RAD, (k, rows)."""
+        return np.asarray(np.moveaxis(self.errors(xs), 1, 0).reshape(len(xs), -1) / np.float32(ERROR_SCALE_RAD))
 
     def mean(self, errors: Array) -> Array:
-        """Mean |error| by window, (k, windows) rad."""
+        """Return the mean |error| by window, (k, windows) rad."""
         return np.asarray(np.abs(errors).mean(axis=3).sum(axis=0) / self.counted.sum(axis=0))

@@ -1,8 +1,8 @@
 """Identification from recorded torque, for windows so short that positions do not tell a gain from a load.
 
-A servo's own law says its gains: torque = kp (command − position) − kd velocity. What the model does not ask for says
-where payloads hang and what hand it lacks, by least squares. Positions say damping, friction, armature, zero and delay,
-near that. How near, and which of it is believed, is chosen on motions that were not fitted.
+A servo's torque is kp (command − position) − kd velocity, which gives its gains. The torque that the model does not
+explain gives the payload's place and the mass of a hand that the model lacks, by least squares. Positions give damping,
+friction, armature, zero and delay, near those values. Validation motions choose how near, and which parts are used.
 """
 
 from __future__ import annotations
@@ -23,71 +23,90 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import CUTOFF
 from gaponet.sim.metrics import metrics, runs
 from gaponet.sim.model import build_model
-from gaponet.sim.replay import replay, whole_errors
-from gaponet.sysid.axes import CLASSIC, MAX_DELAY, Bounds
-from gaponet.sysid.fit import Fit, Identified, Tried
-from gaponet.sysid.joint_rollouts import SOFT, JointRollouts
+from gaponet.sim.replay import motion_errors, replay
+from gaponet.sysid.acceptance import Comparison, Identified
+from gaponet.sysid.adapt import PRIOR_RAD
+from gaponet.sysid.axes import CLASSIC, MAX_DELAY_S, Bounds
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import descend
-from gaponet.sysid.refit import PRIOR
+from gaponet.sysid.problem import JointFit, standard_errors, undetermined
 from gaponet.sysid.robot_rollouts import cut
 
-WINDOWS = 80  # at most, since they may be short
-EVERY, MOST = 5, 6000  # rows between those that tell where a payload hangs, and how many
-PRIOR_MOUNT = 3.0  # N·m for a metre
-MOVES = 0.05  # rad: of a command that asks something of a joint
-EXPLAINED = 0.9  # of a torque's variance, from which gains are read off it
-PAST = 12  # periods whose commands stand for what the servo measured
-LATE, ITERATIONS = 0.25, 10  # a first delay, of 20 ms; of the fit near what torque says
-SLIPS = 0.02  # rad/s: friction turns its sign within this
-HAND = 5.0  # kg, at most
-
-How = tuple[bool, bool, float]  # payload's place from torque; friction, too; rad per scale of leaving what it says
-HOWS: tuple[How, ...] = ((True, False, 2.0), (True, False, PRIOR), (True, True, 2.0), (False, False, PRIOR))
+MAX_WINDOWS = 80  # more than elsewhere, since they may be short
+ROW_STEP, MAX_ROWS = 5, 6000  # between rows that tell where a payload hangs, and how many
+MOUNT_PRIOR_NM_PER_M = 3.0  # price of moving the payload
+MIN_MOVE_RAD = 0.05  # of a command that excites a joint
+MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
+INSTRUMENTS = 12  # periods whose commands are instruments for what the servo measured
+START_DELAY, ITERATIONS = 0.25, 10  # in 20 ms; of the fit of positions
+SLIP_SPEED = 0.02  # rad/s: friction turns its sign within this
+MAX_HAND_MASS = 5.0  # kg
 
 
-def rival(
-    made: Identified, sequences: ListOf[Sequence], validation: ListOf[Sequence], given: RobotSpec, nthread: int
+class TorqueOptions(NamedTuple):
+    """Options of a fit from torque: payload's place from torque, friction as well, and the prior of the positions' fit
+    around it, rad per large change."""
+
+    place: bool
+    friction: bool
+    prior: float
+
+
+OPTIONS = (
+    TorqueOptions(True, False, 2.0), TorqueOptions(True, False, PRIOR_RAD), TorqueOptions(True, True, 2.0),
+    TorqueOptions(False, False, PRIOR_RAD),
+)  # fmt: skip
+
+
+def with_torque(
+    fitted: Identified, sequences: ListOf[Sequence], validation: ListOf[Sequence], given: RobotSpec, nthread: int
 ) -> Identified:
-    """What torque says, where that is better for motions that were not fitted, by more than its standard error over
-    them; then fitted once more, to these too, which must follow them no worse.
+    """Return the fit from torque if validation motions accept it, else `fitted`.
+
+    An accepted fit is repeated with the validation motions as well, and kept if they are followed no worse.
 
     Args:
-        made: What positions say.
+        fitted: Fit to positions.
         sequences: Recordings that were fitted.
-        validation: Others, which judge.
-        given: Where the fit starts.
+        validation: Recordings that judge.
+        given: Robot that the fit starts from.
         nthread: Threads, 0 for all cores.
     """
-    said = TorqueFit(sequences, given)
-    if not said.trusted or any(s.tau is None for s in validation):
-        return made
-    how, judged = said.best(validation)
-    before, after = (said.errors(validation, robot) for robot in (made.robot, judged))
-    tried = Tried("torque", before, after)
-    if not tried.kept:
-        return replace(made, tried=(*made.tried, tried))
-    every = [*sequences, *validation]
-    robot = TorqueFit(every, given).fit(how)
-    again = bool(said.errors(validation, robot).mean() <= after.mean())
+    torque = TorqueFit(sequences, given)
+    if not torque.trusted or any(s.tau is None for s in validation):
+        return fitted
+    options, judged = torque.best(validation)
+    comparison = Comparison("torque", *(motion_errors(validation, robot) for robot in (fitted.robot, judged)))
+    if not comparison.accepted:
+        return replace(fitted, comparisons=(*fitted.comparisons, comparison))
+    every, after = [*sequences, *validation], float(comparison.after.mean())
+    robot = TorqueFit(every, given).fit(options)
+    again = bool(motion_errors(validation, robot).mean() <= after)
     robot = robot if again else judged
     bounds = Bounds(robot, every)
-    fit = Fit(JointRollouts(cut(every, WINDOWS), robot, nthread=nthread), robot, bounds).whole(nthread)
+    whole = JointFit(JointRollouts(cut(every, MAX_WINDOWS), robot, nthread=nthread), robot, bounds).robot_fit(nthread)
     values = {f: bounds.first[f] for f in CLASSIC}
-    std, over_kp = fit.uncertainty(values)
-    unknown = fit.undetermined(values, std, over_kp)
+    errors = standard_errors(whole, values)
+    unknown = undetermined(whole, values, errors)
     part = runs(validation, [t.qpos for t in replay(validation, judged, nthread=nthread, lock_idle=True)], judged)
-    left = {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(given.operated)}
+    by_joint = {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(given.operated)}
     return Identified(
-        robot, made.before, float(after.mean()), "torque", tuple(text for _, text in unknown.values()), std,
-        (*made.tried, tried), None, (), {j: (was, left[j]) for j, (was, _) in (made.by_joint or {}).items()},
-        fit.covariance, {joint: fields for joint, (fields, _) in unknown.items()},
-        judged if again else None,
+        robot, fitted.before, after, "torque", tuple(text for _, text in unknown.values()), errors.std,
+        (*fitted.comparisons, comparison), None, (),
+        {j: (before, by_joint[j]) for j, (before, _) in fitted.by_joint.items()}, errors.covariance,
+        {joint: fields for joint, (fields, _) in unknown.items()}, judged if again else None,
     )  # fmt: skip
 
 
 class Gains(NamedTuple):
-    """kp, N·m/rad, and its standard error over recordings; kd, N·m·s/rad; which share of the torque's variance they
-    explain."""
+    """Gains of a servo from its torque.
+
+    Attributes:
+        kp: N·m/rad.
+        error: Standard error of kp over recordings.
+        kd: N·m·s/rad.
+        explained: Share of the torque's variance that they explain.
+    """
 
     kp: float
     error: float
@@ -96,28 +115,28 @@ class Gains(NamedTuple):
 
     @property
     def trusted(self) -> bool:
-        """Whether torque is the servo's own."""
-        return self.explained > EXPLAINED and self.kp > 0 <= self.kd
+        """Whether the recorded torque is that of a PD servo."""
+        return self.explained > MIN_EXPLAINED and self.kp > 0 <= self.kd
 
 
 def servo_gains(recordings: ListOf[Array], last: int = 0) -> Gains:
-    """A servo's gains from its own law, torque = kp (command of the period before − position) − kd velocity.
+    """Estimate a servo's gains: torque = kp (command of the period before − position) − kd velocity.
 
-    Rows are means of five. Noise of measured position and speed would soften a gain, so by two-stage least squares,
-    with the commands of PAST periods as instruments (Janot, Vandanjon & Gautier 2014).
+    Rows are means of five. Noise of measured position and speed would lower the gains, so two-stage least squares take
+    the commands of INSTRUMENTS periods as instruments (Janot, Vandanjon & Gautier 2014).
 
     Args:
         recordings: Command, position, velocity and torque of the joint, (4, T) each.
-        last: Only so many rows at each end count, as their mean, by plain least squares; 0 for all.
+        last: Only so many rows at the end of each count, as their mean, by plain least squares; 0 for all.
     """
     sums, rows = [], []
     for ctrl, qpos, qvel, tau in recordings:
         t = np.arange(len(tau) - 1)
-        past = [ctrl[np.maximum(t - k, 0)] for k in range(PAST)]
+        past = [ctrl[np.maximum(t - k, 0)] for k in range(INSTRUMENTS)]
         channels = [ctrl[:-1] - qpos[1:], -qvel[1:], tau[1:], *past]
-        error, speed, torque, *told = (np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float))
+        error, speed, torque, *commands = (np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float))
         one = np.ones_like(torque)
-        x, z = np.stack([error, speed, one], axis=1), np.stack([*told, one], axis=1)
+        x, z = np.stack([error, speed, one], axis=1), np.stack([*commands, one], axis=1)
         if last:
             x, torque = x[-last:].mean(axis=0, keepdims=True), torque[-last:].mean(keepdims=True)
             z = x
@@ -138,13 +157,19 @@ def servo_gains(recordings: ListOf[Array], last: int = 0) -> Gains:
 
 
 class TorqueFit:
-    """What recordings with torque say of a robot."""
+    """Fit of a robot to recordings with torque.
+
+    Attributes:
+        robot: The robot with gains from torque.
+        trusted: Whether gains follow from the torque of some joint, and all recordings have torque.
+        hangs: Whether recordings with several payloads tell where these hang.
+    """
 
     def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec) -> None:
         """
         Args:
-            sequences: Recordings; those whose gains are stated need no torque to say them.
-            robot: What is not told stays its own; its payloads' masses are taken as true.
+            sequences: Recordings; those whose gains are stated are left out.
+            robot: Start of the fit; its payload masses are taken as true.
         """
         self.robot, self.nominal = robot, robot
         self.sequences = [s for s in sequences if s.tau is not None and s.meta.known_gains[0] is None]
@@ -156,7 +181,7 @@ class TorqueFit:
         self.hangs = bool(robot.payload_mounts) and len(masses) > 1
 
     def gains(self) -> dict[str, Gains]:
-        """Joint → gains; joints whose command never moves are left out."""
+        """Return joint → gains; without joints whose command never moves."""
         parts: dict[int, list[Array]] = {}
         for s in self.sequences:
             assert s.tau is not None
@@ -165,43 +190,45 @@ class TorqueFit:
         return {self.nominal.joint_names[j]: servo_gains(each) for j, each in parts.items()}
 
     def hanging(self, friction: bool = False) -> RobotSpec:
-        """Where the payload hangs, and what hangs there always, by least squares on recorded torque.
+        """Return the robot with the payload's place and the mass of the hand, by least squares on recorded torque.
 
-        Torque of a joint, in some rows, is what the model asks for, what (payload + hand) at the mount asks for, and
-        what the joint's own friction, armature and damping do. Every mount is moved alike, mirrored to the other side.
+        A joint's torque is that of the model, that of (payload + hand) at the mount, and that of the joint's own
+        friction, armature and damping. Every mount is moved alike, mirrored to the other side.
 
         Args:
-            friction: Whether that friction, armature and damping are taken, too.
+            friction: Use the friction, armature and damping as well.
         """
         robot, mount = self.robot, self.robot.payload_mounts[0]
-        joints, column, tau, qacc, qvel, asked = self._balance()
-        own = np.stack([np.tanh(qvel / SLIPS), qacc, qvel])  # friction, armature, damping
+        joints, column, tau, qacc, qvel, required = self._balance()
+        own = np.stack([np.tanh(qvel / SLIP_SPEED), qacc, qvel])  # friction, armature, damping
         n = 3 * len(joints)
         start = np.r_[mount.pos, mount.mass, np.zeros(n)]
-        low, high = (np.r_[np.array(mount.pos) + a, m, np.full(n, z)] for a, m, z in ((-0.3, 0, 0), (0.3, HAND, 20)))
+        low, high = (
+            np.r_[np.array(mount.pos) + a, m, np.full(n, z)] for a, m, z in ((-0.3, 0, 0), (0.3, MAX_HAND_MASS, 20))
+        )
 
-        def left(x: Array) -> Array:  # what torque does not tell stays where it was
+        def residual(x: Array) -> Array:  # a place that torque does not tell stays
             mine = (x[4:].reshape(3, -1)[:, column] * own).sum(axis=0)
-            return np.r_[asked(x) + mine - tau, PRIOR_MOUNT * (x[:3] - start[:3])]
+            return np.r_[required(x) + mine - tau, MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])]
 
         scale, first = np.r_[0.1 * np.ones(3), 1.0, np.ones(n)], np.clip(start, low + 1e-6, high - 1e-6)
-        found = least_squares(left, first, bounds=(low, high), x_scale=scale, loss="soft_l1").x
-        x, y, z, hand = (round(float(v), 3) for v in found[:4])
+        solution = least_squares(residual, first, bounds=(low, high), x_scale=scale, loss="soft_l1").x
+        x, y, z, hand = (round(float(v), 3) for v in solution[:4])
         mounts = tuple(replace(m, pos=(x, y if m is mount else -y, z), mass=hand) for m in robot.payload_mounts)
         armature = build_model(robot).dof_armature
-        said = {
+        servos = {
             robot.joint_names[j]: {"frictionloss": v[0], "armature": float(armature[j]) + v[1], "damping": v[2]}
-            for j, v in zip(joints, found[4:].reshape(3, -1).T.round(4).tolist(), strict=True)
+            for j, v in zip(joints, solution[4:].reshape(3, -1).T.round(4).tolist(), strict=True)
         }
-        return replace(robot.with_servos(said if friction else {}), payload_mounts=mounts)
+        return replace(robot.with_servos(servos if friction else {}), payload_mounts=mounts)
 
     def _balance(self) -> tuple[list[int], Array, Array, Array, Array, Callable[[Array], Array]]:
-        """Joints; of rows which of them, torque, acceleration and speed; and the torque that is asked for where payload
-        and hand x (place, kg) hang."""
+        """Return the joints; joint, torque, acceleration and speed of each row; and the torque that inverse dynamics
+        require for a payload's place and hand x, (4,) m and kg."""
         robot, mount, rows = self.robot, self.robot.payload_mounts[0], []
         model = build_model(replace(robot, payload_mounts=tuple(replace(m, mass=0.0) for m in robot.payload_mounts)))
         data, body, full = mujoco.MjData(model), model.body(mount.body).id, np.empty((model.nv, model.nv))
-        every = max(EVERY, sum(map(len, self.sequences)) // MOST)
+        every = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
         for s in self.sequences:
             assert s.tau is not None
             qacc = differentiate(differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF), s.dt), s.dt)
@@ -221,55 +248,49 @@ class TorqueFit:
         column = np.array([joints.index(r[0]) for r in rows])
         mass, bias, axis, frame, arm, tau, qacc, qvel = (np.array([r[i] for r in rows]) for i in range(1, 9))
 
-        def asked(x: Array) -> Array:
+        def required(x: Array) -> Array:
             point = np.cross(axis, arm + frame @ x[:3])  # (k, 3) m: how far the payload goes for a radian
             there = 9.81 * point[:, 2] + np.square(point).sum(axis=1) * qacc
             return np.asarray(bias + (mass + x[3]) * there)
 
-        return joints, column, tau, qacc, qvel, asked
+        return joints, column, tau, qacc, qvel, required
 
-    def fit(self, how: How) -> RobotSpec:
-        """The robot with what torque says, and near that with what positions say."""
-        start = self.hanging(how[1]) if how[0] else self.robot
-        alone = JointRollouts(cut(self.sequences, WINDOWS), start)
-        first = Bounds(start, alone.parts).first
+    def fit(self, options: TorqueOptions) -> RobotSpec:
+        """Return the robot with values from torque, and near those with values from positions."""
+        start = self.hanging(options.friction) if options.place else self.robot
+        rollouts = JointRollouts(cut(self.sequences, MAX_WINDOWS), start)
+        first = Bounds(start, rollouts.parts).first
         kp, one = first["kp"], np.ones(len(first["kp"]))
         scale = {
             "damping": np.maximum(first["damping"], 0.01 * kp), "armature": np.maximum(first["armature"], 1e-3),
             "frictionloss": np.maximum(first["frictionloss"], 0.005 * kp), "offset": 0.02 * one, "delay": 0.02 * one,
         }  # fmt: skip
         least = {f: -first[f] / x for f, x in scale.items()} | {"offset": -10 * one}
-        most = dict.fromkeys(scale, 200 * one) | {"offset": 10 * one, "delay": (MAX_DELAY - first["delay"]) / 0.02}
+        most = dict.fromkeys(scale, 200 * one) | {"offset": 10 * one, "delay": (MAX_DELAY_S - first["delay"]) / 0.02}
         low, high = (np.stack([ends[f] for f in scale], axis=1) for ends in (least, most))
 
         def values(x: Array) -> dict[str, Array]:
             moved = {f: first[f] + x[..., i] * scale[f] for i, f in enumerate(scale)}  # at the least 0, or −1e-20
-            known = {f: np.broadcast_to(v, x.shape[:2]) for f, v in first.items()}
-            return known | {f: v if f == "offset" else np.maximum(v, 0) for f, v in moved.items()}
+            rest = {f: np.broadcast_to(v, x.shape[:2]) for f, v in first.items()}
+            return rest | {f: v if f == "offset" else np.maximum(v, 0) for f, v in moved.items()}
 
         def errors(x: Array) -> Array:
-            return np.concatenate([alone.errors(values(x)).reshape(*x.shape[:2], -1), how[2] * x], axis=2) / SOFT
+            return np.concatenate([rollouts.flat_errors(values(x)), options.prior * x], axis=2) / ERROR_SCALE_RAD
 
         x, _ = descend(
-            np.zeros((1, *low.shape)) + LATE * (np.array([*scale]) == "delay"), low, high, errors, ITERATIONS
+            np.zeros((1, *low.shape)) + START_DELAY * (np.array([*scale]) == "delay"), low, high, errors, ITERATIONS
         )
-        found = {f: values(x)[f][0] for f in scale}
+        fitted = {f: values(x)[f][0] for f in scale}
         joints = enumerate(start.operated)
-        return start.with_servos({j: {f: float(f"{v[i]:.6g}") for f, v in found.items()} for i, j in joints})
+        return start.with_servos({j: {f: float(f"{v[i]:.6g}") for f, v in fitted.items()} for i, j in joints})
 
-    def best(self, validation: ListOf[Sequence]) -> tuple[How, RobotSpec]:
-        """What follows these recordings best, and how it was fitted."""
-        fits = [(how, self.fit(how)) for how in HOWS if self.hangs or not how[0]]
-        return min(fits, key=lambda one: float(self.errors(validation, one[1]).mean()))
-
-    @staticmethod
-    def errors(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
-        """Mean |error| of each motion, its recordings averaged, (motions,) rad."""
-        each, motions = whole_errors(sequences, robot), np.array([s.meta.motion for s in sequences])
-        return np.array([each[motions == motion].mean() for motion in dict.fromkeys(motions.tolist())])
+    def best(self, validation: ListOf[Sequence]) -> tuple[TorqueOptions, RobotSpec]:
+        """Return the options whose fit follows these recordings best, and that fit."""
+        fits = [(options, self.fit(options)) for options in OPTIONS if self.hangs or not options.place]
+        return min(fits, key=lambda one: float(motion_errors(validation, one[1]).mean()))
 
 
 def _moved(sequence: Sequence, robot: RobotSpec) -> list[int]:
-    """Operated joints that a recording holds, and whose command moves."""
-    moved = np.ptp(sequence.ctrl, axis=0) > MOVES
+    """Return the operated joints that a recording holds and whose command moves."""
+    moved = np.ptp(sequence.ctrl, axis=0) > MIN_MOVE_RAD
     return [int(i) for i in robot.operated_index if moved[i] and robot.joint_names[i] not in sequence.meta.unrecorded]

@@ -1,9 +1,9 @@
-"""A robot that is driven by torque or current: friction, inertia and delay of its joints with the torque as the input.
+"""Identification of robots that are driven by torque or current: friction, inertia and delay of the joints.
 
-What inverse dynamics of the robot's file ask for along a recording, and what was told, differ by armature · q̈ +
-damping · q̇ + friction · sign(q̇); of a current also by N·m per ampere. All columns pass one filter, which alters no sum.
-The delay is the shift of the torque that leaves least. What is found is judged forwards, on rows that were not fitted:
-the simulator starts in a recorded state and is driven by the recorded torque.
+The recorded torque exceeds that of inverse dynamics by armature · q̈ + damping · q̇ + friction · sign(q̇); a current is
+also scaled by N·m per ampere. All columns pass one filter, which keeps sums. The delay is the shift of the torque with
+the least residual. The fit is judged forwards on rows that were not fitted: the simulator starts in a recorded state
+and is driven by the recorded torque.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model
 
-SMOOTH, FILTER = 25.0, 8.0  # Hz: before differentiating, and of every column
-MOVES = 0.05  # rad/s below which a row says nothing of friction
-DELAYS = np.arange(0.0, 0.0405, 0.001)  # s
-BLOCKS = 10  # of the rows, each left out once for standard errors
-HORIZONS = (0.1, 0.5, 1.0)  # s
-PART = 4.0  # s
-HUBER, ROUNDS = 1.345, 10  # of what is left in the middle row, beyond which a row counts less: somebody pushed
-TERMS = ("armature", "damping", "frictionloss")
+DIFFERENTIATION_CUTOFF_HZ, CUTOFF_HZ = 25.0, 8.0  # before differentiating; of every column
+MIN_SPEED = 0.05  # rad/s below which a row says nothing about friction
+DELAYS_S = np.arange(0.0, 0.0405, 0.001)
+JACKKNIFE_BLOCKS = 10  # of the rows, each left out once
+HORIZONS_S = (0.1, 0.5, 1.0)
+PART_S = 4.0  # of recordings that fit and judge in turn
+MIN_ROWS = 20  # of a regression
+HUBER_SCALE, HUBER_ROUNDS = 1.345, 10  # in standard deviations, beyond which a row counts less: somebody pushed
+PASSIVE_FIELDS = ("armature", "damping", "frictionloss")
 
 
 class _Rows(NamedTuple):
-    """What a regression needs of recordings, operated joints."""
+    """Filtered rows of a recording, operated joints."""
 
-    told: Array  # N·m or A, one for each of DELAYS, (D, rows, n)
-    asked: Array  # by inverse dynamics without the terms that are sought, N·m, (rows, n)
+    torque: Array  # N·m or A, for each of DELAYS_S, (delays, rows, n)
+    required: Array  # by inverse dynamics without the fitted fields, N·m, (rows, n)
     acceleration: Array
     velocity: Array
     sign: Array
@@ -46,18 +47,18 @@ class _Rows(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Driven:
-    """What was found of the operated joints, (n,).
+class TorqueDrivenFit:
+    """Result of the fit, arrays of the operated joints (n,).
 
     Attributes:
         robot: The robot with armature, damping, friction and delay.
-        constant: N·m in one unit of what was recorded; 1 where that was believed.
-        bias: N·m that is left on average: gravity that the file does not know, or the sensor's.
+        constant: N·m per unit of the recorded torque; 1 if it is taken as N·m.
+        bias: Mean residual, N·m: gravity that the file lacks, or the sensor's.
         std: Joint → field → standard error.
-        torque: Median |told − asked for| of rows that were not fitted, N·m: of the file, of the robot. Medians, for
-            a row in which somebody pushed says nothing of the robot.
-        angle: s ahead → median |error| when driven by the torque, rad: of the file, of the robot.
-        windows: How many starts that is of.
+        torque: Median |residual| of rows that were not fitted, N·m: of the file, of the robot. A median, since a push
+            by hand says nothing about the robot.
+        angle: Horizon, s → median |error| when driven by the torque, rad: of the file, of the robot.
+        windows: Number of starts of these rollouts.
     """
 
     robot: RobotSpec
@@ -69,14 +70,16 @@ class Driven:
     windows: int
 
 
-def driven(train: ListOf[Sequence], judging: ListOf[Sequence], robot: RobotSpec, constant: bool = False) -> Driven:
+def fit_torque_driven(
+    train: ListOf[Sequence], judging: ListOf[Sequence], robot: RobotSpec, constant: bool = False
+) -> TorqueDrivenFit:
     """Fit the joints one by one, and judge all together.
 
     Args:
         train: Recordings with torque.
-        judging: Others; the same list is taken in parts of PART, which fit and judge in turn.
-        robot: The robot whose file says inertias and gravity; its payloads are taken as true.
-        constant: The torque's unit is not known, as of a current: fit N·m in one of it.
+        judging: Other recordings; if it is `train` itself, parts of PART_S fit and judge in turn.
+        robot: Its file gives inertias and gravity; payloads are taken as true.
+        constant: Fit N·m per unit of the torque, as of a current.
 
     Raises:
         UsageError: A recording has no torque.
@@ -88,32 +91,32 @@ def driven(train: ListOf[Sequence], judging: ListOf[Sequence], robot: RobotSpec,
             )
     if train is judging:
         parts = [
-            s.rows(slice(i, i + round(PART / s.dt)))
+            s.rows(slice(i, i + round(PART_S / s.dt)))
             for s in judging
-            for i in range(0, len(s) - round(2 / s.dt), round(PART / s.dt))
+            for i in range(0, len(s) - round(2 / s.dt), round(PART_S / s.dt))
         ]
         train, judging = parts[::2], parts[1::2]
         if not judging:
-            raise UsageError(f"less than {2 * PART:g} s in all: record more, or other motions to judge by")
+            raise UsageError(f"less than {2 * PART_S:g} s in all: record more, or other motions to judge by")
     fit, test = ([_rows(s, robot) for s in part] for part in (train, judging))
     names, servos, std = robot.operated, dict[str, dict[str, float]](), dict[str, dict[str, float]]()
     factor, bias = np.ones(len(names)), np.zeros(len(names))
     for j, name in enumerate(names):
         x, lag = _joint(fit, j, constant)
         spread = _jackknife(fit, j, constant, lag)
-        servos[name] = dict(zip(TERMS, x[:3].tolist(), strict=True)) | {"delay": float(DELAYS[lag])}
-        std[name] = dict(zip((*TERMS, "bias", "constant"), spread.tolist(), strict=True))
+        servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True)) | {"delay": float(DELAYS_S[lag])}
+        std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), spread.tolist(), strict=True))
         bias[j], factor[j] = x[3], x[4]
-    found = robot.with_servos(servos)
-    angles = [_ahead(judging, r, k) for r, k in ((robot, np.ones_like(factor)), (found, factor))]
+    fitted = robot.with_servos(servos)
+    angles = [_ahead(judging, r, k) for r, k in ((robot, np.ones_like(factor)), (fitted, factor))]
     given = build_model(robot)
     dof = [given.joint(name).dofadr[0] for name in names]
-    old = {f: np.ravel(getattr(given, f"dof_{f}"))[dof] for f in TERMS}
-    new = {f: getattr(found, f)[robot.operated_index] for f in TERMS}
-    lags = np.array([round(servos[n]["delay"] / (DELAYS[1] - DELAYS[0])) for n in names])
-    told = (_left(test, old, np.ones_like(factor), 0 * lags), _left(test, new, factor, lags))
-    angle = {h: (angles[0][h], angles[1][h]) for h in HORIZONS}
-    return Driven(found, factor, bias, std, told, angle, _windows(judging))
+    old = {f: np.ravel(getattr(given, f"dof_{f}"))[dof] for f in PASSIVE_FIELDS}
+    new = {f: getattr(fitted, f)[robot.operated_index] for f in PASSIVE_FIELDS}
+    lags = np.array([round(servos[n]["delay"] / (DELAYS_S[1] - DELAYS_S[0])) for n in names])
+    residuals = (_residual(test, old, np.ones_like(factor), 0 * lags), _residual(test, new, factor, lags))
+    angle = {h: (angles[0][h], angles[1][h]) for h in HORIZONS_S}
+    return TorqueDrivenFit(fitted, factor, bias, std, residuals, angle, sum(len(_starts(s)) for s in judging))
 
 
 def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
@@ -123,80 +126,76 @@ def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
         dof = model.joint(name).dofadr[0]
         model.dof_armature[dof] = 0.0
         model.dof_damping[dof, ...] = 0.0
-    smooth = lowpass(s.qpos.astype(float), dt, SMOOTH)
+    smooth = lowpass(s.qpos.astype(float), dt, DIFFERENTIATION_CUTOFF_HZ)
     v = differentiate(smooth, dt)
     a = differentiate(v, dt)
     assert s.tau is not None
     time, tau = np.arange(len(s)) * dt, s.tau[:, op].astype(float)
-    late = [np.stack([np.interp(time - d, time, x) for x in tau.T], axis=1) for d in DELAYS]
-    columns = (inverse_dynamics(model, smooth, v, a)[:, op], a[:, op], v[:, op], np.tanh(v[:, op] / MOVES))
-    asked, acceleration, velocity, sign = (lowpass(x, dt, FILTER) for x in columns)
-    told = np.array([lowpass(x, dt, FILTER) for x in late])
-    return _Rows(told, asked, acceleration, velocity, sign, np.abs(v[:, op]) > MOVES)
+    late = [np.stack([np.interp(time - d, time, x) for x in tau.T], axis=1) for d in DELAYS_S]
+    columns = (inverse_dynamics(model, smooth, v, a)[:, op], a[:, op], v[:, op], np.tanh(v[:, op] / MIN_SPEED))
+    required, acceleration, velocity, sign = (lowpass(x, dt, CUTOFF_HZ) for x in columns)
+    torque = np.array([lowpass(x, dt, CUTOFF_HZ) for x in late])
+    return _Rows(torque, required, acceleration, velocity, sign, np.abs(v[:, op]) > MIN_SPEED)
 
 
 def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Array, Array]:
-    """Columns armature, damping, friction, bias, and the constant's; and what they have to make up."""
+    """Return the regression's columns armature, damping, friction, bias and constant, and its right-hand side."""
     parts = []
     for r in rows:
         use = r.moving[:, j]
-        told, asked = r.told[lag][use, j], r.asked[use, j]
-        columns = [r.acceleration[use, j], r.velocity[use, j], r.sign[use, j], np.ones_like(told)]
-        columns += [-told] if constant else []
-        parts.append((np.stack(columns, axis=1), -asked if constant else told - asked))
+        torque, required = r.torque[lag][use, j], r.required[use, j]
+        columns = [r.acceleration[use, j], r.velocity[use, j], r.sign[use, j], np.ones_like(torque)]
+        columns += [-torque] if constant else []
+        parts.append((np.stack(columns, axis=1), -required if constant else torque - required))
     return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
 
 
 def _solved(a: Array, y: Array) -> tuple[Array, float]:
-    """Armature, damping, friction ≥ 0, bias, constant; and the square of what is left, robustly."""
+    """Return armature, damping, friction ≥ 0, bias and constant, and the robust squared residual."""
     low = np.array([0.0, 0.0, 0.0, -np.inf, 1e-9])[: a.shape[1]]
-    if len(y) < 20:
+    if len(y) < MIN_ROWS:
         return np.array([0.0, 0.0, 0.0, 0.0, 1.0]), np.inf
     weight = np.ones(len(y))
-    for _ in range(ROUNDS):
+    for _ in range(HUBER_ROUNDS):
         q, r = np.linalg.qr(a * weight[:, None])
         x = lsq_linear(r, q.T @ (y * weight), (low, np.inf), method="bvls").x
-        left = np.abs(a @ x - y)
-        scale = 1.4826 * float(np.median(left))
-        weight = np.sqrt(np.minimum(1.0, HUBER * scale / np.maximum(left, 1e-12)))
+        residual = np.abs(a @ x - y)
+        scale = 1.4826 * float(np.median(residual))
+        weight = np.sqrt(np.minimum(1.0, HUBER_SCALE * scale / np.maximum(residual, 1e-12)))
     return np.append(x, np.ones(5 - len(x))), scale**2
 
 
 def _joint(rows: ListOf[_Rows], j: int, constant: bool) -> tuple[Array, int]:
-    """Its parameters, and which of DELAYS leaves least."""
-    fits = [_solved(*_system(rows, j, constant, lag)) for lag in range(len(DELAYS))]
-    lag = int(np.argmin([left / (x[4] ** 2) for x, left in fits]))
+    """Return a joint's parameters, and the index of the delay with the least residual."""
+    fits = [_solved(*_system(rows, j, constant, lag)) for lag in range(len(DELAYS_S))]
+    lag = int(np.argmin([residual / (x[4] ** 2) for x, residual in fits]))
     return fits[lag][0], lag
 
 
 def _jackknife(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> Array:
-    """Standard errors, (5,), of blocks of rows that are each left out once."""
+    """Return standard errors, (5,), by a jackknife over blocks of rows."""
     a, y = _system(rows, j, constant, lag)
-    block = np.arange(len(y)) * BLOCKS // max(len(y), 1)
-    each = np.array([_solved(a[block != k], y[block != k])[0] for k in range(BLOCKS)])
-    return np.sqrt((BLOCKS - 1) * each.var(axis=0))
+    block = np.arange(len(y)) * JACKKNIFE_BLOCKS // max(len(y), 1)
+    each = np.array([_solved(a[block != k], y[block != k])[0] for k in range(JACKKNIFE_BLOCKS)])
+    return np.sqrt((JACKKNIFE_BLOCKS - 1) * each.var(axis=0))
 
 
-def _left(rows: ListOf[_Rows], terms: dict[str, Array], constant: Array, lags: Array) -> Array:
-    """Median |told − asked for|, (n,) N·m."""
-    apart = []
+def _residual(rows: ListOf[_Rows], terms: dict[str, Array], constant: Array, lags: Array) -> Array:
+    """Return the median |recorded − required torque|, (n,) N·m."""
+    residuals = []
     for r in rows:
-        told = constant * np.stack([r.told[lag][:, j] for j, lag in enumerate(lags)], axis=1)
-        asked = r.asked + terms["armature"] * r.acceleration + terms["damping"] * r.velocity
-        apart.append(np.abs(told - asked - terms["frictionloss"] * r.sign))
-    return np.asarray(np.median(np.concatenate(apart), axis=0))
+        torque = constant * np.stack([r.torque[lag][:, j] for j, lag in enumerate(lags)], axis=1)
+        required = r.required + terms["armature"] * r.acceleration + terms["damping"] * r.velocity
+        residuals.append(np.abs(torque - required - terms["frictionloss"] * r.sign))
+    return np.asarray(np.median(np.concatenate(residuals), axis=0))
 
 
 def _starts(s: Sequence) -> Array:
-    return np.arange(0, len(s) - round(HORIZONS[-1] / s.dt) - 1, max(1, round(HORIZONS[1] / s.dt)))
-
-
-def _windows(sequences: ListOf[Sequence]) -> int:
-    return sum(len(_starts(s)) for s in sequences)
+    return np.arange(0, len(s) - round(HORIZONS_S[-1] / s.dt) - 1, max(1, round(HORIZONS_S[1] / s.dt)))
 
 
 def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> dict[float, Array]:
-    """Median |error| of the operated joints so many seconds after a recorded state, driven by the torque, (n,) rad."""
+    """Return horizon → median |error| of the operated joints, driven by the torque from recorded states, (n,) rad."""
     op, errors = robot.operated_index, dict[float, list[Array]]()
     for s in sequences:
         model = build_model(robot, s.meta.payload_mass, s.meta.payload_side, dt=s.dt)
@@ -208,13 +207,13 @@ def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> di
         time, tau = np.arange(len(s)) * s.dt, s.tau.astype(float)
         for j, i in enumerate(op):
             tau[:, i] = constant[j] * np.interp(time - robot.delay[i], time, tau[:, i])
-        v = differentiate(lowpass(s.qpos.astype(float), s.dt, SMOOTH), s.dt)
+        v = differentiate(lowpass(s.qpos.astype(float), s.dt, DIFFERENTIATION_CUTOFF_HZ), s.dt)
         for start in _starts(s):
             mujoco.mj_resetData(model, data)
             data.qpos[at], data.qvel[dof] = s.qpos[start], v[start]
-            for h in HORIZONS:
+            for h in HORIZONS_S:
                 last = start + round(h / s.dt)
-                for t in range(start + round(([0.0, *HORIZONS][HORIZONS.index(h)]) / s.dt), last):
+                for t in range(start + round(([0.0, *HORIZONS_S][HORIZONS_S.index(h)]) / s.dt), last):
                     data.qfrc_applied[dof] = tau[t]
                     mujoco.mj_step(model, data, steps)
                 errors.setdefault(h, []).append(np.abs(data.qpos[at] - s.qpos[last])[op])

@@ -11,7 +11,12 @@ from gaponet.cli.main import main
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.evidence import estimate_uncertainty
-from gaponet.sysid.motion.experiment_design import ExperimentDesign, candidates, expected, open_gains
+from gaponet.sysid.motion.experiment_design import (
+    ExperimentDesign,
+    candidate_motions,
+    simulated_recordings,
+    undetermined_gains,
+)
 from gaponet.sysid.motion.feasible import Feasibility
 from gaponet.sysid.motion.files import read_motion
 from gaponet.sysid.motion.library import Library
@@ -38,12 +43,14 @@ def robot(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pool(robot):
-    return candidates(Library(robot, 3, HELD))[::3]
+    return candidate_motions(Library(robot, 3, HELD))[::3]
 
 
 @pytest.fixture(scope="module")
 def told(robot, pool):
-    return ExperimentDesign.from_recordings(robot, ParameterUncertainty.load(robot), expected(robot, pool, 0.0, 1), 1)
+    return ExperimentDesign.from_recordings(
+        robot, ParameterUncertainty.load(robot), simulated_recordings(robot, pool, 0.0, 1), 1
+    )
 
 
 def errors(covariance):
@@ -92,13 +99,13 @@ def test_a_robot_that_is_known_well_has_little_more_worth_playing(told):
 
 def test_where_gravity_turns_nothing_a_known_payload_is_asked_for(tmp_path, robot, pool, told):
     """Its joints turn about upright axes, and no log has shown what moves: friction over kp is seen, kp is not."""
-    assert open_gains(robot, ParameterUncertainty.load(robot), told, pool, (0.0,)) == {}
+    assert undetermined_gains(robot, ParameterUncertainty.load(robot), told, pool, (0.0,)) == {}
     free = identified(tmp_path, XML.replace('axis="0 1 0"', 'axis="0 0 1"'))
     mine = ParameterUncertainty.load(free)
-    motions = [m for m in candidates(Library(free, 3, HELD)) if m.name.startswith("creep")]
-    slow = ExperimentDesign.from_recordings(free, mine, expected(free, motions, 0.0, 1), 1)
+    motions = [m for m in candidate_motions(Library(free, 3, HELD)) if m.name.startswith("creep")]
+    slow = ExperimentDesign.from_recordings(free, mine, simulated_recordings(free, motions, 0.0, 1), 1)
     unsure = replace(slow, covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0])
-    said = open_gains(free, mine, unsure, motions, (0.0,))
+    said = undetermined_gains(free, mine, unsure, motions, (0.0,))
     assert set(said) == {"shoulder", "elbow"}
     assert all("so no motion tells kp from friction and damping" in why for why in said.values())
 

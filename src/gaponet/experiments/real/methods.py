@@ -15,9 +15,9 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import Corrector, replay
+from gaponet.sysid.adapt import adapt
 from gaponet.sysid.identify import identify
-from gaponet.sysid.refit import refit
-from gaponet.sysid.robot_rollouts import WINDOW
+from gaponet.sysid.robot_rollouts import WINDOW_S
 
 LEFT_OUT = "left out"  # starts the note of a network that validation rejected
 ADAPTATION_S = 30.0  # of the test's session
@@ -104,9 +104,9 @@ def adapted(question: Question) -> FittedSim:
     if not question.few:
         raise UsageError(f"{question.name}: has no recordings for adaptation")
     start, few = identified(question).robot if question.elsewhere is None else question.elsewhere(), question.few
-    seconds = len(few) * WINDOW if few[0].duration < WINDOW else ADAPTATION_S  # all of the short windows
-    fit = refit(few, start, seconds, judge=True)
-    return FittedSim(fit.robot if fit.kept else start)
+    seconds = len(few) * WINDOW_S if few[0].duration < WINDOW_S else ADAPTATION_S  # all of the short windows
+    fit = adapt(few, start, seconds, judge=True)
+    return FittedSim(fit.robot if fit.accepted else start)
 
 
 def elsewhere(question: Question) -> FittedSim:

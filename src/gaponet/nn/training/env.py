@@ -20,7 +20,7 @@ from gaponet.nn.training.config import RewardConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs
-from gaponet.sysid.robot_rollouts import IMMOVABLE
+from gaponet.sysid.robot_rollouts import IMMOVABLE_ARMATURE
 
 COUNTERS = ("row", "first", "last", "elapsed")  # per environment, in checkpoints
 CRITIC_PREVIEW = (1, 2, 5, 10, 20)  # rows of the recording ahead that the critic observes
@@ -140,7 +140,7 @@ class DeltaEnv:
         conditions = [rows.conditions[g] for g in rows.group]
         sim = BatchSim(robot, conditions, nthread, rows.locked)
         if rows.unobserved.any():  # these joints stay where the recording says, as in identification
-            sim.batch.expand("dof_armature")[:] += IMMOVABLE * rows.unobserved[rows.group]
+            sim.batch.expand("dof_armature")[:] += IMMOVABLE_ARMATURE * rows.unobserved[rows.group]
         self.sim: Any = sim
         if device != "cpu":
             from gaponet.sim.warp import WarpSim

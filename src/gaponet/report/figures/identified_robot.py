@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from gaponet.base.files import lock_folder, write_text
 from gaponet.report.figures.style import figure, joint_label, legend, save, styled
 from gaponet.report.methods import colour, shade, title
-from gaponet.sysid.uncertainty import ParameterUncertainty
-from gaponet.sysid.uncertainty_table import FIELD_UNITS, summarize
+from gaponet.sysid.uncertainty import FIELD_UNITS, ParameterUncertainty, summarize
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -31,63 +31,64 @@ from gaponet.sysid.motion.motion import GRID, Motion
 from gaponet.sysid.motion.whole_body import ANY
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
-ALL_AT_ONCE, VARIANTS = 24, 4  # candidates in which every joint plays a signal of its own; tours and the like
-ALONE = 8  # joints: of a robot with more, none is moved by itself
-AWAY = 0.5  # of a joint's interval: how far from home it plays beside others
-PACE, LITTLE = 30.0, 0.05  # s; so long that makes no error smaller than this share is not worth playing
-LOOSE = 0.1  # of kp: an error as large after all motions says that they do not tell it
-MASSES = (3.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05)  # kg: what a payload might tell is tried with the heaviest that is held
-NONE = 1e-9
+MOTIONS_OF_ALL_JOINTS, VARIANTS = 24, 4  # candidates with a signal in every joint; of tours and the like
+MAX_SINGLE_JOINTS = 8  # of a robot with more, no joint moves by itself
+RANGE_SHARE = 0.5  # of a joint's interval, from home, beside others
+WORTH_INTERVAL_S, MIN_WORTH = 30.0, 0.05  # time that must reduce the errors by this share to be worth playing
+MAX_KP_ERROR = 0.1  # relative, after all motions; more means that they do not determine it
+PAYLOADS_KG = (3.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05)  # the heaviest that can be held is tried
+EPSILON = 1e-9
 
 
 @dataclass(frozen=True)
 class ExperimentDesign:
-    """What R recordings would tell of n joints' P numbers, on the axes of sysid/uncertainty.py.
+    """Information that R recordings would hold about n joints' P parameters, on the axes of sysid/uncertainty.py.
 
     Attributes:
-        normals: Slopes of the path over the numbers, squared, (n, R, P, P).
-        seconds: (R,).
-        covariance: Known already, (n, P, P).
-        scatter: How much farther recordings pull apart than independent rows, (n, P).
+        information: Gauss-Newton information of each recording, (n, R, P, P).
+        seconds: Durations, (R,).
+        covariance: Present covariance, (n, P, P).
+        overdispersion: Variance of recordings' gradients over that of independent rows, (n, P).
     """
 
-    normals: Array
+    information: Array
     seconds: Array
     covariance: Array
-    scatter: Array
+    overdispersion: Array
 
     @classmethod
     def from_recordings(
-        cls, robot: RobotSpec, known: ParameterUncertainty, played: ListOf[Sequence], nthread: int = 0
+        cls, robot: RobotSpec, uncertainty: ParameterUncertainty, recordings: ListOf[Sequence], nthread: int = 0
     ) -> ExperimentDesign:
-        """What recordings would tell that the identified robot would make; their names differ."""
-        says = evidence(robot, played, known.fields, 10**6, nthread).by_recording()
-        kept = lambda what: np.stack([known.array(j, what) for j in robot.operated])  # noqa: E731
-        scatter = np.maximum(kept("overdispersion")[:, :-1], 1.0)
-        return cls(says.normals[..., :-1, :-1], np.array([s.duration for s in played]), kept("covariance"), scatter)
+        """Make the design from simulated recordings of the identified robot; their names differ."""
+        own = evidence(robot, recordings, uncertainty.fields, 10**6, nthread).by_recording()
+        covariance = np.stack([uncertainty.array(j, "covariance") for j in robot.operated])
+        overdispersion = np.stack([uncertainty.array(j, "overdispersion") for j in robot.operated])
+        seconds = np.array([s.duration for s in recordings])
+        return cls(own.information[..., :-1, :-1], seconds, covariance, np.maximum(overdispersion[:, :-1], 1.0))
 
     def after(self, picks: ListOf[int]) -> Array:
-        """Covariance when these have been recorded too, (n, P, P)."""
-        return self._joined(self.normals[:, list(picks)].sum(axis=1))
+        """Return the covariance after these recordings, (n, P, P)."""
+        return self._covariance_with(self.information[:, list(picks)].sum(axis=1))
 
-    def _joined(self, normal: Array) -> Array:
-        """Covariance after recordings with these slopes squared, (…, n, P, P)."""
-        size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), NONE))
-        share = normal / (size[..., :, None] * size[..., None, :]) + NONE * np.eye(normal.shape[-1])
-        scaled = share / np.sqrt(self.scatter)[:, None, :]
-        told = scaled @ np.linalg.solve(share, np.swapaxes(scaled, -1, -2))
-        told = size[..., :, None] * told * size[..., None, :]
-        return np.asarray(np.linalg.inv(np.linalg.inv(self.covariance) + told))
+    def _covariance_with(self, normal: Array) -> Array:
+        """Return the covariance after recordings with this information, (…, n, P, P)."""
+        size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), EPSILON))
+        share = normal / (size[..., :, None] * size[..., None, :]) + EPSILON * np.eye(normal.shape[-1])
+        scaled = share / np.sqrt(self.overdispersion)[:, None, :]
+        added = scaled @ np.linalg.solve(share, np.swapaxes(scaled, -1, -2))
+        added = size[..., :, None] * added * size[..., None, :]
+        return np.asarray(np.linalg.inv(np.linalg.inv(self.covariance) + added))
 
-    def _errors(self, normal: Array) -> Array:
-        """Mean over joints and numbers of the logarithm of the standard error then, (…,)."""
-        variance = np.einsum("...ii->...i", self._joined(normal))
+    def _mean_log_error(self, normal: Array) -> Array:
+        """Return the mean over joints and parameters of the logarithm of the standard error then, (…,)."""
+        variance = np.einsum("...ii->...i", self._covariance_with(normal))
         return np.asarray(0.5 * np.log(variance).mean(axis=(-2, -1)))
 
     def choose(self, seconds: float) -> list[int]:
-        """Recordings that tell most in so much time: the most a second, one after another, then exchanged."""
+        """Return the best recordings in so much time, s: greedily by gain per second, then by exchanges."""
         picks = [i for i, _ in self.greedy(seconds)]
-        best = float(self._errors(self.normals[:, picks].sum(axis=1))) if picks else np.inf
+        best = float(self._mean_log_error(self.information[:, picks].sum(axis=1))) if picks else np.inf
         for _ in range(2 * len(picks)):
             tried = [
                 (float(e), k, int(i))
@@ -96,16 +97,16 @@ class ExperimentDesign:
                 for fits in [np.setdiff1d(np.flatnonzero(self.seconds <= seconds - self.seconds[rest].sum()), picks)]
                 for i, e in zip(fits, self._with(rest, fits), strict=True)
             ]
-            if not tried or min(tried)[0] > best - NONE:
+            if not tried or min(tried)[0] > best - EPSILON:
                 break
             best, k, i = min(tried)
             picks[k] = i
         return picks
 
     def greedy(self, seconds: float = np.inf) -> Iterator[tuple[int, float]]:
-        """One after another: the recording that tells most a second, and the mean logarithm of the errors after it."""
+        """Yield the recording with the largest gain per second, one after another, and the mean log error after it."""
         picks = list[int]()
-        now = float(self._errors(np.zeros_like(self.normals[:, 0])))
+        now = float(self._mean_log_error(np.zeros_like(self.information[:, 0])))
         while len(fits := np.setdiff1d(np.flatnonzero(self.seconds <= seconds - self.seconds[picks].sum()), picks)):
             then = self._with(picks, fits)
             best = int(((now - then) / self.seconds[fits]).argmax())
@@ -113,28 +114,30 @@ class ExperimentDesign:
             yield picks[-1], now
 
     def _with(self, picks: ListOf[int], more: Array) -> Array:
-        """Mean logarithm of the errors with each of some more recordings, (more,)."""
-        here = self.normals[:, list(picks)].sum(axis=1)
-        return self._errors(here + np.swapaxes(self.normals[:, more], 0, 1))
+        """Return the mean log error after the picks and each of some more recordings, (more,)."""
+        here = self.information[:, list(picks)].sum(axis=1)
+        return self._mean_log_error(here + np.swapaxes(self.information[:, more], 0, 1))
 
     def worth(self) -> float:
-        """Seconds after which PACE more make the errors smaller by less than LITTLE, on average."""
-        played, before = 0.0, float(self._errors(np.zeros_like(self.normals[:, 0])))
+        """Return the seconds after which WORTH_INTERVAL_S more reduce the errors by less than MIN_WORTH, on average."""
+        played, before = 0.0, float(self._mean_log_error(np.zeros_like(self.information[:, 0])))
         for i, now in self.greedy():
-            if (before - now) * PACE / self.seconds[i] < LITTLE:
+            if (before - now) * WORTH_INTERVAL_S / self.seconds[i] < MIN_WORTH:
                 return played
             played, before = played + float(self.seconds[i]), now
         return played
 
 
-def candidates(library: Library, progress: Progress = no_progress) -> list[Motion]:
-    """Motions within a robot's limits: joints alone, tours, and all joints at once with a signal each."""
+def candidate_motions(library: Library, progress: Progress = no_progress) -> list[Motion]:
+    """Return motions within a robot's limits: single joints, tours, and all joints at once with a signal each."""
     robot = library.robot
-    alone = [f"{s}-{short(j)}" for j in robot.operated for s in SIGNALS] if len(robot.operated) <= ALONE else []
+    alone = (
+        [f"{s}-{short(j)}" for j in robot.operated for s in SIGNALS] if len(robot.operated) <= MAX_SINGLE_JOINTS else []
+    )
     names = [*alone, *(f"{kind.__name__}-all-{v}" for kind in ANY for v in range(VARIANTS))]
     found = []
-    for k in range(len(names) + ALL_AT_ONCE):
-        progress(k, len(names) + ALL_AT_ONCE, "which motions fit the robot's limits")
+    for k in range(len(names) + MOTIONS_OF_ALL_JOINTS):
+        progress(k, len(names) + MOTIONS_OF_ALL_JOINTS, "which motions fit the robot's limits")
         try:
             found.append(library.make(names[k]) if k < len(names) else _at_once(library, k - len(names)))
         except UsageError:  # does not fit this robot's limits: no candidate
@@ -145,13 +148,15 @@ def candidates(library: Library, progress: Progress = no_progress) -> list[Motio
 
 
 def _at_once(library: Library, variant: int) -> Motion:
-    """Every operated joint plays a signal of its own, around the posture from which all motions begin."""
+    """Return a motion in which every operated joint plays a signal of its own around the ready posture."""
     robot, rng = library.robot, np.random.default_rng([library.seed, 5, variant])
     kinds = list(SIGNALS.values())
     columns = {}
     for joint in robot.operated:
         i, stage = robot.index([joint])[0], library.stage(joint)
-        low, high = (library.kit.ready[i] + AWAY * (end - library.kit.ready[i]) for end in (stage.low, stage.high))
+        low, high = (
+            library.kit.ready[i] + RANGE_SHARE * (end - library.kit.ready[i]) for end in (stage.low, stage.high)
+        )
         columns[i] = kinds[rng.integers(len(kinds))](min(low, high), max(low, high), rng, GRID)
     ctrl = np.repeat(library.kit.ready[None], max(map(len, columns.values())), axis=0)
     for i, column in columns.items():
@@ -160,56 +165,54 @@ def _at_once(library: Library, variant: int) -> Motion:
     return library.limits.fit(made)
 
 
-def expected(robot: RobotSpec, motions: ListOf[Motion], payload: float, nthread: int = 0) -> list[Sequence]:
-    """What recordings of motions would be if the robot were as it is identified."""
-    asked = []
+def simulated_recordings(robot: RobotSpec, motions: ListOf[Motion], payload: float, nthread: int = 0) -> list[Sequence]:
+    """Return recordings of motions that the robot would make as it is identified."""
+    commanded = []
     for motion in motions:
         ctrl = motion.sample(robot.dt).astype(np.float32)
         meta = SequenceMeta(robot.name, "expected", f"{motion.name} {payload:g} kg", payload, virtual=True)
-        asked.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl)))
-    twins = replay(asked, robot, nthread=nthread, lock_idle=True)
-    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, twins, strict=True)]
+        commanded.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl)))
+    twins = replay(commanded, robot, nthread=nthread, lock_idle=True)
+    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(commanded, twins, strict=True)]
 
 
-def open_gains(
-    robot: RobotSpec,
-    known: ParameterUncertainty,
-    told: ExperimentDesign,
-    motions: ListOf[Motion],
+def undetermined_gains(
+    robot: RobotSpec, uncertainty: ParameterUncertainty, design: ExperimentDesign, motions: ListOf[Motion],
     payloads: ListOf[float],
-) -> dict[str, str]:
-    """Joints whose kp none of these motions tells, with what would."""
-    kp = known.fields.index("kp")
+) -> dict[str, str]:  # fmt: skip
+    """Return joint → advice for joints whose kp none of these motions determines."""
+    kp = uncertainty.fields.index("kp")
 
-    def errors(of: ExperimentDesign) -> dict[str, float]:
+    def kp_errors(of: ExperimentDesign) -> dict[str, float]:
         whole = of.after(range(len(of.seconds)))
-        return dict(zip(known.joints, np.sqrt(whole[:, kp, kp]).tolist(), strict=True))
+        return dict(zip(uncertainty.joints, np.sqrt(whole[:, kp, kp]).tolist(), strict=True))
 
-    left = {j: e for j, e in errors(told).items() if e > LOOSE}
-    mass = _held(robot, motions) if left and max(payloads) == 0 else None
-    tried = {}
+    errors = {j: e for j, e in kp_errors(design).items() if e > MAX_KP_ERROR}
+    mass = _heaviest_payload(robot, motions) if errors and max(payloads) == 0 else None
+    loaded = {}
     if mass is not None:
-        with_it = ExperimentDesign.from_recordings(robot, known, expected(robot, motions, mass))
-        tried = errors(replace(told, normals=np.concatenate([told.normals, with_it.normals], axis=1)))
-    return {j: _advice(e, tried.get(j), mass, bool(robot.payload_mounts), max(payloads)) for j, e in left.items()}
+        added = ExperimentDesign.from_recordings(robot, uncertainty, simulated_recordings(robot, motions, mass))
+        both = np.concatenate([design.information, added.information], axis=1)
+        loaded = kp_errors(replace(design, information=both))
+    return {j: _advice(e, loaded.get(j), mass, bool(robot.payload_mounts), max(payloads)) for j, e in errors.items()}
 
 
-def _advice(error: float, tried: float | None, mass: float | None, hand: bool, most: float) -> str:
-    """What to do about a joint of which motions show friction, damping and offset over kp, and not kp."""
-    said = f"nothing loads it, so no motion tells kp from friction and damping (± {error:.0%} after all of them)"
-    if tried is not None and tried < min(LOOSE, 0.5 * error):
-        return f"{said}; {mass:g} kg in the hand would, to ± {tried:.0%}: weigh it, --payloads 0 {mass:g}"
+def _advice(error: float, loaded: float | None, mass: float | None, hand: bool, most: float) -> str:
+    """Return what to do about a joint's kp: its error after all motions, and with a payload `mass` in the hand."""
+    why = f"nothing loads it, so no motion tells kp from friction and damping (± {error:.0%} after all of them)"
+    if loaded is not None and loaded < min(MAX_KP_ERROR, 0.5 * error):
+        return f"{why}; {mass:g} kg in the hand would, to ± {loaded:.0%}: weigh it, --payloads 0 {mass:g}"
     if mass is not None:
-        return f"{said}, nor would {mass:g} kg in the hand (± {tried:.0%}); take its numbers as a set"
+        return f"{why}, nor would {mass:g} kg in the hand (± {loaded:.0%}); take its numbers as a set"
     if hand and not most:
-        return f"{said}, and no payload can be held in all of them; take its numbers as a set"
-    return f"{said}; take its numbers as a set{'' if hand else ', or give robot.toml a [[payload_mount]]'}"
+        return f"{why}, and no payload can be held in all of them; take its numbers as a set"
+    return f"{why}; take its numbers as a set{'' if hand else ', or give robot.toml a [[payload_mount]]'}"
 
 
-def _held(robot: RobotSpec, motions: ListOf[Motion]) -> float | None:
-    """The heaviest of MASSES that all motions can be held with, kg."""
+def _heaviest_payload(robot: RobotSpec, motions: ListOf[Motion]) -> float | None:
+    """Return the heaviest of PAYLOADS_KG with which all postures can be held, kg; None if there is none."""
     postures = np.concatenate([m.ctrl[::50] for m in motions])
-    for mass in MASSES if robot.payload_mounts else ():
+    for mass in PAYLOADS_KG if robot.payload_mounts else ():
         if (np.abs(static_torque(build_model(robot, mass), postures)) <= TORQUE_SHARE * robot.effort_limit).all():
             return mass
     return None

@@ -10,7 +10,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
-from gaponet.sysid.target_speed import target_speeds
+from gaponet.sysid.motion_limits import target_speeds
 
 
 def recorded(robot, count=6, still=()):
@@ -52,7 +52,7 @@ def test_identification_finds_a_ramp_and_says_so(tmp_path, servos):
     found = identify(logs[:5], robot, logs[5:], windows=5, terms=(), table=False, nthread=1)
     assert found.robot.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
     assert found.after < 0.1 * found.before
-    assert found.tried[-1].name == "ramp"
+    assert found.comparisons[-1].name == "ramp"
     assert "profile velocity" in found.warnings[0]
     assert found.robot.before_identification.target_speed.max() == 0
 

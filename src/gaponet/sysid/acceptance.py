@@ -1,0 +1,169 @@
+"""Acceptance of candidates on validation motions, and the result of an identification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import stdtrit
+
+from gaponet.base.arrays import Array
+from gaponet.data.sequence import Sequence
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.metrics import standard_error
+from gaponet.sysid.axes import Values
+from gaponet.sysid.robot_rollouts import RobotRollouts
+from gaponet.sysid.table_contact import TableFit, tip_heights
+
+Std = dict[str, dict[str, float]]  # joint → field → standard error
+Covariance = dict[str, tuple[list[str], Array]]  # joint → fields (P), (P, P) on the axes of uncertainty.py
+
+MIN_RELATIVE_GAIN = 0.01  # of the mean error, where several motions judge
+MIN_RELATIVE_GAIN_ONE_MOTION = 0.1
+CONFIDENCE = 0.84  # one-sided level of Student's t: one standard error where motions are many
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A candidate against another one by the errors of the motions that judge, (motions,) rad."""
+
+    name: str
+    before: Array
+    after: Array
+
+    @property
+    def gain(self) -> tuple[float, float]:
+        """Decrease of the mean error, and its paired standard error over motions, rad."""
+        gains = self.before - self.after
+        return float(gains.mean()), standard_error(gains)
+
+    @property
+    def accepted(self) -> bool:
+        """True if the mean error falls by more than 1 % and the paired relative gain exceeds one standard error
+        (Student's t); of a single motion by more than 10 %."""
+        freedom, least = len(self.before) - 1, MIN_RELATIVE_GAIN
+        if not freedom:
+            least = MIN_RELATIVE_GAIN_ONE_MOTION
+        relative = (self.before - self.after) / np.maximum(self.before + self.after, 1e-12)
+        significant = not freedom or relative.mean() > stdtrit(freedom, CONFIDENCE) * standard_error(relative)
+        return bool(significant and self.gain[0] > least * self.before.mean())
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Result of an identification.
+
+    Attributes:
+        robot: The robot with identified parameters; the given robot if no candidate was better.
+        before, after: Mean |error| of the motions that judge, rad: of the given robot, of this one.
+        chosen: Best candidate: given, joints (each by itself), whole (all together), limbs (kinematic chains), mixed,
+            torque or ramp.
+        warnings: Parameters at a bound, what to check, and what the recordings do not determine (last).
+        std: Joint → field → standard error; empty for joints with a shared servo model.
+        comparisons: Terms of the servo model in the order in which they were fitted; then torque and speed limits.
+        table_fit: Result for the table; None if no tip may touch anything.
+        shared: Type of servo whose joints were given one servo model, with the errors before and after.
+        by_joint: Joint → mean |error| before and after, rad.
+        covariance: Joint → fields and their covariance; without joints with a shared servo model.
+        undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
+        judged_robot: The robot that the validation motions judged, if `robot` was fitted to them as well afterwards.
+    """
+
+    robot: RobotSpec
+    before: float
+    after: float
+    chosen: str
+    warnings: tuple[str, ...]
+    std: Std
+    comparisons: tuple[Comparison, ...]
+    table_fit: TableFit | None
+    shared: tuple[Comparison, ...] = ()
+    by_joint: dict[str, tuple[float, float]] = field(default_factory=dict)
+    covariance: Covariance = field(default_factory=dict)
+    undetermined: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    judged_robot: RobotSpec | None = None
+
+    @property
+    def improved(self) -> bool:
+        """Whether the result is another robot than the given one."""
+        return self.chosen != "given" or bool(self.table_fit and self.table_fit.accepted)
+
+    def no_gain_message(self, robot: RobotSpec, given: Array, fitted: Array) -> str:
+        """Explain why nothing is written, and what to record; errors of the given and the fitted robot, rad."""
+        worst = sorted(self.by_joint, key=lambda joint: -self.by_joint[joint][0])[:3]
+        joints = ", ".join(f"{joint} {1e3 * self.by_joint[joint][0]:.2f}" for joint in worst)
+        why = f"; {self.warnings[0]}" if self.warnings else ""
+        return (
+            f"nothing is written: no fit follows the {len(given)} validation motion(s) better than {robot.name} as it "
+            f"is ({1e3 * given.mean():.2f} mrad, best fit {1e3 * fitted.mean():.2f}; worst {joints}). Record gaponet "
+            f"excite's motions, every joint over its range, slow and fast, and look at gaponet doctor{why}"
+        )
+
+
+class Judge:
+    """Errors of candidates on whole motions in the robot's simulator; repetitions of a motion count as one."""
+
+    def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float, nthread: int) -> None:
+        """Judge by sequences; rows with a tip below `contact_height`, m, do not count."""
+        self.rollouts = RobotRollouts(
+            list(sequences), robot, nthread, touch=_contact_rows(sequences, robot, contact_height)
+        )
+        # Repetitions and gains of what one unit plays with one payload are one judge.
+        keys = [(s.meta.motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
+        each = [np.array([key == one for key in keys])[self.rollouts.window] for one in dict.fromkeys(keys)]
+        self.motions = [rows for rows in each if rows.any()]
+        self._sums_of: dict[bytes, Array] = {}
+
+    def _sums(self, values: Values) -> tuple[Array, Array]:
+        """Return the sums of |error| over counted rows, rad, and their numbers, by motion and joint, (motions, n)."""
+        key = b"".join(f.encode() + values[f].tobytes() for f in sorted(values))
+        if key not in self._sums_of:
+            size = np.abs(self.rollouts.flat_errors({f: v[None] for f, v in values.items()}))[0]
+            self._sums_of[key] = np.stack([size[:, rows].sum(axis=1) for rows in self.motions])
+        return self._sums_of[key], np.stack([self.rollouts.recorded[:, rows].sum(axis=1) for rows in self.motions])
+
+    def errors(self, values: Values) -> Array:
+        """Return the mean |error| of each motion, (motions,) rad."""
+        total, count = self._sums(values)
+        return np.asarray(total.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
+
+    def errors_by_joint(self, values: Values) -> Array:
+        """Return the mean |error| of each joint, (n,) rad."""
+        total, count = self._sums(values)
+        return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
+
+    def compare(self, name: str, before: Values, after: Values) -> Comparison:
+        """Compare a candidate with the values before it."""
+        return Comparison(name, self.errors(before), self.errors(after))
+
+    def best(self, candidates: dict[str, Values]) -> tuple[str, Values]:
+        """Return name and values of the best candidate.
+
+        The second candidate is the default. Another one replaces it if it is accepted by `Comparison`, or better by
+        10 %. The best values joint by joint ("mixed") replace it only if they are accepted. The first candidate, the
+        given robot, is returned if no fit is better by 1 %.
+        """
+        given, default, *others = candidates
+        joints = np.array([self.errors_by_joint(v) for v in candidates.values()])
+        winner = joints.argmin(axis=0)
+        if len(set(winner.tolist())) > 1:
+            fields = set.intersection(*(set(v) for v in candidates.values()))
+            rows = {f: np.stack([v[f] for v in candidates.values()]) for f in fields}
+            candidates = candidates | {"mixed": {f: x[winner, np.arange(len(winner))] for f, x in rows.items()}}
+        errors, name = {name: self.errors(v) for name, v in candidates.items()}, default
+        for other in (*others, *(candidates.keys() & {"mixed"})):
+            limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[name].mean()
+            much_better = other != "mixed" and errors[other].mean() < limit
+            name = other if much_better or Comparison(other, errors[name], errors[other]).accepted else name
+        name = name if errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean() else given
+        return name, candidates[name]
+
+
+def _contact_rows(sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float) -> Array | None:
+    """Return the rows in which a tip is below a height, (sequences, rows)."""
+    if not robot.tips:
+        return None
+    heights = tip_heights(sequences, robot)
+    rows = max(map(len, heights))
+    return np.array([np.r_[h < contact_height, np.zeros(rows - len(h), bool)] for h in heights])

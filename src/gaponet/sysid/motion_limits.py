@@ -1,0 +1,175 @@
+"""Limits of motion that recordings show: joint stops, and servos that limit the speed of their targets.
+
+A servo's own trajectory generator moves its target along a ramp, and the joint follows the ramp, never the command. So
+the recorded state is compared with the commands, with commands behind a first-order lag, and with ramps of several
+speeds, each with the lag and the offset that suit it best. That needs none of the servo's parameters. Where a ramp fits
+much better, the robot is identified with it as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import replace
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.data.sequence import Sequence
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.batch import ramped
+from gaponet.sim.replay import motion_errors
+from gaponet.sysid.acceptance import Comparison, Identified
+
+MIN_PERIOD_S, MAX_LAG_S, LAGS = 0.01, 0.3, 16  # of rows that are compared; lags that are tried
+SPEED_RATIOS = np.geomspace(0.7, 1.25, 30)  # ramps that are tried, over a joint's greatest speed
+GREATEST_SPEED_QUANTILE = 0.995
+SPEED_SPAN_S = 0.06  # over which a speed is measured
+LAG_TIME_CONSTANTS_S = (0.0, 0.02, 0.04, 0.08, 0.16, 0.32)  # of a servo without a ramp
+MAX_ERROR_RATIO = 0.8  # of a ramp over the best lag, in both halves of the recordings
+MIN_RAMP_ERROR_RAD, MIN_RAMP_DELAY_S = 0.02, 0.3  # RMS and time by which a ramp must be behind its command
+MIN_BEYOND_STOP_RAD, MIN_STOP_ROWS = 0.1, 50  # that commands go beyond a stop, and further there; rows that show it
+AT_STOP_RAD = 0.005  # from the end of a joint's path
+MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
+
+
+def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
+    """Return the robot with joint stops narrower than the MJCF's where commands go on and the joint stays.
+
+    A joint far behind its command is loaded, or sticks as its command comes back. A stop is where a command went on by
+    MIN_BEYOND_STOP_RAD after the joint had come to its end, twice at least.
+    """
+    servos: dict[str, dict[str, float]] = {}
+    for joint, i in zip(robot.operated, robot.operated_index, strict=True):
+        for name, sign in (("stop_low", -1.0), ("stop_high", 1.0)):
+            paths = [(sign * s.ctrl[:, i], sign * s.qpos[:, i]) for s in sequences]
+            end = max(float(qpos.max()) for _, qpos in paths)
+            pushes = [c for ctrl, qpos in paths for c in _pushes(ctrl, qpos, end)]
+            went_on = [c.max() - c[0] > MIN_BEYOND_STOP_RAD for c in pushes]
+            met = sum(map(len, pushes)) >= MIN_STOP_ROWS and sum(went_on) > 1
+            if met and sign * robot.qpos_range[i, int(sign > 0)] > end + MIN_NARROWING_RAD:
+                servos.setdefault(joint, {})[name] = round(sign * end, 4)
+    return robot.with_servos(servos) if servos else robot
+
+
+def _pushes(ctrl: Array, qpos: Array, end: float) -> list[Array]:
+    """Return the commands well beyond the end of a joint's path while the joint is there, push by push."""
+    rows = np.flatnonzero((ctrl > end + MIN_BEYOND_STOP_RAD) & (qpos > end - AT_STOP_RAD))
+    return np.split(ctrl[rows], np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
+
+
+def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
+    """Return a question for each stop that `with_stops` added, since the joint may have met anything."""
+    questions = []
+    for joint, i in zip(given.operated, given.operated_index, strict=True):
+        for name, side in (("stop_low", 0), ("stop_high", 1)):
+            stop = float(getattr(stopped, name)[i])
+            if np.isfinite(stop) and stop != getattr(given, name)[i]:
+                questions.append(
+                    f"{joint}: stayed at {stop:.3f} rad where commands went on towards {given.qpos_range[i, side]:.3f}:"
+                    " if that is a stop, identify with --stops; if something was in its way, leave those motions out"
+                )
+    return questions
+
+
+def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
+    """Return the speed of each operated joint's ramp, (n,) rad/s; 0 where a lag explains the state as well."""
+    op = robot.operated_index
+    low, high = robot.qpos_range[op].T
+    parts = []
+    for s in sequences:
+        if s.duration < 2 * MAX_LAG_S:
+            continue
+        every = max(1, round(MIN_PERIOD_S / s.dt))
+        ctrl, qpos = np.clip(s.ctrl[::every, op], low, high).astype(float), s.qpos[::every, op].astype(float)
+        parts.append((ctrl, qpos, every * s.dt))
+    if len(parts) < 2:
+        return np.zeros(len(op))
+    span = [max(1, round(SPEED_SPAN_S / dt)) for _, _, dt in parts]
+    speeds = [np.abs(q[k:] - q[:-k]) / (k * dt) for (_, q, dt), k in zip(parts, span, strict=True) if len(q) > k]
+    greatest = np.quantile(np.concatenate(speeds), GREATEST_SPEED_QUANTILE, axis=0)  # (n,)
+    tried = np.maximum(SPEED_RATIOS[:, None] * greatest, 1e-6)  # (k, n)
+    # Squared errors of odd and even recordings; squares and maxima of how far ramps are behind their commands.
+    error = np.zeros((2, len(SPEED_RATIOS) + len(LAG_TIME_CONSTANTS_S), len(op), LAGS))
+    behind_command, rows = np.zeros((2, *tried.shape)), np.zeros(2)
+    for i, (ctrl, qpos, dt) in enumerate(parts):
+        ramps = ramped(np.broadcast_to(ctrl[:, None], (len(ctrl), *tried.shape)), qpos[0], tried, dt)
+        behind = np.abs(ramps - ctrl[:, None])
+        squares, most = behind_command
+        behind_command = np.stack([squares + (behind**2).sum(axis=0), np.maximum(most, behind.max(axis=0))])
+        aims = np.concatenate([ramps, _lagged(ctrl, dt)], axis=1)  # (T, k and lags, n)
+        for j, lag in enumerate(np.linspace(0, MAX_LAG_S, LAGS)):
+            late = round(lag / dt)
+            away = qpos[late:, None] - aims[: len(aims) - late]
+            error[i % 2, ..., j] += ((away - away.mean(axis=0)) ** 2).sum(axis=0)
+        rows[i % 2] += len(ctrl)
+    rms = np.sqrt(error.min(axis=-1) / rows[:, None, None])  # (2, k, n)
+    ramp_rms, lag_rms = np.split(rms, [len(tried)], axis=1)
+    best = ramp_rms.sum(axis=0).argmin(axis=0)
+    lowest = np.take_along_axis(ramp_rms, best[None, None], axis=1)[:, 0]
+    ratio = lowest / np.maximum(lag_rms.min(axis=1), 1e-9)  # (2, n)
+    joints = np.arange(len(op))
+    speed, (squares, most) = tried[best, joints], behind_command[:, best, joints]
+    limited = (ratio < MAX_ERROR_RATIO).all(axis=0) & (np.sqrt(squares / rows.sum()) > MIN_RAMP_ERROR_RAD)
+    limited &= most > MIN_RAMP_DELAY_S * speed
+    speed[~limited] = 0.0
+    if limited.any():
+        speed[limited] = _speed_behind([(c[:, limited], q[:, limited], dt) for c, q, dt in parts], speed[limited])
+    return np.asarray(speed)
+
+
+def _speed_behind(parts: list[tuple[Array, Array, float]], speed: Array) -> Array:
+    """Return the median speed of joints well behind a ramp of about `speed` (n,) rad/s: that of the ramp itself."""
+    seen = []
+    for ctrl, qpos, dt in parts:
+        behind = np.abs(ramped(ctrl, qpos[0], speed, dt) - ctrl)
+        k, late = max(1, round(SPEED_SPAN_S / dt)), round(MIN_RAMP_DELAY_S / 2 / dt)  # then it is as fast as its ramp
+        moved = np.abs(qpos[late + k :] - qpos[late:-k]) / (k * dt)
+        seen.append(np.where(behind[: len(moved)] > MIN_RAMP_DELAY_S / 2 * speed, moved, np.nan))
+    return np.asarray(np.nanmedian(np.concatenate([*seen, speed[None]]), axis=0))
+
+
+def _lagged(ctrl: Array, dt: float) -> Array:
+    """Return commands (T, n) behind first-order lags of LAG_TIME_CONSTANTS_S, (T, lags, n)."""
+    share = np.minimum(dt / np.maximum(LAG_TIME_CONSTANTS_S, dt), 1)[:, None]
+    lagged = np.empty((len(ctrl), len(LAG_TIME_CONSTANTS_S), ctrl.shape[1]))
+    at = np.repeat(ctrl[:1], len(LAG_TIME_CONSTANTS_S), axis=0)
+    for t, target in enumerate(ctrl):
+        lagged[t] = at = at + share * (target - at)
+    return lagged
+
+
+def with_speed_limits(
+    fit: Callable[[RobotSpec, float | None], Identified],
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    validation: ListOf[Sequence],
+    budget: float | None,
+) -> Identified:
+    """Fit the robot, and again with speed limits where recordings show some; return the fit that validation accepts.
+
+    Args:
+        fit: Function of the robot to start from and of the time that it may take, s.
+        sequences: Recordings that are fitted.
+        robot: Start of the fit; speed limits that it has are taken as true.
+        validation: Recordings that choose, motion by motion.
+        budget: Time of all fits together, s; None for no limit.
+    """
+    speeds = {} if robot.target_speed.any() else dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
+    limits = {j: {"target_speed": float(f"{v:.3g}")} for j, v in speeds.items() if v}
+    if not limits:
+        return fit(robot, budget)
+    fits = [fit(r, budget and budget / 2) for r in (robot, robot.with_servos(limits))]
+    plain, limited = fits
+    comparison = Comparison("ramp", *(motion_errors(validation, f.judged_robot or f.robot) for f in fits))
+    if not comparison.accepted:
+        return replace(plain, comparisons=(*plain.comparisons, comparison))
+    listed = ", ".join(f"{joint} {v['target_speed']:.3g}" for joint, v in limits.items())
+    warning = (
+        f"servos limit the speed of their targets, rad/s: {listed}. That is a setting of theirs (profile velocity, "
+        "goal speed). The simulator has it, so record and run with the same one; engines that load an export do not"
+    )
+    return replace(
+        limited, before=plain.before, chosen=limited.chosen if limited.improved else "ramp",
+        comparisons=(*limited.comparisons, comparison), warnings=(warning, *limited.warnings),
+    )  # fmt: skip

@@ -1,0 +1,393 @@
+"""Fitting problem of servo parameters: errors of rollouts and of a prior, searches, and standard errors."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.text import format_uncertainty
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.sim.model import build_model
+from gaponet.sysid.acceptance import Covariance, Std
+from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, OVER_KP, SINGLE_JOINT_FIELDS, Axes, Bounds, Values
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
+from gaponet.sysid.least_squares import Errors, agreed_slopes, better_half, descend
+from gaponet.sysid.robot_rollouts import RobotRollouts
+
+ROBOT_WINDOWS = 8  # windows of the fit in the robot's simulator
+STARTS, START_STD = 4, 2.0  # of each joint's search, and their standard deviation in large changes
+SHORT_WINDOW_S = 0.5  # a search begins with windows this short
+SEARCH_ITERATIONS = (10, 8, 15)  # of all starts on short windows, of all on whole windows, of the better half
+CHAIN_ITERATIONS, CHAIN_CANDIDATES = 8, 160  # at most
+MIN_COST_DECREASE, MIN_CHAIN_COST_DECREASE = 2e-3, 2e-4  # relative, for another iteration in the robot's simulator
+MIN_CLUSTERS = 24  # parts of the recordings that count as independent of each other
+CORRELATION_TIME_BOUNDS_S = (1.0, 4.0)  # least, and the value before it is estimated
+MIN_CORRELATION = 0.05  # of an error with itself later; less counts as none
+PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5}  # of the robot file's values
+STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
+UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
+MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
+
+
+class Rollouts(Protocol):
+    """Simulated windows of recordings for many candidates.
+
+    Attributes:
+        window: Window of each row of the flattened errors, (rows,).
+        rows: Number of rows that count, of each joint, (n,).
+    """
+
+    @property
+    def window(self) -> Array: ...
+    @property
+    def rows(self) -> Array: ...
+    def flat_errors(self, values: Values) -> Array:
+        """Return q_sim − q_real of candidates (k, n), (k, n, rows) rad."""
+
+
+class GainPrior:
+    """Prior of kp and armature around the robot file's values.
+
+    Its weight decreases with the residual of the best fit and increases with the residual's correlation time.
+
+    Attributes:
+        residual: RMS error of each joint's best fit so far, (n,) rad.
+        correlation_time: Duration of a recording that counts as one measurement, (n,) s.
+    """
+
+    def __init__(self, bounds: Bounds, row_period: float) -> None:
+        self.residual = np.full(bounds.n, 1e-3)
+        self.correlation_time = np.full(bounds.n, CORRELATION_TIME_BOUNDS_S[1])
+        self._row_period = max(row_period, 0.01)
+        self._log_std = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
+        self._given = {f: np.where(bounds.first[f] > 0, bounds.first[f], np.nan) for f in self._log_std}
+
+    def error_std(self) -> Array:
+        """Return the standard deviation that one row's error has beside the prior, (n,) in ERROR_SCALE_RAD."""
+        return np.asarray(self.residual / ERROR_SCALE_RAD * np.sqrt(self.correlation_time / self._row_period))
+
+    def errors(self, values: Values) -> Array:
+        """Return the prior's errors of candidates (k, n), (k, n, 2) in ERROR_SCALE_RAD."""
+        far = [
+            np.nan_to_num(np.log(np.maximum(values[f], 1e-9) / given)) * self.error_std() / self._log_std[f]
+            for f, given in self._given.items()
+        ]
+        return np.stack(far, axis=-1)
+
+    def update_residual(self, cost: Array, rows: Array) -> None:
+        """Take the residual from the cost of each joint's best fit, (n,)."""
+        self.residual = np.maximum(ERROR_SCALE_RAD * np.sqrt(2 * cost / np.maximum(rows, 1)), 1e-5)
+
+    def update_correlation_time(self, rollouts: JointRollouts, values: Values) -> None:
+        """Estimate the correlation time from the errors of values (n,)."""
+        errors = rollouts.errors({f: v[None] for f, v in values.items()})[0]  # (n, windows, rows)
+        power = (np.abs(np.fft.rfft(errors, 2 * errors.shape[-1])) ** 2).sum(axis=1)
+        correlation = np.fft.irfft(power)[:, : errors.shape[-1]]
+        correlation /= np.maximum(correlation[:, :1], 1e-30)
+        correlation *= np.cumprod(correlation > MIN_CORRELATION, axis=1)
+        seconds = rollouts.dt * rollouts.thin * (2 * correlation.sum(axis=1) - 1)
+        self.correlation_time = np.maximum(seconds, CORRELATION_TIME_BOUNDS_S[0])
+
+
+@dataclass
+class FitProblem:
+    """Least-squares problem of n joints: rollouts of one kind, bounds and the prior."""
+
+    rollouts: Rollouts
+    robot: RobotSpec
+    bounds: Bounds
+    prior: GainPrior
+    physics_step: float  # s
+
+    def errors(self, values: Values, rollouts: Rollouts | None = None) -> Array:
+        """Return errors of candidates (k, n), (k, n, rows + 2) in ERROR_SCALE_RAD; the last two are the prior's."""
+        errors = (rollouts or self.rollouts).flat_errors(values)
+        return np.concatenate(
+            [errors / np.float32(ERROR_SCALE_RAD), self.prior.errors(values)], axis=2, dtype=np.float32
+        )
+
+    def of_axes(self, axes: Axes, rollouts: Rollouts | None = None) -> Errors:
+        """Return `errors` as a function of values on axes."""
+        return lambda x: self.errors(axes.values(x), rollouts)
+
+    def robot_with(self, values: Values) -> RobotSpec:
+        """Return the robot with values (n,)."""
+        return self.robot.with_servos({
+            j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in enumerate(self.robot.operated)
+        })  # fmt: skip
+
+
+Report = Callable[[Array], None]  # called in each iteration with every problem's least cost
+Expired = Callable[[], bool]  # whether the time of a search is over
+
+
+class JointFit(FitProblem):
+    """Fit of every joint by itself, the others moving as recorded."""
+
+    rollouts: JointRollouts
+
+    def __init__(self, rollouts: JointRollouts, robot: RobotSpec, bounds: Bounds) -> None:
+        step = rollouts.dt / rollouts.count
+        super().__init__(rollouts, robot, bounds, GainPrior(bounds, rollouts.dt), step)
+
+    def regressed(self) -> list[Values]:
+        """Return starts that balance the recorded accelerations, with their own and with the file's kp."""
+        own, first, balanced = self.bounds.start, self.bounds.first["kp"], self.rollouts.regressed()
+        valid = balanced["kp"] > 0
+        ratio = np.divide(first, balanced["kp"], out=np.ones(self.bounds.n), where=valid)
+        scaled = {f: x if f in ("offset", "delay") else x * ratio for f, x in balanced.items()}
+        return [
+            {f: np.where(valid, x - self.bounds.kd_slack * (f == "damping"), own[f]) for f, x in values.items()}
+            for values in (balanced, scaled)
+        ]
+
+    def search(
+        self,
+        fields: ListOf[str],
+        start: Values,
+        others: ListOf[Values] = (),
+        *,
+        report: Report = lambda cost: None,
+        expired: Expired = lambda: False,
+    ) -> Values:
+        """Fit the fields, the classic ones and those of the servo model that `start` has; return values (n,).
+
+        Args:
+            fields: Fields beside those of `start`.
+            start: First start, (n,); STARTS in all are drawn around it.
+            others: At most two starts in place of drawn ones.
+            report: Called in each iteration.
+            expired: Ends the search early.
+        """
+        axes = Axes(self.bounds, fitted_fields(dict.fromkeys([*start, *fields]), encoder=True), start)
+        rng = np.random.default_rng(0)
+        x = np.repeat(axes.normalize(start)[None], STARTS, axis=0)
+        x[1:] += START_STD * rng.standard_normal(x[1:].shape)
+        for i, one in enumerate(others):
+            x[2 + i] = axes.normalize(one)
+        x = np.clip(x, axes.low, axes.high)
+        windows = (self.rollouts.shortened(SHORT_WINDOW_S), self.rollouts, self.rollouts)
+        for rollouts, iterations in zip(windows, SEARCH_ITERATIONS, strict=True):
+            errors = self.of_axes(axes, rollouts)
+            x, cost = descend(x, axes.low, axes.high, errors, iterations, report, expired)
+            self.prior.update_residual(cost.min(axis=0), rollouts.rows)
+            if rollouts is self.rollouts:
+                x = better_half(x, cost)
+        return {f: v[0].copy() for f, v in axes.values(x[:1]).items()}
+
+    def robot_fit(self, nthread: int) -> RobotFit:
+        """Return the fit of the same robot in its simulator, with fewer windows; its prior begins as this one's."""
+        parts = self.rollouts.parts
+        some = np.unique(np.arange(ROBOT_WINDOWS) * len(parts) // ROBOT_WINDOWS)
+        rollouts = RobotRollouts([parts[i] for i in some], self.robot, nthread, touch=self.rollouts.touch[some])
+        return RobotFit(rollouts, self.robot, self.bounds, copy.copy(self.prior), self.physics_step)
+
+
+class RobotFit(FitProblem):
+    """Fit of all joints in the simulator of the whole robot."""
+
+    def descend(
+        self,
+        fields: ListOf[str],
+        rest: Values,
+        starts: ListOf[Values],
+        iterations: ListOf[int],
+        *,
+        report: Report = lambda cost: None,
+        expired: Expired = lambda: False,
+    ) -> Values:
+        """Fit fields from starts (n,), the better of which go on after each number of iterations; return values (n,).
+
+        A joint's parameters are judged by the joint's own error. Fields of `rest` that are not fitted stay.
+        """
+        axes = Axes(self.bounds, fields, rest)
+        x, cost = np.stack([axes.normalize(v) for v in starts]), np.zeros((len(starts), self.bounds.n))
+        for i, count in enumerate(iterations):
+            errors = self.of_axes(axes)
+            x, cost = descend(x, axes.low, axes.high, errors, count, report, expired, MIN_COST_DECREASE)
+            self.prior.update_residual(cost.min(axis=0), self.rollouts.rows)
+            if i < len(iterations) - 1:
+                # The better start of every joint; and the start that is better in the sum over joints.
+                x = np.concatenate([better_half(x, cost)[:1], x[[cost.sum(axis=1).argmin()]]])
+                x = x[:1] if np.array_equal(x[0], x[1]) else x
+        return {f: v[0].copy() for f, v in axes.values(x[[cost.sum(axis=1).argmin()]]).items()}
+
+    def descend_chains(
+        self, values: Values, report: Callable[[tuple[str, ...], Array], Report], expired: Expired = lambda: False
+    ) -> Values:
+        """Fit values (n,) once more, with a joint's parameters judged by all joints of its kinematic chain.
+
+        Args:
+            values: Start.
+            report: Makes the function that is called in each iteration, from names and row counts of the chains.
+            expired: Ends the search early.
+        """
+        axes, chains = Axes(self.bounds, robot_fields(values), values), KinematicChains(self.robot)
+
+        def errors(x: Array) -> Array:
+            return chains.pack(self.errors(axes.values(chains.unpack(x))))
+
+        rows = chains.pack(self.rollouts.rows[:, None]).sum(axis=1)
+        names = tuple(self.robot.operated[i] for i in chains.joints[:, 0])
+        x, low, high = chains.pack(axes.normalize(values)[None]), chains.pack(axes.low), chains.pack(axes.high)
+        iterations = max(1, min(CHAIN_ITERATIONS, CHAIN_CANDIDATES // (x.shape[-1] + 5)))
+        x, _ = descend(x, low, high, errors, iterations, report(names, rows), expired, MIN_CHAIN_COST_DECREASE)
+        return {f: v[0].copy() for f, v in axes.values(chains.unpack(x)).items()}
+
+
+class KinematicChains:
+    """Joints that move each other: arrays of joints (…, n, P) as arrays of chains (…, chains, most · P).
+
+    Attributes:
+        joints: Joints of each chain, (chains, most); −1 for none.
+    """
+
+    def __init__(self, robot: RobotSpec) -> None:
+        model = build_model(replace(robot, table=None), bare=True)
+        tree = model.dof_treeid[[model.joint(j).dofadr[0] for j in robot.operated]]
+        chains = [np.flatnonzero(tree == t) for t in np.unique(tree)]
+        most = max(map(len, chains))
+        self.joints = np.array([[*chain, *[-1] * (most - len(chain))] for chain in chains])
+
+    def pack(self, x: Array) -> Array:
+        """Return values of joints as values of chains; 0 where a chain has fewer joints."""
+        padded = np.concatenate([x, np.zeros_like(x[..., :1, :])], axis=-2)[..., self.joints, :]
+        return padded.reshape(*x.shape[:-2], len(self.joints), -1)
+
+    def unpack(self, x: Array) -> Array:
+        """Return values of chains as values of joints."""
+        split = x.reshape(*x.shape[:-2], self.joints.size, -1)
+        return np.asarray(split[..., np.argsort(self.joints.ravel(), kind="stable")[(self.joints < 0).sum() :], :])
+
+
+def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:
+    """Return the fields among values that a joint's search changes, in order; encoder_step if `encoder`."""
+    return [
+        f for f in (*CLASSIC, "effort_limit", *SERVO_TERMS) if f in values and (encoder or f != "encoder_step")
+    ]  # fmt: skip
+
+
+def robot_fields(values: Values) -> list[str]:
+    """Return the fields among values that the fit in the robot's simulator changes."""
+    return [f for f in (*CLASSIC, *SERVO_TERMS) if f in values and f not in SINGLE_JOINT_FIELDS]
+
+
+@dataclass
+class StandardErrors:
+    """Standard errors of fitted values.
+
+    Attributes:
+        std: Joint → field → standard error in SI units.
+        scaled: The same on the axes of the search, in large changes: torques there are divided by kp.
+        covariance: Joint → fields and their covariance on the axes of uncertainty.py.
+    """
+
+    std: Std
+    scaled: Std
+    covariance: Covariance = field(default_factory=dict)
+
+
+def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
+    """Estimate the standard errors of values (n,).
+
+    They come from derivatives, from the spread of the gradients over windows, from the width of the prior where it
+    holds a value, and from the length of a further step.
+    """
+    bounds, prior = problem.bounds, problem.prior
+    names, joints = fitted_fields(values), problem.robot.operated
+    axes = Axes(bounds, names, values)
+    x = axes.normalize(values)
+    here, jac = (y[0] for y in agreed_slopes(x[None], axes.low, axes.high, problem.of_axes(axes)))
+    weight = 1 / np.sqrt(1 + here**2)
+    gradient = jac * (weight * here)[..., None]  # (n, rows + 2, P)
+    cluster, _ = cluster_of_rows(problem.rollouts.window)
+    clusters = int(cluster.max()) + 1
+    each = np.zeros((bounds.n, clusters, len(names)))
+    np.add.at(each, (slice(None), cluster), gradient[:, :-2])  # type: ignore[arg-type]
+    each -= each.mean(axis=1, keepdims=True)
+    prior_jac = jac[:, -2:] * prior.error_std()[:, None, None]
+    normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
+    few = clusters / max(clusters - len(names), 1)  # squared, as a jackknife of so few clusters has it
+    scatter = np.swapaxes(each, -1, -2) @ each * few**2
+    scatter += np.swapaxes(prior_jac, -1, -2) @ prior_jac
+    # A parameter that no row depends on is as unknown as before.
+    size = np.sqrt(np.einsum("...ii->...i", normal))
+    lost = size < 3e-5
+    inverse = _inverse(normal, np.where(lost | (axes.low == axes.high), np.inf, size))
+    step = np.clip((inverse @ gradient.sum(axis=1)[..., None])[..., 0], -1, 1)
+    cov = inverse @ scatter @ inverse + step[..., :, None] * step[..., None, :]
+    width = np.sqrt(np.einsum("...ii->...i", cov)) + np.where(lost & (axes.low < axes.high), 1e3, 0)
+    ahead = [axes.values(x + 1e-3 * row) for row in np.eye(len(names))]
+    by = {f: np.stack([(a[f] - values[f]) / 1e-3 for a in ahead], axis=-1) for f in names}
+    std = {f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + (np.abs(g) * lost).max(axis=1) for f, g in by.items()}
+    std |= {f: np.hypot(std[f], error) for f, error in _discretisation_std(problem, values).items()}
+    unit = axes.unit[..., None]
+    wide = unit * (cov + 1e3 * np.eye(len(names)) * lost[..., None, :]) * np.swapaxes(unit, -1, -2)
+    return StandardErrors(
+        {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)},
+        {j: {f: float(width[i, k]) for k, f in enumerate(names)} for i, j in enumerate(joints)},
+        {j: (names, wide[i]) for i, j in enumerate(joints)},
+    )
+
+
+def cluster_of_rows(window: Array) -> tuple[Array, int]:
+    """Return the cluster of each row, by its window (rows,), and how many clusters a window has.
+
+    Clusters are windows, or parts of them where there are fewer than MIN_CLUSTERS.
+    """
+    parts = max(1, -(-MIN_CLUSTERS // (int(window.max()) + 1)))
+    order, turn = np.argsort(window, kind="stable"), np.zeros(len(window), int)
+    turn[order] = np.concatenate([np.arange(c) * parts // c for c in np.unique(window, return_counts=True)[1]])
+    return window * parts + turn, parts
+
+
+def _discretisation_std(problem: FitProblem, values: Values) -> Values:
+    """Return standard errors of damping, armature and delay by the length of a physics step, (n,)."""
+    h = UNIFORM_STD * problem.physics_step
+    total = values["damping"] + problem.robot.kd[problem.robot.operated_index]
+    return {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
+
+
+def _inverse(normal: Array, size: Array) -> Array:
+    """Return inverses of (…, P, P) by their diagonals' roots (…, P); 0 for parameters whose size is infinite."""
+    each = size[..., :, None] * size[..., None, :]
+    fixed = np.eye(size.shape[-1]) * np.isinf(size)[..., None]
+    return np.asarray(np.linalg.pinv(normal / each + fixed, rcond=1e-10, hermitian=True) / each)
+
+
+def undetermined(problem: FitProblem, values: Values, errors: StandardErrors) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Return joint → fields that the recordings do not determine, and a sentence; all fields of unexcited joints."""
+    bounds, names, found = problem.bounds, fitted_fields(values), dict[str, tuple[tuple[str, ...], str]]()
+    axes = Axes(bounds, names, values)
+    x = axes.normalize(values)
+    ahead = axes.values(x + 1)
+    for i, joint in enumerate(problem.robot.operated):
+        if bounds.unexcited[i]:
+            why = (
+                f"{joint}: not determined by these logs: no command moves it by {MIN_EXCITATION_RAD:g} rad; it keeps "
+                "the file's values but for what others that move it show (kp, damping, friction, offset); record its "
+                "motion"
+            )
+            found[joint] = tuple(names), why
+            continue
+        wide, also_over_kp = dict[str, str](), list[str]()
+        for k, f in enumerate(names):
+            if f == "stribeck_speed" and not values["stribeck"][i]:
+                continue
+            value, error = values[f][i], errors.std[joint].get(f, 0.0)
+            if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):
+                wide[f] = f"{f} {format_uncertainty(value, error)}"
+                scaled = errors.scaled.get(joint, {}).get(f, np.inf)
+                if f not in OVER_KP or scaled > MAX_RELATIVE_STD * max(abs(x[i, k]), 1.0):
+                    also_over_kp.append(f)
+        if wide:
+            as_set = set(also_over_kp) == {"kp"} and len(wide) > 1
+            advice = "; known as multiples of kp: take the values as a set" if as_set else ""
+            found[joint] = tuple(wide), f"{joint}: not determined by these logs: {', '.join(wide.values())}{advice}"
+    return found
