@@ -150,7 +150,7 @@ def examine(robot: RandomRobot, spec: RobotSpec, logs: Logs, folder: Path) -> li
         names = {c: v for c in ("ctrl", "qpos", "qvel", "tau") if (v := getattr(log, c)) is not None}
         raw = Log(spec.name, robot.joints, {c: Channel(log.time, v) for c, v in names.items()}, log.motion)
         data.append(to_sequence(raw, spec, SequenceMeta(spec.name, "a", log.motion, log.payload)))
-    found = Diagnosis.of(data, spec, model=gravity_of(spec)).findings
+    found = Diagnosis.of(data, spec, gravity_model=gravity_of(spec)).findings
     return [f for f in found if f.level in ("warning", "error")]
 
 

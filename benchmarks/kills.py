@@ -96,7 +96,7 @@ def result(out: Path) -> Any:
 
 
 def cases(given: Path) -> dict[str, Case]:
-    """Return every command that writes; `given` holds data, bare (data without twins), logs (LeRobot) and a run."""
+    """Return every command that writes; `given` holds data, bare (data without replays), logs (LeRobot) and a run."""
     robot = ["--robot", "so101"]
     data, log, run = (str(given / name) for name in ("data", "logs", "run"))
     recipe = ["--recipe", str(given / "more.toml")]
@@ -112,7 +112,7 @@ def cases(given: Path) -> dict[str, Case]:
     return {
         "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),
         "collect": Case(lambda out: ["collect", *robot, *recipe, "--out", str(out)], entries),
-        "gap": Case(lambda out: ["gap", str(out)], entries, given / "bare", unwritable=0),  # twins go elsewhere
+        "gap": Case(lambda out: ["gap", str(out)], entries, given / "bare", unwritable=0),  # replays go elsewhere
         "train": Case(train, trained),
         "export": Case(lambda out: ["data", "export", data, "--out", str(out)], digests, done=2),
         "artifact": Case(lambda out: ["export", run, "--out", str(out)], names),
@@ -134,7 +134,7 @@ def prepare(given: Path) -> None:
     ):
         if wait(start(argv, given / "prepare.txt")):
             raise SystemExit(f"{argv[0]} failed; see {given / 'prepare.txt'}")
-    shutil.copytree(given / "data", given / "bare", ignore=shutil.ignore_patterns("twins"))
+    shutil.copytree(given / "data", given / "bare", ignore=shutil.ignore_patterns("replays"))
 
 
 def start(argv: list[str], log: Path) -> int:

@@ -104,9 +104,9 @@ def main() -> None:
     found = plain_fit(parts["train"], robot)
     seconds, op = time.monotonic() - began, robot.operated_index
     for name, spec in (("as it is", robot), ("plain fit", found)):
-        twins = replay(parts["val"], spec)
-        error = np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(parts["val"], twins, strict=True)])
-        print(f"{name}: {1e3 * error:.3f} mrad over {len(twins)} validation motions")
+        replays = replay(parts["val"], spec)
+        error = np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(parts["val"], replays, strict=True)])
+        print(f"{name}: {1e3 * error:.3f} mrad over {len(replays)} validation motions")
     print(f"{seconds:.0f} s")
     if args.out:
         save_robot(found, args.out)

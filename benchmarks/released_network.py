@@ -41,7 +41,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 from gaponet.base.arrays import Array
-from gaponet.data.split import one_motion
+from gaponet.data.split import canonical_motions
 from gaponet.experiments.real.cards import prepare, read_cards
 from gaponet.experiments.real.methods import FittedSim
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
@@ -168,7 +168,7 @@ def on_logs(net: PaperNet, logs: Path) -> None:
     card = next(c for c in read_cards().set if c.name == "h1_2")
     with tempfile.TemporaryDirectory() as work:
         dataset, robot, _ = prepare(replace(card, folder=str(logs.resolve())), Path(), Path(work))
-        recordings, lead = dataset.sequences(dataset.entries), one_motion(dataset)
+        recordings, lead = dataset.sequences(dataset.entries), canonical_motions(dataset)
         command = np.array([lead[e.meta.motion] for e in dataset.entries])
 
     def errors(answer: FittedSim) -> Array:

@@ -106,7 +106,7 @@ def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Calla
                 else tuple(f"{n}={gain * k}" for n, k in zip(robot.joint_names, robot.kp, strict=True))
             )
             report = import_logs(folder / f"{mass:g}", robot, "a", mass, folder / "data", kp=kp)
-        return Diagnosis.of(report.dataset, robot, model=gravity_of(robot))
+        return Diagnosis.of(report.dataset, robot, gravity_model=gravity_of(robot))
     except GAPONetError as error:
         return error
 

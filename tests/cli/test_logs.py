@@ -52,7 +52,7 @@ def test_import_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
     assert result["sequences"] == 1
     assert result["rate_hz"] == [49.85]
     assert result["offsets_applied"] is False
-    assert result["offsets"]["elbow_flex"]["identifiable"] is False
+    assert result["offsets"]["elbow_flex"]["rests_up"] == 0
     (delays,) = result["delay_s"].values()
     assert delays["elbow_flex"] == pytest.approx(0.04, abs=0.003)
     assert delays["gripper"] is None

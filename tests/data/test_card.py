@@ -7,8 +7,7 @@ import pytest
 from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import DatasetError
-from gaponet.data.card import make_card, write_card
-from gaponet.data.card_text import card_text, headline
+from gaponet.data.card import card_markdown, headline, make_card, write_card
 from gaponet.data.store import Dataset
 
 
@@ -100,18 +99,18 @@ def test_virtual_is_said_in_the_first_line(dataset):
 
 
 def test_a_licence_that_was_not_stated_says_how_to(dataset):
-    text = card_text(make_card(dataset))
+    text = card_markdown(make_card(dataset))
     assert "- licence: not stated; set with `gaponet data card DIR --licence …`" in text
-    dataset.state(licence="CC-BY-4.0", source="a laboratory")
+    dataset.set_provenance(licence="CC-BY-4.0", source="a laboratory")
     card = make_card(Dataset(dataset.path))
     assert (card["licence"], card["source"]) == ("CC-BY-4.0", "a laboratory")
-    dataset.state(licence="")
+    dataset.set_provenance(licence="")
     assert make_card(Dataset(dataset.path))["licence"] == "not stated"
 
 
 def test_the_card_is_written_beside_the_data(dataset):
     card = make_card(dataset)
-    write_card(dataset, card, card_text(card))
+    write_card(dataset, card)
     assert json.loads((dataset.path / "card.json").read_text(encoding="utf-8")) == card
     text = (dataset.path / "CARD.md").read_text(encoding="utf-8")
     assert "| 0.2 | 1 | 0.00 | 100 | 1 |" in text

@@ -9,13 +9,13 @@ import pytest
 from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import DatasetError
-from gaponet.data.checks.timing import EARLY, _drift
+from gaponet.data.checks.timing import MIN_EARLY_RATIO, _drift
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import Response, lowpass
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import Finding
-from gaponet.sim.dynamics import static_torque
+from gaponet.sim.dynamics import gravity_of, static_torque
 from gaponet.sim.model import build_model
 
 ROWS = 600
@@ -160,8 +160,8 @@ def test_a_clock_that_drifts_is_late_by_half_in_the_middle_and_motions_that_diff
 @pytest.mark.parametrize(("ahead", "said"), [(0, False), (6, True)])
 def test_commands_to_come_explain_states_only_where_states_come_first(ahead, said):
     logs = [lively(seed) for seed in range(4)]
-    told = Response.following([Response.of(u[: len(u) - ahead], q[ahead:], 0.02) for u, q in logs])
-    assert (told.early > EARLY).tolist() == [said] * 2
+    told = Response.common([Response.of(u[: len(u) - ahead], q[ahead:], 0.02) for u, q in logs])
+    assert (told.early > MIN_EARLY_RATIO).tolist() == [said] * 2
     assert (told.onset < 0).tolist() == [said] * 2
 
 
@@ -201,7 +201,9 @@ def weigh(arm, tmp_path, *sequences) -> Diagnosis:
     dataset = Dataset.create(tmp_path / "data", arm)
     for sequence in sequences:
         dataset.append(sequence)
-    return Diagnosis.of(dataset, arm, model=lambda qpos, mass, side: static_torque(build_model(arm, mass, side), qpos))
+    return Diagnosis.of(
+        dataset, arm, gravity_model=lambda qpos, mass, side: static_torque(build_model(arm, mass, side), qpos)
+    )
 
 
 @pytest.mark.parametrize("payload", [0.0, 0.2])
@@ -354,8 +356,7 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
 
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
-    model = build_model(so101)
-    diagnosis = Diagnosis.of(real_dataset, so101, model=lambda qpos, mass, side: static_torque(model, qpos))
+    diagnosis = Diagnosis.of(real_dataset, so101, gravity_model=gravity_of(so101))
     assert diagnosis.verdict == "Usable. Read the 4 warning(s) first."
     lags = found(diagnosis, "lag", "note").values
     for joint in so101.operated:

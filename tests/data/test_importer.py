@@ -212,7 +212,7 @@ def test_offsets_are_fitted_where_a_gravity_is_given(logs, so101, tmp_path):
 
     report = import_logs(logs, so101, "lab", 0.2, tmp_path / "data", gravity=weightless, simulator="abc")
     assert asked[0] == (0.2, "both")
-    assert list(report.offsets.joints) == list(so101.operated)
+    assert list(report.offsets) == list(so101.operated)
     assert json.loads((tmp_path / "data" / FILE).read_text())["units"]["lab"]["simulator"] == "abc"
 
 

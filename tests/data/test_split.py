@@ -10,17 +10,17 @@ from arm import commands, record
 from logs import arm_columns, arm_sequence, late, table_text, wave
 
 from gaponet.base.errors import DatasetError, UsageError
-from gaponet.data.commands import alike, sketch
+from gaponet.data.fingerprint import equal_commands, fingerprint
 from gaponet.data.importer import import_logs
 from gaponet.data.split import (
-    PARTS,
-    _by_motion,
+    SPLITS,
+    canonical_motions,
     make_split,
-    one_motion,
     read_split,
     require_distinct_samples,
     split_entries,
-    spread,
+    split_motions,
+    stratified_subset,
     write_split,
 )
 from gaponet.data.store import Dataset
@@ -45,23 +45,23 @@ def values(entries, field):
 
 def test_a_split_holds_every_motion_once():
     motions = [f"m{i}" for i in range(40)]
-    split = _by_motion(motions)
+    split = split_motions(motions)
     assert {part: len(names) for part, names in split.items()} == {"train": 25, "val": 5, "test": 10}
     assert sorted(name for names in split.values() for name in names) == sorted(motions)
 
 
 def test_a_split_depends_on_names_alone_and_not_on_their_order_or_number():
     motions = [f"m{i}" for i in range(40)]
-    assert _by_motion(motions) == _by_motion([*reversed(motions), *motions])
+    assert split_motions(motions) == split_motions([*reversed(motions), *motions])
 
 
 def test_two_motions_cannot_be_split_in_three():
     with pytest.raises(UsageError, match=r"2 motion\(s\) \(.*\): a split by motion needs 3 or more"):
-        _by_motion(["a", "b"])
+        split_motions(["a", "b"])
 
 
 def test_by_motion_is_the_rule_that_training_uses(dataset):
-    parts, rule = make_split(dataset, "motion"), _by_motion(list("abcdefgh"))
+    parts, rule = make_split(dataset, "motion"), split_motions(list("abcdefgh"))
     assert values(parts["test"], "motion") == set(rule["test"])
     assert values(parts["val"], "motion") == set(rule["val"])
     assert values(parts["train"], "motion") == set(rule["train"])
@@ -77,12 +77,12 @@ def test_held_out_units_are_in_the_test_part_alone(dataset):
 
 def test_a_few_entries_are_of_every_payload_and_unit_and_of_several_motions(dataset):
     """Every sixth entry would be of one payload and one unit: the recipe has six of each motion."""
-    few = spread(dataset.entries, 8)
+    few = stratified_subset(dataset.entries, 8)
     assert len(few) == 8
     conditions = {(e.meta.payload_mass, e.meta.unit_id) for e in few}
     assert len(conditions) == 6
     assert len(values(few, "motion")) >= 6
-    assert spread(few, 100) == few
+    assert stratified_subset(few, 100) == few
 
 
 def test_payloads_are_numbers_however_they_are_written(dataset):
@@ -196,7 +196,7 @@ def test_a_rate_keeps_the_split_by_motion_and_a_smaller_share_lies_in_a_larger(a
         for seed in range(8):
             data.append(record(replace(arm, dt=dt), commands(20, seed, dt), f"motion{seed}"))
     both, fast = split_entries(data), split_entries(data, rates=(100,))
-    for part in PARTS:
+    for part in SPLITS:
         assert values(both[part], "motion") == values(fast[part], "motion")
         assert {e.dt for e in fast[part]} == {0.01}
     half, quarter = (split_entries(data, train_share=s) for s in (0.5, 0.25))
@@ -231,8 +231,11 @@ def walk(rows, seed, dt=0.02, shift=0.0):
 def test_a_command_is_known_again_and_others_are_not_taken_for_it(again):
     first = walk(400, 3)
     dt = 0.01 if len(again(first)) == 800 else 0.02
-    assert alike([sketch(first, 0.02), sketch(again(first), dt)]) == [(0, 1)]
-    assert alike([sketch(again(first), dt), *(sketch(walk(400, seed), 0.02) for seed in range(4, 60))]) == []
+    assert equal_commands([fingerprint(first, 0.02), fingerprint(again(first), dt)]) == [(0, 1)]
+    assert (
+        equal_commands([fingerprint(again(first), dt), *(fingerprint(walk(400, seed), 0.02) for seed in range(4, 60))])
+        == []
+    )
 
 
 def steps(*targets, rests=40):
@@ -245,9 +248,11 @@ def test_motions_that_rest_at_one_place_are_not_one():
     park, there = (0.0, 0.0), (0.5, 0.3)
     walks = [np.concatenate([steps(), walk(400, seed), steps(park)]) for seed in range(4, 8)]
     others = [steps((0.7, 0.1), park), steps((-0.4, 0.3), park), steps(), *walks]
-    assert alike([sketch(x, 0.02) for x in (steps(there, park), *others)]) == []
-    assert alike([sketch(steps(there, park), 0.02), sketch(steps(there, park, rests=70), 0.02)]) == [(0, 1)]
-    assert alike([sketch(steps(there), 0.02), sketch(steps(there, rests=70), 0.02)]) == [(0, 1)]
+    assert equal_commands([fingerprint(x, 0.02) for x in (steps(there, park), *others)]) == []
+    assert equal_commands([fingerprint(steps(there, park), 0.02), fingerprint(steps(there, park, rests=70), 0.02)]) == [
+        (0, 1)
+    ]
+    assert equal_commands([fingerprint(steps(there), 0.02), fingerprint(steps(there, rests=70), 0.02)]) == [(0, 1)]
 
 
 def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_path):
@@ -262,7 +267,7 @@ def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_pat
     old = [line | {"command": None} if i % 3 else line for i, line in enumerate(lines)]  # before sketches were kept
     journal.write_text("".join(json.dumps(line) + "\n" for line in old))
     data = Dataset(data.path)
-    assert len(set(one_motion(data).values())) == 12
+    assert len(set(canonical_motions(data).values())) == 12
     for parts in (split_entries(data), make_split(data, "motion"), make_split(data, "motion", ("lift3_1kg",)),
                   make_split(data, "payload", ("1",))):  # fmt: skip
         sides = {part: {re.sub("_.*", "", e.meta.motion) for e in entries} for part, entries in parts.items()}
@@ -277,7 +282,7 @@ def test_motions_that_are_all_one_are_repetitions_and_no_motions(arm, tmp_path):
     for lag in range(4):
         data.append(arm_sequence(arm, walk(100, 1), late(walk(100, 1), lag), f"m{lag}"))
     parts = split_entries(data)
-    assert [[e.meta.motion for e in parts[part]] for part in PARTS] == [["m0", "m1"], ["m2"], ["m3"]]
+    assert [[e.meta.motion for e in parts[part]] for part in SPLITS] == [["m0", "m1"], ["m2"], ["m3"]]
     with pytest.raises(UsageError, match="all 4 motions have equal commands, so they are one"):
         make_split(data, "motion")
 
@@ -288,9 +293,9 @@ def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(a
         played = arm_sequence(arm, whole, late(whole, 2) + 1e-3 * i, "chirp")
         data.append(replace(played, meta=replace(played.meta, repetition=i)))
     first = split_entries(data)
-    assert [sorted(e.meta.repetition for e in first[part]) for part in PARTS] == [[0, 1, 2, 3], [4], [5, 6]]
+    assert [sorted(e.meta.repetition for e in first[part]) for part in SPLITS] == [[0, 1, 2, 3], [4], [5, 6]]
     parts = make_split(data, "repetition", ("2",))
-    assert [sorted(e.meta.repetition for e in parts[part]) for part in PARTS] == [[0, 1, 3, 4, 5], [6], [2]]
+    assert [sorted(e.meta.repetition for e in parts[part]) for part in SPLITS] == [[0, 1, 3, 4, 5], [6], [2]]
     with pytest.raises(UsageError, match="needs 3 pieces of one recording"):
         make_split(data, "time")
     (tmp_path / "long.csv").write_text(table_text(arm_columns(900)))
@@ -305,7 +310,7 @@ def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(a
     (piece,) = import_logs(tmp_path / "rest.csv", arm, "a", 0.0, tmp_path / "rests", **how).entries
     assert piece.meta.motion == "rest@0s"  # equal pieces of one recording are one
     parts = make_split(report.dataset, "time")
-    named = [[e.meta.motion for e in parts[part]] for part in PARTS]
+    named = [[e.meta.motion for e in parts[part]] for part in SPLITS]
     assert named == [["long@0s", "long@4s"], ["long@9s"], ["long@14s"]]
 
 
@@ -318,6 +323,6 @@ def test_joints_recorded_one_at_a_time_are_all_judged_and_asked(arm, tmp_path):
             one = arm_sequence(arm, ctrl, late(ctrl, 2), motion)
             data.append(replace(one, meta=replace(one.meta, notes={"posture": {still: 0.0}})))
     parts = split_entries(data)
-    for part in PARTS:
+    for part in SPLITS:
         assert {e.meta.unrecorded for e in parts[part]} == {("shoulder",), ("elbow",)}
     assert sum(map(len, parts.values())) == 7

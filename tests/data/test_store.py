@@ -16,7 +16,7 @@ from arm import write_arm
 from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import DatasetError, FolderError
-from gaponet.data.pair import Twin
+from gaponet.data.pair import SimulatedReplay
 from gaponet.data.store import Dataset, dataset_hash
 
 
@@ -176,11 +176,11 @@ def test_a_folder_with_other_things_in_it_is_not_taken(arm, tmp_path):
 
 
 def test_peeking_makes_nothing(arm, tmp_path):
-    assert Dataset.peek(tmp_path / "new", arm) is None
+    assert Dataset.open_existing(tmp_path / "new", arm) is None
     assert not (tmp_path / "new").exists()
     (tmp_path / "file").touch()
     with pytest.raises(FolderError, match="file: is no folder; choose another place"):
-        Dataset.peek(tmp_path / "file", arm)
+        Dataset.open_existing(tmp_path / "file", arm)
 
 
 def test_a_newer_format_asks_for_an_upgrade(dataset):
@@ -203,20 +203,20 @@ def test_a_motion_that_is_not_there_names_those_that_are(dataset):
         dataset.select(("dance",))
 
 
-def test_a_twin_belongs_to_one_simulator(dataset, sequence):
+def test_a_replay_belongs_to_one_simulator(dataset, sequence):
     entry = dataset.entries[0]
-    twin = Twin("abc", sequence.qpos, sequence.qvel, sequence.tau)
-    dataset.write_twin(entry, twin)
-    assert dataset.has_twin(entry, "abc")
+    simulated = SimulatedReplay("abc", sequence.qpos, sequence.qvel, sequence.tau)
+    dataset.write_replay(entry, simulated)
+    assert dataset.has_replay(entry, "abc")
     assert np.array_equal(dataset.pair(entry, "abc").sim.tau, sequence.tau)
-    with pytest.raises(DatasetError, match="has no twin for simulator xyz; run gaponet gap"):
+    with pytest.raises(DatasetError, match="has no replay by simulator xyz; run gaponet gap"):
         dataset.pair(entry, "xyz")
 
 
 def test_licence_and_source_are_kept_in_the_header(dataset):
-    dataset.state(licence="CC0-1.0", source="here")
+    dataset.set_provenance(licence="CC0-1.0", source="here")
     assert Dataset(dataset.path).header["licence"] == "CC0-1.0"
-    dataset.state(licence="")
+    dataset.set_provenance(licence="")
     assert "licence" not in Dataset(dataset.path).header
     assert Dataset(dataset.path).header["source"] == "here"
 
@@ -273,7 +273,7 @@ def test_a_journal_line_of_another_kind_is_refused_with_line_and_field(dataset, 
 def test_opening_parses_only_how_a_line_begins_and_the_rest_when_it_is_asked_for(dataset):
     journal = dataset.path / "sequences.jsonl"
     (here,), (opened,), whole = dataset.entries, Dataset(dataset.path).entries, journal.read_bytes()
-    assert vars(opened).keys() == {"id", "hash", "dt", "rows", "channels", "_line"}
+    assert "_parsed" not in vars(opened)
     assert opened.line == here.line == whole[:-1]
     assert pickle.loads(pickle.dumps(opened)) == opened == here
     assert opened.meta == here.meta

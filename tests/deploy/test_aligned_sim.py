@@ -27,15 +27,15 @@ def model(robot, tmp_path_factory):
 
 def test_it_is_the_replay_with_the_corrector(robot, model):
     sequences = recordings(robot, 3, rows=40, kp=0.7)
-    twins = replay(sequences, robot, model.corrector(robot))
+    replays = replay(sequences, robot, model.corrector(robot))
     sim = AlignedSim(robot, model, np.array([s.meta.payload_mass for s in sequences]), num_envs=3)
     sim.reset(*(np.stack([getattr(s, name)[0] for s in sequences]) for name in ("qpos", "qvel")))
     for t in range(39):
         sim.step(np.stack([s.ctrl[t] for s in sequences]))
         np.testing.assert_allclose(
-            sim.delta, np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(twins, sequences, strict=True)]), atol=1e-6
+            sim.delta, np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(replays, sequences, strict=True)]), atol=1e-6
         )
-        np.testing.assert_allclose(sim.qpos, np.stack([w.qpos[t + 1] for w in twins]), atol=1e-6)
+        np.testing.assert_allclose(sim.qpos, np.stack([w.qpos[t + 1] for w in replays]), atol=1e-6)
     assert np.abs(sim.delta).max() > 1e-3
 
 
@@ -74,12 +74,12 @@ def test_late_servos_follow_the_target_in_force_at_the_start(robot, tmp_path):
     late = replace(robot, delay=[0.05, 0.0])
     model = small_model(late, tmp_path)
     sequences = recordings(robot, 1, rows=20)
-    twin = replay(sequences, late, model.corrector(late))[0]
+    simulated = replay(sequences, late, model.corrector(late))[0]
     sim = AlignedSim(late, model)
     sim.reset(sequences[0].qpos[0], sequences[0].qvel[0], sequences[0].ctrl[0])
     for t in range(19):
         sim.step(sequences[0].ctrl[t])
-    np.testing.assert_allclose(sim.qpos, twin.qpos[-1], atol=1e-6)
+    np.testing.assert_allclose(sim.qpos, simulated.qpos[-1], atol=1e-6)
 
 
 def test_a_mujoco_loop_of_ones_own_is_aligned_by_one_call_a_period(robot, model):

@@ -135,7 +135,7 @@ def _export(folder: Path) -> None:
         for i in range(2):
             ctrl = wave(ROWS, 2, hertz=0.4 + 0.1 * i)
             data.append(arm_sequence(arm(), ctrl, late(ctrl, 2), f"m{i}", 0.1, tau=ctrl, tau_eq=ctrl, qacc=ctrl))
-        data.state(licence="CC0-1.0")
+        data.set_provenance(licence="CC0-1.0")
         export(data, arm(), Path(place) / "out", "lerobot")
         for file in sorted((Path(place) / "out").rglob("*")):
             if file.is_file():

@@ -15,10 +15,9 @@ from logs import arm_sequence, late, wave
 from fuzzing.harness import AbsurdError, Target
 from fuzzing.mutate import Files
 from fuzzing.readers import ROWS, arm, written
-from gaponet.data.card import make_card
-from gaponet.data.card_text import card_text
+from gaponet.data.card import card_markdown, make_card
 from gaponet.data.offsets import read_offsets
-from gaponet.data.pair import Twin
+from gaponet.data.pair import SimulatedReplay
 from gaponet.data.split import make_split, read_split, write_split
 from gaponet.data.store import Dataset
 from gaponet.nn.adaptation import Adaptation
@@ -52,8 +51,8 @@ def _dataset(folder: Path) -> None:
         for i in range(4):
             ctrl = wave(ROWS, 2, hertz=0.4 + 0.1 * i)
             entry = data.append(arm_sequence(arm(), ctrl, late(ctrl, 2), f"m{i}", 0.1, tau=ctrl))
-            data.write_twin(entry, Twin("0123456789ab", ctrl, ctrl, ctrl))
-        data.state(licence="CC0-1.0")
+            data.write_replay(entry, SimulatedReplay("0123456789ab", ctrl, ctrl, ctrl))
+        data.set_provenance(licence="CC0-1.0")
         write_split(data, make_split(data, "motion"), "motion")
         (data.path / "offsets.json").write_text(json.dumps({"applied": False, "unit": "rad", "units": {}}))
         (data.path / "collect.json").write_text(json.dumps({"fleet": "easy", "seed": 0}))
@@ -76,7 +75,7 @@ def _open_dataset(source: Path, out: Path) -> None:
         pair = data.pair(entry, "0123456789ab")
         if not np.isfinite(pair.gap).all():
             raise AbsurdError(f"{entry.id}: gap holds NaN")
-    card_text(make_card(data))
+    card_markdown(make_card(data))
     read_offsets(data)
     read_split(source / "splits" / "motion.json", data)
 

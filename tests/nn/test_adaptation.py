@@ -53,8 +53,8 @@ def test_gain_and_delay_of_the_unit_are_found(found, robot):
 
 def test_a_motion_that_was_not_used_is_followed_better(found, model, robot, logs):
     def error(simulator):
-        twin = replay(logs[2:], simulator, model.corrector(robot))[0]
-        return np.abs(twin.qpos - logs[2].qpos).mean()
+        simulated = replay(logs[2:], simulator, model.corrector(robot))[0]
+        return np.abs(simulated.qpos - logs[2].qpos).mean()
 
     assert error(found.robot(robot)) < 0.2 * error(robot)
 

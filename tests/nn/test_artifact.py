@@ -66,8 +66,8 @@ def test_files_of_two_exports_are_not_taken_for_one_model(artifact, robot, tmp_p
 def test_a_corrected_replay_applies_the_artifacts_corrections(artifact, robot):
     model = GapModel.load(artifact[0].parent)
     sequences = recordings(robot, 2, rows=30)
-    twins = replay(sequences, robot, model.corrector(robot))
-    first = np.abs(twins[0].ctrl - sequences[0].ctrl)[:-1]
+    replays = replay(sequences, robot, model.corrector(robot))
+    first = np.abs(replays[0].ctrl - sequences[0].ctrl)[:-1]
     assert 0 < first.max() <= model.config.delta_max + 1e-6
 
 

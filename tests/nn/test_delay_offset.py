@@ -18,8 +18,8 @@ def test_with_the_true_delay_the_simulator_follows_exactly(tmp_path):
     robot = write_arm(tmp_path)
     sequence = record(robot, np.round(commands(80, 1) * 256) / 256, "m", delay=2)
     values = DelayOffset({"shoulder": 0.04, "elbow": 0.04}, {"shoulder": 0.0, "elbow": 0.0})
-    twin = replay([sequence], robot, values.corrector(robot))[0]
-    np.testing.assert_allclose(twin.qpos, sequence.qpos, atol=1e-6)
+    simulated = replay([sequence], robot, values.corrector(robot))[0]
+    np.testing.assert_allclose(simulated.qpos, sequence.qpos, atol=1e-6)
 
 
 def test_pieces_cover_long_sequences(tmp_path):

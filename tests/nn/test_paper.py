@@ -176,8 +176,8 @@ def test_answers_of_the_simulator_are_what_the_branch_sees_and_no_control_loop_h
     model = GapModel.load(tmp_path / "run")
     with pytest.raises(ModelError, match="for gaponet eval alone"):
         model.loop()
-    (twin,) = replay(recordings(robot, 1, rows=20), robot, model.corrector(robot), nthread=1)
-    assert np.isfinite(twin.qpos).all()
+    (simulated,) = replay(recordings(robot, 1, rows=20), robot, model.corrector(robot), nthread=1)
+    assert np.isfinite(simulated.qpos).all()
 
 
 def test_learned_probes_start_at_the_fixed_ones_and_gradients_reach_them_alone():

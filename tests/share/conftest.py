@@ -38,7 +38,7 @@ def dataset(arm, tmp_path):
     add(data, arm, [f"wave {i}" for i in range(4)], virtual=True)
     ctrl = wave(60, 2, hertz=0.9)
     data.append(replace(arm_sequence(arm, ctrl, late(ctrl, 1), "slow", 0.0), dt=0.05))
-    data.state(licence="CC-BY-4.0")
+    data.set_provenance(licence="CC-BY-4.0")
     write_split(data, make_split(data, "motion"), "motion")
     return data
 

@@ -179,7 +179,7 @@ def test_a_push_with_nothing_new_reads_no_recording(dataset, place, tmp_path, mo
     with monkeypatch.context() as patch:
         patch.setattr("gaponet.share.dataset.write", None)
         assert push(dataset.path, place) == first
-    dataset.state(licence="MIT")
+    dataset.set_provenance(licence="MIT")
     push(dataset.path, place)
     pull(place, tmp_path / "back")
     assert Dataset(tmp_path / "back").header["licence"] == "MIT"

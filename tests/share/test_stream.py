@@ -55,7 +55,7 @@ def test_a_command_says_of_an_address_what_it_says_of_the_folder(dataset, addres
 
 def test_what_lies_in_a_bucket_is_not_changed_from_here(dataset, address):
     far, _ = gp.open_dataset(address)
-    for change in (lambda: far.append(dataset.read(dataset.entries[0])), lambda: far.state(licence="mine")):
+    for change in (lambda: far.append(dataset.read(dataset.entries[0])), lambda: far.set_provenance(licence="mine")):
         with pytest.raises(DatasetError, match=r"arm: is only read; .* gaponet pull"):
             change()
 

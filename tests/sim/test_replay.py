@@ -1,4 +1,4 @@
-"""Twins: free runs under recorded commands."""
+"""Simulated replays: rollouts under recorded commands."""
 
 from dataclasses import replace
 
@@ -12,25 +12,25 @@ from gaponet.sim.model import model_hash
 from gaponet.sim.replay import idle_limbs, pair_dataset, replay
 
 
-def test_the_twin_of_a_nominal_robot_is_itself_bit_for_bit(tmp_path):
+def test_the_replay_of_a_nominal_robot_is_itself_bit_for_bit(tmp_path):
     robot = write_arm(tmp_path)
-    # Rows are stored as float32; a start that float32 holds exactly starts the twin exactly.
+    # Rows are stored as float32; a start that float32 holds exactly starts the replay exactly.
     sequences = [
         record(robot, np.round(commands(rows, seed) * 256) / 256, f"m{seed}") for seed, rows in enumerate((60, 90))
     ]
-    for sequence, twin in zip(sequences, replay(sequences, robot), strict=True):
-        np.testing.assert_array_equal(sequence.qpos, twin.qpos)
-        np.testing.assert_array_equal(sequence.qvel, twin.qvel)
+    for sequence, simulated in zip(sequences, replay(sequences, robot), strict=True):
+        np.testing.assert_array_equal(sequence.qpos, simulated.qpos)
+        np.testing.assert_array_equal(sequence.qvel, simulated.qvel)
 
 
 def test_sequences_of_any_length_and_payload_run_side_by_side(tmp_path):
     robot = write_arm(tmp_path)
     sequences = [record(robot, commands(rows, rows), f"m{rows}", payload=rows / 500) for rows in (40, 120, 80)]
     together = replay(sequences, robot)
-    for sequence, twin in zip(sequences, together, strict=True):
+    for sequence, simulated in zip(sequences, together, strict=True):
         alone = replay([sequence], robot)[0]
-        np.testing.assert_array_equal(twin.qpos, alone.qpos)
-        assert twin.qpos.shape == sequence.qpos.shape
+        np.testing.assert_array_equal(simulated.qpos, alone.qpos)
+        assert simulated.qpos.shape == sequence.qpos.shape
 
 
 def test_each_recording_runs_at_its_own_gains(tmp_path):
@@ -41,8 +41,8 @@ def test_each_recording_runs_at_its_own_gains(tmp_path):
         told = {"kp": (kp, kp), "kd": (kd, kd)}
         made = record(robot.with_gains(*told.values()), ctrl, f"at {kp}")
         sequences.append(replace(made, meta=replace(made.meta, **told)))
-    for sequence, twin in zip(sequences, replay(sequences, robot), strict=True):
-        np.testing.assert_array_equal(sequence.qpos, twin.qpos)
+    for sequence, simulated in zip(sequences, replay(sequences, robot), strict=True):
+        np.testing.assert_array_equal(sequence.qpos, simulated.qpos)
     soft = sequences[0]
     untold = replace(soft, meta=replace(soft.meta, notes={"gains": "of robot.toml"}))
     assert np.abs(replay([untold], robot)[0].qpos - soft.qpos).max() > 0.01

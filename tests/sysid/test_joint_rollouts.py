@@ -119,8 +119,8 @@ def test_windows_at_several_rates_each_run_at_their_own(tmp_path):
         rows = round(2 / dt)
         ctrl = commands(rows, motion, dt)
         asked = Sequence(template.meta, robot.joint_names, dt, ctrl, np.tile(ctrl[0], (rows, 1)), 0 * ctrl)
-        (twin,) = replay([asked], acting)
-        parts.append(replace(asked, qpos=twin.qpos, qvel=twin.qvel))
+        (simulated,) = replay([asked], acting)
+        parts.append(replace(asked, qpos=simulated.qpos, qvel=simulated.qvel))
     runs = JointRollouts(parts, robot)
     values = {f: np.array([getattr(acting, f)]) for f in FIRST}
     first = np.abs(runs.errors({f: np.full((1, 2), v) for f, v in FIRST.items()})).mean(axis=(0, 1, 3))

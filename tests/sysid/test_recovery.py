@@ -21,8 +21,8 @@ def played(robot, acting, count, rows):
     """Recordings of an arm of known servos."""
     template = recordings(robot, 1, rows=rows)[0]
     asked = [replace(template, ctrl=commands(rows, seed)) for seed in range(count)]
-    twins = replay(asked, acting)
-    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, twins, strict=True)]
+    replays = replay(asked, acting)
+    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replays, strict=True)]
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,8 @@ def test_the_robot_as_it_is_errs_as_in_a_replay_and_each_candidate_on_its_own(ro
     both = {f: np.concatenate([x, x * (1.3 if f == "kp" else 1.0)]) for f, x in values.items()}
     errors = runs.flat_errors(both)
     assert np.abs(errors[1] - errors[0]).max() > 1e-3
-    for window, (part, twin) in enumerate(zip(parts, replay(parts, robot), strict=True)):
-        expected = (twin.qpos - part.qpos)[1:][runs.counted[: len(part) - 1, window]].T
+    for window, (part, simulated) in enumerate(zip(parts, replay(parts, robot), strict=True)):
+        expected = (simulated.qpos - part.qpos)[1:][runs.counted[: len(part) - 1, window]].T
         np.testing.assert_allclose(errors[0][:, runs.window == window], expected, atol=1e-6)
 
 

@@ -79,8 +79,8 @@ def loaded(robot):
             ctrl = commands(60, motion)
             one = arm_sequence(robot, ctrl, ctrl, f"m{motion}")
             one = replace(one, meta=replace(one.meta, payload_mass=mass))
-            (twin,) = replay([one], true)
-            windows.append(replace(one, qpos=twin.qpos, qvel=twin.qvel, tau=twin.tau))
+            (simulated,) = replay([one], true)
+            windows.append(replace(one, qpos=simulated.qpos, qvel=simulated.qvel, tau=simulated.tau))
     return windows
 
 

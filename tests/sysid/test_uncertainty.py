@@ -106,8 +106,8 @@ def test_a_band_is_wider_where_few_motions_differ_much(arm, folder):
     robot, judges = load_robot(folder), played(arm, 20, 4)
     alike = estimate_uncertainty(robot, judges, judges, nthread=1).joints["elbow"]
     apart = [replace(s, qpos=s.qpos + np.float32(0.05 * (i == 0))) for i, s in enumerate(judges)]
-    twins = replay(apart, robot, nthread=1, lock_idle=True)
-    pooled = np.concatenate([np.abs(t.qpos - s.qpos)[1:] for s, t in zip(apart, twins, strict=True)])
+    replays = replay(apart, robot, nthread=1, lock_idle=True)
+    pooled = np.concatenate([np.abs(t.qpos - s.qpos)[1:] for s, t in zip(apart, replays, strict=True)])
     wide = estimate_uncertainty(robot, judges, apart, nthread=1).joints["elbow"].residual_p90
     assert wide > 1.5 * np.quantile(pooled[:, robot.index(["elbow"])], 0.9) > alike.residual_p90
     one = estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"].residual_p90

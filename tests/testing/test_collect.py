@@ -166,7 +166,7 @@ def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tm
     assert len(list((out / "sequences").glob("*.parquet"))) == 16
     assert not list((out / "sequences").glob(".*"))
     dataset = Dataset(out)
-    assert all(dataset.has_twin(entry, model_hash(spec)) for entry in dataset.entries)
+    assert all(dataset.has_replay(entry, model_hash(spec)) for entry in dataset.entries)
 
 
 def _wait_for_orphans(session):

@@ -338,7 +338,7 @@ def adapt_robot(
         lock_folder(folder, "robot"),
         unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
     ):
-        gains_stated = all(s.meta.known_gains[1] is not None for s in sequences)
+        gains_stated = all(s.meta.recorded_gains[1] is not None for s in sequences)
         fitted = adapt(
             sequences, spec, seconds, unknown_payload, None, _window_rms(progress), gains_stated,
             judge=not unknown_payload,

@@ -85,7 +85,7 @@ def import_logs(
     from gaponet.sim.model import model_hash, require_stored_robot
 
     spec = as_robot(robot)
-    if Dataset.peek(out, spec) is not None:
+    if Dataset.open_existing(out, spec) is not None:
         require_stored_robot(Path(out), spec, DatasetError, MOVE_STORED_ROBOT)
     report = read_logs(
         src, spec, unit_id, payload_mass, out, payload_side=payload_side, fmt=format,
@@ -95,7 +95,7 @@ def import_logs(
     )  # fmt: skip
     return ImportResult(
         dataset=report.dataset, robot=spec, added=tuple(report.entries), present=tuple(report.present),
-        offsets=report.offsets, cut=tuple(report.cut),
+        offsets=report.offsets, cut=tuple(report.skipped),
     )  # fmt: skip
 
 
@@ -118,11 +118,10 @@ def doctor(
         DatasetError: The folder is no dataset, or damaged.
     """
     from gaponet.data.doctor import Diagnosis
-    from gaponet.sim.dynamics import gravity_of, tips_of
-    from gaponet.sim.model import model_hash
+    from gaponet.sim.dynamics import gravity_of
 
     data, spec = as_dataset(dataset, robot)
-    found = Diagnosis.of(data, spec, progress, gravity_of(spec), tips_of(spec), model_hash(spec), executor)
+    found = Diagnosis.of(data, spec, gravity_model=gravity_of(spec), progress=progress, executor=executor)
     return DoctorResult(
         verdict=found.verdict, findings=tuple(found.findings), sequences=tuple(found.sequences),
         joints=tuple(found.joints),

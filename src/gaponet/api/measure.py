@@ -193,7 +193,7 @@ def replay(
     Raises:
         UsageError: Neither recordings nor an uncertainty of the robot exist.
     """
-    from gaponet.data.reading import read_first
+    from gaponet.data.describe.preview import read_first_recording
     from gaponet.export.plain_servos import read_recordings
     from gaponet.export.rollout import BAND_SHARE, predict, sample_robots, summary, validation_error
     from gaponet.sysid.uncertainty import ParameterUncertainty
@@ -212,7 +212,7 @@ def replay(
         )
     with tempfile.TemporaryDirectory() as place:
         toml = None if described is None else Path(described)
-        _, _, guessed = read_first(Path(logs), spec, toml)
+        _, _, guessed = read_first_recording(Path(logs), spec, toml)
         if guessed:
             write_text(toml := Path(place) / "logs.toml", guessed)
         report = import_logs(

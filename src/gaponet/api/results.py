@@ -16,7 +16,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 if TYPE_CHECKING:
-    from gaponet.data.offsets import UnitOffsets
+    from gaponet.data.offsets import JointOffset
     from gaponet.data.store import Dataset, Entry
     from gaponet.export.rollout import RolloutPrediction
     from gaponet.nn.artifact import GapModel
@@ -45,7 +45,7 @@ class ImportResult:
     robot: RobotSpec
     added: tuple[Entry, ...]
     present: tuple[Entry, ...]
-    offsets: UnitOffsets | None
+    offsets: dict[str, JointOffset] | None
     cut: tuple[str, ...]
 
     @property
@@ -55,17 +55,17 @@ class ImportResult:
 
     def fast_lags(self, joint: str) -> list[float]:
         """Lags of a joint in the sequences that command it fast, s."""
-        from gaponet.data.signals import FAST
+        from gaponet.data.signals import FAST_COMMAND_RAD_S
 
         def finding(entry: Entry, name: str) -> float | None:
             return entry.findings.get(name, {}).get(joint)  # a collected recording has none
 
-        lags = [finding(e, "delay_s") for e in self.entries if (finding(e, "fast_speed") or 0) >= FAST]
+        lags = [finding(e, "delay_s") for e in self.entries if (finding(e, "fast_speed") or 0) >= FAST_COMMAND_RAD_S]
         return [lag for lag in lags if lag is not None]
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain data."""
-        offsets = self.offsets.joints if self.offsets else {}
+        offsets = self.offsets or {}
         return {
             "dataset": str(self.dataset.path), "imported": [e.id for e in self.added],
             "present": [e.id for e in self.present], "sequences": len(self.dataset),

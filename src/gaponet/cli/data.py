@@ -28,19 +28,18 @@ def _card(
         source: Record where the data come from: a paper, a laboratory, an address.
     """
     from gaponet.data.card import make_card, write_card
-    from gaponet.data.card_text import card_text
 
     out, data = Out(json), Dataset(dataset)
     stated = {k: v for k, v in (("licence", licence), ("source", source)) if v is not None}
     if stated:
-        data.state(**stated)
+        data.set_provenance(**stated)
     with progress_bar("reading") as update:
         made = make_card(data, update)
     _show_card(out, made)
     if data.read_only:
         out.say("nothing may be written into that folder, so the card is only shown")
     else:
-        write_card(data, made, card_text(made))
+        write_card(data, made)
         out.say(f"written: {dataset / 'CARD.md'!s}, {dataset / 'card.json'!s}")
     out.result(made)
 
@@ -58,7 +57,7 @@ def _split(
             last.
         holdout: Motions, units or payloads (kg) for the test part; default a quarter of them by a fixed rule.
     """
-    from gaponet.data.card import count
+    from gaponet.data.card import count_entries
     from gaponet.data.split import make_split, require_distinct_samples, write_split
 
     out, data = Out(json), Dataset(dataset)
@@ -66,7 +65,9 @@ def _split(
     with progress_bar("comparing") as update:
         require_distinct_samples(data, parts, update)
     path = write_split(data, parts, by, holdout)
-    rows: dict[str, dict[str, Any]] = {part: count(entries) | _members(entries) for part, entries in parts.items()}
+    rows: dict[str, dict[str, Any]] = {
+        part: count_entries(entries) | _members(entries) for part, entries in parts.items()
+    }
     columns = ["part", "sequences", "hours", "frames", "motions", "units", "payloads, kg"]
     virtual = ", VIRTUAL robots" if any(e.meta.virtual for e in data.entries) else ""
     out.table(f"{data.path.name} by {by}{virtual}; parts share no recording", columns, [
@@ -84,9 +85,9 @@ def _figures(
     robot: Robot = None,
     json: Json = False,
 ) -> None:
-    """Draw the dataset: joint ranges, composition, torque and temperature, real against twin, gap against payload.
+    """Draw the dataset: joint ranges, composition, torque and temperature, real against simulated, gap against payload.
 
-    Sequences without a twin that a figure needs are replayed first.
+    Sequences that a figure needs are replayed first.
 
     Args:
         out: Folder for the pictures, each as SVG and PNG.
@@ -135,7 +136,7 @@ def _export(
 
 
 def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Json = False) -> None:
-    """Take sequences out of a dataset, with their twins; the logs that they came from can be imported again.
+    """Take sequences out of a dataset, with their simulated replays; their logs can be imported again.
 
     Args:
         ids: Names or patterns of them, as sequences.jsonl lists them: '*-1kg-*' is all with a payload of 1 kg.
@@ -204,12 +205,11 @@ def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Acti
 
 def _show_card(out: Out, made: dict[str, Any]) -> None:
     """Counts, repeatability and licence; ranges of all signals stand in CARD.md."""
-    from gaponet.data.card import NOT_STATED
-    from gaponet.data.card_text import TITLES, headline, shares
+    from gaponet.data.card import NOT_STATED, PROPERTIES, count_table, headline
 
     out.say("", headline(made))
-    for name in TITLES:
-        out.show("", shares(made, name))
+    for name in PROPERTIES:
+        out.show("", count_table(made, name))
     repeated = made["repeatability"]
     if repeated["channels"]:
         spread = ", ".join(f"{name} {c['mean']:.3g} {c['unit']}" for name, c in repeated["channels"].items())

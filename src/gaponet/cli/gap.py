@@ -29,7 +29,7 @@ def gap(
 ) -> None:  # fmt: skip
     """How far is the simulator from the robot, by joint and payload?
 
-    Sequences without a twin are replayed in the nominal simulator first, and the twins kept.
+    Sequences without a simulated replay are replayed in the nominal simulator first, and the replays stored.
 
     Args:
         executor: Where they are replayed: local, ray or ray:ADDRESS (docs/scale.md).

@@ -148,7 +148,7 @@ def _cuts(entries: ListOf[Entry]) -> dict[str, list[str]]:
 
 
 def _nonsense(entries: ListOf[Entry]) -> list[str]:
-    """What was nonsense in some rows, a line for each channel (data.describe.limits)."""
+    """What was nonsense in some rows, a line for each channel (data.describe.plausibility)."""
     told: dict[str, list[tuple[Entry, dict[str, Any]]]] = {}
     for entry in entries:
         for channel, found in entry.meta.notes.get("nonsense", {}).items():
@@ -201,7 +201,7 @@ def _show_import(out: Out, made: ImportResult) -> None:
         out.say(f"  {line}", "cut", "yellow")
     if len(made.cut) > MAX_ROWS:
         out.say(f"  … and {len(made.cut) - MAX_ROWS} more; --json lists all", "cut", "yellow")
-    offsets = made.offsets.joints if made.offsets else {}
+    offsets = made.offsets or {}
     _show_offsets(out, table["fast_lag_s"], offsets)
     if offsets:
         out.say(f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data.")
@@ -210,29 +210,16 @@ def _show_import(out: Out, made: ImportResult) -> None:
 
 
 def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, JointOffset]) -> None:
-    """Lag and static errors by joint, and why a zero offset is not identified."""
+    """Show lag and static errors by joint."""
     rows = []
     for name, found in lags.items():
         median = f"{np.median(found) * 1e3:.0f}" if found else "–"
         joint = offsets.get(name)
-        at_rest = (
-            [_signed_mrad(joint.static_error, joint.stiction_band), _signed_mrad(joint.tracking_offset)]
-            if joint
-            else ["–", "–"]
-        )
-        zero = _signed_mrad(joint.zero_offset, joint.zero_std) if joint else "–"
-        rows.append([name, median, *at_rest, zero if joint and joint.identifiable else f"({zero})"])
-    out.table("Lag in fast motions, ms; errors at rest, mrad", ["joint", "lag", "at rest", "offset", "zero"], rows)
-    if not offsets:
-        return
-    out.say(
-        "at rest: state − command half way between both approaches, ± stiction; offset: what of it the nominal model's "
-        "gravity sag leaves; zero: turn of the encoder zero that would explain it, ± standard error, in brackets where "
-        "it is not identified"
-    )
-    for reason in dict.fromkeys(joint.reason for joint in offsets.values() if joint.reason):
-        joints = ", ".join(name for name, joint in offsets.items() if joint.reason == reason)
-        out.say(f"zero not identified for {joints}: {reason}")
+        at_rest = _signed_mrad(joint.static_error, joint.stiction_band) if joint else "–"
+        rows.append([name, median, at_rest, _signed_mrad(joint.tracking_offset) if joint else "–"])
+    out.table("Lag in fast motions, ms; errors at rest, mrad", ["joint", "lag", "at rest", "offset"], rows)
+    if offsets:
+        out.say("at rest: state − command, mean of both approaches, ± stiction; offset: without the nominal sag")
 
 
 def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:

@@ -35,7 +35,7 @@ def record(
         seed: virtual: of the first recording's noise; later ones count on.
         args: Robot and loop.
     """
-    from gaponet.data.importer import findings
+    from gaponet.data.importer import measure_delays
     from gaponet.data.sequence import SequenceMeta, to_sequence
     from gaponet.data.store import Dataset
     from gaponet.robot.folder import MOVE_STORED_ROBOT
@@ -49,7 +49,7 @@ def record(
         unit_id = f"virtual-{connection.unit}" if connection.unit.isdigit() else connection.unit
     request = RunArgs(**vars(args), payload_mass=payload_mass)
     spec = resolve_robot(request)
-    known = Dataset.peek(out, spec)
+    known = Dataset.open_existing(out, spec)
     if known is not None:  # before anything moves
         require_stored_robot(out, spec, DatasetError, MOVE_STORED_ROBOT)
     written: list[str] = []
@@ -58,7 +58,7 @@ def record(
         recording, played, spec = perform(screen, name, request, count, out / "recordings")
         assert played
         slot = (played.name, unit_id, payload_mass, side)
-        same = [e for e in known.entries if e.meta.slot == slot] if known else []
+        same = [e for e in known.entries if e.meta.repetition_key == slot] if known else []
         stem = f"{played.name}-{unit_id}-{payload_mass:g}kg-{len(same)}"
         stem = recording.save(out / "recordings", stem).stem
         if recording.fault:
@@ -72,7 +72,7 @@ def record(
         )  # fmt: skip
         sequence = to_sequence(recording.log(stem), spec, meta)
         known = known or Dataset.create(out, spec)  # not before there is something to keep
-        written.append(known.append(sequence, findings(sequence)).id)
+        written.append(known.append(sequence, measure_delays(sequence)).id)
         errors.append(tracking(recording))
         screen.say(f"added to {out}: {written[-1]}, {len(sequence)} rows at {sequence.rate:.2f} Hz")
     screen.result({"dataset": str(out), "written": written, "tracking": errors})

@@ -120,7 +120,7 @@ def start(
     from gaponet.report.view.portrait import prepare
 
     prepare()  # before MuJoCo is imported, which the report's picture would be too late for
-    from gaponet.data.reading import UnreadError
+    from gaponet.data.describe.preview import DescriptionNeededError
     from gaponet.robot.new import RobotOptions
 
     screen, logs_toml = Out(json), out / "logs.toml"
@@ -137,7 +137,7 @@ def start(
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
         try:
             inspection = inspect_inputs(model, logs, logs_toml, robot_options, read_options, write_guess=not dry_run)
-        except UnreadError as unread:
+        except DescriptionNeededError as unread:
             for line in unread.text.splitlines():
                 screen.say(f"  {line}")
             raise UsageError(f"{unread}. The lines above are a guess from these logs; without --dry-run they are "
@@ -176,14 +176,14 @@ def inspect_inputs(
         logs: Folder.
         logs_toml: File for the guess. The user corrects it, and the next call reads it.
         robot_options: Options for a robot that is made from a file.
-        read_options: Options for the logs, as read_first takes them.
+        read_options: Options for the logs, as read_first_recording takes them.
         write_guess: Write the guess if a person has to check it.
 
     Raises:
-        UnreadError: Without `write_guess`: a person has to check the guess.
+        DescriptionNeededError: Without `write_guess`: a person has to check the guess.
         RobotError, UsageError, LogError: The model is broken, or the logs cannot be read; the message says what to do.
     """
-    from gaponet.data.reading import UnreadError, read_first
+    from gaponet.data.describe.preview import DescriptionNeededError, read_first_recording
     from gaponet.robot.new import new_robot
 
     with tempfile.TemporaryDirectory() as place:
@@ -195,8 +195,10 @@ def inspect_inputs(
             robot, packaged = new_robot(model, Path(place) / "robot", robot_options).robot, ""
         try:
             existing = logs_toml if logs_toml.is_file() else None
-            return Inspection(robot, packaged, *read_first(logs, robot, existing, not write_guess, **read_options))
-        except UnreadError as unread:
+            return Inspection(
+                robot, packaged, *read_first_recording(logs, robot, existing, not write_guess, **read_options)
+            )
+        except DescriptionNeededError as unread:
             if not write_guess:
                 raise
             logs_toml.parent.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,10 @@
-"""The data card: what a dataset holds, counted and measured from its files; only licence and source are typed in."""
+"""The data card: counts and measured ranges of a dataset, as JSON and Markdown."""
 
 from __future__ import annotations
 
 import json
-from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -14,58 +14,79 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import write_text
 from gaponet.base.progress import Progress, no_progress
+from gaponet.base.result_table import ResultTable
 from gaponet.base.structure import read_json
+from gaponet.base.text import escape_markdown
 from gaponet.data.log import UNITS
 from gaponet.data.repeatability import Repetitions
 from gaponet.data.sequence import ARRAYS
+from gaponet.data.statistics import Statistics, pool, statistics
 from gaponet.data.store import Dataset, Entry, dataset_hash
 
-QUANTILE_ROWS = 100_000  # so many rows, evenly spread over the set, give the 1 % and 99 % quantiles
+PERCENTILE_ROWS = 100_000  # about so many rows, evenly taken from the dataset, give the 1 % and 99 % percentiles
 NOT_STATED = "not stated"
-SHARES: dict[str, Callable[[Entry], str]] = {
-    "level": lambda e: e.meta.level,
-    "payload_kg": lambda e: f"{e.meta.payload_mass:g}",
-    "unit": lambda e: e.meta.unit_id,
-    "rate_hz": lambda e: f"{1 / e.dt:.2f}".rstrip("0").rstrip("."),
+# Property → its heading and its value; the card counts sequences by each.
+PROPERTIES: dict[str, tuple[str, Callable[[Entry], str]]] = {
+    "level": ("Level", lambda e: e.meta.level),
+    "payload_kg": ("Payload, kg per hand", lambda e: f"{e.meta.payload_mass:g}"),
+    "unit": ("Unit", lambda e: e.meta.unit_id),
+    "rate_hz": ("Rate, Hz", lambda e: f"{1 / e.dt:.2f}".rstrip("0").rstrip(".")),
 }
 
 
 def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, Any]:
-    """Read every sequence once, repetitions of a motion one after the other, and count.
+    """Read every sequence once, and return counts, ranges and repeatability.
 
     Raises:
-        DatasetError: Empty, or a file has other rows than the journal says.
+        DatasetError: It is empty, or a file is damaged.
     """
-    if not dataset.entries:
-        raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
-    stride = max(1, sum(e.rows for e in dataset.entries) // QUANTILE_ROWS)
-    ranges = {name: _Range(stride) for name in ARRAYS}
+    dataset.require_sequences()
+    stride = max(1, sum(e.rows for e in dataset.entries) // PERCENTILE_ROWS)
+    stats: dict[str, list[Statistics]] = defaultdict(list)
+    samples: dict[str, list[Array]] = defaultdict(list)
+    groups: dict[tuple[object, ...], list[Entry]] = defaultdict(list)
+    for e in dataset.entries:
+        groups[*e.meta.repetition_key, round(e.dt, 7)].append(e)
+    rows_before: Counter[str] = Counter()
     repeated, done = [], 0
-    for group in _repetition_groups(dataset.entries):
+    for group in groups.values():
         repetitions = Repetitions()
         for entry in group:
             sequence = dataset.read(entry)
             for name in entry.channels:
-                ranges[name].add(getattr(sequence, name))
+                values = getattr(sequence, name)
+                samples[name].append(values[-rows_before[name] % stride :: stride].copy())
+                rows_before[name] += len(values)
+                stats[name].append(statistics(values))
             repetitions.add(sequence)
             done += 1
             progress(done, len(dataset), entry.meta.motion)
         if repetitions.count > 1:
             repeated.append(repetitions.result())
-    return counted(dataset) | {
+    return _counted(dataset) | {
         "signals": {
-            name: {"unit": UNITS[name], "sequences": r.sequences, "joints": r.by_joint(dataset.joint_names)}
-            for name, r in ranges.items()
-            if r.sequences
+            name: {
+                "unit": UNITS[name],
+                "sequences": len(stats[name]),
+                "joints": _by_joint(pool(stats[name]), np.concatenate(samples[name]), dataset.joint_names),
+            }
+            for name in ARRAYS
+            if stats[name]
         },
         "repeatability": Repetitions.summary(repeated, dataset.joint_names),
     }
 
 
-def counted(dataset: Dataset) -> dict[str, Any]:
-    """What of the card the journal says: what the dataset is, where it comes from and how much there is."""
-    made = dataset.path / "collect.json"
+def _counted(dataset: Dataset) -> dict[str, Any]:
+    """Return what the journal and dataset.json alone say."""
+    collected = dataset.path / "collect.json"
     recorded = sorted({e.meta.recorded_at for e in dataset.entries} - {""})
+    by_property: dict[str, dict[str, Any]] = {}
+    for name, (_, value_of) in PROPERTIES.items():
+        groups: dict[str, list[Entry]] = defaultdict(list)
+        for entry in dataset.entries:
+            groups[value_of(entry)].append(entry)
+        by_property[name] = {value: count_entries(groups[value]) for value in sorted(groups, key=_number_or_name)}
     return {
         "name": dataset.path.resolve().name,
         "robot": dataset.robot_name,
@@ -74,27 +95,20 @@ def counted(dataset: Dataset) -> dict[str, Any]:
         "licence": dataset.header.get("licence", NOT_STATED),
         "source": dataset.header.get("source", NOT_STATED),
         "recorded": [recorded[0], recorded[-1]] if recorded else NOT_STATED,
-        "collected": read_json(dict[str, Any], made, DatasetError, "restore it or delete it")
-        if made.is_file()
+        "collected": read_json(dict[str, Any], collected, DatasetError, "restore it or delete it")
+        if collected.is_file()
         else None,
         "dataset_hash": dataset_hash(dataset.entries),
         "format": dataset.header["format"],
         "bytes": sum(f.stat().st_size for f in (dataset.path / "sequences").iterdir()),
         "gaponet": __version__,
-        "total": count(dataset.entries),
-        "shares": {name: _shares(dataset.entries, key) for name, key in SHARES.items()},
+        "total": count_entries(dataset.entries),
+        "shares": by_property,
     }
 
 
-def write_card(dataset: Dataset, card: dict[str, Any], text: str) -> None:
-    """card.json and CARD.md in the dataset folder."""
-    with dataset.writing():
-        write_text(dataset.path / "card.json", json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-        write_text(dataset.path / "CARD.md", text)
-
-
-def count(entries: list[Entry]) -> dict[str, float]:
-    """sequences, hours, frames, motions."""
+def count_entries(entries: list[Entry]) -> dict[str, float]:
+    """Return the number of sequences, hours, frames and motions."""
     return {
         "sequences": len(entries),
         "hours": sum(e.rows * e.dt for e in entries) / 3600,
@@ -103,53 +117,92 @@ def count(entries: list[Entry]) -> dict[str, float]:
     }
 
 
-def _shares(entries: list[Entry], key: Callable[[Entry], str]) -> dict[str, dict[str, float]]:
-    """Counts by a property, numbers in the order of their size, names in the alphabet's."""
-    groups: dict[str, list[Entry]] = defaultdict(list)
-    for entry in entries:
-        groups[key(entry)].append(entry)
-    return {name: count(groups[name]) for name in sorted(groups, key=_number_or_name)}
-
-
-def _repetition_groups(entries: list[Entry]) -> Iterable[list[Entry]]:
-    """Entries of the same motion, unit, payload and period together."""
-    groups: dict[tuple[object, ...], list[Entry]] = defaultdict(list)
-    for e in entries:
-        groups[*e.meta.slot, round(e.dt, 7)].append(e)
-    return groups.values()
-
-
-class _Range:
-    """Least, greatest, mean, spread and outer percentiles of one channel, without keeping it; every `stride`-th row
-    is kept for the percentiles."""
-
-    def __init__(self, stride: int) -> None:
-        self.stride = stride
-        self.sequences = self._rows = 0
-        self._low, self._high, self._sum, self._squares = np.inf, -np.inf, 0.0, 0.0
-        self._kept: list[Array] = []
-
-    def add(self, values: Array) -> None:
-        """Take in a sequence, (T, n)."""
-        self._kept.append(values[-self._rows % self.stride :: self.stride].copy())
-        self.sequences += 1
-        self._rows += len(values)
-        self._low = np.minimum(self._low, values.min(axis=0))
-        self._high = np.maximum(self._high, values.max(axis=0))
-        self._sum = self._sum + values.sum(axis=0, dtype=float)
-        self._squares = self._squares + (values.astype(float) ** 2).sum(axis=0)
-
-    def by_joint(self, names: tuple[str, ...]) -> dict[str, dict[str, float]]:
-        """{joint: min, p1, mean, p99, max, std}."""
-        mean = self._sum / self._rows
-        std = np.sqrt(np.maximum(self._squares / self._rows - mean**2, 0))
-        p1, p99 = np.percentile(np.concatenate(self._kept), [1, 99], axis=0)
-        columns = {"min": self._low, "p1": p1, "mean": mean, "p99": p99, "max": self._high, "std": std}
-        return {j: {k: float(f"{v[i]:.6g}") for k, v in columns.items()} for i, j in enumerate(names)}
+def _by_joint(pooled: Statistics, samples: Array, names: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    p1, p99 = np.percentile(samples, [1, 99], axis=0)
+    columns = {"min": pooled["min"], "p1": p1, "mean": pooled["mean"], "p99": p99, "max": pooled["max"],
+               "std": pooled["std"]}  # fmt: skip
+    return {j: {k: float(f"{v[i]:.6g}") for k, v in columns.items()} for i, j in enumerate(names)}
 
 
 def _number_or_name(text: str) -> tuple[float, str]:
+    """Return a sort key: numbers by size, names by the alphabet."""
     try:
         return float(text), ""
     except ValueError:
         return 0.0, text
+
+
+def write_card(dataset: Dataset, card: dict[str, Any]) -> None:
+    """Write card.json and CARD.md into the dataset folder."""
+    with dataset.writing():
+        write_text(dataset.path / "card.json", json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        write_text(dataset.path / "CARD.md", card_markdown(card))
+
+
+def headline(card: dict[str, Any]) -> str:
+    """Return the first line: "demo: 128 sequences, 0.39 h of h1_2, all on VIRTUAL robots"."""
+    total, virtual = card["total"], card["virtual_sequences"]
+    count = "all" if virtual == total["sequences"] else f"{virtual} of them"
+    kind = f", {count} on VIRTUAL robots" if virtual else ""
+    return f"{card['name']}: {total['sequences']:,} sequences, {total['hours']:.2f} h of {card['robot']}{kind}"
+
+
+def count_table(card: dict[str, Any], by: str) -> ResultTable:
+    """Return sequences, hours, frames and motions by one of PROPERTIES."""
+    counts = card["shares"][by]
+    rows = tuple((value, c["sequences"], c["hours"], c["frames"], c["motions"]) for value, c in counts.items())
+    return ResultTable(by, (PROPERTIES[by][0], "sequences", "hours", "frames", "motions"), rows)
+
+
+def card_markdown(card: dict[str, Any]) -> str:
+    """Return the card as Markdown; the first line says if robots were virtual."""
+    tables = [line for by in PROPERTIES for line in (count_table(card, by).markdown(), "")]
+    lines = [f"# {escape_markdown(headline(card))}", "", *_facts(card), *tables, *_repeatability(card), *_signals(card)]
+    return "\n".join(lines)
+
+
+def _facts(card: dict[str, Any]) -> Iterator[str]:
+    total, recorded, collected = card["total"], card["recorded"], card["collected"]
+    for name in ("licence", "source"):
+        ask = f"; set with `gaponet data card DIR --{name} …`" if card[name] == NOT_STATED else ""
+        yield f"- {name}: {escape_markdown(card[name])}{ask}"
+    dates = recorded if isinstance(recorded, str) else " to ".join(dict.fromkeys(recorded))
+    yield f"- recorded: {escape_markdown(dates)}"
+    if collected:
+        fleet, seed = (escape_markdown(str(collected.get(name))) for name in ("fleet", "seed"))
+        yield f"- made by gaponet collect: fleet {fleet}, seed {seed}"
+    yield f"- {total['frames']:,} frames of {len(card['joints'])} joints, {total['motions']} motions"
+    yield f"- {card['bytes'] / 1e6:,.1f} MB, dataset hash {card['dataset_hash']}, gaponet {card['gaponet']}"
+    yield "\nEvery number was counted or measured from the files; `gaponet data card DIR` writes this page again.\n"
+
+
+def _repeatability(card: dict[str, Any]) -> Iterator[str]:
+    repeated = card["repeatability"]
+    yield "## Repeatability\n"
+    if not repeated["channels"]:
+        yield "No motion was repeated with the same command by the same unit with the same payload.\n"
+        return
+    yield (
+        f"Standard deviation over repetitions of the same command, root mean square over rows; {repeated['groups']:,} "
+        f"groups, {repeated['sequences']:,} sequences; joints that were commanded to move."
+    )
+    if excluded := repeated["left_out_other_command"]:
+        yield f"{excluded:,} sequences of these groups had another command and were left out."
+    channels = repeated["channels"]
+    joints = dict.fromkeys(j for c in channels.values() for j in c["joints"])
+    rows = [(joint, *(_digits(c["joints"].get(joint)) for c in channels.values())) for joint in joints]
+    mean = ("mean", *(_digits(c["mean"]) for c in channels.values()))
+    headings = ("joint", *(f"{name}, {c['unit']}" for name, c in channels.items()))
+    yield "\n" + ResultTable("repeatability", headings, (*rows, mean)).markdown() + "\n"
+
+
+def _signals(card: dict[str, Any]) -> Iterator[str]:
+    yield "## Signals\n"
+    for name, signal in card["signals"].items():
+        yield f"### {name}, {signal['unit']} ({signal['sequences']:,} sequences)\n"
+        rows = tuple((joint, *map(_digits, values.values())) for joint, values in signal["joints"].items())
+        yield ResultTable(name, ("joint", "min", "1 %", "mean", "99 %", "max", "std"), rows).markdown() + "\n"
+
+
+def _digits(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"

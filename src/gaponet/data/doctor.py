@@ -1,4 +1,4 @@
-"""Doctor: looks through a dataset and says what a person must know before training on it."""
+"""Doctor: examine a dataset, and report what a person must know before training on it."""
 
 from __future__ import annotations
 
@@ -9,28 +9,26 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base.errors import DatasetError
 from gaponet.base.executor import LOCAL
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.checks import CHECKS
+from gaponet.data.checks.check_cache import CheckCache
 from gaponet.data.checks.gravity import gravity
-from gaponet.data.checks.looked import Looked
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
-from gaponet.data.checks.rests import rests
-from gaponet.data.checks.touching import Heights, touching
+from gaponet.data.checks.static_checks import static_checks
+from gaponet.data.checks.survey import Survey
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
-from gaponet.data.survey import Survey
 from gaponet.robot.finding import LEVELS, Finding
 from gaponet.robot.spec import RobotSpec
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found in a dataset.
+    """Result of examining a dataset.
 
     Attributes:
-        findings: What to look at, worst first.
+        findings: Worst first.
         sequences, joints: One row of numbers each, for tables.
     """
 
@@ -39,12 +37,12 @@ class Diagnosis:
     joints: list[dict[str, Any]]
 
     def count(self, level: str) -> int:
-        """Findings of a level."""
+        """Return the number of findings of a level."""
         return sum(f.level == level for f in self.findings)
 
     @property
     def verdict(self) -> str:
-        """The verdict in one sentence."""
+        """The result in one sentence."""
         errors, warnings = self.count("error"), self.count("warning")
         if errors:
             return f"Do not train on this yet: {errors} error(s) and {warnings} warning(s)."
@@ -53,7 +51,7 @@ class Diagnosis:
         return "Good: nothing found that training should not see."
 
     def as_dict(self) -> dict[str, Any]:
-        """The diagnosis as a dictionary that JSON can hold."""
+        """Return the diagnosis as a dictionary for JSON."""
         return {"verdict": self.verdict} | asdict(self)
 
     @classmethod
@@ -61,36 +59,34 @@ class Diagnosis:
         cls,
         dataset: Dataset,
         robot: RobotSpec,
+        *,
+        gravity_model: Gravity | None = None,
         progress: Progress = no_progress,
-        model: Gravity | None = None,
-        heights: Heights | None = None,
-        simulator: str = "",
         executor: str | Executor = LOCAL,
     ) -> Diagnosis:
-        """Survey every sequence that was not yet, and judge them together; what each has is kept (checks.looked).
+        """Examine every sequence, and judge them together. Measurements are stored (checks.check_cache).
 
         Args:
             robot: The dataset's robot.
-            model: Gravity of the nominal model, to tell wrong zeros and signs from torques; default: not looked for.
-            heights: Lowest tip in postures, m, to tell motions that press on something; needs `model`.
-            simulator: Hash of the model that both are of.
-            executor: Where much that is new is looked at; default: on this machine's cores.
+            gravity_model: Gravity of the nominal model, which shows wrong zeros, signs, gains and payload labels; these
+                are not examined without it.
+            executor: Measures new sequences, if there are many; default: this machine's cores.
+
+        Raises:
+            DatasetError: The dataset is empty, damaged or another robot's.
         """
         dataset.require_robot(robot)
-        if not dataset.entries:
-            raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
-        looked = Looked(dataset, robot, model, heights, simulator)
-        surveys = looked.surveys(progress, executor)
-        findings = [f for check in CHECKS for f in check(surveys, robot)]
-        if model is not None:
-            findings += _weighed(findings, surveys, robot, model)
-        findings += touching(looked.sample, looked.standing)
+        dataset.require_sequences()
+        surveys = CheckCache(dataset, robot).surveys(progress, executor)
+        findings = [f for check in CHECKS for f in check.run(surveys, robot)]
+        if gravity_model is not None:
+            findings += _examine_loads(findings, surveys, robot, gravity_model)
         findings.sort(key=lambda f: -LEVELS.index(f.level))
         return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
 
     @staticmethod
     def inventory(dataset: Dataset) -> str:
-        """How much there is, of which units and payloads."""
+        """Return the number of sequences, motions and minutes, and the units and payloads."""
         motions = len({e.meta.motion for e in dataset.entries})
         units = Counter(e.meta.unit_id for e in dataset.entries)
         payloads = sorted({e.meta.payload_mass for e in dataset.entries})
@@ -102,14 +98,14 @@ class Diagnosis:
         )
 
 
-def _weighed(findings: list[Finding], surveys: list[Survey], robot: RobotSpec, model: Gravity) -> list[Finding]:
-    """What gravity says, where nothing is wrong that it would only say in other words."""
-    wrong = [f.check for f in findings if f.level == "error" or "slope" in f.values]
-    if wrong:
-        text = f"zeros, offsets, gains and payloads are judged by gravity once this is mended: {', '.join(set(wrong))}"
+def _examine_loads(findings: list[Finding], surveys: list[Survey], robot: RobotSpec, model: Gravity) -> list[Finding]:
+    """Compare torques and static poses with gravity, unless another error would cause these findings too."""
+    errors = [f.check for f in findings if f.level == "error" or "slope" in f.values]
+    if errors:
+        text = f"zeros, offsets, gains and payloads are judged by gravity once this is mended: {', '.join(set(errors))}"
         return [Finding("ok", "gravity", text)]
-    found = [*gravity(surveys, robot, model)]
-    return found if any(f.level == "warning" for f in found) else [*found, *rests(surveys, robot, model)]
+    result = [*gravity(surveys, robot, model)]
+    return result if any(f.level == "warning" for f in result) else [*result, *static_checks(surveys, robot, model)]
 
 
 def _sequence_row(s: Survey, robot: RobotSpec) -> dict[str, Any]:
@@ -129,16 +125,16 @@ def _joint_rows(surveys: list[Survey], robot: RobotSpec) -> list[dict[str, Any]]
     qpos = np.array([s.qpos_limits for s in surveys])
     rows = []
     for i, name in enumerate(robot.joint_names):
-        rest = errors.get(name)
+        error = errors.get(name)
         rows.append({
             "joint": name,
             "operated": name in robot.operated,
             "commanded_rad": [float(ctrl[:, i, 0].min()), float(ctrl[:, i, 1].max())],
             "measured_rad": [float(qpos[:, i, 0].min()), float(qpos[:, i, 1].max())],
             "lag_s": lag_values(lags[name]) if name in lags else None,
-            "static_error_rad": rest.middle if rest and np.isfinite(rest.middle) else None,
-            "stiction_band_rad": rest.half_band if rest and rest.balanced else None,
-            "rests": rest.up + rest.down if rest else 0,
+            "static_error_rad": error.middle if error and np.isfinite(error.middle) else None,
+            "stiction_band_rad": error.half_band if error and error.balanced else None,
+            "rests": error.up + error.down if error else 0,
             "torque_spikes": sum(int(s.torque.spikes[i]) for s in surveys if s.torque),
         })  # fmt: skip
     return rows

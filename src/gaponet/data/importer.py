@@ -1,4 +1,7 @@
-"""Logs → dataset. Everything is read and checked before anything is written; one that was cut short is resumed."""
+"""Import of logs into a dataset. Everything is read and checked before anything is written.
+
+An import that was interrupted is completed by the same call.
+"""
 
 from __future__ import annotations
 
@@ -16,39 +19,41 @@ from gaponet.base.errors import DatasetError, LogError, UsageError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.formats import find_logs, read_logs
-from gaponet.data.holds import Holds
-from gaponet.data.log import Log, skipping
-from gaponet.data.offsets import Gravity, UnitOffsets, read_offsets, record_offsets
+from gaponet.data.journal import Findings
+from gaponet.data.log import Log, skip_bad_rows
+from gaponet.data.offsets import Gravity, JointOffset, read_offsets, record_offsets, unit_offsets
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
 from gaponet.data.signals import estimate_delay, fast_speed
+from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import KIND, Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
-HOLD = 1 << 26  # bytes of samples kept between checking and writing; a larger source is read twice
-UNSTATED = -1  # repetition that the format does not state, until it is counted
+MAX_HELD_BYTES = 1 << 26  # of samples that are held between checking and writing; a larger source is read twice
+MIN_PIECE_S = 0.8
+UNSTATED_REPETITION = -1
 
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What one import added.
+    """Result of one import.
 
     Attributes:
         entries: Sequences that were added.
-        present: Sequences of this source that were there before, by their content.
-        offsets: None where no gravity model was given or several units were recorded.
-        cut: Rows that were cut and recordings left out, one line each, where that was asked for.
+        present: Sequences of this source that the dataset held already, by their content.
+        offsets: Joint → static offset of the unit; None without a gravity model, or if several units were recorded.
+        skipped: Rows that were cut and recordings that were left out, one line each, if skip_bad was given.
     """
 
     dataset: Dataset
     entries: list[Entry]
     present: list[Entry]
-    offsets: UnitOffsets | None
-    cut: list[str] = field(default_factory=list)
+    offsets: dict[str, JointOffset] | None
+    skipped: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class _Given:
-    """What the user says of all recordings; None where it is left to the format, or to the default."""
+class _Labels:
+    """What the user states of all recordings; None if the format states it, or for the default."""
 
     unit_id: str | None
     payload_mass: float | None
@@ -56,7 +61,6 @@ class _Given:
     level: str | None
     kp: tuple[float, ...] | None
     kd: tuple[float, ...] | None
-    cut: float | None
 
 
 def import_logs(
@@ -65,6 +69,7 @@ def import_logs(
     unit_id: str | None,
     payload_mass: float | None,
     out: str | Path,
+    *,
     payload_side: str | None = None,
     level: str | None = None,
     fmt: str | None = None,
@@ -77,24 +82,24 @@ def import_logs(
     cut: float | None = None,
     **options: Any,
 ) -> ImportReport:
-    """Import every recording under a path that is not there yet; a bad one refuses them all, and nothing is written.
+    """Import every recording under a path that the dataset does not hold yet. A bad recording refuses all of them.
 
-    What could be written before a full disk or a kill stays, complete, and the same call adds the rest.
+    What was written before a full disk or a kill stays, complete, and the same call adds the rest.
 
     Args:
-        src: File or folder in one of data.formats.formats().
-        unit_id: Which of its kind; zero offsets belong to a unit. None where the format states it.
-        payload_mass: In each hand named by payload_side, kg; 0.0 when empty. None where the format states it.
-        out: Dataset folder; made, or appended to by one process at a time.
+        src: File or folder in one of data.formats.available_formats().
+        unit_id: Name of the robot copy, to which offsets belong. None if the format states it.
+        payload_mass: In each hand named by payload_side, kg; 0.0 when empty. None if the format states it.
+        out: Dataset folder; created, or appended to by one process at a time.
         payload_side: "both" (default), or the side of one payload mount.
         level: joint, upper_body or whole_body (default).
-        gravity: Nominal model's gravity, to fit offsets with (data.offsets); default: no offsets.
+        fmt: Name of the format; default by looking at the files.
+        gravity: Gravity of the nominal model, to measure offsets (data.offsets); default: no offsets.
         simulator: Hash of that model, recorded beside the offsets.
-        kp, kd: Gains while recording, N·m/rad and N·m·s/rad: one number, or JOINT=NUMBER for some of the joints;
-            default what the format states, else the robot's.
-        skip_bad: Cut bad rows and leave out recordings that cannot be read, instead of refusing all; the report lists
-            both.
-        cut: Cut recordings into pieces of about so long, s, each a motion of its own.
+        kp, kd: Gains while recording, N·m/rad and N·m·s/rad: one number, or JOINT=NUMBER for some joints; default what
+            the format states, else the robot's.
+        skip_bad: Cut bad rows and leave out recordings that cannot be read, instead of refusing all.
+        cut: Cut recordings into pieces of about this duration, s; each becomes a motion of its own.
         options: Options of data.formats.read_logs: joint_map, logs, position_unit, time_unit, rate, allow_pickle,
             strict.
 
@@ -107,100 +112,143 @@ def import_logs(
     src, out = Path(src), Path(out)
     if payload_side is not None:
         _require_side(robot, payload_side)
-    given = _Given(
-        unit_id, payload_mass, payload_side, level, _given_gains("kp", kp, robot), _given_gains("kd", kd, robot), cut
-    )
-    if cut is not None and not cut >= 0.8:
-        raise UsageError(f"--cut {cut:g}: pieces are 0.8 s long or more")
+    gains = (_parse_gains("kp", kp, robot), _parse_gains("kd", kd, robot))
+    labels = _Labels(unit_id, payload_mass, payload_side, level, *gains)
+    if cut is not None and not cut >= MIN_PIECE_S:
+        raise UsageError(f"--cut {cut:g}: pieces are {MIN_PIECE_S} s long or more")
     with lock_folder(out, KIND):
-        known = Dataset.peek(out, robot)
-        if known is not None:
-            read_offsets(known)  # a damaged one is said before anything is read
-        rests: dict[str, Holds] | None = {} if gravity else None
-        with skipping(skip_bad) as bad:
-            dataset, added, present = _import(src, out, robot, given, fmt, progress, options, rests)
-        units = dict.fromkeys(e.meta.unit_id for e in (*present, *added))
-        offsets = {unit: UnitOffsets.of_unit(dataset, robot, unit, gravity, rests) for unit in units} if gravity else {}
-        for unit, fitted in offsets.items():
-            record_offsets(dataset, unit, fitted, simulator)
+        existing = Dataset.open_existing(out, robot)
+        if existing is not None:
+            read_offsets(existing)  # a damaged file is refused before anything is read
+        source = _Source(src, robot, labels, fmt, cut, options)
+        with skip_bad_rows(skip_bad) as skipped:
+            recordings = source.check(existing, progress)
+            dataset = Dataset.create(out, robot)
+            poses: dict[str, StaticPoses] = {}
+            added, present = source.write(dataset, recordings, poses if gravity else None)
+        units = dict.fromkeys(e.meta.unit_id for e in (*present, *added)) if gravity else {}
+        offsets = {unit: unit_offsets(dataset, robot, unit, gravity, poses) for unit in units} if gravity else {}
+        for unit, of_unit in offsets.items():
+            record_offsets(dataset, unit, of_unit, simulator)
     only = next(iter(offsets.values())) if len(offsets) == 1 else None
-    return ImportReport(dataset, added, present, only, list(dict.fromkeys(bad or ())))
+    return ImportReport(dataset, added, present, only, list(dict.fromkeys(skipped or ())))
 
 
-def _import(
-    src: Path,
-    out: Path,
-    robot: RobotSpec,
-    given: _Given,
-    fmt: str | None,
-    progress: Progress,
-    options: dict[str, Any],
-    rests: dict[str, Holds] | None,
-) -> tuple[Dataset, list[Entry], list[Entry]]:
-    """Read and check all, then write what is new; where all is too much to hold, read it again for writing.
+@dataclass
+class _Checked:
+    """Recordings of a source after the first reading; `held` is None if they are too large to hold."""
 
-    Each recording is hashed once, and its rests, by hash, are put into `rests` where they are asked for.
-
-    Returns:
-        Dataset, entries added, entries that were there.
-    """
-    digests: list[tuple[str, str]] = []
-    held: list[Sequence] = []
-    facts: dict[str, str] = {}
-    known = Dataset.peek(out, robot)
-    size, total = 0, len(find_logs(src, fmt))
-    for sequence, log in _sequences(src, robot, given, fmt, options):
-        digests.append((sequence.content_hash(), sequence.meta.source))
-        if known is not None:
-            _refuse_relabelled(sequence, known)
-        facts |= log.meta.get("dataset", {})
-        size += sum(x.nbytes for c in ARRAYS if (x := getattr(sequence, c)) is not None)
-        held.append(sequence)
-        if size > HOLD:
-            held.clear()
-        progress(len(digests), max(total, len(digests)), sequence.meta.motion)  # a file may hold many
-    _refuse_twice(digests, given.cut is not None)
-    again = (s for s, _ in _sequences(src, robot, given, fmt, options))
-    dataset = Dataset.create(out, robot)
-    if facts and not dataset.entries:
-        dataset.state(**facts)
-    present = [entry for digest, _ in digests if (entry := dataset.find(digest))]
-    taken = Counter(e.meta.slot for e in dataset.entries)
-    added = []
-    with dataset.appending():
-        for (digest, _), sequence in zip(digests, held if size <= HOLD else again, strict=True):
-            if rests is not None:
-                rests[digest] = Holds.of(sequence, robot.operated_index)
-            if dataset.find(digest):
-                continue
-            slot = sequence.meta.slot
-            if sequence.meta.repetition < 0:  # the format does not state it
-                sequence = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
-            added.append(dataset.append(sequence, findings(sequence), digest))
-            taken[slot] += 1
-    return dataset, added, present
+    hashes: list[str] = field(default_factory=list)
+    held: list[Sequence] | None = field(default_factory=list)
+    provenance: dict[str, str] = field(default_factory=dict)
 
 
-def _sequences(
-    src: Path, robot: RobotSpec, given: _Given, fmt: str | None, options: dict[str, Any]
-) -> Iterator[tuple[Sequence, Log]]:
-    """Every recording on its grid, with what the format and the user say of it."""
-    digests: dict[tuple[str, ...], str] = {}
-    for motion, log in read_logs(src, robot, fmt, **options):
-        files = tuple(sorted({*log.meta["files"].values(), *log.meta.get("all_files", ())}))
-        if files not in digests:  # many episodes may lie in one file
-            digests[files] = _sha256(files)
-        meta = _meta(log, motion, src, robot, given, digests[files])
-        _require_side(robot, meta.payload_side)
-        sequence = to_sequence(log, robot, meta)
-        if "notes" in log.meta.get("stated", {}):  # how it was first recorded, not how it was written here
-            sequence = replace(sequence, meta=meta)
-        for piece in _pieces(sequence, given.cut):
-            yield piece, log
+@dataclass(frozen=True)
+class _Source:
+    """Logs to import, with what the user states of them."""
+
+    src: Path
+    robot: RobotSpec
+    labels: _Labels
+    fmt: str | None
+    cut: float | None
+    options: dict[str, Any]
+
+    def check(self, existing: Dataset | None, progress: Progress) -> _Checked:
+        """Read and check every recording."""
+        checked, total = _Checked(), len(find_logs(self.src, self.fmt))
+        source_of: dict[str, str] = {}  # content hash → source
+        duplicates: list[tuple[str, str]] = []
+        size = 0
+        for sequence, log in self.sequences():
+            content_hash, source = sequence.content_hash(), sequence.meta.source
+            checked.hashes.append(content_hash)
+            # Pieces of one recording may be equal, where the robot rested.
+            if content_hash in source_of and not (self.cut and source_of[content_hash] == source):
+                duplicates.append((source, source_of[content_hash]))
+            source_of.setdefault(content_hash, source)
+            if existing is not None:
+                _refuse_relabelled(sequence, existing)
+            checked.provenance |= log.meta.get("dataset", {})
+            size += sum(x.nbytes for c in ARRAYS if (x := getattr(sequence, c)) is not None)
+            if size > MAX_HELD_BYTES:
+                checked.held = None
+            if checked.held is not None:
+                checked.held.append(sequence)
+            progress(len(checked.hashes), max(total, len(checked.hashes)), sequence.meta.motion)
+        if not checked.hashes:
+            raise LogError("no recording found")
+        if duplicates:
+            raise DatasetError(
+                f"{len(duplicates)} of {len(checked.hashes)} recordings are there twice (same samples, unit and "
+                f"payload): {duplicates[0][0]} is {duplicates[0][1]}. Nothing was imported; leave one of them out"
+            )
+        return checked
+
+    def write(
+        self, dataset: Dataset, checked: _Checked, poses: dict[str, StaticPoses] | None
+    ) -> tuple[list[Entry], list[Entry]]:
+        """Append what is new; return the added and the present entries.
+
+        Args:
+            poses: Filled with content hash → static poses.
+        """
+        if checked.provenance and not dataset.entries:
+            dataset.set_provenance(**checked.provenance)
+        present = [entry for content_hash in checked.hashes if (entry := dataset.find(content_hash))]
+        repetitions = Counter(e.meta.repetition_key for e in dataset.entries)
+        sequences = checked.held if checked.held is not None else (s for s, _ in self.sequences())
+        added = []
+        with dataset.appending():
+            for content_hash, sequence in zip(checked.hashes, sequences, strict=True):
+                if poses is not None:
+                    poses[content_hash] = StaticPoses.of(sequence, self.robot.operated_index)
+                if dataset.find(content_hash):
+                    continue
+                key = sequence.meta.repetition_key
+                if sequence.meta.repetition == UNSTATED_REPETITION:
+                    sequence = replace(sequence, meta=replace(sequence.meta, repetition=repetitions[key]))
+                added.append(dataset.append(sequence, measure_delays(sequence), content_hash))
+                repetitions[key] += 1
+        return added, present
+
+    def sequences(self) -> Iterator[tuple[Sequence, Log]]:
+        """Yield every recording, or every piece, on its grid and with its labels."""
+        file_hashes: dict[tuple[str, ...], str] = {}  # many episodes may be in one file
+        for motion, log in read_logs(self.src, self.robot, self.fmt, **self.options):
+            files = tuple(sorted({*log.meta["files"].values(), *log.meta.get("all_files", ())}))
+            if files not in file_hashes:
+                file_hashes[files] = _sha256(files)
+            meta = self._meta(log, motion, file_hashes[files])
+            _require_side(self.robot, meta.payload_side)
+            sequence = to_sequence(log, self.robot, meta)
+            if "notes" in log.meta.get("stated", {}):  # an export of ours: notes of the first import
+                sequence = replace(sequence, meta=meta)
+            for piece in _pieces(sequence, self.cut):
+                yield piece, log
+
+    def _meta(self, log: Log, motion: str, sha256: str) -> SequenceMeta:
+        """Combine what the user and the format state; refuse contradictions and gaps."""
+        stated = {k: tuple(v) if k in ("kp", "kd") else v for k, v in log.meta.get("stated", {}).items()}
+        stated = {k: v for k, v in stated.items() if v is not None}
+        given = {name: value for name, value in vars(self.labels).items() if value is not None}
+        for name, value in given.items():
+            if name in stated and stated[name] != value:
+                flag = "--" + name.replace("_", "-")
+                raise UsageError(f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out")
+        needed = {"unit_id": "--unit-id NAME", "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)"}
+        missing = [flag for name, flag in needed.items() if name not in given | stated]
+        if missing:
+            raise UsageError(f"{log.source}: this format does not say it: give {' and '.join(missing)}")
+        # A relative path: no home folder gets into a dataset.
+        source = Path(os.path.relpath(log.source, Path(os.path.abspath(self.src)).parent)).as_posix()
+        origin = {"source": source, "source_sha256": sha256, "repetition": UNSTATED_REPETITION}
+        fields: dict[str, Any] = origin | given | {"robot": self.robot.name, "motion": motion} | stated
+        return SequenceMeta(**fields)
 
 
 def _pieces(sequence: Sequence, seconds: float | None) -> Iterator[Sequence]:
-    """A recording, or equal pieces of it of about so long, s; each says from when it is."""
+    """Yield a recording, or equal pieces of it; each piece notes its start."""
     count = max(1, round(sequence.duration / seconds)) if seconds else 1
     if count == 1:
         yield sequence
@@ -212,25 +260,8 @@ def _pieces(sequence: Sequence, seconds: float | None) -> Iterator[Sequence]:
         yield replace(sequence.rows(slice(start, start + rows)), meta=named)
 
 
-def _meta(log: Log, motion: str, src: Path, robot: RobotSpec, given: _Given, sha256: str) -> SequenceMeta:
-    """The user's word, completed by the format's; contradictions and gaps are refused."""
-    stated = {k: tuple(v) if k in ("kp", "kd") else v for k, v in log.meta.get("stated", {}).items() if v is not None}
-    said = {name: value for name, value in vars(given).items() if name != "cut"}
-    for name, value in said.items():
-        flag = "--" + name.replace("_", "-")
-        if value is not None and name in stated and stated[name] != value:
-            raise UsageError(f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out")
-    needed = {"unit_id": "--unit-id NAME", "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)"}
-    missing = [flag for name, flag in needed.items() if said[name] is None and name not in stated]
-    if missing:
-        raise UsageError(f"{log.source}: this format does not say it: give {' and '.join(missing)}")
-    fields: dict[str, Any] = {"source": _relative(log.source, src), "source_sha256": sha256, "repetition": UNSTATED}
-    fields |= {name: value for name, value in said.items() if value is not None}
-    return SequenceMeta(**(fields | {"robot": robot.name, "motion": motion} | stated))
-
-
-def _given_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[float, ...] | None:
-    """("17.8",) or ("elbow=9", …) → gains of all joints, (n); joints that are not named keep the robot's."""
+def _parse_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[float, ...] | None:
+    """Parse ("17.8",) or ("elbow=9", …) to gains of all joints, (n); the others are the robot's."""
     if not words:
         return None
     gains = np.array(getattr(robot.nominal or robot, name), float)
@@ -246,44 +277,26 @@ def _given_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[f
     return tuple(gains.tolist())
 
 
-def findings(sequence: Sequence) -> dict[str, dict[str, float | None]]:
-    """Measure by joint: delay_s, command-to-state lag (None where the motion shows none); fast_speed of the command."""
-    lag = estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt)
+def measure_delays(sequence: Sequence) -> Findings:
+    """Return by joint: delay_s, lag of the state (None if the motion does not show it), and fast_speed."""
+    delay, speed = estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt), fast_speed(sequence.ctrl, sequence.dt)
     by_joint = lambda x: {  # noqa: E731
         j: round(float(v), 4) if np.isfinite(v) else None for j, v in zip(sequence.joint_names, x, strict=True)
     }
-    return {"delay_s": by_joint(lag), "fast_speed": by_joint(fast_speed(sequence.ctrl, sequence.dt))}
+    return {"delay_s": by_joint(delay), "fast_speed": by_joint(speed)}
 
 
-def _refuse_twice(recordings: list[tuple[str, str]], cut: bool) -> None:
-    """Refuse (content hash, source) that stand twice in the source; pieces of one recording may be equal: it rested."""
-    if not recordings:
-        raise LogError("no recording found")
-    names: dict[str, str] = {}
-    twice = []
-    for digest, source in recordings:
-        if digest in names and not (cut and names[digest] == source):
-            twice.append((source, names[digest]))
-        names.setdefault(digest, source)
-    if twice:
-        source, twin = twice[0]
-        raise DatasetError(
-            f"{len(twice)} of {len(recordings)} recordings are there twice (same samples, unit and payload): {source} "
-            f"is {twin}. Nothing was imported; leave one of them out"
-        )
-
-
-def _refuse_relabelled(sequence: Sequence, known: Dataset) -> None:
-    """Refuse samples that the dataset has under another unit or payload: one of the labels is wrong."""
-    meta, alike = sequence.meta, [e.meta for e in known.entries if e.rows == len(sequence)]
-    for unit, mass, side in {(m.unit_id, m.payload_mass, m.payload_side) for m in alike}:
+def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:
+    """Refuse samples that the dataset holds under another unit or payload: one of the labels is wrong."""
+    meta, same_length = sequence.meta, [e.meta for e in existing.entries if e.rows == len(sequence)]
+    for unit, mass, side in {(m.unit_id, m.payload_mass, m.payload_side) for m in same_length}:
         other = replace(meta, unit_id=unit, payload_mass=mass, payload_side=side)
-        twin = known.find(replace(sequence, meta=other).content_hash())
-        if twin is not None and (unit, mass, side) != (meta.unit_id, meta.payload_mass, meta.payload_side):
+        entry = existing.find(replace(sequence, meta=other).content_hash())
+        if entry is not None and (unit, mass, side) != (meta.unit_id, meta.payload_mass, meta.payload_side):
             raise DatasetError(
-                f"{meta.source}: known samples under new labels: {known.path} holds them as unit {unit}, {mass:g} kg "
-                f"({side}), not unit {meta.unit_id}, {meta.payload_mass:g} kg ({meta.payload_side}). Nothing was "
-                f"imported; where the old label is the wrong one: gaponet data remove {known.path} {twin.id}"
+                f"{meta.source}: known samples under new labels: {existing.path} holds them as unit {unit}, {mass:g} "
+                f"kg ({side}), not unit {meta.unit_id}, {meta.payload_mass:g} kg ({meta.payload_side}). Nothing was "
+                f"imported; where the old label is the wrong one: gaponet data remove {existing.path} {entry.id}"
             )
 
 
@@ -293,13 +306,8 @@ def _require_side(robot: RobotSpec, side: str) -> None:
         raise UsageError(f"payload side '{side}' is unknown to {robot.name}; use one of {', '.join(sides)}")
 
 
-def _relative(source: str, src: Path) -> str:
-    """Path of a recording from the folder that holds src: no home folder ends up in a dataset."""
-    return Path(os.path.relpath(source, Path(os.path.abspath(src)).parent)).as_posix()
-
-
 def _sha256(files: tuple[str, ...]) -> str:
-    """SHA-256 of a recording's files one after the other, by name (cat control.csv state_motor.csv)."""
+    """Return the SHA-256 of files one after the other (cat control.csv state_motor.csv)."""
     digest = hashlib.sha256()
     for file in files:
         with Path(file).open("rb") as content:

@@ -23,7 +23,7 @@ _bad: ContextVar[list[str] | None] = ContextVar("bad", default=None)
 
 
 @contextmanager
-def skipping(wanted: bool = True) -> Iterator[list[str] | None]:
+def skip_bad_rows(wanted: bool = True) -> Iterator[list[str] | None]:
     """While this is open, a Log cuts its bad rows instead of refusing them; yields the list of what was cut."""
     token = _bad.set([] if wanted else None)
     try:
@@ -32,7 +32,7 @@ def skipping(wanted: bool = True) -> Iterator[list[str] | None]:
         _bad.reset(token)
 
 
-def skipped() -> list[str] | None:
+def skipped_rows() -> list[str] | None:
     """Where bad rows are listed now; None where they are refused."""
     return _bad.get()
 

@@ -14,12 +14,12 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import Json
 from gaponet.data.log import Log
-from gaponet.data.signals import TIE, differentiate, resample_linear, resample_zoh
+from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
 from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
-SHORTEST, LONGEST = 1e-4, 1.0  # periods, s
+MIN_PERIOD_S, MAX_PERIOD_S = 1e-4, 1.0  # periods, s
 MAX_GAP = 2.0  # between two samples of the state, s: what moved there is not known, and a clock that jumps is no clock
 MAX_GROWTH = 3  # times as many rows as were recorded: a few bursts must not set the period of all
 FEW = 16  # rows of which a loop's period is told first
@@ -65,7 +65,7 @@ class SequenceMeta:
             raise LogError(f"{self.source}: level '{self.level}' is not one of {', '.join(LEVELS)}")
 
     @property
-    def known_gains(self) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+    def recorded_gains(self) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
         """kp and kd; None where the log did not say them and those of robot.toml stand for them."""
         kp, _, kd = str(self.notes.get("gains", "")).removeprefix("kp ").partition(", kd ")
         return None if kp == ASSUMED else self.kp, None if (kd or kp) == ASSUMED else self.kd
@@ -76,7 +76,7 @@ class SequenceMeta:
         return (*self.notes.get("posture", {}), *self.notes.get("held_at_home", ()))
 
     @property
-    def slot(self) -> tuple[str, str, float, str]:
+    def repetition_key(self) -> tuple[str, str, float, str]:
         """Recordings in one slot, at one rate, are repetitions of each other."""
         return self.motion, self.unit_id, self.payload_mass, self.payload_side
 
@@ -107,8 +107,8 @@ class Sequence:
     temperature: Array | None = None
 
     def __post_init__(self) -> None:
-        if not SHORTEST <= self.dt <= LONGEST:
-            raise LogError(f"{self.meta.source}: dt is {self.dt} s; expected {SHORTEST} to {LONGEST:g}")
+        if not MIN_PERIOD_S <= self.dt <= MAX_PERIOD_S:
+            raise LogError(f"{self.meta.source}: dt is {self.dt} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}")
         shape = (len(self.ctrl), len(self.joint_names))
         for name in ARRAYS:
             value = getattr(self, name)
@@ -277,10 +277,10 @@ def _median_period(log: Log) -> float:
     time = log.channels["qpos"].time
     period = np.diff(time)
     median, longest = float(np.median(period)), int(period.argmax())
-    if not SHORTEST <= median <= LONGEST:
+    if not MIN_PERIOD_S <= median <= MAX_PERIOD_S:
         raise LogError(
-            f"{log.source}: the median period is {median:.3g} s, expected {SHORTEST} to {LONGEST:g}; is the unit of "
-            "time right (tables: --time-unit)?"
+            f"{log.source}: the median period is {median:.3g} s, expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}; is the "
+            "unit of time right (tables: --time-unit)?"
         )
     if period[longest] > MAX_GAP:
         raise LogError(
@@ -330,7 +330,7 @@ def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
             f"{log.source}: command and state channels overlap for {stop - start:.3f} s only; check the clocks"
         )
     if begin is None:
-        grid, near = start + dt * np.arange(int((stop - start) / dt + 1e-9) + 1), TIE
+        grid, near = start + dt * np.arange(int((stop - start) / dt + 1e-9) + 1), SAME_INSTANT
     else:
         grid, near = begin + dt * np.arange(round((stop - begin) / dt) + 1), 0.5
     grid = np.clip(grid, start, stop)

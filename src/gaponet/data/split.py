@@ -1,10 +1,9 @@
-"""Split files: which sequences are for training, validation (choosing) and test (reporting), by content hash.
+"""Train, validation and test splits of a dataset, by a fixed rule or from a split file.
 
-By motion, a fixed rule puts every repetition, payload and unit of a motion into one part; motions with equal commands
-are one motion, whatever they are called (data.commands). By unit or payload, the test part is what is held out, and
-validation is a part of the motions of the rest. By repetition the last ones are the test, by time the last pieces of
-each recording that was cut (gaponet import --cut): both ask for what was asked before. Parts share no recording:
-neither one listed twice nor the same samples under another name, unit or payload.
+By motion, every repetition, payload and unit of a motion is in one split. Motions with equal commands count as one
+motion, whatever their names (data.fingerprint). By unit or payload, the test split holds the held-out ones; validation
+holds some motions of the others. By repetition the last repetitions are for testing, by time the last pieces of each
+recording that was cut (gaponet import --cut). Splits share no recording, also not under another name, unit or payload.
 """
 
 from __future__ import annotations
@@ -25,28 +24,28 @@ from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.files import write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json
-from gaponet.data.commands import Sketch, alike, sketch
-from gaponet.data.pair import hash_order
+from gaponet.data.fingerprint import CommandFingerprint, equal_commands, fingerprint
 from gaponet.data.store import Dataset, Entry, dataset_hash
 
-Parts = dict[str, list[Entry]]
+Splits = dict[str, list[Entry]]
 
 FORMAT = 1
-PARTS = ("train", "val", "test")
-BY: dict[str, Callable[[Entry], str]] = {
+SPLITS = ("train", "val", "test")
+PROPERTIES: dict[str, Callable[[Entry], str]] = {
     "motion": lambda e: e.meta.motion,
     "unit": lambda e: e.meta.unit_id,
     "payload": lambda e: f"{e.meta.payload_mass:g}",
     "repetition": lambda e: str(e.meta.repetition),
     "time": lambda e: f"{e.meta.notes.get('from_s', 0.0):g}",
 }
-IN_TURN = ("repetition", "time")  # what was asked before comes again: the later ones are held out
-MOTIONS = 3  # one for each part
+ORDERED = ("repetition", "time")  # properties of which the last values are held out
+MIN_MOTIONS = 3  # one for each split
 TEST_SHARE, VAL_SHARE = 0.25, 0.125  # of motions, units or payloads; at least one each
+RATE_TOLERANCE = 0.02  # relative; rates are measured
 
 
-class RunSplit(TypedDict):
-    """{sequence id: content hash} of each part."""
+class SplitHashes(TypedDict):
+    """{sequence id: content hash} of each split, as stored in a run or a split file."""
 
     train: dict[str, str]
     val: dict[str, str]
@@ -54,9 +53,28 @@ class RunSplit(TypedDict):
 
 
 class _SplitFile(TypedDict):
-    """A split file, and whatever else stands there."""
+    parts: SplitHashes
 
-    parts: RunSplit
+
+def hash_order(names: Iterable[str]) -> list[str]:
+    """Return distinct names in the order of their SHA-256: shuffled, and the same on every machine."""
+    return sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).hexdigest())
+
+
+def resolve_splits(dataset: Dataset, split_file: str, *rule: Any) -> Splits:
+    """Return the splits of a split file, if one is given, else of `split_entries(dataset, *rule)`.
+
+    Raises:
+        UsageError: Both a file and a rule are given.
+    """
+    if not split_file:
+        return split_entries(dataset, *rule)
+    if rule != ((), (), (), 1):
+        raise UsageError(
+            f"--split {split_file} says already which recordings are for training: leave out --holdout-units, "
+            "--holdout-payloads, --rates and --train-share, or make another split with gaponet data split"
+        )
+    return read_split(split_file, dataset)
 
 
 def split_entries(
@@ -65,192 +83,136 @@ def split_entries(
     holdout_payloads: tuple[float, ...] = (),
     rates: tuple[float, ...] = (),
     train_share: float = 1.0,
-) -> Parts:
-    """Entries per part: the fixed split by motion, the same for all rates and shares, of each set of joints by itself
-    where recordings hold different ones; by repetition, where one or two motions were played three times or more.
+) -> Splits:
+    """Split by motion with the fixed rule, the same for all rates and shares.
+
+    Where recordings hold different sets of joints, each set is split by itself. Fewer than three motions with three or
+    more repetitions are split by repetition.
 
     Args:
-        holdout_units: Appear in the test part only, with its motions.
-        holdout_payloads: The same, kg.
-        rates: Only recordings at these, Hz; all by default.
-        train_share: Share of the training motions to use, in the order of the hash of their names: a smaller one lies
-            in a larger.
-    """
-    units = {e.meta.unit_id for e in dataset.entries}
-    payloads = {e.meta.payload_mass for e in dataset.entries}
-    strangers = [u for u in holdout_units if u not in units]
-    if strangers:
-        raise UsageError(f"unit '{strangers[0]}' is not in {dataset.path}; it holds {', '.join(sorted(units))}")
-    unknown = [p for p in holdout_payloads if p not in payloads]
-    if unknown:
-        known = ", ".join(f"{p:g}" for p in sorted(payloads))
-        raise UsageError(f"no recording with {unknown[0]:g} kg in {dataset.path}; it holds {known} kg")
-    held_rates = sorted({round(1 / e.dt, 2) for e in dataset.entries})
-    absent = [r for r in rates if not any(_same_rate(r, h) for h in held_rates)]
-    if absent:
-        known = ", ".join(f"{h:g}" for h in held_rates)
-        raise UsageError(f"no recording at {absent[0]:g} Hz in {dataset.path}; it holds {known} Hz")
-    if not 0 < train_share <= 1:
-        raise UsageError(f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1")
-    away = lambda m: m.unit_id in holdout_units or m.payload_mass in holdout_payloads  # noqa: E731
-    lead = one_motion(dataset)
-    played = Counter((lead[e.meta.motion], *e.meta.slot[1:]) for e in dataset.entries)
-    if len(set(lead.values())) < MOTIONS <= max(played.values(), default=0):
-        parts = in_turn(dataset, "repetition")
-        return parts | {p: [e for e in parts[p] if not away(e.meta)] for p in ("train", "val")}
-    motions = _split_by_joints({lead[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries})
-    motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
-    entries_at = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
-    parts = {
-        part: [e for e in entries_at if lead[e.meta.motion] in motions[part] and (part == "test" or not away(e.meta))]
-        for part in PARTS
-    }
-    for part, entries in parts.items():
-        if not entries:
-            held = ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)]) or "all other rates"
-            raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {held}")
-    return parts
-
-
-def in_turn(dataset: Dataset, by: str) -> Parts:
-    """The last quarter of the repetitions (or of the pieces of each recording in time) for testing, one before it for
-    validation, the rest for training. Recordings of one command are repetitions, whatever they are called.
+        holdout_units: Units that appear in the test split only.
+        holdout_payloads: Payloads that appear in the test split only, kg.
+        rates: Rates of the recordings to use, Hz; all by default.
+        train_share: Share of the training motions to use, in hash_order: a smaller set is part of a larger one.
 
     Raises:
-        UsageError: There are fewer than three.
+        UsageError: A unit, payload or rate is not in the dataset, or a split would be empty.
     """
-    entries, lead = dataset.entries, one_motion(dataset) if by == "repetition" else {}
-    group: Callable[[Entry], Any] = lambda e: (*e.meta.slot[1:], lead[e.meta.motion] if lead else e.meta.source)  # noqa: E731
-    place: Callable[[Entry], Any] = (
-        (lambda e: (e.meta.motion, e.meta.repetition)) if lead else (lambda e: e.meta.notes.get("from_s", 0.0))
-    )
-    parts: Parts = {part: [] for part in PARTS}
-    for key in dict.fromkeys(map(group, entries)):
-        mine = [e for e in entries if group(e) == key]
-        turns = sorted({place(e) for e in mine})
-        test = max(1, round(TEST_SHARE * len(turns))) if len(turns) >= MOTIONS else 0
-        for e in mine:
-            last = len(turns) - 1 - turns.index(place(e))
-            parts["test" if last < test else "val" if test and last == test else "train"].append(e)
-    if not parts["test"]:
-        what = "repetitions" if by == "repetition" else "pieces of one recording (gaponet import --cut 8)"
-        raise UsageError(f"a split by {by} needs {MOTIONS} {what} or more")
-    return parts
+    _require_present(dataset, holdout_units, holdout_payloads, rates)
+    if not 0 < train_share <= 1:
+        raise UsageError(f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1")
+    held_out = lambda e: e.meta.unit_id in holdout_units or e.meta.payload_mass in holdout_payloads  # noqa: E731
+    canonical = canonical_motions(dataset)
+    repetitions = Counter((canonical[e.meta.motion], *e.meta.repetition_key[1:]) for e in dataset.entries)
+    if len(set(canonical.values())) < MIN_MOTIONS <= max(repetitions.values(), default=0):
+        splits = split_by_order(dataset, "repetition")
+        return splits | {s: [e for e in splits[s] if not held_out(e)] for s in ("train", "val")}
+    motions = _split_by_joints({canonical[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries})
+    motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
+    entries = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
+    splits = {
+        s: [e for e in entries if canonical[e.meta.motion] in motions[s] and (s == "test" or not held_out(e))]
+        for s in SPLITS
+    }
+    if empty := [s for s in SPLITS if not splits[s]]:
+        reason = ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)]) or "all other rates"
+        raise UsageError(f"{dataset.path}: nothing left for {empty[0]} after holding out {reason}")
+    return splits
 
 
-def spread(entries: ListOf[Entry], most: int) -> list[Entry]:
-    """At most so many entries, taken in turn from each payload, unit and rate, and from other motions each time.
-
-    Every k-th of a recipe's entries can have the same payload: recipes count in fours as well.
-    """
-    groups: dict[tuple[object, ...], list[Entry]] = {}
-    for entry in entries:
-        m = entry.meta
-        groups.setdefault((m.payload_mass, m.payload_side, m.unit_id, round(1 / entry.dt, 1)), []).append(entry)
-    turned = [g[i % len(g) :] + g[: i % len(g)] for i, g in enumerate(groups.values())]
-    found = [e.id for turn in itertools.zip_longest(*turned) for e in turn if e is not None][:most]
-    return [e for e in entries if e.id in found]
-
-
-def one_motion(dataset: Dataset) -> dict[str, str]:
-    """Motion → the name under which it is split: of motions with equal commands, the first in hash_order."""
-    sketches: dict[str, list[Sketch]] = {}
-    for entry in dataset.entries:
-        known = sketches.setdefault(entry.meta.motion, [])
-        told = entry.command
-        if told is None and not known:  # imported before sketches were kept: one recording speaks for the motion
-            told = sketch(dataset.channels(entry, ("ctrl",))["ctrl"], entry.dt)
-        if told is not None and told not in known:
-            known.append(told)
-    names = hash_order(sketches)
-    whose = [name for name in names for _ in sketches[name]]
-    leads = {name: name for name in names}
-    for i, j in alike([one for name in names for one in sketches[name]]):
-        first, second = leads[whose[i]], leads[whose[j]]
-        if first != second:
-            leads = {name: first if lead == second else lead for name, lead in leads.items()}
-    heads: dict[str, str] = {}
-    for name in names:
-        heads.setdefault(leads[name], name)
-    return {name: heads[lead] for name, lead in leads.items()}
-
-
-def _by_motion(motions: Iterable[str]) -> dict[str, list[str]]:
-    """The motions of each part by a fixed rule without a seed: in the order of the SHA-256 of their names, test first,
-    then validation. Repetitions, payloads and units of a motion stay together. Adding a motion later moves few others.
-    """
-    names = hash_order(motions)
-    if len(names) < MOTIONS:
-        raise UsageError(
-            f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs {MOTIONS} or more; motions with "
-            "equal commands count once. Long recordings can be cut into several: gaponet import --cut 8"
-        )
-    test, val = (max(1, round(len(names) * share)) for share in (TEST_SHARE, VAL_SHARE))
-    return {"train": names[test + val :], "val": names[test : test + val], "test": names[:test]}
-
-
-def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[str]]:
-    """Split motions; where they hold different joints (one at a time, say) those of each set by themselves, so that
-    each joint is judged; of two motions one judges."""
-    groups = [[m for m in unrecorded if unrecorded[m] == joints] for joints in set(unrecorded.values())]
-    if len(groups) == 1 or max(map(len, groups)) < MOTIONS:
-        return _by_motion(unrecorded)
-    parts: dict[str, list[str]] = {part: [] for part in PARTS}
-    for names in map(hash_order, groups):
-        few = {"train": names[-1:], "val": names[:-1], "test": []}
-        for part, mine in (_by_motion(names) if len(names) >= MOTIONS else few).items():
-            parts[part] += mine
-    return {part: hash_order(names) for part, names in parts.items()}
+def _require_present(
+    dataset: Dataset, units: tuple[str, ...], payloads: tuple[float, ...], rates: tuple[float, ...]
+) -> None:
+    known_units = sorted({e.meta.unit_id for e in dataset.entries})
+    if missing_units := [u for u in units if u not in known_units]:
+        raise UsageError(f"unit '{missing_units[0]}' is not in {dataset.path}; it holds {', '.join(known_units)}")
+    known_payloads = sorted({e.meta.payload_mass for e in dataset.entries})
+    if missing := [p for p in payloads if p not in known_payloads]:
+        text = ", ".join(f"{p:g}" for p in known_payloads)
+        raise UsageError(f"no recording with {missing[0]:g} kg in {dataset.path}; it holds {text} kg")
+    known_rates = sorted({round(1 / e.dt, 2) for e in dataset.entries})
+    if missing := [r for r in rates if not any(_same_rate(r, h) for h in known_rates)]:
+        text = ", ".join(f"{h:g}" for h in known_rates)
+        raise UsageError(f"no recording at {missing[0]:g} Hz in {dataset.path}; it holds {text} Hz")
 
 
 def _same_rate(a: float, b: float) -> bool:
-    """Rates of recordings are as measured."""
-    return abs(a - b) < 0.02 * a
+    return abs(a - b) < RATE_TOLERANCE * a
 
 
-def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Parts:
-    """Divide a dataset's sequences.
+def split_by_order(dataset: Dataset, by: str) -> Splits:
+    """Split by repetition or time: the last quarter for testing, the one before for validation, the rest for training.
+
+    Recordings of one command are repetitions, whatever their names. Recordings with fewer than three repetitions or
+    pieces are for training.
+
+    Raises:
+        UsageError: No recording has three.
+    """
+    canonical = canonical_motions(dataset) if by == "repetition" else {}
+    groups: dict[tuple[Any, ...], list[Entry]] = {}
+    for e in dataset.entries:
+        groups.setdefault((*e.meta.repetition_key[1:], canonical.get(e.meta.motion, e.meta.source)), []).append(e)
+    splits: Splits = {s: [] for s in SPLITS}
+    for group in groups.values():
+        place = {e.id: (e.meta.motion, e.meta.repetition) if canonical else (e.meta.notes.get("from_s", 0.0),)
+                 for e in group}  # fmt: skip
+        places = sorted(set(place.values()), reverse=True)
+        test = max(1, round(TEST_SHARE * len(places))) if len(places) >= MIN_MOTIONS else 0
+        for e in group:
+            rank = places.index(place[e.id])
+            splits["test" if rank < test else "val" if test and rank == test else "train"].append(e)
+    if not splits["test"]:
+        kind = "repetitions" if by == "repetition" else "pieces of one recording (gaponet import --cut 8)"
+        raise UsageError(f"a split by {by} needs {MIN_MOTIONS} {kind} or more")
+    return splits
+
+
+def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Splits:
+    """Split a dataset by one of PROPERTIES.
 
     Args:
-        by: motion, unit, payload, repetition or time.
-        holdout: Motions, units or payloads (kg) for the test part; default a quarter, by the hash of their names.
+        holdout: Values of the property for the test split; default a quarter, in hash_order.
 
     Returns:
         train, val and test, none of them empty.
 
     Raises:
-        UsageError: Something held out is not there, or nothing is left for a part.
+        UsageError: A value is not in the dataset, or a split would be empty.
     """
-    if by in IN_TURN and not holdout:
-        return in_turn(dataset, by)
-    lead = one_motion(dataset)
-    key = (lambda e: lead[e.meta.motion]) if by == "motion" else BY[by]
-    held = _held_out(dataset, by, holdout, key)
-    rest = [e for e in dataset.entries if key(e) not in held]
-    motions = hash_order(lead[e.meta.motion] for e in rest)
-    choice = key if by in IN_TURN else lambda e: lead[e.meta.motion]
-    if by in IN_TURN and rest:
-        motions = [max(map(key, rest), key=float)]  # of those that are not held out, the last
-    chosen = set(motions[: max(1, round(len(set(lead.values())) * VAL_SHARE))])
-    parts = {
-        "train": [e for e in rest if choice(e) not in chosen],
-        "val": [e for e in rest if choice(e) in chosen],
-        "test": [e for e in dataset.entries if key(e) in held],
+    if by in ORDERED and not holdout:
+        return split_by_order(dataset, by)
+    canonical = canonical_motions(dataset)
+    motion_of: Callable[[Entry], str] = lambda e: canonical[e.meta.motion]  # noqa: E731
+    key = motion_of if by == "motion" else PROPERTIES[by]
+    held_out = _held_out_values(dataset, by, holdout, key)
+    rest = [e for e in dataset.entries if key(e) not in held_out]
+    if by in ORDERED:
+        val_key, val_values = key, {max(map(key, rest), key=float)} if rest else set()
+    else:
+        count = max(1, round(len(set(canonical.values())) * VAL_SHARE))
+        val_key, val_values = motion_of, set(hash_order(map(motion_of, rest))[:count])
+    splits = {
+        "train": [e for e in rest if val_key(e) not in val_values],
+        "val": [e for e in rest if val_key(e) in val_values],
+        "test": [e for e in dataset.entries if key(e) in held_out],
     }
-    for part in PARTS:
-        if not parts[part]:
-            raise UsageError(
-                f"{dataset.path}: holding out {by} {', '.join(sorted(held))} leaves nothing for {part} "
-                f"({len(motions)} motion(s) remain); hold out less"
-            )
-    return parts
+    if empty := [s for s in SPLITS if not splits[s]]:
+        raise UsageError(
+            f"{dataset.path}: holding out {by} {', '.join(sorted(held_out))} leaves nothing for {empty[0]} "
+            f"({len(set(map(motion_of, rest)))} motion(s) remain); hold out less"
+        )
+    return splits
 
 
-def _held_out(dataset: Dataset, by: str, holdout: tuple[str, ...], key: Callable[[Entry], str]) -> set[str]:
-    """Keys of what is held out; a motion takes those with equal commands with it."""
-    values = hash_order(map(BY[by], dataset.entries))
+def _held_out_values(dataset: Dataset, by: str, holdout: tuple[str, ...], key: Callable[[Entry], str]) -> set[str]:
+    """Return the keys that are held out; a motion takes those with equal commands with it."""
+    values = hash_order(map(PROPERTIES[by], dataset.entries))
     if by == "payload":
-        holdout = tuple(_kilograms(text) for text in holdout)
+        try:
+            holdout = tuple(f"{float(text):g}" for text in holdout)
+        except ValueError:
+            raise UsageError(f"--holdout {' '.join(holdout)}: payloads are numbers, kg") from None
     for value in holdout:
         if value not in values:
             raise UsageError(f"{dataset.path}: no {by} '{value}' to hold out; it holds {', '.join(sorted(values))}")
@@ -262,41 +224,103 @@ def _held_out(dataset: Dataset, by: str, holdout: tuple[str, ...], key: Callable
             f"{dataset.path}: all {len(values)} {by}s have equal commands, so they are one: nothing to split"
         )
     if holdout:
-        return {key(e) for e in dataset.entries if BY[by](e) in holdout}
+        return {key(e) for e in dataset.entries if PROPERTIES[by](e) in holdout}
     return set(keys[: max(1, round(len(keys) * TEST_SHARE))])
 
 
-def _kilograms(text: str) -> str:
-    try:
-        return f"{float(text):g}"
-    except ValueError:
-        raise UsageError(f"--holdout {text}: payloads are numbers, kg") from None
+def canonical_motions(dataset: Dataset) -> dict[str, str]:
+    """Return motion → the name under which it is split: of motions with equal commands, the first in hash_order."""
+    fingerprints: dict[str, list[CommandFingerprint]] = {}
+    for entry in dataset.entries:
+        of_motion = fingerprints.setdefault(entry.meta.motion, [])
+        command = entry.command
+        if command is None and not of_motion:  # an old journal: one recording is enough for its motion
+            command = fingerprint(dataset.channels(entry, ("ctrl",))["ctrl"], entry.dt)
+        if command is not None and command not in of_motion:
+            of_motion.append(command)
+    names = hash_order(fingerprints)
+    owners = [name for name in names for _ in fingerprints[name]]
+    group = {name: name for name in names}
+    for i, j in equal_commands([one for name in names for one in fingerprints[name]]):
+        first, second = group[owners[i]], group[owners[j]]
+        if first != second:
+            group = {name: first if g == second else g for name, g in group.items()}
+    canonical: dict[str, str] = {}
+    for name in names:
+        canonical.setdefault(group[name], name)
+    return {name: canonical[g] for name, g in group.items()}
 
 
-def require_distinct_samples(dataset: Dataset, parts: Parts, progress: Progress = no_progress) -> None:
-    """Refuse parts that share samples, whatever unit or payload these are filed under.
+def split_motions(motions: Iterable[str]) -> dict[str, list[str]]:
+    """Split names of motions by a fixed rule without a seed: hash_order, test first, then validation, then training.
 
-    Content hashes contain unit and payload: a log imported twice, for two units, has two. So commands and states are
-    read and hashed without them, one sequence at a time.
+    A motion that is added later moves few others.
+
+    Raises:
+        UsageError: There are fewer than three.
+    """
+    names = hash_order(motions)
+    if len(names) < MIN_MOTIONS:
+        raise UsageError(
+            f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs {MIN_MOTIONS} or more; motions with "
+            "equal commands count once. Long recordings can be cut into several: gaponet import --cut 8"
+        )
+    test, val = (max(1, round(len(names) * share)) for share in (TEST_SHARE, VAL_SHARE))
+    return {"train": names[test + val :], "val": names[test : test + val], "test": names[:test]}
+
+
+def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[str]]:
+    """Split motions, each set of recorded joints by itself, so that every joint is validated.
+
+    Args:
+        unrecorded: Motion → joints that it does not hold.
+    """
+    groups = [[m for m in unrecorded if unrecorded[m] == joints] for joints in set(unrecorded.values())]
+    if len(groups) == 1 or max(map(len, groups)) < MIN_MOTIONS:
+        return split_motions(unrecorded)
+    splits: dict[str, list[str]] = {s: [] for s in SPLITS}
+    for names in map(hash_order, groups):
+        few = {"train": names[-1:], "val": names[:-1], "test": []}
+        for s, part in (split_motions(names) if len(names) >= MIN_MOTIONS else few).items():
+            splits[s] += part
+    return {s: hash_order(names) for s, names in splits.items()}
+
+
+def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
+    """Return at most `count` entries, taken in turn from each payload, unit and rate, with different motions."""
+    groups: dict[tuple[object, ...], list[Entry]] = {}
+    for entry in entries:
+        m = entry.meta
+        groups.setdefault((m.payload_mass, m.payload_side, m.unit_id, round(1 / entry.dt, 1)), []).append(entry)
+    rotated = [g[i % len(g) :] + g[: i % len(g)] for i, g in enumerate(groups.values())]
+    chosen = [e.id for turn in itertools.zip_longest(*rotated) for e in turn if e is not None][:count]
+    return [e for e in entries if e.id in chosen]
+
+
+def require_distinct_samples(dataset: Dataset, splits: Splits, progress: Progress = no_progress) -> None:
+    """Refuse splits that share samples under different units or payloads, which content hashes do not show.
+
+    Raises:
+        DatasetError: Naming both sequences.
     """
     seen: dict[str, tuple[str, Entry]] = {}
-    total, done = sum(map(len, parts.values())), 0
-    for part, entries in parts.items():
+    total, done = sum(map(len, splits.values())), 0
+    for split, entries in splits.items():
         for entry in entries:
             arrays = dataset.channels(entry, ("ctrl", "qpos"))
             digest = hashlib.sha256(arrays["ctrl"].tobytes() + arrays["qpos"].tobytes()).hexdigest()
-            other, twin = seen.setdefault(digest, (part, entry))
-            if other != part:
+            other_split, other = seen.setdefault(digest, (split, entry))
+            if other_split != split:
                 raise DatasetError(
-                    f"{dataset.path}: '{entry.id}' ({part}) and '{twin.id}' ({other}) hold the same samples; delete "
-                    "the line of the wrong one from sequences.jsonl"
+                    f"{dataset.path}: '{entry.id}' ({split}) and '{other.id}' ({other_split}) hold the same samples; "
+                    "delete the line of the wrong one from sequences.jsonl"
                 )
             done += 1
             progress(done, total, entry.meta.motion)
 
 
-def write_split(dataset: Dataset, parts: Parts, by: str, holdout: tuple[str, ...] = ()) -> Path:
-    """Write splits/<by>[-<held out>].json in the dataset folder; the same call writes the same file."""
+def write_split(dataset: Dataset, splits: Splits, by: str, holdout: tuple[str, ...] = ()) -> Path:
+    """Write splits/<by>[-<held out>].json in the dataset folder; return its path."""
     name = re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join([by, *holdout]))[:100]
     path = dataset.path / "splits" / f"{name}.json"
     record: dict[str, Any] = {
@@ -304,9 +328,9 @@ def write_split(dataset: Dataset, parts: Parts, by: str, holdout: tuple[str, ...
         "robot": dataset.robot_name,
         "dataset_hash": dataset_hash(dataset.entries),
         "by": by,
-        "held_out": sorted({BY[by](e) for e in parts["test"]}),
+        "held_out": sorted({PROPERTIES[by](e) for e in splits["test"]}),
         "virtual": any(e.meta.virtual for e in dataset.entries),
-        "parts": {part: {e.id: e.hash for e in parts[part]} for part in PARTS},
+        "parts": {s: {e.id: e.hash for e in splits[s]} for s in SPLITS},
     }
     with dataset.writing():
         path.parent.mkdir(exist_ok=True)
@@ -314,39 +338,23 @@ def write_split(dataset: Dataset, parts: Parts, by: str, holdout: tuple[str, ...
     return path
 
 
-def parts_of(dataset: Dataset, split: str, *rule: Any) -> Parts:
-    """The parts by a split file, where one is given, else by the fixed rule; `rule` as split_entries takes it.
+def read_split(path: str | Path, dataset: Dataset) -> Splits:
+    """Return the entries of a split file, found in the dataset by content, whatever their names.
 
     Raises:
-        UsageError: Both are given.
-    """
-    if not split:
-        return split_entries(dataset, *rule)
-    if rule != ((), (), (), 1):
-        raise UsageError(
-            f"--split {split} says already who is for training: leave out --holdout-units, --holdout-payloads, "
-            "--rates and --train-share, or make another split with gaponet data split"
-        )
-    return read_split(split, dataset)
-
-
-def read_split(path: str | Path, dataset: Dataset) -> Parts:
-    """Entries of a dataset by a split file; sequences found are those with the same content, whatever their name.
-
-    Raises:
-        DatasetError: Not a split file, a sequence of it is not in the dataset, or parts share one.
+        DatasetError: It is no split file, a sequence is not in the dataset, or two splits share one.
     """
     hashes = read_json(_SplitFile, Path(path), DatasetError, "make one with gaponet data split", allow_extra=True)[
         "parts"
     ]
-    parts: Parts = {part: [] for part in PARTS}
-    taken: dict[str, str] = {}
-    for part in PARTS:
-        for name, digest in hashes[part].items():  # type: ignore[literal-required]
+    splits: Splits = {s: [] for s in SPLITS}
+    split_of_hash: dict[str, str] = {}
+    for s in SPLITS:
+        for name, digest in hashes[s].items():  # type: ignore[literal-required]
             entry = dataset.find(digest)
             if entry is None:
                 raise DatasetError(f"{path}: '{name}' is not in {dataset.path}; split that dataset anew")
-            if taken.setdefault(digest, part) != part:
-                raise DatasetError(f"{path}: '{name}' is in {taken[digest]} and in {part}; split the dataset anew")
-            parts[part].append(entry)
-    return parts
+            if split_of_hash.setdefault(digest, s) != s:
+                raise DatasetError(f"{path}: '{name}' is in {split_of_hash[digest]} and in {s}; split the dataset anew")
+            splits[s].append(entry)
+    return splits

@@ -124,7 +124,7 @@ def _by_group(
     sequences: list[Sequence], robot: RobotSpec, corrector: Corrector | None, holdout: tuple[str, ...], nthread: int = 0
 ) -> Outcome:
     """Return {"known": summary, "new": summary of the units held out}; a group without recordings is left out."""
-    twins = replay(sequences, robot, corrector, nthread, lock_idle=True)
-    done = runs(sequences, [t.qpos for t in twins], robot)
+    replays = replay(sequences, robot, corrector, nthread, lock_idle=True)
+    done = runs(sequences, [t.qpos for t in replays], robot)
     groups = {name: [r for r in done if (r.meta.unit_id in holdout) == new] for name, new in (("known", 0), ("new", 1))}
     return {name: summary(part, robot) for name, part in groups.items() if part}

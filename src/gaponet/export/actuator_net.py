@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.data.sequence import Sequence
-from gaponet.data.split import spread
+from gaponet.data.split import stratified_subset
 from gaponet.export.plain_servos import comparable, mean_error
 from gaponet.export.shipped.mujoco_servos import delay_weights
 from gaponet.export.simulator_facts import ServoFacts
@@ -96,7 +96,7 @@ def read_run_recordings(run: Path, data: str | None, robot: RobotSpec, payload_m
     dataset = load_dataset(place if data or "://" in place else run / place)
     entries = [e for e in dataset.entries if e.meta.payload_mass == payload_mass]
     hashes = [set(split_of_run(run)[split].values()) for split in ("train", "val")]
-    chosen = [spread([e for e in entries if e.hash in split], MAX_RECORDINGS) for split in hashes]
+    chosen = [stratified_subset([e for e in entries if e.hash in split], MAX_RECORDINGS) for split in hashes]
     recordings = [comparable(dataset.sequences(split), robot, payload_mass) for split in chosen]
     if not all(recordings):
         raise UsageError(f"no recording of {run} was made with {payload_mass:g} kg and the robot's own gains")

@@ -11,7 +11,7 @@ from typing_extensions import TypedDict
 
 from gaponet.base.errors import DatasetError, ModelError, RobotError, UsageError
 from gaponet.base.structure import read_json
-from gaponet.data.split import RunSplit
+from gaponet.data.split import SplitHashes
 from gaponet.data.store import Dataset, Entry
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
@@ -29,7 +29,7 @@ class _Origin(TypedDict):
     split, and the error on validation motions, rad."""
 
     dataset: str
-    parts: RunSplit
+    parts: SplitHashes
     motions: dict[str, tuple[str, ...]]
     val_mpjae: dict[str, float]
 
@@ -177,7 +177,7 @@ class FittedData:
 def split_of_run(run: Path) -> dict[str, dict[str, str]]:
     """Read {split: {sequence id: content hash}} of a run."""
     hint = "give a run folder of gaponet train"
-    return dict(read_json(RunSplit, run / "split.json", ModelError, hint))  # type: ignore[arg-type]
+    return dict(read_json(SplitHashes, run / "split.json", ModelError, hint))  # type: ignore[arg-type]
 
 
 def read_origin(folder: Path) -> _Origin | None:

@@ -17,8 +17,8 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write, lock_folder, write_json
 from gaponet.base.progress import Progress, no_progress, with_note
-from gaponet.data.pair import Twin
-from gaponet.data.repeatability import MOVED
+from gaponet.data.pair import SimulatedReplay
+from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
@@ -130,20 +130,20 @@ def evaluate(
     deltas: dict[str, list[Array]] = {}
     op = robot.operated_index
     ctrl = [s.ctrl[:, op] for s in sequences]
-    moved = [np.ptp(c, axis=0) > MOVED for c in ctrl]
+    moved = [np.ptp(c, axis=0) > MIN_MOTION_RAD for c in ctrl]
     simulators: dict[str, str] = {}
     for name, simulator, corrector in itertools.chain(
         _methods(candidates, nominal), _transferred(target, first, nominal)
     ):
         simulators[name] = model_hash(simulator)
-        twins = replay(sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True)
-        done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
+        replays = replay(sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True)
+        done_runs[name] = runs(sequences, [t.qpos for t in replays], robot)
         if name in models:
-            deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
+            deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, replays, strict=True)]
     adapted = first.adaptations()
     if any(s.meta.unit_id in adapted for s in sequences):
-        twins = _by_unit(sequences, first, adapted, with_note(progress, "adapted"))
-        done_runs["adapted"] = runs(sequences, [t.qpos for t in twins], robot)
+        replays = _by_unit(sequences, first, adapted, with_note(progress, "adapted"))
+        done_runs["adapted"] = runs(sequences, [t.qpos for t in replays], robot)
         simulators["adapted"] = simulators[first.method]
     methods = {name: summary(part, robot) for name, part in done_runs.items()}
     result = {
@@ -215,16 +215,16 @@ def _by_unit(
     candidate: Candidate,
     adapted: Mapping[str, Adaptation],
     progress: Callable[[int, int], None],
-) -> list[Twin]:
+) -> list[SimulatedReplay]:
     """Roll out the model in each unit's adapted simulator, or in the common one for other units."""
-    twins: dict[int, Twin] = {}
+    replays: dict[int, SimulatedReplay] = {}
     for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
         rows = [i for i, s in enumerate(sequences) if s.meta.unit_id == unit]
         physics = adapted[unit].robot(candidate.robot) if unit in adapted else candidate.robot
         part = replay([sequences[i] for i in rows], physics, candidate.corrector(), lock_idle=True)
-        twins |= dict(zip(rows, part, strict=True))
-        progress(len(twins), len(sequences))
-    return [twins[i] for i in range(len(sequences))]
+        replays |= dict(zip(rows, part, strict=True))
+        progress(len(replays), len(sequences))
+    return [replays[i] for i in range(len(sequences))]
 
 
 def _delta_summary(parts: list[Array], sequences: list[Sequence], limit: float) -> dict[str, float]:

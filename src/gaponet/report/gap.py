@@ -57,8 +57,8 @@ def gap_by_step(
     causes, done = cause_steps(robot), {}
     for name, physics, corrector in _steps(candidate, causes):
         report = with_note(progress, name)
-        twins = replay(sequences, physics, corrector, lock_idle=True, progress=report, creeps=name == "friction")
-        done[name] = runs(sequences, [t.qpos for t in twins], robot)
+        replays = replay(sequences, physics, corrector, lock_idle=True, progress=report, creeps=name == "friction")
+        done[name] = runs(sequences, [t.qpos for t in replays], robot)
     units = {s.meta.unit_id for s in sequences}
     others = (dataset.sequences([e])[0] for e in dataset.entries if e.meta.unit_id in units)
     floors = error_floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
@@ -162,7 +162,7 @@ def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, di
     angles: list[Array] = []
     for s in sequences:
         angles.append(s.qpos[:, robot.operated_index])
-        same = (*s.meta.slot, round(s.dt * 1e6))
+        same = (*s.meta.repetition_key, round(s.dt * 1e6))
         groups[same].add(s)
         for period in Repetitions.periods(s):
             groups[*same, "period"].add(period)

@@ -16,10 +16,9 @@ from gaponet import __version__
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import FOLDER_MARKER, write_text
 from gaponet.base.progress import progress_bar
-from gaponet.data.card import make_card
-from gaponet.data.card_text import card_text
+from gaponet.data.card import card_markdown, make_card
 from gaponet.data.formats.lerobot_set import Stated
-from gaponet.data.importer import findings
+from gaponet.data.importer import measure_delays
 from gaponet.data.offsets import FILE as OFFSETS
 from gaponet.data.offsets import read_offsets
 from gaponet.data.split import read_split
@@ -53,7 +52,7 @@ def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
     (folder / SIDECAR / STORED_ROBOT / ".gaponet").unlink()
     copy_sidecars(dataset.path, folder / SIDECAR, dataset)
     card = make_card(dataset)
-    text = dataset_readme(card, card_text(card), address, [part.path.as_posix() for part in sets])
+    text = dataset_readme(card, card_markdown(card), address, [part.path.as_posix() for part in sets])
     write_text(folder / "README.md", text)
     write_text(folder / SOURCE, source)
     return contents
@@ -88,12 +87,13 @@ def add_missing(pushed: Dataset, robot: RobotSpec, out: Path, new: bool) -> None
     """
     dataset = Dataset.create(out, robot)
     if new:
-        dataset.state(**{name: str(pushed.header[name]) for name in Stated.__annotations__ if name in pushed.header})
+        known = (name for name in Stated.__annotations__ if name in pushed.header)
+        dataset.set_provenance(**{name: str(pushed.header[name]) for name in known})
     missing = [entry for entry in pushed.entries if dataset.find(entry.hash) is None]
     with dataset.appending(), progress_bar("checking") as update:
         for done, entry in enumerate(missing, 1):
             sequence = pushed.read(entry)
-            dataset.append(sequence, entry.findings or findings(sequence), entry.hash)
+            dataset.append(sequence, entry.findings or measure_delays(sequence), entry.hash)
             update(done, len(missing), entry.meta.motion)
     copy_sidecars(pushed.path, dataset.path, dataset)
 

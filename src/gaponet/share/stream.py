@@ -22,8 +22,9 @@ from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.formats.lerobot import read_episode
 from gaponet.data.formats.lerobot_set import FEATURES, Set, Stated, sets_under
+from gaponet.data.journal import Entry, EntryHeader
 from gaponet.data.sequence import ARRAYS, SequenceMeta, to_sequence
-from gaponet.data.store import Dataset, Entry, entry_id
+from gaponet.data.store import Dataset, entry_id
 from gaponet.share import dataset as datasets
 from gaponet.share.remote import INDEX, Index, Remote, RemoteError, download, file_errors, read_index
 
@@ -72,8 +73,9 @@ class RemoteDataset(Dataset):
             for part in self._sets:
                 if part.ours is None:
                     raise RemoteError(f"{part.path}: gaponet did not write this set")
-                made.state(**{k: str(v) for k, v in part.ours["dataset"].items() if k in Stated.__annotations__})
-            super().__init__(made.path)
+                stated = {k: str(v) for k, v in part.ours["dataset"].items() if k in Stated.__annotations__}
+                made.set_provenance(**stated)
+            super().__init__(made.path, remote.address)
             if sorted(entry.hash for entry in self.entries) != sorted(index.contents):
                 raise RemoteError(f"the sequences listed are not those of {INDEX}; {AGAIN}")
             datasets.copy_sidecars(self.files / datasets.SIDECAR, self.path, self)
@@ -116,7 +118,7 @@ class RemoteDataset(Dataset):
         raise DatasetError(f"{self.address}: is only read; to change it, gaponet pull it and push it again")
         yield
 
-    def _journal(self) -> Iterator[Entry]:
+    def _read_entries(self) -> Iterator[Entry]:
         for part in self._sets:
             rows: dict[Path, int] = {}  # of each data file, before the next episode
             for episode in part.episodes:
@@ -125,7 +127,8 @@ class RemoteDataset(Dataset):
                 digest, first = str(episode.get("content_hash")), rows.get(file, 0)
                 channels = tuple(c for c in ARRAYS if FEATURES[c] in part.features)
                 found = episode["findings"]
-                entry = Entry(entry_id(meta, digest), digest, part.dt, episode["length"], channels, meta, found)
+                header = EntryHeader(entry_id(meta, digest), digest, part.dt, episode["length"], channels)
+                entry = Entry.create(header, meta, found)
                 self._locations[digest], rows[file] = (part, episode, first), first + entry.rows
                 yield entry
 

@@ -118,7 +118,7 @@ class Condition(NamedTuple):
     @classmethod
     def of(cls, sequence: Sequence, robot: RobotSpec) -> Condition:
         """The state in a row of a recording of this robot."""
-        meta, gains = sequence.meta, sequence.meta.known_gains
+        meta, gains = sequence.meta, sequence.meta.recorded_gains
         other = () if robot.with_gains(*gains) is robot else gains
         return cls(meta.payload_mass, meta.payload_side, sequence.dt, *other)
 

@@ -1,4 +1,4 @@
-"""Replay recorded commands in the nominal simulator: the twins. Free-running from the recorded start state."""
+"""Replay recorded commands in the simulator, open-loop from the recorded start state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from gaponet.base.executor import LOCAL, open_pool
-from gaponet.data.pair import Twin
+from gaponet.data.pair import SimulatedReplay
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
@@ -46,7 +46,7 @@ def replay(
     progress: Progress | None = None,
     lock_idle: bool = False,
     creeps: bool = False,
-) -> list[Twin]:
+) -> list[SimulatedReplay]:
     """Step every sequence's commands from its first recorded state; the recording is not looked at again.
 
     Args:
@@ -59,13 +59,13 @@ def replay(
         creeps: Friction creeps as MuJoCo's own does, to see what that takes.
 
     Returns:
-        One twin per sequence, in order.
+        One simulated replay per sequence, in order.
     """
     idle: list[tuple[str, ...]] = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
     locked = [_held(s, robot, limbs) for s, limbs in zip(sequences, idle, strict=True)]
     total = sum(len(s) - 1 for s in sequences)
     done = 0
-    twins: dict[int, Twin] = {}
+    replays: dict[int, SimulatedReplay] = {}
     for chunk in _chunks(sequences, locked):
         part = [sequences[i] for i in chunk]
 
@@ -75,16 +75,16 @@ def replay(
 
         clamped = locked[chunk[0]]
         runs = _free_run(part, robot, corrector, nthread, tell, clamped, creeps)
-        twins |= dict(zip(chunk, runs, strict=True))
+        replays |= dict(zip(chunk, runs, strict=True))
         done += sum(len(s) - 1 for s in part)
-    return [twins[i] for i in range(len(sequences))]
+    return [replays[i] for i in range(len(sequences))]
 
 
 def rollout_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> Array:
     """Return the mean |error| of each sequence's rollout, of the operated joints that it holds, (sequences,) rad."""
-    twins = replay(sequences, robot, nthread=nthread, lock_idle=True)
+    replays = replay(sequences, robot, nthread=nthread, lock_idle=True)
     held = [[i for i in robot.operated_index if robot.joint_names[i] not in s.meta.unrecorded] for s in sequences]
-    errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t, op in zip(sequences, twins, held, strict=True)]
+    errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t, op in zip(sequences, replays, held, strict=True)]
     return np.nan_to_num(np.array(errors), nan=np.pi)
 
 
@@ -140,7 +140,7 @@ def _free_run(
     progress: Callable[[int], None],
     clamped: Clamped,
     creeps: bool,
-) -> list[Twin]:
+) -> list[SimulatedReplay]:
     """Sequences that have the same joints clamped."""
     digest, locked, home = model_hash(robot), tuple(j for j, _ in clamped), np.array(robot.qpos_home)
     home[robot.index(locked)] = [at for _, at in clamped]
@@ -149,7 +149,7 @@ def _free_run(
     if creeps:
         _loosen_friction(sim.batch)
     out = rollout(sim, sequences, corrector, progress)
-    return [Twin(digest, *out[:, : len(s), i].astype(np.float32)) for i, s in enumerate(sequences)]
+    return [SimulatedReplay(digest, *out[:, : len(s), i].astype(np.float32)) for i, s in enumerate(sequences)]
 
 
 def _loosen_friction(batch: Batch) -> None:
@@ -215,17 +215,17 @@ def pair_dataset(
     lock_idle: bool = False,
     executor: str | Executor = LOCAL,
 ) -> int:
-    """Replay the sequences that have no twin for this simulator yet, and store the twins; returns how many.
+    """Replay the sequences that have no replay by this simulator yet, and store the replays; return their number.
 
     All sequences, or only some; `lock_idle` as in replay. Locally on threads of this process, else on an executor.
-    Twins are kept per simulator hash: changing a gain makes new ones and leaves the old.
+    Replays are stored per simulator hash: a changed gain makes new ones and leaves the old.
     """
     dataset.require_robot(robot)
     digest = model_hash(robot)
-    todo = sorted((e for e in entries or dataset.entries if not dataset.has_twin(e, digest)), key=lambda e: e.rows)
+    todo = sorted((e for e in entries or dataset.entries if not dataset.has_replay(e, digest)), key=lambda e: e.rows)
     if not todo:
         return 0
-    with dataset.making_twins():
+    with dataset.writing_replays():
         _pair(dataset, robot, todo, progress or (lambda done, total: None), lock_idle, executor)
     return len(todo)
 
@@ -240,14 +240,14 @@ def _pair(
     work = partial(replay, robot=robot, lock_idle=lock_idle)
     with ExitStack() as stack:
         if executor == LOCAL:
-            replayed: Iterator[list[Twin]] = (
+            replayed: Iterator[list[SimulatedReplay]] = (
                 work(part, progress=lambda k, of: progress(done + k, total)) for part in sequences
             )
         else:
             pool = stack.enter_context(open_pool(executor, 0, 1))
             replayed = pool.map(partial(work, nthread=1), sequences)
-        for part, twins in zip(parts, replayed, strict=True):
-            for entry, twin in zip(part, twins, strict=True):
-                dataset.write_twin(entry, twin)
+        for part, replays in zip(parts, replayed, strict=True):
+            for entry, simulated in zip(part, replays, strict=True):
+                dataset.write_replay(entry, simulated)
             done += sum(e.rows - 1 for e in part)
             progress(done, total)

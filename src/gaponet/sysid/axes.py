@@ -68,8 +68,8 @@ class Bounds:
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
         kp, limit = robot.kp[op], robot.effort_limit[op]
         self.first = first_values(robot)
-        self.stated = all(s.meta.known_gains[0] is not None for s in sequences)
-        kd_stated = all(s.meta.known_gains[1] is not None for s in sequences)
+        self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
+        kd_stated = all(s.meta.recorded_gains[1] is not None for s in sequences)
         self.kd_slack = np.zeros(self.n) if kd_stated else self._kd.copy()
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
         self.unexcited = excitation < MIN_EXCITATION_RAD

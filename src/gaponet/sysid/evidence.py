@@ -215,8 +215,8 @@ def estimate_uncertainty(
 
 def _errors_by_joint(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int) -> dict[str, list[Array]]:
     """Return joint → |error| of each rollout that holds it, rad; the worst joint's for joints that none holds."""
-    twins = replay(sequences, robot, nthread=nthread, lock_idle=True)
-    pairs = [(s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:]) for s, t in zip(sequences, twins, strict=True)]
+    replays = replay(sequences, robot, nthread=nthread, lock_idle=True)
+    pairs = [(s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:]) for s, t in zip(sequences, replays, strict=True)]
     errors = {}
     for j, i in zip(robot.operated, robot.operated_index, strict=True):
         if mine := [error[:, i] for unrecorded, error in pairs if j not in unrecorded]:

@@ -105,7 +105,7 @@ class JointRollouts:
         self.recorded = np.array([[j not in p.meta.unrecorded for p in parts] for j in robot.operated])
         self.counted = self._counted()
         # Gains of each recording: kp over the robot's own, kd in N·m·s/rad, (windows, n).
-        acting = [robot.with_gains(*p.meta.known_gains) for p in parts]
+        acting = [robot.with_gains(*p.meta.recorded_gains) for p in parts]
         self.kp_ratio = np.array([(r.kp / robot.kp)[self.op] for r in acting])
         self.kd = np.array([r.kd[self.op] for r in acting])
 

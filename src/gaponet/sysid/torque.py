@@ -172,7 +172,7 @@ class TorqueFit:
             robot: Start of the fit; its payload masses are taken as true.
         """
         self.robot, self.nominal = robot, robot
-        self.sequences = [s for s in sequences if s.tau is not None and s.meta.known_gains[0] is None]
+        self.sequences = [s for s in sequences if s.tau is not None and s.meta.recorded_gains[0] is None]
         trusted = {joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.gains().items() if g.trusted}
         self.trusted = len(self.sequences) == len(sequences) and bool(trusted)
         if self.trusted:

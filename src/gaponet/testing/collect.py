@@ -20,7 +20,7 @@ from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool, open_pool
 from gaponet.base.files import lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json, validated
-from gaponet.data.pair import Twin
+from gaponet.data.pair import SimulatedReplay
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import KIND, Dataset
 from gaponet.robot.folder import MOVE_STORED_ROBOT
@@ -70,7 +70,7 @@ def collect(
     seed: int = 0,
     nproc: int = 0,
     progress: Progress = no_progress,
-    twins: bool = True,
+    replays: bool = True,
     executor: str | Executor = LOCAL,
 ) -> Collection:
     """Record every take of a recipe that the dataset at `out` lacks, with the gains of the fleet.
@@ -79,7 +79,7 @@ def collect(
         seed: Seed of motions and of all random numbers in a take.
         nproc: Processes; 0 for one per core, 1 for this process only. Several start new interpreters: a script that
             calls this needs `if __name__ == "__main__":`.
-        twins: Store the simulated replay of each sequence, with resting joints locked in both.
+        replays: Store the simulated replay of each sequence, with resting joints locked in both.
         executor: Where takes are played (gaponet.base.executor); no folder is shared with it.
 
     Raises:
@@ -108,12 +108,12 @@ def collect(
         jobs = [
             Job(robot, fleet, recipe, files, seed, tuple(part)) for part in _batches(missing, nproc or Pool.cores(1))
         ]
-        if twins:
+        if replays:
             pair_dataset(dataset, robot, lock_idle=True)  # of sequences whose replay a killed run did not store
-        for sequence, twin in _play_jobs(jobs, nproc, twins, executor):
+        for sequence, simulated in _play_jobs(jobs, nproc, replays, executor):
             entry = dataset.append(sequence)
-            if twin is not None:
-                dataset.write_twin(entry, twin)
+            if simulated is not None:
+                dataset.write_replay(entry, simulated)
             written += 1
             seconds += sequence.duration
             progress(written, len(missing), f"{written} of {len(missing)}, {seconds / 3600:.2f} h recorded")
@@ -181,10 +181,10 @@ def _batches(missing: list[Take], nproc: int) -> Iterator[list[Take]]:
 
 
 def _play_jobs(
-    jobs: list[Job], nproc: int, twins: bool, executor: str | Executor
-) -> Iterator[tuple[Sequence, Twin | None]]:
+    jobs: list[Job], nproc: int, replays: bool, executor: str | Executor
+) -> Iterator[tuple[Sequence, SimulatedReplay | None]]:
     """Yield sequences and their replays in the order of the jobs."""
-    work = partial(_play_job, twins=twins)
+    work = partial(_play_job, replays=replays)
     if executor == LOCAL and (len(jobs) < 2 or (nproc or Pool.cores(1)) == 1):
         for job in jobs:
             yield from work(job)
@@ -194,9 +194,9 @@ def _play_jobs(
             yield from played
 
 
-def _play_job(job: Job, twins: bool) -> list[tuple[Sequence, Twin | None]]:
+def _play_job(job: Job, replays: bool) -> list[tuple[Sequence, SimulatedReplay | None]]:
     """Return the takes of a job and their replays, on one core."""
     sequences = play(job)
-    if not twins:
+    if not replays:
         return [(s, None) for s in sequences]
     return list(zip(sequences, replay(sequences, job.robot, nthread=1, lock_idle=True), strict=True))

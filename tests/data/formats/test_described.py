@@ -10,7 +10,7 @@ from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.describe.joints import resolve_all
 from gaponet.data.formats import detect, read_logs
-from gaponet.data.log import skipping
+from gaponet.data.log import skip_bad_rows
 from gaponet.data.store import Dataset
 
 UNITS = 'time_unit = "s"\nposition_unit = "rad"\n'
@@ -153,7 +153,7 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
     lines[20] = lines[10]  # back in time
     (folder / "wave.csv").write_text("\n".join(lines))
     (folder / "short.csv").write_text("t,shoulder_des\n0,1\n")
-    with skipping() as bad:
+    with skip_bad_rows() as bad:
         ((_, log),) = read_logs(folder, arm)
     assert [line.rpartition("/")[2].split(":")[1] for line in bad if line.endswith("cut")] == ["6", "10", "21"]
     assert any(line.startswith("left out: ") and "short.csv" in line for line in bad)

@@ -35,7 +35,7 @@ def dataset(arm, tmp_path):
                   "source_sha256": "ab" * 32, "recorded_at": "2026-01-02T03:04:05Z"}  # fmt: skip
         fields |= {"kp": (5.0 + i, 6.0), "kd": (0.1, 0.2)} if i else {}  # the first from before gains were kept
         data.append(replace(sequence, meta=replace(sequence.meta, **fields)))
-    data.state(licence="CC0-1.0")
+    data.set_provenance(licence="CC0-1.0")
     return data
 
 
@@ -47,11 +47,11 @@ def same(one, other):
     """Every sample, period and field of metadata."""
     assert len(one) == len(other)
     for entry in one.entries:
-        twin = other.find(entry.hash)
-        assert twin is not None
-        assert (twin.meta, twin.dt, twin.channels) == (entry.meta, entry.dt, entry.channels)
+        copy = other.find(entry.hash)
+        assert copy is not None
+        assert (copy.meta, copy.dt, copy.channels) == (entry.meta, entry.dt, entry.channels)
         for c in entry.channels:
-            assert np.array_equal(getattr(one.read(entry), c), getattr(other.read(twin), c))
+            assert np.array_equal(getattr(one.read(entry), c), getattr(other.read(copy), c))
 
 
 def test_a_round_trip_loses_nothing(dataset, arm, tmp_path):
@@ -135,7 +135,7 @@ def test_of_a_dataset_that_grew_all_files_but_the_last_are_the_same(arm, tmp_pat
 
 
 def test_what_is_too_much_to_hold_is_read_twice(dataset, arm, tmp_path, monkeypatch):
-    monkeypatch.setattr("gaponet.data.importer.HOLD", 2000)
+    monkeypatch.setattr("gaponet.data.importer.MAX_HELD_BYTES", 2000)
     export_lerobot(dataset, tmp_path / "out")
     same(dataset, back(tmp_path / "out", arm, tmp_path / "again"))
 

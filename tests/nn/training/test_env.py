@@ -37,10 +37,10 @@ def test_without_correction_the_environment_is_the_replay(robot):
     first = env.first.copy()
     for _ in range(59):
         env.advance(np.zeros((env.num_envs, 2)))
-    twins = replay(sequences, robot)
+    replays = replay(sequences, robot)
     for i in range(env.num_envs):
-        twin = twins[int(np.flatnonzero(env.rows.first == first[i])[0])]
-        np.testing.assert_array_equal(env.sim.qpos[i].astype(np.float32), twin.qpos[59])
+        simulated = replays[int(np.flatnonzero(env.rows.first == first[i])[0])]
+        np.testing.assert_array_equal(env.sim.qpos[i].astype(np.float32), simulated.qpos[59])
 
 
 def test_the_reward_of_a_joint_compares_it_one_row_on(robot):

@@ -8,8 +8,7 @@ import pytest
 from arm import commands, record, recordings, write_arm
 
 import gaponet.sim.batch
-from gaponet.base.errors import DatasetError, ModelError, UsageError
-from gaponet.data.pair import require_disjoint
+from gaponet.base.errors import ModelError, UsageError
 from gaponet.data.split import split_entries, write_split
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
@@ -121,12 +120,6 @@ def test_parts_of_the_split_share_no_content(trained):
     parts = split_entries(trained[0])
     hashes = [{e.hash for e in entries} for entries in parts.values()]
     assert sum(map(len, hashes)) == len(set().union(*hashes)) == 8
-
-
-def test_one_recording_under_two_names_in_two_parts_is_refused(robot):
-    a, b = recordings(robot, 1), recordings(robot, 1)
-    with pytest.raises(DatasetError, match="two parts of the split"):
-        require_disjoint(a, b)
 
 
 def test_a_robot_without_a_gap_is_left_alone(robot, tmp_path):

@@ -30,7 +30,7 @@ def dataset(arm, tmp_path):
 def test_every_picture_is_drawn_as_svg_and_png(dataset, arm, tmp_path):
     told = []
     written, left_out = draw_all(dataset, arm, tmp_path / "out", lambda *what: told.append(what))
-    names = ["composition", "gap_by_payload", "joint_ranges", "real_and_twin", "torque_temperature"]
+    names = ["composition", "gap_by_payload", "joint_ranges", "real_and_simulated", "torque_temperature"]
     assert sorted(p.name for p in written) == [f"{n}.{s}" for n in names for s in ("png", "svg")]
     assert left_out == {}
     assert told[-1][0] == told[-1][1] == len(names)
@@ -61,7 +61,7 @@ def test_only_simulations_that_a_figure_needs_are_made(dataset, arm):
     dataset.append(recordings(arm, 1, rows=60, unit="b")[0])  # with one payload only
     for picture in FIGURES.values():
         picture(dataset, arm, lambda *_: None)
-    assert [dataset.has_twin(e, model_hash(arm)) for e in dataset.entries] == [True] * 6 + [False]
+    assert [dataset.has_replay(e, model_hash(arm)) for e in dataset.entries] == [True] * 6 + [False]
 
 
 def test_the_motion_whose_torques_change_most_is_shown(dataset, arm):

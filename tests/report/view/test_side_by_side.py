@@ -20,15 +20,15 @@ def dataset(arm, tmp_path):
     return made
 
 
-def test_the_nominal_copy_is_the_twin_and_its_mean_error_the_mpjae(dataset, arm):
+def test_the_nominal_copy_is_the_replay_and_its_mean_error_the_mpjae(dataset, arm):
     shown = side_by_side(dataset, dataset.entries[1], arm)
     real = dataset.read(dataset.entries[1])
-    twin = replay([real], arm)[0]
+    simulated = replay([real], arm)[0]
     nominal = shown.motions[1]
     assert [m.method for m in shown.motions] == ["target", "nominal", "recorded"]
     assert shown.seen is None
-    np.testing.assert_array_equal(nominal.qpos, twin.qpos)
-    assert nominal.mpjae == pytest.approx(metrics(runs([real], [twin.qpos], arm))["mpjae"])
+    np.testing.assert_array_equal(nominal.qpos, simulated.qpos)
+    assert nominal.mpjae == pytest.approx(metrics(runs([real], [simulated.qpos], arm))["mpjae"])
     assert shown.motions[-1].mpjae == 0.0
 
 

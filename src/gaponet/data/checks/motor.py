@@ -1,4 +1,4 @@
-"""What the motors do that an ideal one would not: lag, sag, stiction; and whether their torque can be believed."""
+"""How do the motors differ from ideal ones: lag, sag, stiction; and is their torque credible?"""
 
 from __future__ import annotations
 
@@ -7,49 +7,52 @@ from collections.abc import Iterator
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.data.holds import Holds, StaticError
-from gaponet.data.signals import FAST, Response
-from gaponet.data.survey import Survey, Torque
+from gaponet.data.checks.check import Check
+from gaponet.data.checks.survey import Survey
+from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
+from gaponet.data.static_poses import StaticError, StaticPoses
 from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
-SAG = 0.02  # static error worth a line, rad
-LONG, APART = 0.15, 0.05  # s: dead time worth a warning; of one joint beyond the others'
-DEAD_TIMES = (
+MIN_SAG_RAD = 0.02  # static error that is reported
+MAX_DEAD_TIME_S, MAX_EXTRA_LAG_S = 0.15, 0.05  # of all joints; of one joint beyond the others
+DEAD_TIMES = (  # up to s, verdict
     (0.015, "as good as none"), (0.06, "usual for a bus and a servo's firmware"),
-    (LONG, "long; hobby servos and slow buses have it"),
+    (MAX_DEAD_TIME_S, "long; hobby servos and slow buses have it"),
     (np.inf, "very long: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
 
 
 def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How long after the command does each joint move?"""
-    found = fast_lags(surveys, robot)
-    if not found:
-        text = f"nothing is commanded faster than {FAST} rad/s: lag cannot be told from stiction; add fast motions"
-        yield Finding("note", "lag", text)
+    lags = fast_lags(surveys, robot)
+    if not lags:
+        text = f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag cannot be told from stiction"
+        yield Finding("note", "lag", f"{text}; add fast motions")
         return
-    every = np.concatenate(list(found.values()))
+    every = np.concatenate(list(lags.values()))
     period = float(np.median([1 / s.rate_hz for s in surveys]))
-    told = ", ".join(
-        f"{name} {np.median(x) * 1e3:.0f} ms ({x.min() * 1e3:.0f}–{x.max() * 1e3:.0f})" for name, x in found.items()
+    by_joint = ", ".join(
+        f"{name} {np.median(x) * 1e3:.0f} ms ({x.min() * 1e3:.0f}–{x.max() * 1e3:.0f})" for name, x in lags.items()
     )
     text = (
-        f"state follows command after (median and range over motions at {FAST} rad/s or faster) {told}: "
-        f"{every.min() / period:.0f} to {every.max() / period:.0f} control periods; the operator's history must span it"
+        f"state follows command after (median and range over motions at {FAST_COMMAND_RAD_S} rad/s or faster) "
+        f"{by_joint}: {every.min() / period:.0f} to {every.max() / period:.0f} control periods; the operator's history "
+        "must span it"
     )
-    own, sharp = _servo_lag(robot), Response.sharp([s.response for s in surveys])
-    jumps = dict(zip(robot.operated, sharp, strict=True))
-    asked = [name for name in found if name in robot.operated and not jumps[name]]  # of others `timing` sees more
-    extra = {name: float(np.median(found[name])) - own[name] for name in asked}
-    usual = float(np.median(list(extra.values()))) if extra else 0.0
-    if extra:
-        words = next(word for most, word in DEAD_TIMES if usual <= most)
-        text += f". Beyond what kp and damping make of it that is {usual * 1e3:.0f} ms of dead time: {words}"
-    level = "warning" if usual > LONG else "note" if np.median(every) > period else "ok"
-    yield Finding(level, "lag", text, tuple(found), {name: lag_values(x) for name, x in found.items()})
-    for name, late in extra.items():
-        if len(extra) > 2 and late - usual > APART and late > 2 * own[name]:
+    expected = _expected_lag(robot)
+    sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
+    # The timing check sees more of joints whose commands change sharply.
+    smooth = [name for name in lags if name in robot.operated and not sharp[name]]
+    dead_time = {name: float(np.median(lags[name])) - expected[name] for name in smooth}
+    usual = float(np.median(list(dead_time.values()))) if dead_time else 0.0
+    if dead_time:
+        verdict = next(words for limit, words in DEAD_TIMES if usual <= limit)
+        text += f". Beyond what kp and damping make of it that is {usual * 1e3:.0f} ms of dead time: {verdict}"
+    level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
+    yield Finding(level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()})
+    for name, late in dead_time.items():
+        if len(dead_time) > 2 and late - usual > MAX_EXTRA_LAG_S and late > 2 * expected[name]:
             text = (
                 f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: its channel is read late, "
                 "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
@@ -57,8 +60,8 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             yield Finding("warning", "lag", text, (name,), {"extra_s": late - usual})
 
 
-def _servo_lag(robot: RobotSpec) -> dict[str, float]:
-    """Lag of a slow motion that kp, kd and the MJCF's damping make, by joint, s."""
+def _expected_lag(robot: RobotSpec) -> dict[str, float]:
+    """Return the lag of a slow motion that kp, kd and the MJCF's damping explain, by joint, s."""
     from gaponet.robot.mjcf import compile_spec, read_mjcf
 
     model = compile_spec(read_mjcf(robot.mjcf), robot.mjcf)
@@ -71,91 +74,79 @@ def _servo_lag(robot: RobotSpec) -> dict[str, float]:
 def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How far from its command does each joint rest, with the lightest and the heaviest payload?"""
     payloads = sorted({s.entry.meta.payload_mass for s in surveys})
-    rests = {
+    errors = {
         p: static_errors([s for s in surveys if s.entry.meta.payload_mass == p], robot)
         for p in dict.fromkeys([payloads[0], payloads[-1]])
     }
-    most = {name: max(abs(e[name].middle) for e in rests.values()) for name in robot.operated}
-    heavy = sorted((name for name in robot.operated if most[name] >= SAG), key=lambda name: -most[name])
-    if heavy:
-        told = [
-            ", ".join(f"{name} {_mrad(e[name])}" for name in heavy[:4]) + (f" with {p:g} kg" if payloads[1:] else "")
-            for p, e in rests.items()
-        ]
-        more = f"; {len(heavy) - 4} more joints above {SAG * 1e3:.0f}" if len(heavy) > 4 else ""
-        text = (
-            f"state − command at rest, mrad: {'; '.join(told)}{more}: sag under load, or an offset. ± is stiction: so "
-            "far to either side of it a joint stays stuck"
+    largest = {name: max(abs(e[name].middle) for e in errors.values()) for name in robot.operated}
+    sagging = sorted((name for name in robot.operated if largest[name] >= MIN_SAG_RAD), key=lambda name: -largest[name])
+    if sagging:
+        by_payload = "; ".join(
+            ", ".join(f"{name} {_mrad(e[name])}" for name in sagging[:4]) + (f" with {p:g} kg" if payloads[1:] else "")
+            for p, e in errors.items()
         )
-        values = {f"{p:g} kg": {name: e[name].middle for name in heavy} for p, e in rests.items()}
-        yield Finding("note", "sag", text, tuple(heavy), values)
-    elif all(e.up + e.down == 0 for by_joint in rests.values() for e in by_joint.values()):
+        more = f"; {len(sagging) - 4} more joints above {MIN_SAG_RAD * 1e3:.0f}" if len(sagging) > 4 else ""
+        text = (
+            f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. ± is stiction: so far "
+            "to either side of it a joint stays stuck"
+        )
+        values = {f"{p:g} kg": {name: e[name].middle for name in sagging} for p, e in errors.items()}
+        yield Finding("note", "sag", text, tuple(sagging), values)
+    elif all(e.up + e.down == 0 for by_joint in errors.values() for e in by_joint.values()):
         text = "the robot never rests under a constant command: sag and offsets cannot be told; add holds"
         yield Finding("note", "sag", text)
-    else:
-        yield Finding("ok", "sag", f"every joint rests within {SAG * 1e3:.0f} mrad of its command")
 
 
 def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Can the torque signal be trusted?"""
-    told = [(s, s.torque) for s in surveys if s.torque is not None]
-    if not told:
+    recorded = [(s, s.torque) for s in surveys if s.torque is not None]
+    if not recorded:
         yield Finding("note", "torque", "no torque recorded; equivalent torque comes from inverse dynamics")
         return
-    low, high = np.min([t.low for _, t in told], axis=0), np.max([t.high for _, t in told], axis=0)
-    used = np.max([s.qpos_range for s, _ in told], axis=0) > 0.05
-    dead, alive = masked_names(robot, used & (low == high)), masked_names(robot, used & (low < high))
+    low, high = np.min([t.low for _, t in recorded], axis=0), np.max([t.high for _, t in recorded], axis=0)
+    used = np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05
+    constant, alive = masked_names(robot, used & (low == high)), masked_names(robot, used & (low < high))
     unsigned = masked_names(robot, used & (low < high) & (low >= 0))
-    found = []
-    if dead:
-        found.append(Finding("warning", "torque", f"torque of {', '.join(dead)} never changes; ignore it", dead))
+    if constant:
+        text = f"torque of {', '.join(constant)} never changes; ignore it"
+        yield Finding("warning", "torque", text, constant)
     if unsigned and unsigned == alive:
         text = (
             "torque is unsigned (never negative, though joints move both ways): a magnitude of the current, not a "
             "torque; do not fit it"
         )
-        found.append(Finding("warning", "torque", text, unsigned))
-    found += _spikes([(s, t) for s, t in told if t.spikes.any()], robot)
-    yield from found or [Finding("ok", "torque", "torque is signed and without spikes")]
-
-
-def _spikes(spiky: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
-    if not spiky:
-        return
-    height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])  # (sequences, n) N·m
-    k, i = np.unravel_index(height.argmax(), height.shape)
-    samples = sum(int(t.spikes.sum()) for _, t in spiky)
-    text = (
-        f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; worst {height[k, i]:.2f} "
-        "N·m on "
-        f"{robot.joint_names[i]} in {spiky[k][0].motion}"
-    )
-    yield Finding("warning", "torque", text, (robot.joint_names[i],), {"samples": samples, "worst": height[k, i]})
+        yield Finding("warning", "torque", text, unsigned)
+    if spiky := [(s, t) for s, t in recorded if t.spikes.any()]:
+        height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])  # (sequences, n) N·m
+        k, i = np.unravel_index(height.argmax(), height.shape)
+        samples = sum(int(t.spikes.sum()) for _, t in spiky)
+        text = (
+            f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; worst {height[k, i]:.2f} "
+            "N·m "
+            f"on {robot.joint_names[i]} in {spiky[k][0].motion}"
+        )
+        values = {"samples": samples, "worst": height[k, i]}
+        yield Finding("warning", "torque", text, (robot.joint_names[i],), values)
 
 
 def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
-    """Lags (s) of each joint over the motions that command it at FAST or more; joints without one are left out."""
-    found = {
-        name: np.array([s.delay[i] for s in surveys if s.speed[i] >= FAST and np.isfinite(s.delay[i])])
+    """Return joint → lags in motions that command it at FAST_COMMAND_RAD_S or more, s; only joints that have any."""
+    lags = {
+        name: np.array([s.delay[i] for s in surveys if s.speed[i] >= FAST_COMMAND_RAD_S and np.isfinite(s.delay[i])])
         for i, name in enumerate(robot.joint_names)
     }
-    return {name: x for name, x in found.items() if len(x)}
+    return {name: x for name, x in lags.items() if len(x)}
 
 
 def lag_values(lags: Array) -> dict[str, float]:
-    """Seconds, and the number of motions."""
-    return {
-        "median": float(np.median(lags)),
-        "min": float(lags.min()),
-        "max": float(lags.max()),
-        "motions": len(lags),
-    }
+    """Return median and range of lags, s, and their number."""
+    return {"median": float(np.median(lags)), "min": float(lags.min()), "max": float(lags.max()), "motions": len(lags)}
 
 
 def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticError]:
-    """Static error of each operated joint over all rests."""
-    holds = Holds.joined([s.holds for s in surveys], len(robot.joint_names))
-    return {name: holds.static_error(j) for name, j in zip(robot.operated, robot.operated_index, strict=True)}
+    """Return the static error of each operated joint over all static poses."""
+    poses = StaticPoses.joined([s.static_poses for s in surveys], len(robot.joint_names))
+    return {name: poses.static_error(j) for name, j in zip(robot.operated, robot.operated_index, strict=True)}
 
 
 def _mrad(error: StaticError) -> str:
@@ -163,4 +154,8 @@ def _mrad(error: StaticError) -> str:
     return f"{error.middle * 1e3:+.0f}{band}"
 
 
-CHECKS = (_lag, _sag, _torque)
+CHECKS = (
+    Check(_lag, "lag", ""),
+    Check(_sag, "sag", f"every joint rests within {MIN_SAG_RAD * 1e3:.0f} mrad of its command"),
+    Check(_torque, "torque", "torque is signed and without spikes"),
+)

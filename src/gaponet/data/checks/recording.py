@@ -1,47 +1,55 @@
-"""Is the recording whole: rate, jitter, gaps, blocked joints, saturated torque, dead channels?"""
+"""Is the recording complete: rate, jitter, gaps, blocked joints, saturated torque, channels without values?"""
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 
 import numpy as np
 
-from gaponet.data.survey import Survey, Torque
+from gaponet.data.checks.check import Check
+from gaponet.data.checks.survey import Survey, Torque
 from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
-COARSE = 3e-3  # rad
-HALTED = 1.0  # s
-ALIKE = 0.02  # share by which an encoder's steps may differ
-ENOUGH = 20  # rows of torque cut off flat
+MAX_JITTER = (0.1, 0.5)  # of a period, up to which jitter is ok and a note
+MIN_BLOCKED_S, MIN_STANDSTILL_S, MIN_REPEATED_S = 0.5, 1.0, 0.25
+MAX_RESOLUTION_RAD = 3e-3  # step between positions; twice as much is a warning
+RESOLUTION_TOLERANCE = 0.02  # relative difference of an encoder's steps
+MIN_FLAT_ROWS, MIN_FLAT_SHARE = 20, 0.01  # of torque cut off at one value; of the torque limit
+
+
+def _motions(surveys: list[Survey]) -> str:
+    return abbreviate([s.motion for s in surveys])
 
 
 def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """At which rate was each sequence recorded?"""
-    groups: dict[float, int] = defaultdict(int)
+    rates: Counter[float] = Counter()
     for s in surveys:
-        groups[next((g for g in groups if abs(g - s.rate_hz) < 0.01 * g), s.rate_hz)] += 1
-    told = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in groups.items())
-    off = max(abs(s.rate_hz * robot.dt - 1) for s in surveys)
-    level = "warning" if len(groups) > 1 else "note" if off > 0.05 else "ok"
-    hint = f"; robot.toml says {1 / robot.dt:.2f} Hz, each sequence keeps its own" if off > 0.001 else ""
-    yield Finding(level, "rate", told + hint, values={f"{r:.2f}": count for r, count in groups.items()})
-    moved = [s.motion for s in surveys if "resampled" in str(s.entry.meta.notes.get("rows", ""))]
-    if moved:
-        yield Finding("note", "rate", f"{len(moved)} sequence(s) were put on a uniform grid: {abbreviate(moved)}")
+        rates[next((r for r in rates if abs(r - s.rate_hz) < 0.01 * r), s.rate_hz)] += 1
+    text = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in rates.items())
+    deviation = max(abs(s.rate_hz * robot.dt - 1) for s in surveys)
+    level = "warning" if len(rates) > 1 else "note" if deviation > 0.05 else "ok"
+    hint = f"; robot.toml says {1 / robot.dt:.2f} Hz, each sequence keeps its own" if deviation > 0.001 else ""
+    yield Finding(level, "rate", text + hint, values={f"{r:.2f}": count for r, count in rates.items()})
+    resampled = [s.motion for s in surveys if "resampled" in str(s.entry.meta.notes.get("rows", ""))]
+    if resampled:
+        yield Finding(
+            "note", "rate", f"{len(resampled)} sequence(s) were put on a uniform grid: {abbreviate(resampled)}"
+        )
 
 
 def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How evenly was it sampled, and what is missing?"""
-    share = [s.jitter_ms * s.rate_hz / 1e3 for s in surveys]  # of a period
-    worst = surveys[int(np.argmax(share))]
-    level = "ok" if max(share) <= 0.1 else "note" if max(share) <= 0.5 else "warning"
+    jitter = [s.jitter_ms * s.rate_hz / 1e3 for s in surveys]  # of a period
+    worst = surveys[int(np.argmax(jitter))]
+    level = "ok" if max(jitter) <= MAX_JITTER[0] else "note" if max(jitter) <= MAX_JITTER[1] else "warning"
     where = f" ({worst.motion})" if worst.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
     yield Finding(level, "jitter", text, values={"jitter_ms": worst.jitter_ms})
     longest = max(surveys, key=lambda s: s.longest_gap_ms)
-    gaps = [s for s in surveys if s.longest_gap_ms * s.rate_hz / 1e3 > 2.5]
+    gaps = [s for s in surveys if s.missing_samples]
     if not gaps:
         yield Finding("ok", "gaps", f"no samples missing; longest period {longest.longest_gap_ms:.2f} ms")
         return
@@ -54,119 +62,108 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is the state somewhere that no joint can reach and leave in one period?"""
-    found = []
     for i, name in enumerate(robot.joint_names):
-        hit = [s for s in surveys if s.jumps[i] > s.dropped]
+        hit = [s for s in surveys if s.jump_rows[i] > s.zero_rows]
         if hit:
+            rows = sum(int(s.jump_rows[i]) for s in hit)
             text = (
-                f"{name} jumps and comes back faster than any motor in {sum(int(s.jumps[i]) for s in hit)} rows of "
-                f"{abbreviate([s.motion for s in hit])}: a misread sample or a wrap of the encoder; repair or cut "
-                "these rows"
+                f"{name} jumps and comes back faster than any motor in {rows} rows of {_motions(hit)}: a misread "
+                "sample or a wrap of the encoder; repair or cut these rows"
             )
-            found.append(Finding("warning", "jumps", text, (name,), {"rows": sum(int(s.jumps[i]) for s in hit)}))
-    dropped = [s for s in surveys if s.dropped]
+            yield Finding("warning", "jumps", text, (name,), {"rows": rows})
+    dropped = [s for s in surveys if s.zero_rows]
     if dropped:
-        rows = sum(s.dropped for s in dropped)
+        rows = sum(s.zero_rows for s in dropped)
         text = (
-            f"all joints are exactly 0 for {rows} rows of {abbreviate([s.motion for s in dropped])}, and far from it "
-            "a row "
-            "before or after: nothing was read there; repair or cut these rows"
+            f"all joints are exactly 0 for {rows} rows of {_motions(dropped)}, and far from it a row before or after: "
+            "nothing was read there; repair or cut these rows"
         )
-        found.append(Finding("warning", "jumps", text, values={"rows": rows}))
-    yield from found or [Finding("ok", "jumps", "no joint jumps")]
+        yield Finding("warning", "jumps", text, values={"rows": rows})
 
 
 def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Was a channel made up for where it could not be?"""
-    told: dict[str, list[Survey]] = defaultdict(list)
+    """Were impossible values of a channel replaced at import?"""
+    by_channel: dict[str, list[Survey]] = defaultdict(list)
     for s in surveys:
         for channel in s.entry.meta.notes.get("nonsense", {}):
-            told[channel].append(s)
-    for channel, found in told.items():
-        notes = [s.entry.meta.notes["nonsense"][channel] for s in found]
+            by_channel[channel].append(s)
+    for channel, hit in by_channel.items():
+        notes = [s.entry.meta.notes["nonsense"][channel] for s in hit]
         rows, done = sum(n["rows"] for n in notes), ", ".join(dict.fromkeys(n["done"] for n in notes))
         joints = tuple(dict.fromkeys(j for n in notes for j in n["joints"]))
         text = (
-            f"{channel} of {abbreviate(list(joints))} was what no joint does (first {notes[0]['worst']:.4g}) in "
-            f"{rows} rows "
-            f"of {abbreviate([s.motion for s in found])}, a counter or a bad read: there it is {done}"
+            f"{channel} of {abbreviate(list(joints))} was what no joint does (first {notes[0]['worst']:.4g}) in {rows} "
+            "rows "
+            f"of {_motions(hit)}, a counter or a bad read: there it is {done}"
         )
         yield Finding("warning", "nonsense", text, joints, {"rows": rows})
-    if not told:
-        yield Finding("ok", "nonsense", "no channel holds what no joint does")
 
 
 def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a joint run into a stop, or were all of them held?"""
-    found = []
-    held = [s for s in surveys if s.halted_s >= HALTED]
+    held = [s for s in surveys if s.standstill_s >= MIN_STANDSTILL_S]
     if held:
-        worst = max(held, key=lambda s: s.halted_s)
+        seconds = max(s.standstill_s for s in held)
         text = (
-            f"all joints stand still for up to {worst.halted_s:.1f} s while their commands move on in "
-            f"{abbreviate([s.motion for s in held])}: an emergency stop, brakes, or drives that were off; cut it out"
+            f"all joints stand still for up to {seconds:.1f} s while their commands move on in {_motions(held)}: an "
+            "emergency stop, brakes, or drives that were off; cut it out"
         )
-        found.append(Finding("warning", "stop", text, (), {"seconds": worst.halted_s}))
+        yield Finding("warning", "stop", text, (), {"seconds": seconds})
     for i, name in enumerate(robot.joint_names):
-        hit = [s for s in surveys if s.blocked_s[i] >= 0.5 and s not in held]
+        hit = [s for s in surveys if s.blocked_s[i] >= MIN_BLOCKED_S and s not in held]
         if hit:
             worst = max(hit, key=lambda s: s.blocked_s[i])
             text = (
                 f"{name} stood at {worst.blocked_at[i]:.2f} rad for {worst.blocked_s[i]:.1f} s, far from its command, "
-                f"in {abbreviate([s.motion for s in hit])}: a stop, an obstacle, too little torque, or not read; "
-                "leave it "
-                "out or cut it"
+                f"in {_motions(hit)}: a stop, an obstacle, too little torque, or not read; leave it out or cut it"
             )
             values = {"at_rad": float(worst.blocked_at[i]), "seconds": float(worst.blocked_s[i])}
-            found.append(Finding("warning" if name in robot.operated else "note", "blocked", text, (name,), values))
-    yield from found or [Finding("ok", "blocked", "no joint ran into a stop")]
+            yield Finding("warning" if name in robot.operated else "note", "blocked", text, (name,), values)
 
 
 def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a motor reach its torque limit?"""
-    told = [(s, s.torque) for s in surveys if s.torque is not None]
-    over = [(s, t) for s, t in told if t.over_limit.any()]
+    recorded = [(s, s.torque) for s in surveys if s.torque is not None]
+    over = [(s, t) for s, t in recorded if t.over_limit.any()]
     if not over:
-        found = [*_flat(told, robot)]
-        yield from found or [Finding("ok", "saturation", "no torque at a limit" if told else "no torque recorded")]
+        ok = Finding("ok", "saturation", "no torque at a limit" if recorded else "no torque recorded")
+        yield from [*_flat_torque(recorded, robot)] or [ok]
         return
     worst = np.max([np.maximum(-t.low, t.high) for _, t in over], axis=0)  # (n,) N·m
     i = int((worst / robot.effort_limit).argmax())
     rows = sum(int(t.over_limit.sum()) for _, t in over)
     text = (
-        f"torque beyond the limit of robot.toml in {rows} rows of {abbreviate([s.motion for s, _ in over])}; worst "
+        f"torque beyond the limit of robot.toml in {rows} rows of {_motions([s for s, _ in over])}; worst "
         f"{worst[i]:.2f} N·m on {robot.joint_names[i]} (limit {robot.effort_limit[i]:.2f}): a collision, a spike or a "
         "wrong limit"
     )
     yield Finding("warning", "saturation", text, (robot.joint_names[i],), {"rows": rows, "worst": float(worst[i])})
 
 
-def _flat(told: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
-    """Torques cut off flat, above a hundredth of the limit."""
+def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
+    """Find torques that are cut off at one value below the limit of robot.toml."""
     for i, name in enumerate(robot.joint_names):
-        top = max((max(-float(t.low[i]), float(t.high[i])) for _, t in told), default=0.0)
-        near = [(s, t) for s, t in told if max(-t.low[i], t.high[i]) > 0.999 * top]
+        top = max((max(-float(t.low[i]), float(t.high[i])) for _, t in recorded), default=0.0)
+        near = [(s, t) for s, t in recorded if max(-t.low[i], t.high[i]) > 0.999 * top]
         rows = sum(int(t.flat[i]) for _, t in near)
-        if top > 0.01 * robot.effort_limit[i] and rows >= ENOUGH:
+        if top > MIN_FLAT_SHARE * robot.effort_limit[i] and rows >= MIN_FLAT_ROWS:
             text = (
-                f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "
-                f"{abbreviate([s.motion for s, _ in near])}: the motor or its driver gives no more. Write "
-                "effort_limit = "
-                f"{top:.3g} in robot.toml, or leave these out"
+                f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of {_motions([s for s, _ in near])}:"
+                f" the motor or its driver gives no more. Write effort_limit = {top:.3g} in robot.toml, or leave these "
+                "out"
             )
             yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
 
 
 def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Are positions told finely enough?"""
-    step = np.max([s.step for s in surveys], axis=0)
-    degrees = (
-        masked_names(robot, np.abs(np.radians(step) / np.median(step[step > 0]) - 1) < ALIKE) if step.any() else ()
-    )
+    """Are positions recorded finely enough?"""
+    step = np.max([s.resolution for s in surveys], axis=0)
+    ratio = np.radians(step) / np.median(step[step > 0]) if step.any() else np.zeros_like(step)
+    degrees = masked_names(robot, np.abs(ratio - 1) < RESOLUTION_TOLERANCE)
     if degrees and len(degrees) < (step > 0).sum() / 2:
         text = f"{', '.join(degrees)} is told in steps 57.3 times as coarse as other joints: degrees beside radians?"
         yield Finding("warning", "unit", f"{text} Import again with the right unit", degrees)
-    coarse = [(float(x), name) for x, name in zip(step, robot.joint_names, strict=True) if x > COARSE]
+    coarse = [(float(x), name) for x, name in zip(step, robot.joint_names, strict=True) if x > MAX_RESOLUTION_RAD]
     if not coarse:
         yield Finding("ok", "resolution", f"positions are told in steps of at most {step.max() * 1e3:.2f} mrad")
         return
@@ -177,42 +174,48 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         "rounded when logged, or a coarse encoder (12 bits: 1.5 mrad). No error below half of that can be seen; log "
         "more digits"
     )
-    level = "warning" if worst > 2 * COARSE else "note"
+    level = "warning" if worst > 2 * MAX_RESOLUTION_RAD else "note"
     yield Finding(level, "resolution", text, tuple(name for _, name in coarse), {"step": worst})
 
 
 def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does every channel change when it should?"""
-    found = []
     for i, name in enumerate(robot.joint_names):
-        asked = [s for s in surveys if s.ctrl_range[i] > 0.1]
-        still = [s for s in asked if s.qpos_range[i] < 0.03 and s.qpos_range[i] < 0.05 * s.ctrl_range[i]]
+        moved = [s for s in surveys if s.ctrl_range[i] > 0.1]
+        still = [s for s in moved if s.qpos_range[i] < 0.03 and s.qpos_range[i] < 0.05 * s.ctrl_range[i]]
         if still:
             text = (
-                f"{name} does not move when commanded in {abbreviate([s.motion for s in still])}: unplugged, torque "
-                "off or "
-                "not read; leave these out"
+                f"{name} does not move when commanded in {_motions(still)}: unplugged, torque off or not read; leave "
+                "these out"
             )
-            found.append(Finding("error" if len(still) == len(asked) else "warning", "stuck", text, (name,)))
-        # At a stop an encoder's steps repeat one number too: `_blocked` says that.
-        steps = any(s.step[i] for s in surveys)
-        stopped = [s for s in surveys if s.stopped_s[i] > 0.25 and s not in still and not (steps and s.blocked_s[i])]
-        if stopped and not any(s.frozen_s > 0.25 for s in stopped):
-            worst = max(stopped, key=lambda s: s.stopped_s[i])
+            yield Finding("error" if len(still) == len(moved) else "warning", "stuck", text, (name,))
+        # At a stop, an encoder with coarse steps repeats one number too: _blocked reports that.
+        steps = any(s.resolution[i] for s in surveys)
+        repeated = [s for s in surveys if s.repeated_s[i] > MIN_REPEATED_S and s not in still]
+        repeated = [s for s in repeated if not (steps and s.blocked_s[i])]
+        if repeated and not any(s.all_repeated_s > MIN_REPEATED_S for s in repeated):
+            seconds = max(s.repeated_s[i] for s in repeated)
             text = (
-                f"{name} repeats one number for up to {worst.stopped_s[i]:.2f} s while its command moves on in "
-                f"{abbreviate([s.motion for s in stopped])}: it was not read; cut these logs there"
+                f"{name} repeats one number for up to {seconds:.2f} s while its command moves on in "
+                f"{_motions(repeated)}: it was not read; cut these logs there"
             )
-            found.append(Finding("warning", "stuck", text, (name,)))
-    frozen = [s for s in surveys if s.frozen_s > 0.25]
+            yield Finding("warning", "stuck", text, (name,))
+    frozen = [s for s in surveys if s.all_repeated_s > MIN_REPEATED_S]
     if frozen:
-        worst = max(frozen, key=lambda s: s.frozen_s)
         text = (
-            f"the whole state repeats itself for up to {worst.frozen_s:.2f} s while the command moves in "
-            f"{abbreviate([s.motion for s in frozen])}: samples were lost; cut the logs there"
+            f"the whole state repeats itself for up to {max(s.all_repeated_s for s in frozen):.2f} s while the command "
+            f"moves in {_motions(frozen)}: samples were lost; cut the logs there"
         )
-        found.append(Finding("warning", "stuck", text))
-    yield from found or [Finding("ok", "stuck", "every channel changes when it should")]
+        yield Finding("warning", "stuck", text)
 
 
-CHECKS = (_rate, _regularity, _jumps, _nonsense, _blocked, _saturation, _resolution, _stuck)
+CHECKS = (
+    Check(_rate, "rate", ""),
+    Check(_regularity, "jitter", ""),
+    Check(_jumps, "jumps", "no joint jumps"),
+    Check(_nonsense, "nonsense", "no channel holds what no joint does"),
+    Check(_blocked, "blocked", "no joint ran into a stop"),
+    Check(_saturation, "saturation", ""),
+    Check(_resolution, "resolution", ""),
+    Check(_stuck, "stuck", "every channel changes when it should"),
+)

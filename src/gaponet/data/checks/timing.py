@@ -8,104 +8,111 @@ from collections.abc import Iterator
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.data.checks.check import Check
+from gaponet.data.checks.survey import SPECTRUM_HZ, Survey
 from gaponet.data.signals import Response
-from gaponet.data.survey import HERTZ, Survey
 from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
-ROUNDS = 6  # of shifts and of what all follow
-FEW = 4  # recordings that say nothing of one among them
-LATE, FAR = 0.012, 4.0  # s, and times the usual scatter, by which a recording follows later than the others
-FIRST = -0.015  # s: joints that begin so long before their command
-EARLY = 1.08  # times as much unexplained without commands to come, from which joints begin before them
-LONG, APART = 0.1, 0.05  # s: dead time worth a warning; of one joint beyond the others'
-DEAD_TIMES = (
-    (0.035, "as good as no dead time"), (LONG, "usual for a bus, a servo's firmware and its inertia"),
+MAX_ITERATIONS = 6  # of estimating shifts and the common response in turn
+MIN_RECORDINGS = 4  # from which one of them can be compared with the others
+MIN_SHIFT_S, SHIFT_SCATTERS = 0.012, 4.0  # by which a recording follows later than the others; times their scatter
+MIN_LEAD_S = 0.015  # by which joints begin to move before their commands
+MIN_EARLY_RATIO = 1.08  # unexplained motion without future commands over that with them, if joints move before them
+MAX_DEAD_TIME_S, MAX_EXTRA_LAG_S = 0.1, 0.05  # of all joints; of one joint beyond the others
+DEAD_TIMES = (  # up to s, verdict
+    (0.035, "as good as no dead time"), (MAX_DEAD_TIME_S, "usual for a bus, a servo's firmware and its inertia"),
     (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
-DRIFT, SURE, OWN, LASTS = 3e-4, 4.5, 0.7, 10.0  # s a second; errors; what of one motions differ by; s of a recording
-NOTCH = 1.5  # depth, natural logarithm of power
-WIDTHS = np.geomspace(0.04, 0.4, 150)  # of an average, s
-GAP = 2.5  # periods without a sample
+MIN_DRIFT, MIN_DRIFT_ERRORS = 3e-4, 4.5  # s/s; standard errors
+MOTION_SHARE, MIN_DRIFT_DURATION_S = 0.7, 10.0  # of the scatter that motions explain; recordings that show a drift
+MIN_NOTCH_DEPTH = 1.5  # natural logarithm of power
+AVERAGING_WIDTHS_S = np.geomspace(0.04, 0.4, 150)
 
 
 def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Are commands and states of one time, and is their clock one clock?"""
+    """Do commands and states have one clock?"""
     step = Counter(s.response.step for s in surveys).most_common(1)[0][0]
-    every = [s for s in surveys if s.response.step == step]
-    # Across a hole states are interpolated: they begin to move before anything was measured.
-    same = [s for s in every if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or every
-    found = [*_late(every)]
-    odd = {recording for f in found for recording in f.values["recordings"]}
-    told = Response.following([s.response for s in same], [s.entry.id not in odd for s in same])
-    known = np.isfinite(told.onset)
-    onset = float(np.median(told.onset[known])) if known.any() else np.nan
-    onset = max(onset, 0.0) if known.any() and np.median(told.early[known]) < EARLY else onset
-    apart = SURE * _scatter(told.onset - onset)
-    if onset < FIRST - step or onset < -max(-FIRST / 3, step, apart):
+    comparable = [s for s in surveys if s.response.step == step]
+    # Across a gap states are interpolated: they begin to move before anything was measured.
+    complete = [s for s in comparable if not s.missing_samples] or comparable
+    findings = [*_late_recordings(comparable)]
+    odd = {recording for f in findings for recording in f.values["recordings"]}
+    common = Response.common([s.response for s in complete], [s.entry.id not in odd for s in complete])
+    known = np.isfinite(common.onset)
+    onset = float(np.median(common.onset[known])) if known.any() else np.nan
+    if known.any() and np.median(common.early[known]) < MIN_EARLY_RATIO:
+        onset = max(onset, 0.0)
+    error = MIN_DRIFT_ERRORS * _standard_error(common.onset - onset)
+    if onset < -MIN_LEAD_S - step or onset < -max(MIN_LEAD_S / 3, step, error):
         text = (
             f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and state swapped, or are "
             "their clocks apart? Shift one of them at import"
         )
-        found.append(Finding("error", "copied", text, (), {"onset_s": onset}))
+        findings.append(Finding("error", "copied", text, (), {"onset_s": onset}))
     elif np.isfinite(onset):
-        words = next(word for most, word in DEAD_TIMES if onset <= most)
-        text = f"joints begin to move {max(onset, 0) * 1e3:.0f} ms after their commands: {words}"
-        yield Finding("warning" if onset > LONG else "ok", "lag", text, (), {"onset_s": onset})
-    for name, late in zip(robot.operated, told.onset - onset, strict=True):
-        if late > APART and np.isfinite(told.onset).sum() > 2:
+        verdict = next(words for limit, words in DEAD_TIMES if onset <= limit)
+        text = f"joints begin to move {max(onset, 0) * 1e3:.0f} ms after their commands: {verdict}"
+        yield Finding("warning" if onset > MAX_DEAD_TIME_S else "ok", "lag", text, (), {"onset_s": onset})
+    for name, extra in zip(robot.operated, common.onset - onset, strict=True):
+        if extra > MAX_EXTRA_LAG_S and np.isfinite(common.onset).sum() > 2:
             text = (
-                f"{name} begins to move {late * 1e3:.0f} ms later than the other joints: its channel is read late, "
+                f"{name} begins to move {extra * 1e3:.0f} ms later than the other joints: its channel is read late, "
                 "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
             )
-            found.append(Finding("warning", "lag", text, (name,), {"extra_s": float(late)}))
-    found += _drift(same, told.shifts)
-    asked, moved = np.mean([s.spectra for s in same], axis=0)
-    width, depth = _averaged(moved)
-    if depth > NOTCH and _averaged(asked, np.array([width]))[1] < depth / 3:  # steps at a regular pace have notches too
+            findings.append(Finding("warning", "lag", text, (name,), {"extra_s": float(extra)}))
+    findings += _drift(complete, common.shifts)
+    commanded, moved = np.mean([s.spectra for s in complete], axis=0)
+    width, depth = _averaging(moved)
+    # Steps at a regular pace have notches too.
+    if depth > MIN_NOTCH_DEPTH and _averaging(commanded, np.array([width]))[1] < depth / 3:
         text = (
             f"states never move at the multiples of {1 / width:.1f} Hz, as averages over {width * 1e3:.0f} ms: log the "
             "encoder itself; what is averaged is late, and fast motions are lost"
         )
-        found.append(Finding("warning", "averaged", text, (), {"width_s": width}))
-    yield from found or [Finding("ok", "timing", "commands and states keep one time")]
+        findings.append(Finding("warning", "averaged", text, (), {"width_s": width}))
+    yield from findings or [Finding("ok", "timing", "commands and states keep one time")]
 
 
-def _scatter(away: Array) -> float:
-    """Standard error of a median from which values are so far away; those unknown do not count."""
-    known = np.abs(away[np.isfinite(away)])
+def _standard_error(deviations: Array) -> float:
+    """Return the standard error of a median from the deviations of the values; unknown ones do not count."""
+    known = np.abs(deviations[np.isfinite(deviations)])
     return 1.48 * float(np.median(known)) / np.sqrt(len(known)) if len(known) else np.inf
 
 
-def _shifts(own: list[Response]) -> Array:
-    """How much later each recording follows than all do, (recordings) s: found together with how all follow, since
-    one that is late bends what is found of the others."""
-    more = Response.following(own).whole
-    found = np.where(np.isfinite(more), 0.0, np.nan)
-    for _ in range(ROUNDS if np.isfinite(found).sum() >= FEW else 0):
-        away = np.nan_to_num(more - np.nanmedian(more))
-        if not (far := np.abs(away) > LATE / 2).any():
+def _shifts(responses: list[Response]) -> Array:
+    """Return how much later each recording follows than all do, (recordings) s.
+
+    Shifts and the common response are estimated in turn, since a late recording changes the common response.
+    """
+    more = Response.common(responses).whole
+    shifts = np.where(np.isfinite(more), 0.0, np.nan)
+    for _ in range(MAX_ITERATIONS if np.isfinite(shifts).sum() >= MIN_RECORDINGS else 0):
+        deviation = np.nan_to_num(more - np.nanmedian(more))
+        if not (far := np.abs(deviation) > MIN_SHIFT_S / 2).any():
             break
-        found = found + np.where(far, away, 0.0)
-        more = Response.following([r.later(-s) for r, s in zip(own, found, strict=True)]).whole
-    return found + np.nan_to_num(more)
+        shifts = shifts + np.where(far, deviation, 0.0)
+        more = Response.common([r.later(-s) for r, s in zip(responses, shifts, strict=True)]).whole
+    return shifts + np.nan_to_num(more)
 
 
-def _late(surveys: list[Survey]) -> Iterator[Finding]:
-    away = _shifts([s.response for s in surveys])
-    if np.isfinite(away).sum() < FEW:
+def _late_recordings(surveys: list[Survey]) -> Iterator[Finding]:
+    shifts = _shifts([s.response for s in surveys])
+    if np.isfinite(shifts).sum() < MIN_RECORDINGS:
         return
-    away = away - np.nanmedian(away)
-    usual = max(1.48 * float(np.nanmedian(np.abs(away))), 1e-3)
-    far = [(s, late) for s, late in zip(surveys, away.tolist(), strict=True) if abs(late) > max(LATE, FAR * usual)]
-    for word, these in (("later", [f for f in far if f[1] > 0]), ("sooner", [f for f in far if f[1] < 0])):
-        alone = len(these) < FEW
-        for part in [[one] for one in these] if alone else [these]:
-            which = [f"{s.motion} ({s.entry.meta.unit_id}, {s.entry.meta.payload_mass:g} kg)" for s, _ in part]
+    shifts = shifts - np.nanmedian(shifts)
+    scatter = max(1.48 * float(np.nanmedian(np.abs(shifts))), 1e-3)
+    limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter)
+    far = [(s, late) for s, late in zip(surveys, shifts.tolist(), strict=True) if abs(late) > limit]
+    for word, group in (("later", [f for f in far if f[1] > 0]), ("sooner", [f for f in far if f[1] < 0])):
+        single = len(group) < MIN_RECORDINGS
+        for part in [[one] for one in group] if single else [group]:
+            labels = [f"{s.motion} ({s.entry.meta.unit_id}, {s.entry.meta.payload_mass:g} kg)" for s, _ in part]
             ms = sorted(abs(late) * 1e3 for _, late in part)
-            by = f"{ms[0]:.0f} ms" if alone else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
+            by = f"{ms[0]:.0f} ms" if single else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
             text = (
-                f"{abbreviate(which)} {'follows its' if alone else 'follow their'} commands {by} {word} than the other "
+                f"{abbreviate(labels)} {'follows its' if single else 'follow their'} commands {by} {word} than the "
+                "other "
                 "recordings: clocks of command and state that are apart, another servo, or friction in slow motions; "
                 "leave them out if it is the clocks"
             )
@@ -113,17 +120,20 @@ def _late(surveys: list[Survey]) -> Iterator[Finding]:
             yield Finding("warning", "lag", text, (), values)
 
 
-def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
-    long = (between := np.array([s.response.duration for s in surveys])) >= LASTS  # in less friction shifts more
-    between = between[long] * (1 - 1 / shifts.shape[1])
+def _drift(surveys: list[Survey], shifts: Array) -> Iterator[Finding]:
+    """Find a clock drift from the shifts (recordings, parts) s of the parts of each recording."""
+    duration = np.array([s.response.duration for s in surveys])
+    long = duration >= MIN_DRIFT_DURATION_S  # in shorter recordings friction changes the shift
+    between = duration[long] * (1 - 1 / shifts.shape[1])
     first, middle, last = shifts[long, 0], shifts[long, 1:-1].mean(axis=1), shifts[long, -1]
-    slope, bent = (last - first) / between, (last + first - 2 * middle) / between / np.sqrt(3)
-    slope, bent = slope[np.isfinite(slope)], bent[np.isfinite(bent)]  # of one that drifts, what bends is chance
-    if len(slope) < FEW:
+    slope, curvature = (last - first) / between, (last + first - 2 * middle) / between / np.sqrt(3)
+    slope, curvature = slope[np.isfinite(slope)], curvature[np.isfinite(curvature)]  # a drift has no curvature
+    if len(slope) < MIN_RECORDINGS:
         return
     drift = float(np.median(slope))
-    error = max(OWN * _scatter(slope - drift), _scatter(bent), 2e-3 / float(between.max()) / np.sqrt(len(slope)))
-    if abs(drift) > max(DRIFT, SURE * error):
+    resolution = 2e-3 / float(between.max()) / np.sqrt(len(slope))
+    error = max(MOTION_SHARE * _standard_error(slope - drift), _standard_error(curvature), resolution)
+    if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error):
         text = (
             f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
             f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; log them with one"
@@ -131,22 +141,23 @@ def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
         yield Finding("error", "clock", text, (), {"drift": drift})
 
 
-def _averaged(levels: Array, widths: Array = WIDTHS) -> tuple[float, float]:
-    """Width in s of the average that best explains notches at its multiples in `levels` (H), and how deep they are."""
+def _averaging(levels: Array, widths: Array = AVERAGING_WIDTHS_S) -> tuple[float, float]:
+    """Return the width, s, of the moving average that best explains notches in a spectrum (H), and their depth."""
     best = (0.0, 0.0)
-    known = HERTZ[np.isfinite(levels)]
+    known = SPECTRUM_HZ[np.isfinite(levels)]
     if not len(known):
         return best
     for width in widths:
-        depth = []
+        depths = []
         for k in range(1, 5):
             if (k + 0.4) / width > known[-1]:
                 break
-            near = levels[np.abs(HERTZ - k / width) < max(0.11, 0.012 * k / width)].min()
-            depth.append(np.interp([(k - 0.35) / width, (k + 0.35) / width], HERTZ, levels).mean() - near)
-        if depth and min(depth) > best[1]:
-            best = (float(width), float(min(depth)))
+            notch = levels[np.abs(SPECTRUM_HZ - k / width) < max(0.11, 0.012 * k / width)].min()
+            sides = np.interp([(k - 0.35) / width, (k + 0.35) / width], SPECTRUM_HZ, levels)
+            depths.append(sides.mean() - notch)
+        if depths and min(depths) > best[1]:
+            best = (float(width), float(min(depths)))
     return best
 
 
-CHECKS = (_timing,)
+CHECKS = (Check(_timing, "timing", ""),)

@@ -1,4 +1,4 @@
-"""Is the log what it says: order, sign, unit and range of its joints, and its labels?"""
+"""Do the logs mean what they say: order, sign, unit and range of their joints, and their labels?"""
 
 from __future__ import annotations
 
@@ -8,209 +8,211 @@ from collections.abc import Iterator
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.data.survey import Survey
+from gaponet.data.checks.check import Check
+from gaponet.data.checks.survey import Survey
 from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
-SCALE = (0.5, 1.25)  # a loaded joint falls short of its commands, and beyond them where its load stands on it
-OWN, OTHER, SEVERAL = 0.8, 0.95, 3  # correlations with the own joint and another's, and the motions to tell it
-APART, ALIKE = 0.7, 0.7  # of the state's own spread from its command; correlation with what else a command may be
-MOVED = 0.05  # a joint commanded over less says nothing about order, sign and unit, rad
+MIN_COMMAND_RAD = 0.05  # a joint with a smaller command range shows neither order, sign nor unit
+SLOPE_BOUNDS = (0.5, 1.25)  # a loaded joint falls short of its command, or passes it if its load is on top
+MAX_OWN_CORRELATION, MIN_OTHER_CORRELATION, MIN_MOTIONS = 0.8, 0.95, 3  # of a swap that shows in several motions
+MAX_DISTANCE = 0.7  # of positions from position commands, in standard deviations of the positions
+MIN_KIND_CORRELATION = 0.7  # of the command with what else it may be
+RATIO_BOUNDS = (0.03, 10.0)  # measured over commanded range; between 0.03 and 0.1 a joint may be stuck
+QVEL_RATIO_BOUNDS = (0.5, 2.0)
+MIN_WIDEST_COMMAND_RAD = 0.12
+
+
+def _moved(surveys: list[Survey], joint: int) -> list[Survey]:
+    return [s for s in surveys if s.ctrl_range[joint] > MIN_COMMAND_RAD]
 
 
 def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does each command move its own joint?"""
-    guilty: dict[tuple[int, int], list[float]] = defaultdict(list)
-    asked = np.zeros(len(robot.joint_names), int)
+    candidates: dict[tuple[int, int], list[float]] = defaultdict(list)
+    motions = np.zeros(len(robot.joint_names), int)
     for s in surveys:
-        moved = s.ctrl_range > MOVED
-        asked += moved
+        moved = s.ctrl_range > MIN_COMMAND_RAD
+        motions += moved
         for i in np.flatnonzero(moved & (np.diag(s.follows) < 0.3) & (np.diag(s.opposes) < 0.6)):
             others = np.flatnonzero((s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6)))
             if others.size:
                 j = int(others[s.follows[i, others].argmax()])
-                guilty[int(i), j].append(float(s.follows[i, j]))
-    guilty |= _together(surveys, asked)
-    swapped = {pair: found for pair, found in guilty.items() if 2 * len(found) >= asked[pair[0]]}
-    for (own, other), found in swapped.items():
+                candidates[int(i), j].append(float(s.follows[i, j]))
+    candidates |= _swapped_pairs(surveys, motions)
+    swapped = {pair: found for pair, found in candidates.items() if 2 * len(found) >= motions[pair[0]]}
+    for (own, other), correlations in swapped.items():
         a, b = robot.joint_names[own], robot.joint_names[other]
         text = (
-            f"the command of {a} moves {b}, not {a} (correlation {np.median(found):.2f}, {len(found)} of {asked[own]} "
-            "motions): names are swapped; import again with --map NAME_IN_LOG=NAME_OF_ROBOT"
+            f"the command of {a} moves {b}, not {a} (correlation {np.median(correlations):.2f}, {len(correlations)} of "
+            f"{motions[own]} motions): names are swapped; import again with --map NAME_IN_LOG=NAME_OF_ROBOT"
         )
         yield Finding("error", "order", text, (a, b))
-    idle = tuple(name for name, count in zip(robot.joint_names, asked, strict=True) if not count)
+    idle = tuple(name for name, count in zip(robot.joint_names, motions, strict=True) if not count)
     if idle:
         level = "warning" if set(idle) & set(robot.operated) else "note"
-        text = f"no motion commands {abbreviate(list(idle))} over more than {MOVED:g} rad: nothing can be learned there"
-        yield Finding(level, "order", text, idle)
+        text = f"no motion commands {abbreviate(list(idle))} over more than {MIN_COMMAND_RAD:g} rad"
+        yield Finding(level, "order", f"{text}: nothing can be learned there", idle)
     if not swapped:
         yield Finding("ok", "order", "each command moves the joint of its name")
 
 
-def _together(surveys: list[Survey], asked: Array) -> dict[tuple[int, int], list[float]]:
-    """Pairs in each other's place, told over several motions: in one, joints that move together look alike."""
+def _swapped_pairs(surveys: list[Survey], motions: Array) -> dict[tuple[int, int], list[float]]:
+    """Return swapped joints over several motions; in one motion, joints that move together look alike."""
     follows = np.array([s.follows for s in surveys])  # (sequences, n, n)
     own = np.median(np.diagonal(follows, axis1=1, axis2=2), axis=0)
     cross = np.median(follows, axis=0)
-    found = {}
-    for i in np.flatnonzero((asked >= SEVERAL) & (own < OWN)):
+    pairs = {}
+    for i in np.flatnonzero((motions >= MIN_MOTIONS) & (own < MAX_OWN_CORRELATION)):
         j = int(cross[i].argmax())
-        if j != i and min(cross[i, j], cross[j, i]) > OTHER and own[j] < OWN:
-            found[int(i), j] = follows[follows[:, i, j] > OTHER, i, j].tolist()
-    return found
+        if j != i and min(cross[i, j], cross[j, i]) > MIN_OTHER_CORRELATION and own[j] < MAX_OWN_CORRELATION:
+            pairs[int(i), j] = follows[follows[:, i, j] > MIN_OTHER_CORRELATION, i, j].tolist()
+    return pairs
 
 
 def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are the commands positions?"""
     column = lambda field: np.stack([getattr(s, field) for s in surveys])[:, robot.operated_index]  # noqa: E731
-    beside = column("beside")
-    judged = np.isfinite(beside) & (np.stack([s.ctrl_range for s in surveys])[:, robot.operated_index] > 0)
-    if not judged.any() or float(np.median(beside[judged])) < APART:
-        yield Finding("ok", "command", "commands are positions that the joints come near")
+    distance = column("command_distance")
+    judged = np.isfinite(distance) & (column("ctrl_range") > 0)
+    if not judged.any() or float(np.median(distance[judged])) < MAX_DISTANCE:
         return
-    like = {
-        what: float(np.median(column(f)[judged]))
-        for what, f in (("velocities", "as_velocity"), ("torques", "as_torque"))
+    correlation = {
+        kind: float(np.median(column(field)[judged]))
+        for kind, field in (("velocities", "velocity_correlation"), ("torques", "torque_correlation"))
     }
-    best = max(like, key=lambda what: np.nan_to_num(like[what]))
-    what = f"they are most like {best} (correlation {like[best]:.2f})" if like[best] > ALIKE else "are they torques?"
+    best = max(correlation, key=lambda kind: np.nan_to_num(correlation[kind]))
+    kind = f"they are most like {best} (correlation {correlation[best]:.2f})"
+    kind = kind if correlation[best] > MIN_KIND_CORRELATION else "are they torques?"
     text = (
-        f"states are {np.median(beside[judged]):.2f} times as far from their commands as from their own mean: these "
-        f"are no position targets; {what}. Log the targets of the position controller"
+        f"states are {np.median(distance[judged]):.2f} times as far from their commands as from their own mean: these "
+        f"are no position targets; {kind}. Log the targets of the position controller"
     )
-    yield Finding("error", "command", text, (), like)
+    yield Finding("error", "command", text, (), correlation)
 
 
 def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Does each joint move the way it is told?"""
-    wrong = []
+    """Does each joint move in the direction of its command?"""
     for i, name in enumerate(robot.joint_names):
-        asked = [s for s in surveys if s.ctrl_range[i] > MOVED]
-        against = [s for s in asked if s.opposes[i, i] > 0.6 and s.follows[i, i] < 0.3]
-        if against and 2 * len(against) >= len(asked):
-            wrong.append(name)
+        moved = _moved(surveys, i)
+        against = [s for s in moved if s.opposes[i, i] > 0.6 and s.follows[i, i] < 0.3]
+        if against and 2 * len(against) >= len(moved):
             text = (
-                f"{name} moves against its command in {len(against)} of {len(asked)} motions: command and state have "
+                f"{name} moves against its command in {len(against)} of {len(moved)} motions: command and state have "
                 "opposite signs; negate one of them and import again"
             )
             yield Finding("error", "sign", text, (name,))
-    if not wrong:
-        yield Finding("ok", "sign", "no joint moves against its command")
 
 
 def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are command and state two signals, and does the command come first?"""
-    found, copies = [], {}
+    copies: dict[str, list[str]] = {}
     for i, name in enumerate(robot.joint_names):
-        asked = [s for s in surveys if s.ctrl_range[i] > MOVED]
-        same = [s for s in asked if s.copied[i]]
-        first = [s for s in asked if np.isfinite(s.lead[i])]
-        if same:
-            copies[name] = [s.motion for s in same]
-        elif len(first) > 0.5 * len(asked):
-            lead = float(np.median([s.lead[i] for s in first]))
+        moved = _moved(surveys, i)
+        copied = [s.motion for s in moved if s.equals_command[i]]
+        leads = [s.lead[i] for s in moved if np.isfinite(s.lead[i])]
+        if copied:
+            copies[name] = copied
+        elif len(leads) > 0.5 * len(moved):
+            lead = float(np.median(leads))
             text = (
-                f"{name} moves {lead * 1e3:.0f} ms before its command in {len(first)} of {len(asked)} motions: are "
+                f"{name} moves {lead * 1e3:.0f} ms before its command in {len(leads)} of {len(moved)} motions: are "
                 "command and state swapped, or their clocks apart?"
             )
-            found.append(Finding("error", "copied", text, (name,), {"lead_s": lead}))
+            yield Finding("error", "copied", text, (name,), {"lead_s": lead})
     if copies:
-        where = [motion for motions in copies.values() for motion in motions]
+        motions = [motion for of_joint in copies.values() for motion in of_joint]
         text = (
-            f"command and state of {abbreviate(list(copies))} are the same numbers in {abbreviate(where)}: one was "
-            "logged as both; "
-            "log the command that the servo was sent"
+            f"command and state of {abbreviate(list(copies))} are the same numbers in {abbreviate(motions)}: one was "
+            "logged as "
+            "both; log the command that the servo was sent"
         )
-        found.append(Finding("error", "copied", text, tuple(copies)))
-    yield from found or [Finding("ok", "copied", "commands come before states")]
+        yield Finding("error", "copied", text, tuple(copies))
 
 
 def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Are commands, positions and velocities in the same unit, and is it the radian?"""
+    """Are commands, positions and velocities in the same unit, the radian?"""
+    median = lambda values: float(np.median(values)) if values else 1.0  # noqa: E731
     wrong = []
     for i, name in enumerate(robot.joint_names):
-        asked = [s.qpos_range[i] / s.ctrl_range[i] for s in surveys if s.ctrl_range[i] > MOVED]
-        ratio = float(np.median(asked)) if asked else 1.0
-        if ratio > 10 or 0 < ratio < 0.03:  # between 0.03 and 0.1 it may as well be stuck
+        ratio = median([s.qpos_range[i] / s.ctrl_range[i] for s in _moved(surveys, i)])
+        if ratio > RATIO_BOUNDS[1] or 0 < ratio < RATIO_BOUNDS[0]:
             text = (
                 f"{name} moves {ratio:.3g} times as far as commanded (57.3 and 0.0175 are degrees beside radians): "
                 "import again with the right units"
             )
             wrong.append(Finding("error", "unit", text, (name,), {"ratio": ratio}))
-        slopes = [s.slope[i] for s in surveys if np.isfinite(s.slope[i])]
-        slope = float(np.median(slopes)) if slopes else 1.0
-        if not wrong and (slope > SCALE[1] or 0.1 < slope < SCALE[0]):
+        slope = median([s.slope[i] for s in surveys if np.isfinite(s.slope[i])])
+        if not wrong and (slope > SLOPE_BOUNDS[1] or 0.1 < slope < SLOPE_BOUNDS[0]):
             text = (
                 f"{name} goes {slope:.2f} rad where its command goes 1 rad: another scale (a gear, a range, ticks a "
                 "turn), or a motor that does not reach its targets; check both at a right angle"
             )
             wrong.append(Finding("warning", "unit", text, (name,), {"slope": slope}))
-        gains = [s.qvel_gain[i] for s in surveys if np.isfinite(s.qvel_gain[i]) and s.qpos_range[i] > 20 * s.step[i]]
-        gain = float(np.median(gains)) if gains else 1.0
-        if not 0.5 < gain < 2:
+        moved = [s for s in surveys if np.isfinite(s.qvel_ratio[i]) and s.qpos_range[i] > 20 * s.resolution[i]]
+        ratio = median([s.qvel_ratio[i] for s in moved])
+        if not QVEL_RATIO_BOUNDS[0] < ratio < QVEL_RATIO_BOUNDS[1]:
             text = (
-                f"recorded velocity of {name} is {gain:.3g} times the derivative of its position: not rad/s; leave the "
-                "velocity out at import, it is then computed"
+                f"recorded velocity of {name} is {ratio:.3g} times the derivative of its position: not rad/s; leave "
+                "the velocity out at import, it is then computed"
             )
-            wrong.append(Finding("warning", "unit", text, (name,), {"ratio": gain}))
+            wrong.append(Finding("warning", "unit", text, (name,), {"ratio": ratio}))
     widest = max(float(s.ctrl_range.max()) for s in surveys)
-    if widest < 0.12:
-        wrong.append(
-            Finding("warning", "unit", f"no command spans more than {widest:.3f} rad: were radians read as degrees?")
-        )
+    if widest < MIN_WIDEST_COMMAND_RAD:
+        text = f"no command spans more than {widest:.3f} rad: were radians read as degrees?"
+        wrong.append(Finding("warning", "unit", text))
     yield from _converted(surveys, robot)
     yield from wrong or [Finding("ok", "unit", "commands, positions and velocities agree in unit")]
 
 
 def _converted(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    odd: dict[str, str] = {}
+    unit_of: dict[str, str] = {}
     for s in surveys:
-        odd |= s.entry.meta.notes.get("converted_from", {})
-    degrees = tuple(name for name, was in odd.items() if was == "deg")
+        unit_of |= s.entry.meta.notes.get("converted_from", {})
+    degrees = tuple(name for name, unit in unit_of.items() if unit == "deg")
     if degrees:
         yield Finding("note", "unit", f"logged in degrees, converted: {', '.join(degrees)}", degrees)
-    for name, was in odd.items():
-        if was == "fraction":
-            low, high = robot.qpos_range[robot.joint_names.index(name)]
-            text = (
-                f"{name} is logged as 0..1, not in rad: mapped to its range [{low:.2f}, {high:.2f}], velocity computed"
-            )
-            yield Finding("note", "unit", text, (name,))
+    for name in (name for name, unit in unit_of.items() if unit == "fraction"):
+        low, high = robot.qpos_range[robot.joint_names.index(name)]
+        text = f"{name} is logged as 0..1, not in rad: mapped to its range [{low:.2f}, {high:.2f}], velocity computed"
+        yield Finding("note", "unit", text, (name,))
 
 
 def _limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Do commands and positions stay in the joint ranges of the MJCF?"""
-    found = []
     for i, name in enumerate(robot.joint_names):
         low, high = robot.qpos_range[i]
-        for what, level, slack, ends in (
+        for kind, level, tolerance, limits in (
             ("commanded", "warning", 0.01, [s.ctrl_limits[i] for s in surveys]),
             ("measured", "note", 0.05, [s.qpos_limits[i] for s in surveys]),
         ):
-            beyond = np.array([max(low - a, b - high) for a, b in ends])
-            if (beyond > slack).any():
-                clips = ", and the simulator clips there" if what == "commanded" else ""
+            beyond = np.array([max(low - a, b - high) for a, b in limits])
+            if (beyond > tolerance).any():
+                clips = ", and the simulator clips there" if kind == "commanded" else ""
                 text = (
-                    f"{name} is {what} up to {beyond.max():.3f} rad beyond [{low:.2f}, {high:.2f}] in "
-                    f"{(beyond > slack).sum()} sequence(s), worst {surveys[int(beyond.argmax())].motion}{clips}: check "
-                    "its zero, or its range in robot.xml"
+                    f"{name} is {kind} up to {beyond.max():.3f} rad beyond [{low:.2f}, {high:.2f}] in "
+                    f"{(beyond > tolerance).sum()} sequence(s), worst {surveys[int(beyond.argmax())].motion}{clips}: "
+                    "check its zero, or its range in robot.xml"
                 )
-                found.append(Finding(level, "range", text, (name,), {"beyond_rad": float(beyond.max())}))
-    yield from found or [Finding("ok", "range", "commands and positions stay inside the joint ranges")]
+                yield Finding(level, "range", text, (name,), {"beyond_rad": float(beyond.max())})
 
 
 def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is one recording filed under two payloads or units?"""
-    seen: dict[str, list[str]] = defaultdict(list)
+    ids: dict[str, list[str]] = defaultdict(list)
     for s in surveys:
-        seen[s.samples].append(s.entry.id)
-    found = [
-        Finding("error", "labels", f"same samples under different labels: {', '.join(ids)}; remove the wrong one")
-        for ids in seen.values()
-        if len(ids) > 1
-    ]
-    yield from found or [Finding("ok", "labels", "no recording is filed twice")]
+        ids[s.samples].append(s.entry.id)
+    for same in (same for same in ids.values() if len(same) > 1):
+        text = f"same samples under different labels: {', '.join(same)}; remove the wrong one"
+        yield Finding("error", "labels", text)
 
 
-CHECKS = (_command, _order, _sign, _copied, _unit, _limits, _labels)
+CHECKS = (
+    Check(_command, "command", "commands are positions that the joints come near"),
+    Check(_order, "order", ""),
+    Check(_sign, "sign", "no joint moves against its command"),
+    Check(_copied, "copied", "commands come before states"),
+    Check(_unit, "unit", ""),
+    Check(_limits, "range", "commands and positions stay inside the joint ranges"),
+    Check(_labels, "labels", "no recording is filed twice"),
+)

@@ -16,8 +16,8 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import validated
 from gaponet.data.describe.joints import ignored, resolve_all
-from gaponet.data.describe.limits import to_radians
 from gaponet.data.describe.logs_file import HINT, LogsFile
+from gaponet.data.describe.plausibility import to_radians
 from gaponet.data.log import CHANNELS, DERIVED, REQUIRED, Channel, Log
 from gaponet.data.sequence import SequenceMeta
 from gaponet.robot.spec import LOG_UNITS, RobotSpec

@@ -31,10 +31,10 @@ import numpy as np
 
 from gaponet import plugins
 from gaponet.base.errors import LogError, UsageError
-from gaponet.data.describe.limits import refuse_absurd
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
+from gaponet.data.describe.plausibility import require_plausible
 from gaponet.data.describe.recording import COMMAND, Recording
-from gaponet.data.log import Channel, Log, skipped
+from gaponet.data.log import Channel, Log, skipped_rows
 from gaponet.plugins import attempt
 from gaponet.robot.spec import RobotSpec
 
@@ -110,8 +110,8 @@ def read_logs(
 ) -> Iterator[tuple[str, Log]]:
     """Yield (motion name, Log) for every recording under a path.
 
-    While data.log.skipping is open, rows that are not finite, go back in time or cannot be are cut, recordings that
-    cannot be read are left out, and both are listed there.
+    While data.log.skip_bad_rows is open, bad rows are cut, recordings that cannot be read are left out, and both are
+    listed there.
 
     Args:
         fmt: One of formats(); default by looking.
@@ -120,7 +120,7 @@ def read_logs(
         position_unit, time_unit, rate: Win over logs.toml; refused where the format itself fixes them. rate, Hz, is
             of logs without a clock.
         strict: Refuse a recording whose velocity, torque or temperature is nonsense somewhere, instead of making up for
-            that channel there (data.describe.limits).
+            that channel there (data.describe.plausibility).
         allow_pickle: Open pickled files, with an unpickler that makes arrays, numbers and text and nothing else.
 
     Raises:
@@ -137,10 +137,10 @@ def read_logs(
             raise UsageError(f"{said} means nothing to the {kind} format, which fixes it itself; leave it out")
     names = told.get("names", {}) | (joint_map or {})
     naming, root = Naming(told, file), path if path.is_dir() else path.parent
-    bad = skipped()
+    bad = skipped_rows()
     for name, load in _loaders(reader, path, robot, told, names):
         try:
-            log = _corrected(refuse_absurd(load(), robot, strict), robot, told, names)
+            log = _corrected(require_plausible(load(), robot, strict), robot, told, names)
         except LogError as error:
             if bad is None:
                 raise
@@ -246,7 +246,7 @@ def _corrected(log: Log, robot: RobotSpec, told: LogsFile, names: dict[str, str]
         for name, c in log.channels.items()
     }
     notes = log.meta.get("notes", {}) | {k: v for k, v in (("signs", signs), ("offsets", offsets)) if v}
-    return refuse_absurd(replace(log, channels=turned, meta=log.meta | {"notes": notes}), robot)
+    return require_plausible(replace(log, channels=turned, meta=log.meta | {"notes": notes}), robot)
 
 
 def _named(log: Log, said: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:

@@ -29,7 +29,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.data.describe.joints import ignored, resolve_all
-from gaponet.data.describe.limits import to_radians
+from gaponet.data.describe.plausibility import to_radians
 from gaponet.data.formats.lerobot_set import AGAIN, FEATURES, Feature, Set, Stated, read_table, sets_under, tasks_of
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec

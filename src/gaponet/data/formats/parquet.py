@@ -31,7 +31,7 @@ def read(file: Path, wanted: list[str]) -> pa.Table:
     """These columns.
 
     Raises:
-        LogError: No Parquet file, a column is missing, or there is more than LARGEST_ARRAYS in them.
+        LogError: No Parquet file, a column is missing, or there is more than MAX_ARRAYS_BYTES in them.
     """
     import pyarrow.parquet as pq
 

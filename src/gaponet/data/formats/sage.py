@@ -20,7 +20,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.joints import resolve_all
-from gaponet.data.describe.limits import to_radians
+from gaponet.data.describe.plausibility import to_radians
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 

@@ -21,7 +21,7 @@ from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal
 from gaponet.data.formats import DESCRIBED, files_under, parquet
-from gaponet.data.log import CHANNELS, skipped
+from gaponet.data.log import CHANNELS, skipped_rows
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
@@ -151,7 +151,7 @@ def _read_slowly(
     file: Path, body: str, names: list[str], wanted: list[str], delimiter: str, first: int
 ) -> list[list[float]]:
     """Line by line: raises for the first with too few cells or a cell that is no number; NaN where rows are cut."""
-    places, bad = {name: names.index(name) for name in wanted}, skipped()
+    places, bad = {name: names.index(name) for name in wanted}, skipped_rows()
     found: list[list[float]] = []
     rows = csv.reader(body.split("\n"), delimiter=delimiter)
     while True:
@@ -196,7 +196,7 @@ def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
         column = table.column(name)
         if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
             raise LogError(f"{file}: column '{name}' is {column.type}, not numbers; export it as float64")
-        if column.null_count and skipped() is None:
+        if column.null_count and skipped_rows() is None:
             row = int(column.is_null().to_numpy().argmax()) + 1
             raise LogError(f"{file}:{row}: column '{name}' is empty; repair or cut the row")
         data[name] = Signal(column.to_numpy().astype(float))

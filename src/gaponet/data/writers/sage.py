@@ -39,7 +39,7 @@ def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[
 
 
 def _in_log_units(kind: str, values: Array, robot: RobotSpec) -> Array:
-    """rad → what this robot's logs hold: the way back from data.describe.limits.to_radians."""
+    """rad → what this robot's logs hold: the way back from data.describe.plausibility.to_radians."""
     out = np.array(values, float)
     for j, unit in enumerate(robot.log_units):
         if unit == "deg" and kind != "torques":

@@ -118,7 +118,7 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
     report = import_logs(
         data / card.folder, robot, card.unit, card.payload, place / "data", logs=logs if options else None, cut=card.cut
     )
-    report.dataset.state(licence=card.licence, source=card.source)
+    report.dataset.set_provenance(licence=card.licence, source=card.source)
     return report.dataset, robot, labels
 
 

@@ -40,8 +40,8 @@ class FittedSim:
 
     def positions(self, sequences: list[Sequence]) -> list[Array]:
         """Return open-loop rollouts, (T, n) rad each."""
-        twins = replay(sequences, self.robot, self.corrector, lock_idle=True)
-        return [t.qpos + (self.shift(s) if self.shift else 0.0) for s, t in zip(sequences, twins, strict=True)]
+        replays = replay(sequences, self.robot, self.corrector, lock_idle=True)
+        return [t.qpos + (self.shift(s) if self.shift else 0.0) for s, t in zip(sequences, replays, strict=True)]
 
     def errors(self, sequences: list[Sequence]) -> list[float]:
         """Return the mean |error| of each rollout over the recorded joints, rad."""

@@ -12,10 +12,9 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.data.pair import hash_order
-from gaponet.data.repeatability import SAME_COMMAND
+from gaponet.data.repeatability import MAX_COMMAND_DIFFERENCE_RAD
 from gaponet.data.sequence import Sequence
-from gaponet.data.split import in_turn, one_motion, split_entries
+from gaponet.data.split import canonical_motions, hash_order, split_by_order, split_entries
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.robot.spec import RobotSpec
 
@@ -73,7 +72,7 @@ def questions(
     Raises:
         UsageError: No such question.
     """
-    lead = one_motion(dataset)
+    lead = canonical_motions(dataset)
     entries = dataset.entries
 
     def split(train: list[Entry], val: list[Entry], test: list[Entry], few: list[Entry] = []) -> Question:  # noqa: B006
@@ -92,7 +91,7 @@ def questions(
         few = parts["train"] if name == "another session" else []
         yield split(parts["train"], parts["val"], parts["test"], few)
     elif name == "later repetitions":
-        parts = in_turn(dataset, "repetition")
+        parts = split_by_order(dataset, "repetition")
         yield split(parts["train"], parts["val"], parts["test"])
     elif name == "new commands":
         order = {
@@ -144,10 +143,10 @@ def repeatability(question: Question) -> float:
     """Mean |difference| between the errors of two recordings of one command, unit and payload, rad; NaN without any."""
     groups: dict[tuple[object, ...], list[Sequence]] = {}
     for s, motion in zip(question.test, question.test_motions, strict=True):
-        groups.setdefault((motion, *s.meta.slot[1:], s.meta.unrecorded, s.meta.kp), []).append(s)
+        groups.setdefault((motion, *s.meta.repetition_key[1:], s.meta.unrecorded, s.meta.kp), []).append(s)
     pairs = [d for group in groups.values() for d in _differences(group, question.robot)]
     least = min((command for command, _ in pairs), default=0.0)
-    errors = [d for command, d in pairs if command <= max(least, SAME_COMMAND)]
+    errors = [d for command, d in pairs if command <= max(least, MAX_COMMAND_DIFFERENCE_RAD)]
     return float(np.mean(errors)) if errors else float("nan")
 
 

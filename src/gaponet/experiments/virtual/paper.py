@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from gaponet.base.errors import UsageError
 from gaponet.base.result_table import MeanStd, ResultTable
-from gaponet.data.card import count
+from gaponet.data.card import count_entries
 from gaponet.data.store import Dataset
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.outcomes import StudyOutcomes, summarize
@@ -145,7 +145,7 @@ def table_2_rows(study: Study) -> list[Table2Row]:
 def card_table(data: Dataset, robot: RobotSpec) -> ResultTable:
     """Counts of the dataset beside the paper's."""
     entries = data.entries
-    here = count(entries) | {
+    here = count_entries(entries) | {
         "units": len({e.meta.unit_id for e in entries}), "joints": len(robot.operated),
         "repetitions": len({e.meta.repetition for e in entries}),
         "signals": len({c for e in entries for c in e.channels}),

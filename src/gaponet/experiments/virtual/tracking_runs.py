@@ -119,9 +119,9 @@ def align(
         def report(done: int, total: int, method: str = method) -> None:
             progress(f"{method} simulator", done / total)
 
-        twins = replay(list(recorded), simulator, corrector, nthread=1, progress=report, lock_idle=True)
-        for s, twin, source in zip(recorded, twins, sources, strict=True):
-            error = (twin.qpos - s.qpos)[1:, robot.operated_index]
+        replays = replay(list(recorded), simulator, corrector, nthread=1, progress=report, lock_idle=True)
+        for s, simulated, source in zip(recorded, replays, sources, strict=True):
+            error = (simulated.qpos - s.qpos)[1:, robot.operated_index]
             scores.append(_score("alignment", method, seed, source, s.meta.motion, s.meta.payload_mass, error, s.dt))
     return scores
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.data.pair import hash_order
+from gaponet.data.split import hash_order
 from gaponet.data.store import Dataset, Entry
 from gaponet.experiments.virtual.trained_models import TrainedModel
 from gaponet.report.candidate import split_of_run

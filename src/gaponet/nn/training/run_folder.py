@@ -15,9 +15,8 @@ from pathlib import Path
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
-from gaponet.data.pair import require_disjoint
 from gaponet.data.sequence import Sequence, require_same_gains
-from gaponet.data.split import Parts, parts_of, spread
+from gaponet.data.split import Splits, resolve_splits, stratified_subset
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training import ranks
@@ -45,7 +44,7 @@ class TrainingData:
     dataset: Dataset
     robot: RobotSpec
     holdout_units: tuple[str, ...]
-    splits: Parts
+    splits: Splits
     train: list[Sequence]
     val: list[Sequence]
 
@@ -60,19 +59,18 @@ class TrainingData:
         """
         dataset.require_robot(robot)
         rule = (holdout_units, config.holdout_payloads, config.rates, config.train_share)
-        splits = parts_of(dataset, config.split, *rule)
+        splits = resolve_splits(dataset, config.split, *rule)
         if not config.mixed_gains:
             metas = (e.meta for entries in splits.values() for e in entries)
             require_same_gains(metas, dataset.joint_names, robot.operated)
         train = dataset.sequences(splits["train"], optional=False)
-        val = dataset.sequences(spread(splits["val"], MAX_VALIDATION_ROLLOUTS), optional=False)
+        val = dataset.sequences(stratified_subset(splits["val"], MAX_VALIDATION_ROLLOUTS), optional=False)
         data = cls(dataset, robot, holdout_units, splits, train, val)
         if not config.mixed_gains and (other := next((c for c in data.conditions if c.kp or c.kd), None)):
             raise UsageError(
                 f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says others: write there "
                 "what the robot runs with, or add --mixed-gains to train in simulators of the recordings' own gains"
             )
-        require_disjoint(*splits.values(), key=lambda entry: entry.hash)
         return data
 
     @property
@@ -84,7 +82,7 @@ class TrainingData:
         """Return training recordings with about max_rows rows, stratified by payload, unit and rate."""
         entries = self.splits["train"]
         count = max(1, max_rows * len(entries) // sum(e.rows for e in entries))
-        return self.dataset.sequences(spread(entries, count), optional=False)
+        return self.dataset.sequences(stratified_subset(entries, count), optional=False)
 
 
 class RunFolder:

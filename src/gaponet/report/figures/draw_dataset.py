@@ -14,7 +14,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Progress, no_progress
-from gaponet.data.repeatability import MOVED
+from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.report.evaluate import evenly_spaced
@@ -88,7 +88,7 @@ def joint_ranges(dataset: Dataset, robot: RobotSpec, progress: Report) -> Figure
     for entry in entries:
         arrays = dataset.channels(entry, ("ctrl", "qpos"))
         for joint, j in zip(robot.operated, robot.operated_index, strict=True):
-            if np.ptp(arrays["ctrl"][:, j]) > MOVED:
+            if np.ptp(arrays["ctrl"][:, j]) > MIN_MOTION_RAD:
                 rows[joint].append(arrays["qpos"][::stride, j])
     if not rows:
         raise _NoDataError("no operated joint is commanded to move")
@@ -128,7 +128,7 @@ def overlay(dataset: Dataset, robot: RobotSpec, progress: Report) -> Figure:
     pair_dataset(dataset, robot, progress, [entry])
     pair = dataset.pair(entry, model_hash(robot))
     real, meta, op = first_part(pair.real), entry.meta, robot.operated_index
-    moved = np.ptp(real.ctrl[:, op], axis=0) > MOVED
+    moved = np.ptp(real.ctrl[:, op], axis=0) > MIN_MOTION_RAD
     joints = largest_joints(
         robot, np.abs(pair.gap[: len(real), op]).mean(axis=0) + 10 * moved
     )  # joints that move come first
@@ -160,7 +160,7 @@ FIGURES = {
     "joint_ranges": joint_ranges,
     "composition": composition,
     "torque_temperature": torque_temperature,
-    "real_and_twin": overlay,
+    "real_and_simulated": overlay,
     "gap_by_payload": gap_by_payload,
 }
 

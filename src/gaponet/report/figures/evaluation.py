@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd
-from gaponet.data.repeatability import MOVED
-from gaponet.data.signals import busiest
+from gaponet.data.repeatability import MIN_MOTION_RAD
+from gaponet.data.signals import busiest_window
 from gaponet.report.figures.charts import JointTrajectory, against, bars
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 from gaponet.report.methods import colour, title
@@ -109,7 +109,7 @@ def trajectories(
     drawn: dict[int, tuple[Array, dict[str, JointTrajectory]]] = {}
     for row, facts in enumerate(shown):
         recorded, dt = arrays[f"{row}/recorded"], facts["dt"]
-        start = busiest(recorded, rows := round(SHOWN_S / dt))
+        start = busiest_window(recorded, rows := round(SHOWN_S / dt))
         window = slice(start, min(start + rows, len(recorded)))
         drawn[row] = (
             np.arange(len(recorded))[window] * dt,
@@ -124,7 +124,7 @@ def _joint_trajectories(
 ) -> dict[str, JointTrajectory]:
     """Return the three joints with the largest nominal error; joints that are commanded to move come first."""
     command, recorded = arrays[f"{row}/command"][window], arrays[f"{row}/recorded"]
-    still = np.ptp(command, axis=0) <= MOVED
+    still = np.ptp(command, axis=0) <= MIN_MOTION_RAD
     errors = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
     learned = [n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > MIN_CORRECTION]
     joint_trajectories = {}

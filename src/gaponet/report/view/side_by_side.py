@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.sequence import Sequence
-from gaponet.data.signals import busiest
+from gaponet.data.signals import busiest_window
 from gaponet.data.store import Dataset, Entry
 from gaponet.report.candidate import Candidate, FittedData
 from gaponet.report.methods import colour, title
@@ -92,7 +92,7 @@ class SideBySide:
     def busiest(self, seconds: float) -> float:
         """Return the start of the part of this length with the most motion, s."""
         rows = max(round(seconds / self.real.dt), 1)
-        return busiest(self.real.qpos[:, self.robot.operated_index], rows) * self.real.dt
+        return busiest_window(self.real.qpos[:, self.robot.operated_index], rows) * self.real.dt
 
 
 def select_entry(

@@ -172,8 +172,8 @@ def simulated_recordings(robot: RobotSpec, motions: ListOf[Motion], payload: flo
         ctrl = motion.sample(robot.dt).astype(np.float32)
         meta = SequenceMeta(robot.name, "expected", f"{motion.name} {payload:g} kg", payload, virtual=True)
         commanded.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl)))
-    twins = replay(commanded, robot, nthread=nthread, lock_idle=True)
-    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(commanded, twins, strict=True)]
+    replays = replay(commanded, robot, nthread=nthread, lock_idle=True)
+    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(commanded, replays, strict=True)]
 
 
 def undetermined_gains(

@@ -15,8 +15,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.files import atomic_write, write_text
-from gaponet.data.describe.limits import refuse_degrees
-from gaponet.data.sequence import LONGEST, SHORTEST
+from gaponet.data.describe.plausibility import require_radians
+from gaponet.data.sequence import MAX_PERIOD_S, MIN_PERIOD_S
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.motion import Motion
 
@@ -45,13 +45,13 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
         raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
     period = period or SAGE_DT
-    if not SHORTEST <= period <= LONGEST:
-        raise LogError(f"{path}: its period is {period:g} s; expected {SHORTEST} to {LONGEST:g}")
+    if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
+        raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}")
     joints = tuple(robot.resolve(name, str(path)) for name in names)
     columns = robot.index(joints)
     if len(set(joints)) != len(joints):
         raise LogError(f"{path}: two columns are the same joint of {robot.name}; delete one")
-    refuse_degrees(rows, joints, robot, lambda row: f"{path}: command {row + 1}")
+    require_radians(rows, joints, robot, lambda row: f"{path}: command {row + 1}")
     ctrl = np.repeat(robot.qpos_home[None], len(rows), axis=0)
     ctrl[:, columns] = rows
     return Motion(path.stem, level_of(ctrl, robot), period, ctrl, joints)

@@ -11,13 +11,13 @@ from gaponet.base.errors import GAPONetError, LogError, UsageError
 from gaponet.base.files import write_text
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import find_logs, look, read_logs
-from gaponet.data.log import Log, skipping
+from gaponet.data.log import Log, skip_bad_rows
 from gaponet.robot.spec import RobotSpec
 
 NAMED = re.compile(r"^(\[names\]|joints = )", re.MULTILINE)  # lines of a logs.toml by which joints are told apart
 
 
-class UnreadError(LogError):
+class DescriptionNeededError(LogError):
     """A person has to look at `text`, a logs.toml: logs cannot be read by it, or it guesses which joint is which."""
 
     def __init__(self, why: str, text: str) -> None:
@@ -25,7 +25,7 @@ class UnreadError(LogError):
         self.text = text
 
 
-def read_first(
+def read_first_recording(
     logs: Path, robot: RobotSpec, told: Path | None = None, anyhow: bool = False, skip_bad: bool = False, **options: Any
 ) -> tuple[Log, int, str]:
     """The first recording, how many there are, and the logs.toml that was guessed; "" where none was needed.
@@ -38,11 +38,11 @@ def read_first(
         options: Arguments of read_logs.
 
     Raises:
-        UnreadError, LogError, UsageError: The message says what is missing.
+        DescriptionNeededError, LogError, UsageError: The message says what is missing.
     """
 
     def by(file: Path | None, described: str = "") -> tuple[Log, int, str]:
-        with skipping(skip_bad):
+        with skip_bad_rows(skip_bad):
             first = next(iter(read_logs(logs, robot, logs=file, **options)), None)
         if first is None:
             raise UsageError(f"{logs}: holds no recording")
@@ -64,7 +64,7 @@ def read_first(
         try:
             found = by(file, text)
         except GAPONetError as again:
-            raise UnreadError(str(again), text) from None
+            raise DescriptionNeededError(str(again), text) from None
     if NAMED.search(text) and not anyhow:
-        raise UnreadError("which joint is which is a guess", text)
+        raise DescriptionNeededError("which joint is which is a guess", text)
     return found

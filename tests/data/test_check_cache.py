@@ -7,7 +7,6 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing import get_context
 
-import numpy as np
 import pytest
 from arm import recordings
 
@@ -15,11 +14,6 @@ from gaponet.base.errors import WorkerError
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.store import SURVEYS, Dataset
 from gaponet.sim.dynamics import gravity_of
-
-
-def lowest(qpos):
-    """A tip's height."""
-    return -0.2 * np.sin(qpos[:, 0].astype(float))
 
 
 @pytest.fixture
@@ -39,7 +33,7 @@ def read(monkeypatch):
 
 
 def told(dataset, arm, **more):
-    found = Diagnosis.of(Dataset(dataset.path), arm, model=gravity_of(arm), heights=lowest, **more)
+    found = Diagnosis.of(Dataset(dataset.path), arm, gravity_model=gravity_of(arm), **more)
     return json.dumps(found.as_dict())
 
 
@@ -60,7 +54,7 @@ def test_the_second_time_nothing_is_read_and_of_a_larger_dataset_what_is_new(dat
 
 def test_what_is_damaged_or_of_something_else_is_found_again(dataset, arm, read):
     first = told(dataset, arm)
-    kept = [dataset.path / SURVEYS / e.id for e in dataset.entries]
+    kept = [dataset.path / SURVEYS / f"{e.id}.npz" for e in dataset.entries]
     whole = [file.read_bytes() for file in kept]
     flipped = bytearray(whole[1])
     flipped[len(flipped) // 2] ^= 1

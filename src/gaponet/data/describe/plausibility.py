@@ -42,7 +42,7 @@ def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: li
     return out
 
 
-def refuse_absurd(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
+def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     """Return the log without what no joint does, or refuse it.
 
     Positions that can only be degrees (or another joint's) refuse it. Where velocity, torque or temperature is
@@ -61,7 +61,7 @@ def refuse_absurd(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     for name in (n for n in UNITS if n in log.channels):
         values = log.channels[name].values
         if name in ("ctrl", "qpos"):
-            refuse_degrees(values, log.joint_names, robot, partial(_place, log, name))
+            require_radians(values, log.joint_names, robot, partial(_place, log, name))
             continue
         wrong = _nonsense(name, log, robot)
         if strict and wrong.any():
@@ -111,7 +111,7 @@ def _place(log: Log, name: str, row: int) -> str:
     return f"{log.row(name, row)}: {name}"
 
 
-def refuse_degrees(values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]) -> None:
+def require_radians(values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]) -> None:
     """Refuse positions (k, n) that can only be degrees, or another joint's; where: what to call a row in the error.
 
     A real joint may pass its MJCF limit by a calibration offset, not by a radian and half a turn.

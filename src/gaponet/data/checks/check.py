@@ -1,0 +1,22 @@
+"""Check: one test of a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from gaponet.data.checks.survey import Survey
+from gaponet.robot.finding import Finding
+from gaponet.robot.spec import RobotSpec
+
+
+class Check(NamedTuple):
+    """A function that yields findings of surveys, and what is reported if there is none: `name: ok_message`."""
+
+    function: Callable[[list[Survey], RobotSpec], Iterator[Finding]]
+    name: str
+    ok_message: str
+
+    def run(self, surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
+        """Return the findings, at least one."""
+        return [*self.function(surveys, robot)] or [Finding("ok", self.name, self.ok_message)]

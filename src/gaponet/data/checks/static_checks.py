@@ -1,0 +1,306 @@
+"""What static poses show against gravity and the stated gains: offsets, scales, gains, payload labels, mixed robots.
+
+At rest, a servo's distance from its command is qpos − ctrl = offset + (scale − 1)·ctrl − softness·G(qpos)/kp −
+stiction·approach. G is the gravity torque of the nominal model with the labelled payload. The four coefficients of a
+joint are fitted to all poses, and also without some of the sequences: for standard errors (jackknife), and to judge a
+sequence by the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.data.checks.survey import Survey
+from gaponet.data.offsets import Gravity
+from gaponet.robot.finding import Finding, abbreviate
+from gaponet.robot.spec import RobotSpec
+
+MIN_POSES = 12  # of a joint
+MAX_FOLDS = 20  # of the sequences
+SIGNIFICANCE = 4.0  # standard errors
+MIN_OFFSET_RAD, FAR_OFFSET_RAD = 0.015, 0.05  # a note, a warning
+MIN_SCALE_ERROR = 0.1
+SOFTNESS_BOUNDS = (0.5, 1.8)
+MIN_SAG_RAD = 0.01  # rms of the nominal sag, below which softness is unknown
+MIN_UNIT_DISTANCE_RAD = 0.03  # between sequences of one robot
+MIN_MASS, MIN_MASS_SHARE = 0.25, 0.5  # of the heaviest label (or kg); of the misfit that another mass must explain
+MIN_LOAD_CHANGE_RAD = 1e-3  # by which a joint rests elsewhere with another label
+MIN_EVIDENCE = 10.0  # for other labels: poses times the logarithm by which their scatter falls
+MIN_GROUP_DISTANCE_RAD, MIN_GROUP_SCATTERS = 0.006, 6.0  # between two groups of recordings
+PRIOR = np.array([0.0, 0.0, 1.0, 0.0])  # offset, scale − 1, softness, stiction of a motor as stated
+PRIOR_STD = np.array([0.5, 0.5, 1.0, 0.1])
+MIN_SCATTER_RAD, MAX_ITERATIONS = 5e-4, 12  # of the robust fit
+SOFTNESS = 2  # index of the coefficient
+MAX_ODD_SEQUENCES = 10  # that are reported
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Distinct static poses of single joints (k), ordered by sequence.
+
+    Attributes:
+        sequence, joint: Indices.
+        error: qpos − ctrl, rad.
+        columns: Regressors of the four coefficients, (k, 4).
+        per_kg: Change of the softness regressor with 1 kg more payload, rad.
+    """
+
+    sequence: Array
+    joint: Array
+    error: Array
+    columns: Array
+    per_kg: Array
+
+    def only(self, keep: Array | slice) -> _Poses:
+        """Return some of the poses."""
+        return _Poses(*(values[keep] for values in vars(self).values()))
+
+    def of_joint(self, joint: int) -> _Poses:
+        return self.only(self.joint == joint)
+
+    def of_sequence(self, number: int) -> slice:
+        return slice(*np.searchsorted(self.sequence, [number, number + 1]))
+
+    def __len__(self) -> int:
+        return len(self.error)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Coefficients of a joint (4), their standard errors, scatter (rad), and the coefficients without each sequence."""
+
+    x: Array
+    std: Array
+    scatter: float
+    without: dict[int, Array]
+
+    @property
+    def significant(self) -> Array:
+        return np.abs(self.x - PRIOR) > SIGNIFICANCE * self.std
+
+
+def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
+    """Do offsets, scales, gains and payload labels agree with the static poses?"""
+    poses = _collect(surveys, robot, model)
+    judged = [j for j in robot.operated_index.tolist() if (poses.joint == j).sum() >= MIN_POSES]
+    if not judged:
+        yield Finding("ok", "rests", "too few rests: offsets, scales, gains and payloads cannot be told; add holds")
+        return
+    findings = _swapped_labels(surveys, poses, judged) or _two_units(surveys, robot, poses, judged)
+    if findings:
+        yield from findings
+        return
+    while len(findings) < MAX_ODD_SEQUENCES and (odd := _odd_sequence(surveys, robot, poses, judged)) is not None:
+        findings.append(odd[1])
+        poses = poses.only(poses.sequence != odd[0])
+    findings = findings or _two_units(surveys, robot, poses, judged, min_size=1, min_joints=3)
+    softness: dict[str, float] = {}
+    for j in judged:
+        name, own = robot.joint_names[j], poses.of_joint(j)
+        if len(own) < MIN_POSES:
+            continue
+        fit = _fit(own)
+        findings += _offset_and_scale(name, fit)
+        sag, soft = float(np.sqrt(np.mean(own.columns[:, SOFTNESS] ** 2))), float(fit.x[SOFTNESS])
+        if sag > MIN_SAG_RAD and fit.significant[SOFTNESS] and soft > 0:
+            softness |= {} if SOFTNESS_BOUNDS[0] < soft < SOFTNESS_BOUNDS[1] else {name: soft}
+    if softness:
+        median = float(np.median(list(softness.values())))
+        text = (
+            f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: were these logs "
+            "recorded at "
+            "other gains, or with another payload than their label? Import again with --kp or --payload-mass"
+        )
+        findings.append(Finding("warning", "gains", text, tuple(softness), {"softness": softness}))
+    yield from findings or [Finding("ok", "rests", "rests agree with gravity, gains and payload labels")]
+
+
+def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
+    parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4)), np.zeros(0))]
+    for number, s in enumerate(surveys):
+        meta, poses = s.entry.meta, s.static_poses
+        if not len(poses):
+            continue
+        kp = np.where(robot.kp > 0, robot.with_gains(*meta.recorded_gains).kp, np.inf)
+        load = model(poses.qpos, meta.payload_mass, meta.payload_side) / kp
+        heavier = np.zeros_like(load)
+        if robot.payload_mounts:
+            heavier = model(poses.qpos, meta.payload_mass + 1.0, meta.payload_side) / kp - load
+        nth, pose = np.nonzero((poses.distinct & (poses.approach != 0))[:, robot.operated_index].T)
+        at = pose, (j := robot.operated_index[nth])
+        columns = np.column_stack([np.ones(len(j)), poses.ctrl[at], -load[at], -poses.approach[at]])
+        parts.append((np.full(len(j), number), j, poses.qpos[at] - poses.ctrl[at], columns, -heavier[at]))
+    return _Poses(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _fit(poses: _Poses) -> _Fit:
+    """Fit the coefficients of the one joint of these poses."""
+    x, formal_std, scatter = _solve(poses.columns, poses.error)
+    numbers, index = np.unique(poses.sequence, return_inverse=True)
+    fold = index % MAX_FOLDS
+    folds = range(min(len(numbers), MAX_FOLDS))
+    without = {f: _solve(poses.columns[fold != f], poses.error[fold != f])[0] for f in folds}
+    every = np.array(list(without.values()))
+    jackknife = np.sqrt((len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0))
+    std = np.maximum(formal_std, jackknife) if len(every) > 2 else 3 * formal_std
+    return _Fit(x, std, scatter, {s: without[i % MAX_FOLDS] for i, s in enumerate(numbers.tolist())})
+
+
+def _solve(columns: Array, error: Array) -> tuple[Array, Array, float]:
+    """Return robust least-squares coefficients, their formal standard errors, and the scatter of the residuals."""
+    x, scatter, weight, prior = PRIOR, 0.01, np.ones(len(error)), np.diag(1 / PRIOR_STD)
+    a = prior
+    for _ in range(MAX_ITERATIONS):
+        a = np.concatenate([columns * (weight / scatter)[:, None], prior])
+        x = np.linalg.lstsq(a, np.concatenate([error * weight / scatter, prior @ PRIOR]), rcond=None)[0]
+        residual = np.abs(error - columns @ x)
+        scatter = max(1.48 * float(np.median(residual)), MIN_SCATTER_RAD) if len(residual) else scatter
+        weight = np.sqrt(1 / np.maximum(1, residual / (3 * scatter)))
+    return x, np.sqrt(np.diag(np.linalg.inv(a.T @ a))), scatter
+
+
+def _offset_and_scale(name: str, fit: _Fit) -> Iterator[Finding]:
+    offset, scale = float(fit.x[0]), float(1 + fit.x[1])
+    if fit.significant[1] and abs(scale - 1) > MIN_SCALE_ERROR:
+        text = (
+            f"{name} goes {scale:.2f} rad where its command goes 1 rad, sag taken off: another gear ratio, range or "
+            "ticks a turn in one of them; import again with the right scale"
+        )
+        yield Finding("warning", "scale", text, (name,), {"scale": scale})
+    elif fit.significant[0] and abs(offset) > MIN_OFFSET_RAD:
+        far = abs(offset) > FAR_OFFSET_RAD
+        verdict = "more than assembly leaves: a wrong zero or a missed homing" if far else "as assembly leaves it"
+        text = (
+            f"{name} rests {offset * 1e3:+.0f} ± {fit.std[0] * 1e3:.0f} mrad off its command, sag and stiction "
+            f"taken off: a constant offset, {verdict}; gaponet identify finds it, or take it off at import"
+        )
+        yield Finding("warning" if far else "note", "offset", text, (name,), {"offset": offset})
+
+
+def _swapped_labels(surveys: list[Survey], poses: _Poses, judged: list[int]) -> list[Finding]:
+    """Would the labels' masses in another order explain the poses better?"""
+    mass = np.array([s.entry.meta.payload_mass for s in surveys])[poses.sequence]
+    labels = sorted(set(mass.tolist()))
+    if not 1 < len(labels) <= 3:
+        return []
+    best = (0.0, labels)
+    for order in [list(p) for p in permutations(labels)][1:]:
+        other = np.array(order)[np.searchsorted(labels, mass)]
+        columns = poses.columns + np.outer((other - mass) * poses.per_kg, np.eye(4)[SOFTNESS])
+        evidence = 0.0
+        for j in judged:
+            own = poses.joint == j
+            scatters = [_solve(c[own], poses.error[own])[2] for c in (poses.columns, columns)]
+            evidence += float(own.sum() * np.log(scatters[0] / scatters[1]))
+        best = max(best, (evidence, order))
+    loaded = np.abs(poses.per_kg) * (labels[-1] - labels[0]) > MIN_LOAD_CHANGE_RAD
+    if best[0] < max(MIN_EVIDENCE, 0.1 * loaded.sum()):
+        return []
+    swaps = ", ".join(f"{a:g} kg rests as {b:g} kg" for a, b in zip(labels, best[1], strict=True) if a != b)
+    text = f"what is labelled {swaps}: payload labels in each other's place? Import again with the right --payload-mass"
+    return [Finding("warning", "payload", text, (), {"labels": labels, "rests_as": best[1]})]
+
+
+def _two_units(
+    surveys: list[Survey], robot: RobotSpec, poses: _Poses, judged: list[int], min_size: int = 2, min_joints: int = 2
+) -> list[Finding]:
+    """Do the recordings form two groups of `min_size` or more that rest apart in `min_joints` or more joints?"""
+    median = np.full((len(surveys), len(judged)), np.nan)  # residual of each sequence and joint, rad
+    for column, j in enumerate(judged):
+        own = poses.of_joint(j)
+        residual = own.error - own.columns @ _solve(own.columns, own.error)[0]
+        for number in set(own.sequence.tolist()):
+            if len(part := residual[own.of_sequence(number)]) > 1:
+                median[number, column] = np.median(part)
+    known = np.flatnonzero(np.isfinite(median).all(axis=1))
+    best: tuple[int, float, list[str], Array] = (min_joints - 1, 0.0, [], known[:0])
+    for column in range(len(judged)) if len(known) > 2 else ():
+        order = known[np.argsort(median[known, column])]
+        cuts = np.arange(min_size, len(order) + 1 - min_size)
+        centred = median[order] - median[order].mean(axis=0)  # their sum is zero, (N, judged)
+        sums, per = centred.cumsum(axis=0)[cuts - 1], (1 / cuts + 1 / (len(order) - cuts))[:, None]
+        within = np.sqrt(np.maximum((centred**2).sum(axis=0) - sums**2 * per, 0) / (len(order) - 2))
+        gaps = np.abs(sums) * per
+        far = (gaps > MIN_GROUP_DISTANCE_RAD) & (gaps > MIN_GROUP_SCATTERS * np.maximum(within, MIN_SCATTER_RAD))
+        for cut, gap, apart in zip(cuts.tolist(), gaps.max(axis=1).tolist(), far, strict=True):
+            if (int(apart.sum()), gap) > best[:2]:
+                names = [robot.joint_names[j] for j, yes in zip(judged, apart, strict=True) if yes]
+                best = (len(names), gap, names, order[:cut])
+    if best[0] < min_joints:
+        return []
+    motions = [[surveys[i].motion for i in known if (i in best[3]) == side] for side in (True, False)]
+    text = (
+        f"{abbreviate(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where {abbreviate(motions[1])} do "
+        f"({abbreviate(best[2])}): "
+        "two robots under one name, or zeros set in between? Import one part with another --unit-id"
+    )
+    return [Finding("warning", "unit_id", text, tuple(best[2]), {"apart": best[1], "motions": motions[0]})]
+
+
+def _odd_sequence(
+    surveys: list[Survey], robot: RobotSpec, poses: _Poses, judged: list[int]
+) -> tuple[int, Finding] | None:
+    """Return the sequence that rests furthest from where the others say, with its finding, if any is far."""
+    by_joint = {j: poses.of_joint(j) for j in judged}
+    fits = {j: _fit(own) for j, own in by_joint.items() if len(own) >= MIN_POSES}
+    heaviest = max(s.entry.meta.payload_mass for s in surveys) or 1.0
+    odd: tuple[float, int, Finding] | None = None
+    for number in sorted(set(poses.sequence.tolist())):
+        residuals, slopes, apart = [], [], {}
+        for j, fit in fits.items():
+            own = by_joint[j].only(by_joint[j].of_sequence(number))
+            if len(own) < 3 or len(by_joint[j]) - len(own) < MIN_POSES:
+                continue
+            x = fit.without[number]
+            residual = own.error - own.columns @ x
+            residuals.append(residual / fit.scatter)
+            slopes.append(x[SOFTNESS] * own.per_kg / fit.scatter)
+            middle = float(np.median(residual))
+            scatter = max(fit.scatter, 1.48 * float(np.median(np.abs(residual - middle))))
+            if abs(middle) > max(MIN_UNIT_DISTANCE_RAD, SIGNIFICANCE * scatter / np.sqrt(len(residual))):
+                apart[robot.joint_names[j]] = middle
+        judged_sequence = _judge_sequence(surveys[number], heaviest, residuals, slopes, apart)
+        if judged_sequence is not None and (odd is None or judged_sequence[0] > odd[0]):
+            odd = (judged_sequence[0], number, judged_sequence[1])
+    return odd and odd[1:]
+
+
+def _judge_sequence(
+    s: Survey, heaviest: float, residuals: list[Array], slopes: list[Array], apart: dict[str, float]
+) -> tuple[float, Finding] | None:
+    """Return the mean square of a sequence's residuals and its finding, if another mass or unit explains them.
+
+    Args:
+        residuals, slopes: One array per joint, in scatters, and in scatters per kg of payload.
+        apart: Joint → distance from where the others rest, rad, of those that are far.
+    """
+    if not residuals:
+        return None
+    r, slope, meta = np.concatenate(residuals), np.concatenate(slopes), s.entry.meta
+    mean_square, power = float(r @ r) / len(r), float(slope @ slope)
+    more = float(slope @ r) / power if power > 0 else 0.0  # kg
+    explained = more**2 * power
+    unexplained = max(1.0, mean_square - explained / len(r))
+    significant = explained > max(MIN_MASS_SHARE * float(r @ r), SIGNIFICANCE**2 * unexplained)
+    if significant and abs(more) > MIN_MASS * heaviest:
+        text = (
+            f"{meta.motion} rests as with {max(meta.payload_mass + more, 0.0):.2g} kg, its label says "
+            f"{meta.payload_mass:g} kg: a wrong payload label? Import it again with --payload-mass"
+        )
+        values = {"motion": meta.motion, "mass": meta.payload_mass + more}
+        return mean_square, Finding("warning", "payload", text, (), values)
+    if apart:
+        worst = max(apart, key=lambda name: abs(apart[name]))
+        text = (
+            f"{meta.motion} rests {apart[worst] * 1e3:+.0f} mrad from where the other recordings of unit "
+            f"{meta.unit_id} say ({abbreviate(list(apart))}): another robot, or zeros set in between? Import it with "
+            "another "
+            "--unit-id"
+        )
+        return mean_square, Finding("warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart})
+    return None

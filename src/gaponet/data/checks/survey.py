@@ -1,0 +1,373 @@
+"""Survey: measurements of one sequence about its own recording, without judgement (data.checks judges)."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.data.sequence import Sequence
+from gaponet.data.signals import (
+    FAST_COMMAND_RAD_S,
+    Response,
+    correlation,
+    differentiate,
+    estimate_delay,
+    fast_speed,
+    lowpass,
+)  # fmt: skip
+from gaponet.data.static_poses import StaticPoses
+from gaponet.data.store import Entry
+from gaponet.robot.spec import RobotSpec
+
+MAX_LAG_S = 0.4
+STANDSTILL_S, STANDSTILL_RAD = 0.2, 0.005  # a joint that moves less in this time stands still
+BLOCKED_ERROR_RAD = 0.15  # distance of a blocked joint from its command; a loaded joint may be as far,
+BLOCKED_COMMAND_RAD = 0.1  # so that its command must also move by this
+REPEATED_COMMAND_RAD = 0.1  # the command must move by this while the state repeats itself
+SLOPE_MIN_RANGE_RAD = 0.2  # of the command; below, sag and stiction decide the slope
+SLOW_HZ = 0.3  # faster, a servo's resonance changes the slope
+GRAVITY_SAMPLES, SLOW_RAD_S = 60, 0.5  # rows in which torque is compared with gravity, and the highest speed there
+TORQUE_TOLERANCE = 0.05  # share of the torque limit by which a reading may exceed it
+EQUAL_RAD = 1e-5  # command and state that differ by less are one signal
+JUMP_RAD, JUMP_RAD_S2 = 0.1, 1000.0  # distance from the line between the neighbouring rows that no joint reaches
+ZERO_JUMP_RAD = 0.05  # step from a row of zeros to the next row
+COMMAND_STEP_RAD = 0.05  # step of a command; the torque may follow it
+SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
+SPECTRUM_HZ = np.arange(0.5, 60, 0.1)
+MOVING_RAD = 0.05
+LEVELS, LEVEL_TOLERANCE = 8, 0.1  # distinct positions from which a step is known; deviation in steps
+
+
+@dataclass(frozen=True)
+class Torque:
+    """Torques of one sequence per joint, (n).
+
+    Attributes:
+        low, high: Least and greatest, N·m.
+        over_limit, spikes: Rows above the torque limit, and far above the rows around.
+        flat: Rows at exactly the greatest magnitude.
+    """
+
+    low: Array
+    high: Array
+    over_limit: Array
+    spikes: Array
+    flat: Array
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Measurements of one sequence; n joints in robot order.
+
+    Attributes:
+        samples: Hash of command and state alone, without unit and payload.
+        rate_hz, jitter_ms, longest_gap_ms: From the state's timestamps; jitter is the largest deviation from median.
+        ctrl_limits, qpos_limits: (n, 2), least and greatest, rad.
+        speed: signals.fast_speed of the command, (n), rad/s.
+        delay: Lag of the state behind the command, (n) s, NaN where the motion does not show it.
+        lead: Lead of the state before the command, (n) s, NaN where there is none.
+        follows, opposes: (n, n); [i, j] is the greatest correlation of commanded velocity i with measured velocity j,
+            and with its negative, at lags up to MAX_LAG_S; 0 where one does not move. Periodic motion shows both.
+        slope: Motion of the state per motion of the command, (n); NaN where the motion does not show it.
+        equals_command: Joints whose state is the command itself, (n).
+        jump_rows: Rows with a position that no joint can reach and leave in a period, (n).
+        zero_rows: Rows in which every joint is exactly 0, far from the rows around.
+        qvel_ratio: Recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves.
+        blocked_s, blocked_at: Longest standstill far from a moving command, (n) s, and its position, rad.
+        standstill_s: Longest standstill of all joints while the commands of half of them move, s.
+        repeated_s: Longest stretch in which a joint repeats one number while its command moves, (n) s.
+        all_repeated_s: Longest stretch in which the whole state repeats itself while the command moves, s.
+        resolution: Step between positions, (n) rad; 0 where positions are continuous, or too few.
+        torque: None if no torque was recorded.
+        static_poses: Moments at rest.
+        response: Correlations of operated joints with their commands (data.signals).
+        spectra: Log power of command and state, (2, H) at SPECTRUM_HZ.
+        command_distance: Distance of the nearest state from the command of up to MAX_LAG_S before, over the state's
+            standard deviation, (n); NaN where the joint does not move.
+        velocity_correlation, torque_correlation: Command against measured velocity and torque, (n).
+        gravity_samples: Positions and torques in slow rows, (2, k, n); None if no torque was recorded.
+    """
+
+    entry: Entry
+    samples: str
+    rate_hz: float
+    jitter_ms: float
+    longest_gap_ms: float
+    ctrl_limits: Array
+    qpos_limits: Array
+    speed: Array
+    delay: Array
+    lead: Array
+    follows: Array
+    opposes: Array
+    slope: Array
+    equals_command: Array
+    jump_rows: Array
+    zero_rows: int
+    qvel_ratio: Array
+    blocked_s: Array
+    blocked_at: Array
+    standstill_s: float
+    repeated_s: Array
+    all_repeated_s: float
+    resolution: Array
+    torque: Torque | None
+    static_poses: StaticPoses
+    response: Response
+    spectra: Array
+    command_distance: Array
+    velocity_correlation: Array
+    torque_correlation: Array
+    gravity_samples: Array | None
+
+    @property
+    def motion(self) -> str:
+        """Name of the motion."""
+        return self.entry.meta.motion
+
+    @property
+    def ctrl_range(self) -> Array:
+        """(n) rad."""
+        return np.ptp(self.ctrl_limits, axis=1)
+
+    @property
+    def qpos_range(self) -> Array:
+        """(n) rad."""
+        return np.ptp(self.qpos_limits, axis=1)
+
+    @property
+    def missing_samples(self) -> bool:
+        """True if a period is 2.5 times as long as usual."""
+        return self.longest_gap_ms * self.rate_hz / 1e3 > 2.5
+
+    @classmethod
+    def of(cls, entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
+        """Measure one sequence."""
+        ctrl, qpos, dt, notes, op = sequence.ctrl, sequence.qpos, sequence.dt, entry.meta.notes, robot.operated_index
+        blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
+        follows, opposes = _correlations(ctrl, qpos, dt)
+        delay, lead = estimate_delay(ctrl, qpos, dt, MAX_LAG_S), estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
+        return Survey(
+            entry=entry,
+            samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
+            rate_hz=float(notes.get("rate_hz", 1 / dt)),
+            jitter_ms=float(notes.get("jitter_ms", 0.0)),
+            longest_gap_ms=float(notes.get("longest_gap_ms", dt * 1e3)),
+            ctrl_limits=np.stack([ctrl.min(axis=0), ctrl.max(axis=0)], axis=1),
+            qpos_limits=np.stack([qpos.min(axis=0), qpos.max(axis=0)], axis=1),
+            speed=fast_speed(ctrl, dt),
+            delay=delay,
+            lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
+            follows=follows,
+            opposes=opposes,
+            slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
+            equals_command=(np.ptp(ctrl, axis=0) > MOVING_RAD) & (np.abs(ctrl - qpos) < EQUAL_RAD).all(axis=0),
+            jump_rows=_jump_rows(qpos, dt),
+            zero_rows=_zero_rows(sequence, notes, robot),
+            qvel_ratio=_qvel_ratio(sequence),
+            blocked_s=blocked_s,
+            blocked_at=blocked_at,
+            standstill_s=_standstill(ctrl, qpos, dt),
+            repeated_s=_repeated(ctrl, qpos, dt),
+            all_repeated_s=_all_repeated(sequence),
+            resolution=_resolution(qpos),
+            torque=_torque(sequence, robot),
+            static_poses=StaticPoses.of(sequence, op),
+            response=Response.of(ctrl[:, op], qpos[:, op], dt),
+            spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]).astype(np.float32),
+            **_kind_of_command(sequence),
+            gravity_samples=_gravity_samples(sequence),
+        )
+
+
+def _correlations(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
+    """Return `follows` and `opposes`: velocities over about 60 ms, at lags in steps of about 40 ms."""
+    span, stride = max(1, round(0.06 / dt)), max(1, round(0.04 / dt))
+    u, v = ctrl[span:] - ctrl[:-span], qpos[span:] - qpos[:-span]
+    most, least = np.zeros((2, ctrl.shape[1], ctrl.shape[1]))
+    for lag in range(0, min(round(MAX_LAG_S / dt), len(u) // 2) + 1, stride):
+        a, b = u[: len(u) - lag], v[lag:]
+        a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+        scale = np.sqrt(np.outer((a**2).sum(axis=0), (b**2).sum(axis=0)))
+        coefficients = (a.T @ b) / np.where(scale > 0, scale, np.inf)
+        most, least = np.maximum(most, coefficients), np.minimum(least, coefficients)
+    return most, -least
+
+
+def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Array:
+    """Return the slope of the state over the command of `lag` rows before; NaN for a fast joint with unknown lag."""
+    slope = np.full(len(lag), np.nan)
+    slow = [lowpass(x, dt, SLOW_HZ) for x in (ctrl, qpos)] if len(ctrl) * dt > 3 / SLOW_HZ else None
+    for j in np.flatnonzero((np.ptp(ctrl, axis=0) > SLOPE_MIN_RANGE_RAD) & ((lag > 0) | (speed < FAST_COMMAND_RAD_S))):
+        steps, candidates = round(float(lag[j])), []
+        for a, b in ((ctrl, qpos), *([slow] if slow and np.ptp(slow[0][:, j]) > SLOPE_MIN_RANGE_RAD else [])):
+            u, v = a[: len(a) - steps, j].astype(float), b[steps:, j].astype(float)
+            u = u - u.mean()
+            candidates.append(float(u @ v / (u @ u)))
+        slope[j] = min(candidates, key=lambda x: abs(x - 1))  # a resonance changes one of them
+    return slope
+
+
+def _kind_of_command(sequence: Sequence) -> dict[str, Array]:
+    """Compare the command with the position soon after, with the velocity, and with the torque."""
+    every = max(1, round(0.02 / sequence.dt))
+    ctrl, qpos = (np.ascontiguousarray(x[::every].T, float) for x in (sequence.ctrl, sequence.qpos))  # (n, T)
+    rows, speed = qpos.shape[1], np.gradient(qpos, axis=1)
+    distances, velocity = [], []
+    for lag in range(0, min(round(MAX_LAG_S / 0.02), rows // 2), 2):
+        u, q = ctrl[:, : rows - lag], qpos[:, lag:]
+        product = np.abs(u @ q.T) / (rows - lag)  # (n, n)
+        u_power, q_power, variance = (u**2).mean(axis=1)[:, None], (q**2).mean(axis=1), np.maximum(q.var(axis=1), 1e-12)
+        for scale in (1.0, np.degrees(1), np.radians(1)):  # other checks judge units, signs and names
+            square = scale**2 * u_power + q_power - 2 * scale * product
+            distances.append((np.maximum(square, 0) / variance).min(axis=1))
+        velocity.append(correlation(u, speed[:, lag:]))
+    near = np.where(np.ptp(qpos, axis=1) > MOVING_RAD, np.sqrt(np.min(distances, axis=0)), np.nan)
+    torque = np.full(near.shape, np.nan) if sequence.tau is None else correlation(ctrl, sequence.tau[::every].T)
+    return {"command_distance": near, "velocity_correlation": np.max(velocity, axis=0), "torque_correlation": torque}
+
+
+def _standing(qpos: Array, dt: float) -> Array:
+    """Return where joints have not moved for STANDSTILL_S, (T, n) bool."""
+    w = max(1, round(STANDSTILL_S / dt))
+    stands = np.zeros(qpos.shape, bool)
+    stands[w:] = np.abs(qpos[w:] - qpos[:-w]) < STANDSTILL_RAD
+    return stands
+
+
+def _standstill(ctrl: Array, qpos: Array, dt: float) -> float:
+    """Return the longest standstill of all joints (brakes on, drives off) while at least two commands move, s."""
+    commanded = max(2.0, 0.5 * (np.ptp(ctrl, axis=0) > BLOCKED_COMMAND_RAD).sum())
+    late = round(MAX_LAG_S / dt)
+    standing = np.asarray(_standing(qpos, dt).all(axis=1))
+    runs = [r for r in _runs(standing) if r.stop - r.start > 2 * late]
+    runs = [
+        r for r in runs
+        if (np.ptp(ctrl[r.start : r.stop - late], axis=0) > BLOCKED_COMMAND_RAD).sum() >= commanded
+    ]  # fmt: skip
+    return max((r.stop - r.start for r in runs), default=0) * dt
+
+
+def _blocked(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
+    seconds, places = np.zeros((2, qpos.shape[1]))
+    for j, mask in enumerate((_standing(qpos, dt) & (np.abs(ctrl - qpos) > BLOCKED_ERROR_RAD)).T):
+        runs = [r for r in _runs(mask) if np.ptp(ctrl[r, j]) > BLOCKED_COMMAND_RAD]
+        if runs:
+            longest = max(runs, key=lambda r: r.stop - r.start)
+            seconds[j], places[j] = (longest.stop - longest.start) * dt, qpos[longest.start, j]
+    return seconds, places
+
+
+def _jump_rows(qpos: Array, dt: float) -> Array:
+    distance = np.abs(qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2)
+    return (distance > max(JUMP_RAD, JUMP_RAD_S2 / 2 * dt**2)).sum(axis=0)
+
+
+def _zero_rows(sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> int:
+    """Count rows of zeros of the joints that were logged in rad or deg; one joint alone may well pass through zero."""
+    converted = (joint for joint, unit in notes.get("converted_from", {}).items() if unit != "deg")
+    excluded = {*notes.get("held_at_home", ()), *converted}
+    logged = [i for i, name in enumerate(robot.joint_names) if name not in excluded]
+    if len(logged) < 2:
+        return 0
+    count = 0
+    for values, min_edges in ((sequence.qpos[:, logged], 1), (sequence.ctrl[:, logged], 2)):
+        far = np.abs(np.diff(values, axis=0)).max(axis=1) > ZERO_JUMP_RAD  # (T − 1,)
+        for run in _runs((values == 0).all(axis=1)):
+            edges = [*far[run.start - 1 : run.start if run.start else 0], *far[run.stop - 1 : run.stop]]
+            # A command may step away from zero; it does not step there and back within a few rows.
+            if sum(edges) >= min_edges and (min_edges == 1 or run.stop - run.start <= 5):
+                count += run.stop - run.start
+    return count
+
+
+def _gravity_samples(sequence: Sequence) -> Array | None:
+    if sequence.tau is None:
+        return None
+    slow = np.flatnonzero((np.abs(sequence.qvel) < SLOW_RAD_S).all(axis=1))
+    rows = slow[:: max(1, len(slow) // GRAVITY_SAMPLES)]
+    return np.stack([sequence.qpos[rows], sequence.tau[rows]])
+
+
+def _qvel_ratio(sequence: Sequence) -> Array:
+    derivative = differentiate(sequence.qpos, sequence.dt)
+    power = (derivative**2).sum(axis=0)
+    moves = np.ptp(sequence.qpos, axis=0) > MOVING_RAD
+    return np.where(moves, (sequence.qvel * derivative).sum(axis=0) / np.where(power > 0, power, 1.0), np.nan)
+
+
+def _all_repeated(sequence: Sequence) -> float:
+    """A resting robot repeats its positions; if every signal repeats while the command moves, nothing was read."""
+    state = [getattr(sequence, name) for name in ("qpos", "qvel", "tau", "temperature")]
+    same = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in state if x is not None], axis=0)
+    late = round(MAX_LAG_S / 2 / sequence.dt)
+    moved = lambda r: np.ptp(sequence.ctrl[r.start : max(r.stop - late, r.start) + 1], axis=0).max()  # noqa: E731
+    rows = max((r.stop - r.start for r in _runs(same) if moved(r) > REPEATED_COMMAND_RAD), default=0)
+    return rows * sequence.dt
+
+
+def _repeated(ctrl: Array, qpos: Array, dt: float) -> Array:
+    """A loaded or stuck joint stands still, but noise and encoder steps change its number, and it moves at last."""
+    late = round(MAX_LAG_S / 2 / dt)
+    seconds = np.zeros(qpos.shape[1])
+    for j, same in enumerate((np.diff(qpos, axis=0) == 0).T):
+        for r in _runs(same):
+            command = ctrl[r.start : max(r.stop - late, r.start), j]
+            if len(command) and np.ptp(command) > REPEATED_COMMAND_RAD:
+                seconds[j] = max(seconds[j], (r.stop - r.start) * dt)
+    return seconds
+
+
+def _resolution(qpos: Array) -> Array:
+    """Return the step of which all differences of positions are multiples, where there are few distinct positions."""
+    steps = np.zeros(qpos.shape[1])
+    for j, column in enumerate(qpos.T):
+        levels = np.unique(column.astype(float))
+        gaps = np.diff(levels)
+        if LEVELS <= len(levels) <= len(column) / 4:
+            step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+            if np.abs(gaps / step - np.round(gaps / step)).max() < LEVEL_TOLERANCE:
+                steps[j] = step
+    return steps
+
+
+def _runs(mask: Array) -> list[slice]:
+    """Return the runs of True in (T,)."""
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
+    if sequence.tau is None:
+        return None
+    from scipy.ndimage import maximum_filter1d, median_filter
+
+    tau = sequence.tau
+    magnitude = np.abs(tau)
+    window = max(3, round(SPIKE_WINDOW_S / sequence.dt))
+    usual = median_filter(magnitude, size=(window, 1), mode="nearest")
+    steps = np.abs(np.diff(sequence.ctrl, axis=0, prepend=sequence.ctrl[:1])).max(axis=1) > COMMAND_STEP_RAD
+    calm = maximum_filter1d(steps, 2 * window + 1) == 0
+    return Torque(
+        low=tau.min(axis=0),
+        high=tau.max(axis=0),
+        over_limit=(magnitude > robot.effort_limit * (1 + TORQUE_TOLERANCE)).sum(axis=0),
+        spikes=((magnitude - usual > SPIKE_SHARE * robot.effort_limit) & calm[:, None]).sum(axis=0),
+        flat=(magnitude == magnitude.max(axis=0)).sum(axis=0),
+    )
+
+
+def _spectrum(qpos: Array, dt: float) -> Array:
+    """Return the mean logarithm of the power of the velocities at SPECTRUM_HZ, (H); NaN above half the rate."""
+    moved = qpos[:, np.ptp(qpos, axis=0) > 0.02].astype(float)
+    if not moved.size or len(moved) < 100:
+        return np.full(len(SPECTRUM_HZ), np.nan)
+    v = np.diff(moved, axis=0)
+    power = np.log(np.abs(np.fft.rfft(v * np.hanning(len(v))[:, None], axis=0)) ** 2 + 1e-30).mean(axis=1)
+    smooth = np.convolve(power, np.ones(3) / 3, "same")
+    levels = np.interp(SPECTRUM_HZ, np.fft.rfftfreq(len(v), dt), smooth)
+    return np.where(0.48 / dt > SPECTRUM_HZ, levels, np.nan)

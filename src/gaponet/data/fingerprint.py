@@ -1,0 +1,88 @@
+"""Fingerprints of commands: recognise one command in recordings with different names, payloads, rates or lengths.
+
+Two motions with equal commands must not be on two sides of a split. A fingerprint holds hashes of a sample of the
+distinct rows, which are equal where one file was played, and an outline, which is similar where a command was computed
+again at slightly different times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
+
+from gaponet.base.arrays import Array
+
+SAMPLED_ROWS, OUTLINE_POINTS = 32, 24
+ROW_RESOLUTION_RAD = 1e-5  # rows that differ by less are equal
+MIN_SHARED_ROWS, MIN_SHARED_SHARE = 2, 0.3  # of the sampled rows; one common resting place is not enough
+MAX_OUTLINE_DIFFERENCE, MAX_DURATION_DIFFERENCE = 0.004, 0.01  # shares of the outline's range and of the duration
+MAX_START_SHIFT = 0.1  # outline points by which one command may begin later
+OUTLIERS = 2  # outline points that may differ by more: a step is a row early or late
+
+
+class CommandFingerprint(TypedDict):
+    """Fingerprint of the commands of one recording.
+
+    rows: Least hashes of distinct rows, without the first row, which many motions share; seconds: time between the
+    first and the last change; outline: projection of the commands at evenly spaced times between these.
+    """
+
+    rows: Annotated[list[Annotated[int, Interval(ge=0, lt=2**32)]], Len(1, SAMPLED_ROWS)]
+    seconds: Annotated[float, Interval(ge=0, le=1e8)]
+    outline: Annotated[list[Annotated[float, Interval(ge=-1e6, le=1e6)]], Len(OUTLINE_POINTS, OUTLINE_POINTS)]
+
+
+def fingerprint(ctrl: Array, dt: float) -> CommandFingerprint:
+    """Return the fingerprint of commands (T, n), rad, with a period of dt s."""
+    steps = np.round(np.asarray(ctrl, float) / ROW_RESOLUTION_RAD).astype(np.int64)
+    rng = np.random.default_rng(0)
+    weights = rng.integers(1, 2**62, ctrl.shape[1], dtype=np.int64) | 1
+    hashes = ((steps * weights).sum(axis=1).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
+    distinct = hashes[hashes != hashes[0]]
+    changed = np.flatnonzero((steps[1:] != steps[:-1]).any(axis=1))
+    first, last = (int(changed[0]), int(changed[-1]) + 1) if len(changed) else (0, len(ctrl) - 1)
+    projection = np.asarray(ctrl, float) @ rng.normal(size=ctrl.shape[1])
+    outline = np.interp(np.linspace(first, last, OUTLINE_POINTS), np.arange(len(ctrl)), projection)
+    return {
+        "rows": np.unique(distinct if len(distinct) else hashes)[:SAMPLED_ROWS].tolist(),
+        "seconds": round(float(last - first) * dt, 4),
+        "outline": [round(float(x), 5) for x in outline],
+    }
+
+
+def equal_commands(fingerprints: Sequence[CommandFingerprint]) -> list[tuple[int, int]]:
+    """Return pairs (i, j), i < j, of fingerprints of one command."""
+    pairs = set(_pairs_with_shared_rows([set(f["rows"]) for f in fingerprints]))
+    outlines = np.array([f["outline"] for f in fingerprints])  # (N, OUTLINE_POINTS)
+    seconds = np.array([f["seconds"] for f in fingerprints])
+    slopes, ranges = np.gradient(outlines, axis=1), np.ptp(outlines, axis=1)
+    for i in np.flatnonzero(ranges > 0):
+        others = i + 1 + np.flatnonzero(np.abs(seconds[i + 1 :] - seconds[i]) <= MAX_DURATION_DIFFERENCE * seconds[i])
+        difference, slope = outlines[others] - outlines[i], slopes[i]
+        shift = np.clip(difference @ slope / max(slope @ slope, 1e-12), -MAX_START_SHIFT, MAX_START_SHIFT)
+        residual = np.abs(difference - shift[:, None] * slope)
+        worst = np.partition(residual, -1 - OUTLIERS, axis=1)[:, -1 - OUTLIERS]
+        pairs |= {(int(i), int(j)) for j in others[worst <= MAX_OUTLINE_DIFFERENCE * ranges[i]]}
+    return sorted(pairs)
+
+
+def _pairs_with_shared_rows(samples: list[set[int]]) -> Iterator[tuple[int, int]]:
+    """Yield pairs that share enough of the least row hashes of both."""
+    from scipy.sparse import csr_matrix
+
+    index = {row: k for k, row in enumerate(sorted(set().union(*samples)))}
+    places = [(i, index[row]) for i, sample in enumerate(samples) for row in sample]
+    contains = csr_matrix(
+        (np.ones(len(places), np.int32), tuple(zip(*places, strict=True))), (len(samples), len(index))
+    )
+    common = (contains @ contains.T).tocoo()
+    for i, j, n in zip(common.row.tolist(), common.col.tolist(), common.data.tolist(), strict=True):
+        a, b = samples[i], samples[j]
+        if i < j and (a == b or n >= max(MIN_SHARED_ROWS, MIN_SHARED_SHARE * min(len(a), len(b)))):
+            least = set(sorted(a | b)[: min(len(a), len(b))])
+            if len(a & b & least) >= MIN_SHARED_SHARE * len(least):
+                yield i, j

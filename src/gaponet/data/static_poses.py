@@ -1,0 +1,146 @@
+"""Static poses: moments at which a robot stood still under a constant command, with the static error that remains.
+
+A joint with friction stops short of its target, on the side from which it came. Its positions lie in a band; the middle
+of the band is the position without friction. On an SO-101 the elbow's band is 75 mrad wide. A plain median of the
+static error would therefore depend on the direction of motion more than on sag. Each static pose stores the side of
+approach, and `static_error` weighs both sides equally.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.data.sequence import Sequence
+
+WINDOW_S = 0.5  # command and state must stand still for this time
+MAX_CTRL_RANGE_RAD = 1e-3  # of the command in the window
+MAX_DRIFT_RAD = 2e-3  # between the means of the window's halves
+MAX_NOISE_RAD = 3e-3  # standard deviation in the window; two steps of a 12-bit encoder
+MIN_MOTION_RAD = 0.01
+MIN_POSES_PER_SIDE = 3
+BLOCK_ROWS = 1024  # extremes of blocks are searched before the rows
+
+
+@dataclass(frozen=True)
+class StaticPoses:
+    """k static poses of one or more sequences, one row each; n joints.
+
+    Attributes:
+        qpos, ctrl: (k, n), rad; qpos averaged over the window.
+        approach: (k, n), +1 if the joint's last motion was upwards, −1 downwards, 0 if it had not moved.
+        distinct: (k, n) bool; False if neither joint nor command moved since the previous pose.
+    """
+
+    qpos: Array
+    ctrl: Array
+    approach: Array
+    distinct: Array
+
+    def __len__(self) -> int:
+        return len(self.qpos)
+
+    @classmethod
+    def of(cls, sequence: Sequence, joints: Array) -> StaticPoses:
+        """Return the ends of all stretches in which the joints (k indices) rest under a constant command."""
+        ends = _ends_of_rest(sequence, joints)
+        n = sequence.qpos.shape[1]
+        qpos, ctrl = np.zeros((len(ends), n)), np.zeros((len(ends), n))
+        approach, distinct = np.zeros((len(ends), n), int), np.ones((len(ends), n), bool)
+        w, starts = _window_rows(sequence), np.arange(0, len(sequence), BLOCK_ROWS)
+        extremes = np.stack([f.reduceat(sequence.qpos, starts) for f in (np.minimum, np.maximum)])  # (2, blocks, n)
+        for i, end in enumerate(ends):
+            qpos[i], ctrl[i] = sequence.qpos[end + 1 - w : end + 1].mean(axis=0), sequence.ctrl[end]
+            approach[i] = -_last_side(sequence.qpos[: end + 1], extremes, qpos[i])
+            if i:
+                moved = [np.abs(x[i] - x[i - 1]) > MIN_MOTION_RAD for x in (qpos, ctrl)]
+                distinct[i] = moved[0] | moved[1]
+        return cls(qpos, ctrl, approach, distinct)
+
+    @classmethod
+    def joined(cls, parts: list[StaticPoses], n: int) -> StaticPoses:
+        """Return the static poses of several sequences of n joints as one."""
+        empty = cls(np.zeros((0, n)), np.zeros((0, n)), np.zeros((0, n), int), np.zeros((0, n), bool))
+        return cls(*(np.concatenate([getattr(p, f) for p in (empty, *parts)]) for f in vars(empty)))
+
+    def static_error(self, joint: int, expected: Array | float = 0.0) -> StaticError:
+        """Return the static error of a joint over its distinct poses, both approaches weighed equally.
+
+        Args:
+            expected: Error to subtract, (k,) rad, such as the sag of the nominal model.
+        """
+        error = self.qpos[:, joint] - self.ctrl[:, joint] - expected
+        distinct, side = self.distinct[:, joint], self.approach[:, joint]
+        up, down, both = error[distinct & (side > 0)], error[distinct & (side < 0)], error[distinct]
+        if min(len(up), len(down)) < MIN_POSES_PER_SIDE:
+            return StaticError(float(np.median(both)) if len(both) else np.nan, np.nan, len(up), len(down))
+        high, low = float(np.median(down)), float(np.median(up))
+        return StaticError((high + low) / 2, max(high - low, 0.0) / 2, len(up), len(down))
+
+
+@dataclass(frozen=True)
+class StaticError:
+    """qpos − ctrl of one joint at rest.
+
+    Attributes:
+        middle: Mean of the medians of both approaches, rad; the plain median if one side is missing.
+        half_band: Half their distance, rad; NaN if one side is missing. Times kp it is the stiction torque.
+        up, down: Number of poses reached from below and from above.
+    """
+
+    middle: float
+    half_band: float
+    up: int
+    down: int
+
+    @property
+    def balanced(self) -> bool:
+        """True if both sides were recorded; otherwise stiction and sag cannot be separated."""
+        return np.isfinite(self.half_band)
+
+
+def _last_side(qpos: Array, extremes: Array, rest: Array) -> Array:
+    """Return on which side of `rest` (n) the joints of qpos (T, n) were last, (n): +1, −1, or 0 if never away."""
+    full, side = len(qpos) // BLOCK_ROWS, np.zeros(len(rest), int)
+    blocks = (np.abs(extremes[:, :full] - rest) > MIN_MOTION_RAD).any(axis=0)  # complete blocks, (full, n)
+    for j, x in enumerate(rest):
+        for start in (full * BLOCK_ROWS, *BLOCK_ROWS * np.flatnonzero(blocks[:, j])[:-2:-1]):
+            offset = qpos[start : start + BLOCK_ROWS, j] - x
+            away = np.flatnonzero(np.abs(offset) > MIN_MOTION_RAD)
+            if away.size:
+                side[j] = np.sign(offset[away[-1]])
+                break
+    return side
+
+
+def _window_rows(sequence: Sequence) -> int:
+    return max(2, round(WINDOW_S / sequence.dt))
+
+
+def _ends_of_rest(sequence: Sequence, joints: Array) -> Array:
+    """Return the last row of each stretch at rest. Time and memory grow with the rows only, not with the window."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    w = _window_rows(sequence)
+    if len(sequence) < 2 * w:
+        return np.zeros(0, int)
+    ctrl, state = sequence.ctrl[:, joints], sequence.qpos[:, joints].astype(float)
+    half = w // 2
+    ctrl_range = (maximum_filter1d(ctrl, w, axis=0) - minimum_filter1d(ctrl, w, axis=0))[
+        half : half + len(ctrl) - w + 1
+    ]
+    mean = _moving_mean(state, w)  # (T − w + 1, k), of the window that starts at the row
+    noise = np.sqrt(np.maximum(_moving_mean(state**2, w) - mean**2, 0))
+    halves = _moving_mean(state, half)
+    drift = np.abs(halves[w - half :] - halves[: len(halves) - w + half])
+    quiet = (ctrl_range < MAX_CTRL_RANGE_RAD) & (noise < MAX_NOISE_RAD) & (drift < MAX_DRIFT_RAD)
+    rows = np.flatnonzero(quiet.all(axis=1))
+    return rows[np.append(np.diff(rows) > 1, True)] + w - 1 if rows.size else rows
+
+
+def _moving_mean(values: Array, w: int) -> Array:
+    """Return the mean of rows t … t + w − 1, (T, k) → (T − w + 1, k)."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    return (total[w:] - total[:-w]) / w
