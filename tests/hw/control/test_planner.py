@@ -115,6 +115,8 @@ def test_live_targets_that_go_for_the_table_are_cut(so101, planner, judge):
         at.append(guard.step(so101.qpos_home, guard.qpos, 0.02))
     np.testing.assert_allclose(at[-1], so101.qpos_home, atol=1e-6)
     assert not guard.obstacle
+    slow = planner.config.blend_speed * 0.02  # away from an obstacle
+    assert np.abs(np.diff(at[199:], axis=0)).max() <= slow + 1e-9
 
 
 def test_of_an_arm_that_sags_the_arm_itself_is_kept_clear(so101, planner):
