@@ -42,8 +42,8 @@ from gaponet.cli.main import main as gaponet_main
 from gaponet.data.store import Dataset
 
 TRAIN = ["--model.history", "2", "--pretraining.num-envs", "16", "--pretraining.steps", "40",
-         "--pretraining.rounds", "3", "--ppo.num-envs", "16", "--ppo.num-steps", "16",
-         "--validate-every", "2"]  # fmt: skip
+         "--pretraining.rounds", "3", "--pretraining.gradient-steps", "40", "--pretraining.batch-size", "128",
+         "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
 LIMIT_S = 600.0
 REFUSALS = ("Folder", "File", "Usage", "Dataset", "Model")  # first words of one-line errors
 
@@ -90,9 +90,11 @@ def page(out: Path) -> Any:
 
 
 def result(out: Path) -> Any:
-    """Return the rows of an experiment and its files."""
+    """Return the rows of an experiment, without times, and its files."""
     record = json.loads((out / "compare.json").read_text())
-    return [record["tables"][0]["rows"], sorted(p.name for p in (out / "cells").iterdir()), names(out)]
+    table = record["tables"][0]
+    rows = [[cell for cell, name in zip(row, table["columns"], strict=True) if name != "min"] for row in table["rows"]]
+    return [rows, sorted(p.name for p in (out / "cells").iterdir()), names(out)]
 
 
 def cases(given: Path) -> dict[str, Case]:

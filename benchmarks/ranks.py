@@ -20,11 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from kills import prepare, trained
+from kills import TRAIN, prepare, trained
 
-TINY = ["--model.history", "2", "--model.sensors", "off", "--pretraining.num-envs", "16", "--pretraining.steps", "40",
-        "--pretraining.rounds", "3", "--pretraining.gradient-steps", "40", "--pretraining.batch-size", "128",
-        "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m"]
 MINUTE = 60.0
 LIMITS = {"rank frozen": 160.0}  # s; before its first sign of life it is waited for two minutes
@@ -59,7 +56,9 @@ def adversity(data: Path, work: Path, wanted: int, rng: np.random.Generator) -> 
 
     def start(out: Path, mark: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {"TRIAL": mark}
-        return subprocess.Popen(command(data, out, 4000, TINY, 2), stdout=log, stderr=log, env=environment)
+        return subprocess.Popen(
+            command(data, out, 4000, [*TRAIN, "--model.sensors", "off"], 2), stdout=log, stderr=log, env=environment
+        )
 
     began, whole = time.monotonic(), work / "whole"
     if start(whole, f"{work}-whole").wait():
