@@ -56,7 +56,7 @@ def test_a_broken_format_is_one_warning_and_every_other_is_read(installed, tmp_p
     (tmp_path / "log.npz").touch()
     for _ in range(2):
         assert detect(tmp_path / "log.npz") == "npz"
-        assert main(["formats"]) == 0
+        assert main(["import", "--formats"]) == 0
     (text,) = [r.getMessage() for r in caplog.records]
     assert text.startswith("Warning: rival: ")
     assert said in text
@@ -82,7 +82,7 @@ def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, c
         toy="class Toy:\n    def __init__(self, robot, port): self.robot, self.port = robot, port\n\n"
         "def half(q): return q",
     )
-    assert main(["formats"]) == 0
+    assert main(["import", "--formats"]) == 0
     assert "Sound" in capsys.readouterr().out
     (tmp_path / "a.wav").touch()
     assert detect(tmp_path / "a.wav") == "wav"

@@ -36,7 +36,7 @@ def import_logs(
     payload_mass: float | None = None,
     payload_side: str | None = None,
     map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    format: Literal["sage", "lerobot", "bam", "table", "rosbag", "hdf5", "npz", "mat", "pace", "asap"] | None = None,
+    format: str | None = None,
     logs: Path | None = None,
     position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] | None = None,

@@ -101,7 +101,7 @@ def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile
     file = Path(given) if given is not None else beside if beside.is_file() else None
     if file is None:
         return LogsFile(), None
-    return read_toml(LogsFile, file, UsageError, f"docs/data-format.md lists the fields; {HINT}"), file
+    return read_toml(LogsFile, file, UsageError, f"docs/logs.md lists the fields; {HINT}"), file
 
 
 class Naming:
