@@ -7,23 +7,12 @@ import torch
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.observation import History, Layout
-from gaponet.robot.spec import load_robot
 
 
 @pytest.mark.parametrize(("history", "dim"), [(2, 80), (4, 140), (6, 200), (8, 260)])
 def test_dimensions_are_the_papers(history, dim):
     assert ModelConfig(history=history, payload_input=False).observation_dim(10) == dim
     assert ModelConfig(history=4, payload_input=True).observation_dim(10) == 141
-
-
-@pytest.mark.parametrize(("history", "dim"), [(2, 80), (4, 140), (6, 200), (8, 260)])
-def test_so_they_are_of_the_h1_2(history, dim):
-    robot = load_robot("h1_2")
-    n = len(robot.operated)
-    for payload in (0, 1):
-        config = ModelConfig(history=history, payload_input=bool(payload))
-        assert Layout(config, n).observation.stop == dim + payload
-        assert DeltaLoop(config, robot.qpos_range[robot.operated_index], 1).x.shape == (1, dim + payload + n)
 
 
 def test_layout_is_state_then_frames_newest_first_then_payload_and_action():
@@ -53,7 +42,7 @@ def test_frames_are_the_last_ones_a_stride_apart(make, stride, seen):
 
 @pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])
 @pytest.mark.parametrize("stride", [1, 3])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_history_is_what_a_list_of_past_frames_says_whatever_is_pushed_and_reset(make, stride, seed):
     rng, n, num = np.random.default_rng(seed), 2, 4
     config = ModelConfig(history=int(rng.integers(1, 5)), stride=stride)

@@ -99,19 +99,6 @@ def test_one_robot_among_several_begins_anew(artifact):
     assert not np.array_equal(again[1], first[1])
 
 
-def test_robots_that_share_a_model_do_not_share_a_past(artifact):
-    model = GapModel.load(artifact)
-    states = np.random.default_rng(2).normal(0, 0.5, (20, 2, 3, 2))
-    alone = []
-    for robot in range(2):
-        loop = model.loop()
-        alone.append([loop.delta(*state, 0.0) for state in states[:, robot]])
-    loops = model.loop(), model.loop()
-    for t, pair in enumerate(states):
-        for robot in range(2):
-            np.testing.assert_array_equal(loops[robot].delta(*pair[robot], 0.0), alone[robot][t])
-
-
 def test_a_correction_never_leaves_the_joint_limits(artifact, robot):
     model = GapModel.load(artifact)
     np.testing.assert_array_equal(model.qpos_range, robot.qpos_range)

@@ -81,7 +81,7 @@ class AlignedSim:
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
         self.loop, self.transfer = None, None
         trained = model if isinstance(model, GapModel) and not other_payload else None
-        if trained is not None and trained.corrects(robot) and control_periods_of(trained, self.dt) == 1:
+        if trained is not None and trained.is_trained_in(robot) and control_periods_of(trained, self.dt) == 1:
             self.loop = trained.loop(self.num_envs)
         elif model is not None:
             inverted = _inverse_of(self.sim, robot, own, locked, inverse, nthread)

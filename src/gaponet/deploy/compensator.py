@@ -122,7 +122,7 @@ class Compensator:
         max_mass = config.payload_max
         if model is not None:
             robot = _simulator_of(model, robot, self.dt, config)
-            max_mass = model.config.payload_max if extrapolate else model.heaviest
+            max_mass = model.config.payload_max if extrapolate else model.max_payload
         robot = robot if adaptation is None else adaptation.robot(robot)
         self.robot, self.model, self.config, self.single = robot, model, config, num_envs is None
         self.extrapolate = extrapolate
@@ -356,7 +356,7 @@ def _simulator_of(model: GapModel, robot: RobotSpec, dt: float, config: Compensa
     model.require_rate(dt)
     if model.config.holds:
         raise ModelError(f"{model.path}: holds corrections or sensors; to be inverted it must be trained without")
-    if model.corrects(robot):
+    if model.is_trained_in(robot):
         return robot
     if config.aim == "simulator":
         raise ModelError(

@@ -1,8 +1,8 @@
-"""What is particular to one unit, beside a model: a small file per unit in RUN/adaptation/.
+"""Adaptation of a trained model to one unit (one physical robot): a file per unit in RUN/adaptation/.
 
-No model can know a unit's gain, damping, friction, zero offsets and delay before it has seen the unit. They are fitted
-to half a minute of its log, as servo parameters of the simulator under the trained correction (sysid/adapt.py); the
-network stays as it is. If nobody weighed what the unit carried, its mass is fitted with them.
+Units differ in gain, damping, friction, zero offsets and delay. These servo parameters of the simulator are fitted to
+half a minute of the unit's log, with the trained correction (sysid/adapt.py). The network does not change. An unknown
+payload mass is fitted with them.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.adapt import FIELDS, Field, adapt
 
-FOLDERS = ("calibration", "adaptation")  # the former name, and the one that is written
+FOLDERS = ("calibration", "adaptation")  # earlier name, name of today
 
 
 @dataclass(frozen=True)
 class Adaptation:
-    """One unit's servo parameters.
+    """Servo parameters of one unit.
 
     Attributes:
-        weights: Hash of the model.onnx that they were fitted under.
+        weights: Hash of the model.onnx with which they were fitted.
         servos: Joint → kp N·m/rad, damping N·m·s/rad, frictionloss N·m, offset rad, delay s.
-        logs: Content hashes of the recordings used.
-        seconds: How many seconds of them.
-        before, after: RMS error of the windows fitted, rad.
-        payload_mass, payload_std: What the unit carried, kg, and its standard error, where nobody knew; else None.
+        logs: Content hashes of the recordings.
+        seconds: Duration of the fitted windows.
+        before, after: RMS error of the fitted windows, rad.
+        payload_mass, payload_std: Fitted payload and its standard error, kg; None if the payload was known.
     """
 
     unit_id: str
@@ -52,11 +52,11 @@ class Adaptation:
     payload_std: float | None = None
 
     def robot(self, simulator: RobotSpec) -> RobotSpec:
-        """The simulator of this unit."""
+        """Return the simulator with the parameters of this unit."""
         return simulator.with_servos({j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()})
 
     def save(self, run: Path) -> Path:
-        """RUN/adaptation/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
+        """Write RUN/adaptation/UNIT.json and return its path. It replaces an earlier file of this unit."""
         path = run / FOLDERS[-1] / f"{re.sub(r'[^A-Za-z0-9._-]', '_', self.unit_id)}.json"
         with lock_folder(run, "run"):
             path.parent.mkdir(exist_ok=True)
@@ -73,45 +73,51 @@ class Adaptation:
         unknown_payload: bool = False,
         progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
     ) -> Adaptation:
-        """Fit a unit's parameters under a trained model.
+        """Fit the parameters of a unit, with the correction of a trained model.
 
         Args:
-            model: Its correction is applied while fitting.
-            sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
-            unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
-            progress: The same as adapt's.
+            sequences: Recordings of one unit. Windows of 8 s are taken from them evenly.
+            unknown_payload: Fit the payload mass too; all recordings have the same payload.
+            progress: As in sysid.adapt.
+
+        Raises:
+            UsageError: The recordings are of several units.
         """
         unit = _one_unit(sequences)
-        found = adapt(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)
+        fitted = adapt(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)
         servos = {
-            j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
+            j: {f: float(getattr(fitted.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
             for j in simulator.operated
         }
         logs = tuple(s.content_hash() for s in sequences)
         return Adaptation(
-            unit, model.weights_hash(), servos, logs, seconds, found.before, found.after, found.payload_mass,
-            found.payload_std,
+            unit, model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after, fitted.payload_mass,
+            fitted.payload_std,
         )  # fmt: skip
 
     @classmethod
     def load(cls, run: Path, weights: str) -> dict[str, Adaptation]:
-        """Unit → adaptation of this model; those of an earlier model in the same folder are refused."""
-        found = {}
+        """Read all adaptations of a run by unit.
+
+        Raises:
+            ModelError: A file is damaged, or belongs to another model than that with these weights.
+        """
+        adaptations = {}
         for path in sorted(path for name in FOLDERS for path in (run / name).glob("*.json")):
-            one = read_json(Adaptation, path, ModelError, "run gaponet adapt again")
-            if one.weights != weights:
+            adaptation = read_json(Adaptation, path, ModelError, "run gaponet adapt again")
+            if adaptation.weights != weights:
                 raise ModelError(
-                    f"{path}: made for another model ({one.weights}); delete it or run gaponet adapt again"
+                    f"{path}: made for another model ({adaptation.weights}); delete it or run gaponet adapt again"
                 )
-            found[one.unit_id] = one
-        return found
+            adaptations[adaptation.unit_id] = adaptation
+        return adaptations
 
     @staticmethod
     def recordings(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
-        """Recordings of a unit: of these motions, else of those that the model was trained on, else all.
+        """Select the recordings of a unit: of these motions, else of the training motions, else all.
 
         Raises:
-            UsageError: No such unit, or none is named and the dataset holds several.
+            UsageError: The unit does not exist, or it is not given and the dataset has several.
         """
         units = sorted({e.meta.unit_id for e in data.entries})
         if unit not in units and (unit or len(units) != 1):
@@ -122,7 +128,7 @@ class Adaptation:
 
 
 def _one_unit(sequences: ListOf[Sequence]) -> str:
-    """The unit whose recordings these are."""
+    """Return the unit of these recordings; refuse those of several."""
     units = sorted({s.meta.unit_id for s in sequences})
     if len(units) != 1:
         raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")

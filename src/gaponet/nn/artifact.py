@@ -177,7 +177,7 @@ class GapModel:
             )
         return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
 
-    def corrects(self, robot: RobotSpec) -> bool:
+    def is_trained_in(self, robot: RobotSpec) -> bool:
         """Return true if this is the simulator of training.
 
         Raises:
@@ -197,7 +197,7 @@ class GapModel:
         """Refuse another simulator, with other gains or limits, or another control period dt, s, than in training."""
         from gaponet.sim.model import model_hash
 
-        if not self.corrects(robot):
+        if not self.is_trained_in(robot):
             trained, given = self.card["simulator"], model_hash(robot)
             raise ModelError(
                 f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {given} "
@@ -223,7 +223,7 @@ class GapModel:
         return robot
 
     @property
-    def heaviest(self) -> float:
+    def max_payload(self) -> float:
         """Largest payload in the training data, kg; the largest possible input if the card does not have it."""
         return float(max(self.card.get("payload_seen", [self.config.payload_max])))
 
@@ -233,11 +233,11 @@ class GapModel:
         if not (np.isfinite(mass) & (mass >= 0)).all():
             raise UsageError(f"payload_mass is {payload_mass}; give kg, 0 when empty")
         least = min(self.card.get("payload_seen", [0.0]))
-        beyond = mass[(mass > self.heaviest * (1 + 1e-6)) | (mass < least * (1 - 1e-6))]
+        beyond = mass[(mass > self.max_payload * (1 + 1e-6)) | (mass < least * (1 - 1e-6))]
         if beyond.size and not extrapolate:
             raise ModelError(
-                f"{self.path}: trained with {least:g} to {self.heaviest:g} kg, asked for {beyond.flat[0]:g} kg, where "
-                "it only guesses; train on such payloads, or extrapolate (--extrapolate, extrapolate=True)"
+                f"{self.path}: trained with {least:g} to {self.max_payload:g} kg, asked for {beyond.flat[0]:g} kg, "
+                "where it only guesses; train on such payloads, or extrapolate (--extrapolate, extrapolate=True)"
             )
 
     def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:

@@ -13,6 +13,7 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.budget import Budget
+from gaponet.nn.training.checkpoint import RENAMED
 from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
 
@@ -78,6 +79,22 @@ def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage,
     again = memory(tmp_path / "run")
     assert differences(whole, again) == []
     assert [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").open()] == again["progress"]
+
+
+@pytest.fixture
+def earlier_names():
+    names = {today: earlier for earlier, today in RENAMED.items()}
+    return lambda state: {names.get(name, name): value for name, value in state.items()}
+
+
+def test_a_checkpoint_with_earlier_names_is_resumed(world, tmp_path, earlier_names):
+    data, robot, whole = world
+    Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS, show=stop("ppo", 6)).run()
+    state = earlier_names(memory(tmp_path / "run"))
+    state["net"]["bounded.unit"] = state["net"].pop("bounded.scale")
+    torch.save(state, tmp_path / "run" / "checkpoint.pt")
+    Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS, resume=True).run()
+    assert differences(whole, memory(tmp_path / "run")) == []
 
 
 def test_a_run_killed_before_its_first_checkpoint_is_begun_again(world, tmp_path):

@@ -12,16 +12,6 @@ from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.sensor_fit import fit_inputs
 
 
-def test_moving_a_posture_changes_no_relative_feature():
-    config = ModelConfig(history=2)
-    features = build_network(config, 2).features
-    x = torch.randn(5, config.observation_dim(2) + 2)
-    moved = x + torch.from_numpy(features.layout.shifted(np.full((5, 2), 0.7))).float()
-    change = (features.relative(moved) - features.relative(x)).abs()
-    assert torch.allclose(change[:, :2], torch.tensor(0.7))
-    assert change[:, 2:].max() < 1e-5
-
-
 def test_the_predictor_explains_most_of_the_answers_on_held_out_states(tmp_path):
     torch.manual_seed(0)
     robot = write_arm(tmp_path)

@@ -116,12 +116,6 @@ def test_progress_says_how_far_labels_are_fitted(trained):
     assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
 
 
-def test_parts_of_the_split_share_no_content(trained):
-    parts = split_entries(trained[0])
-    hashes = [{e.hash for e in entries} for entries in parts.values()]
-    assert sum(map(len, hashes)) == len(set().union(*hashes)) == 8
-
-
 def test_a_robot_without_a_gap_is_left_alone(robot, tmp_path):
     data = dataset(tmp_path / "data", robot)
     Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS).run()
@@ -160,18 +154,6 @@ def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
     data = dataset(tmp_path / "data", robot, rows=40)
     Trainer.prepare(data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)).run()
     assert asked == {1}
-
-
-def test_a_held_out_unit_is_never_trained_on(robot, tmp_path):
-    data = Dataset.create(tmp_path / "data", robot)
-    for unit, kp in (("a", 0.6), ("b", 0.8)):
-        for sequence in recordings(robot, 6, rows=40, kp=kp, unit=unit):
-            data.append(sequence)
-    parts = split_entries(data, ("b",))
-    assert {e.meta.unit_id for e in parts["train"] + parts["val"]} == {"a"}
-    assert {e.meta.unit_id for e in parts["test"]} == {"a", "b"}
-    with pytest.raises(UsageError, match="unit 'c' is not in"):
-        split_entries(data, ("c",))
 
 
 def test_a_held_out_payload_is_never_trained_on(robot, tmp_path):
