@@ -78,7 +78,7 @@ class Adaptation:
         Args:
             sequences: Recordings of one unit. Windows of 8 s are taken from them evenly.
             unknown_payload: Fit the payload mass too; all recordings have the same payload.
-            progress: As in sysid.adapt.
+            progress: Same arguments as in sysid.adapt.
 
         Raises:
             UsageError: The recordings are of several units.
