@@ -5,6 +5,7 @@ import os
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import pytest
 from runs import untrained
@@ -153,6 +154,39 @@ def test_an_object_in_s3_is_sent_again_if_it_is_younger_than_the_index_that_list
     for day, listed, intact in ((1, True, True), (3, True, False), (3, False, True)):
         info = {"size": 3, "type": "file", "LastModified": datetime(2026, 1, day, tzinfo=UTC)}
         assert bucket._intact(info, record, listed) == intact
+
+
+def test_an_index_is_replaced_on_condition_of_the_one_that_was_read(tmp_path):
+    bucket, calls = Bucket(f"file://{tmp_path}"), []
+    bucket.fs = SimpleNamespace(
+        pipe_file=lambda path, data, **condition: calls.append(condition), _location="http://gcs",
+        call=lambda method, url, **how: calls.append(how),
+    )  # fmt: skip
+    bucket._index_info = {"ETag": "tag", "generation": "7"}
+    for bucket.scheme, before in (("s3", None), ("s3", b"1"), ("gs", b"1")):
+        bucket._replace_index(before, "new text")
+    assert calls[:2] == [{"IfNoneMatch": "*"}, {"IfMatch": "tag"}]
+    assert calls[2]["ifGenerationMatch"] == "7"
+    assert b"new text" in calls[2]["data"]
+
+
+@pytest.mark.parametrize(
+    ("written", "error"), [("", "server is down"), ("mine", ""), ("theirs", "somebody else pushed at the same time")]
+)
+def test_a_write_without_an_answer_counts_by_the_index_that_is_there(dataset, bucket, monkeypatch, written, error):
+    place, replace_index = f"file://{bucket}", Bucket._replace_index
+
+    def fails(self, before, text):
+        if written:
+            replace_index(self, before, text if written == "mine" else "{}")
+        raise OSError("server is down")
+
+    monkeypatch.setattr(Bucket, "_replace_index", fails)
+    if not error:
+        push(dataset.path, place)
+        return
+    with pytest.raises(RemoteError, match=error):
+        push(dataset.path, place)
 
 
 def test_a_dataset_appears_under_its_name_when_it_is_complete(dataset, bucket, tmp_path, monkeypatch):

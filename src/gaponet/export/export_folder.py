@@ -168,7 +168,7 @@ def export_robot(
 def _write_mjcf(
     robot: RobotSpec, plain: RobotSpec, out: Path, facts: dict[str, Any], source: Path, payload_mass: float
 ) -> tuple[Path, tuple[str, ...]]:
-    """Write an edited copy of a user's MJCF; return it and the joints whose targets were not in rad."""
+    """Write an edited copy of a user's MJCF; return it and the joints with targets in another unit than rad."""
     delays = {n: max(facts[form][n]["delay"] for form in ("joints", "plain")) for n in robot.joint_names}
     file, changes, not_rad = edit_mjcf(source, out, plain, facts["plain"], delays, facts["prefix"], payload_mass)
     facts["file"] = str(file.relative_to(out))

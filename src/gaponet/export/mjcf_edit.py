@@ -169,14 +169,14 @@ def edit_mjcf(
     Args:
         path: The file.
         out: Folder for the copy.
-        robot: The robot whose table and payload mounts are put in.
+        robot: Robot with the table and payload mounts to add.
         joints: Servos by joint (facts.json). A joint that is not operated changes only if the file has no servo for it.
         max_delay: Joint → longest delay that its servo must be able to hold, s.
         prefix: Text before each joint's name in the file, e.g. of one of two robots in a scene.
         payload_mass: In each hand, kg.
 
     Returns:
-        The copied main file, the changes as a unified diff, and joints whose targets were not in rad.
+        The copied main file, the changes as a unified diff, and joints with targets in another unit than rad.
 
     Raises:
         RobotError: A joint is not in the text or has several servos, or the compiled copy lacks the wanted servos.

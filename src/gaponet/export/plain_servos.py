@@ -78,7 +78,7 @@ def fit_plain_servos(
     The result is stored in the robot folder, and read from there if nothing changed.
 
     Args:
-        robot: Identified; its table, zeros and stops are kept. Returned as it is if it has no servo model.
+        robot: Identified; table, zeros and stops do not change. Returned unchanged if it has no servo model.
         recordings: Motions that it was fitted to, or its own (`own_motions`).
         progress: Called with done, total and a note, as by `identify`.
     """

@@ -255,8 +255,8 @@ def mjlab_options(folder: str | Path) -> tuple[Any, int]:
     from mjlab.sim import MujocoCfg
 
     facts = read_facts(folder)
-    known = {field.name for field in dataclasses.fields(MujocoCfg)}
-    return MujocoCfg(**{k: v for k, v in facts["options"].items() if k in known}), facts["decimation"]
+    fields = {field.name for field in dataclasses.fields(MujocoCfg)}
+    return MujocoCfg(**{k: v for k, v in facts["options"].items() if k in fields}), facts["decimation"]
 
 
 def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
@@ -286,7 +286,7 @@ class DelayBuffers:
                 continue
             times, values = slice(start + 2, start + 2 + count), slice(start + 2 + count, start + 2 + 2 * count)
             self.mask[start : values.stop] = self.times[times] = self.values[values] = True
-            self.base[start + 1] = count - 1  # index of the newest sample; user data stand before it
+            self.base[start + 1] = count - 1  # index of the newest sample; user data come before it
             self.base[times] = -model.opt.timestep * torch.arange(count, 0, -1)
             self.source[values] = column
         self.any = bool(self.mask.any())
@@ -399,7 +399,9 @@ def _isaaclab_term() -> Any:
             facts = read_facts(self.folder)
             if cfg.check and facts["law"] and "model" in facts:
                 law = ", ".join(facts["law"])
-                raise ValueError(f"{cfg.folder}: trained with servos whose law ({law}) is not here; or check=False")
+                raise ValueError(
+                    f"{cfg.folder}: trained with a servo model ({law}), which Isaac Lab lacks; or give check=False"
+                )
             self.align(self._asset, self._joint_ids, self._joint_names, offset=1.0, form=_isaaclab_form(facts))
             servos = facts[_isaaclab_form(facts)]
             self.set_delays([servos[name]["delay"] for name in self._joint_names], env.physics_dt)
@@ -421,8 +423,8 @@ def isaaclab_actuators(folder: str | Path) -> dict[str, Any]:
     facts = read_facts(folder)
     joints = facts[_isaaclab_form(facts)]
     column = lambda field: {name: joint[field] for name, joint in joints.items()}  # noqa: E731
-    known = {field.name for field in dataclasses.fields(IdealPDActuatorCfg)}
-    limit = "actuator_effort_limit" if "actuator_effort_limit" in known else "effort_limit"  # Isaac Lab 3 renamed it
+    fields = {field.name for field in dataclasses.fields(IdealPDActuatorCfg)}
+    limit = "actuator_effort_limit" if "actuator_effort_limit" in fields else "effort_limit"  # Isaac Lab 3 renamed it
     return {
         "servos": IdealPDActuatorCfg(
             joint_names_expr=list(joints), stiffness=column("kp"), damping=column("kd"), armature=column("armature"),
