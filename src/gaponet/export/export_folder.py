@@ -61,7 +61,7 @@ from typing import Any
 
 import numpy as np
 
-Law = dict[str, Any]  # name of a term → values that broadcast to the joints
+ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the joints
 '''
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
     array_module, servo.present, servo.passing_friction, servo.resting_friction, servo.friction_limit,

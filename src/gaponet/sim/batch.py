@@ -21,10 +21,10 @@ Array = np.ndarray
 
 
 class OneByOne:
-    """The part of mujoco.batch.Batch that gaponet uses, where MuJoCo has none: one simulation after another, slower.
+    """Replacement of mujoco.batch.Batch before MuJoCo 3.17: one simulation after another, slower.
 
-    Bound fields are live (nsim, …) arrays as there. All take turns in one MjData: every bound field, so all that the
-    next step follows from, is put into it before a call and read from it after.
+    Bound fields are live (nsim, …) arrays as there. All simulations share one MjData: every bound field is written to
+    it before a call and read from it after.
     """
 
     STATE = ("time", "qpos", "qvel", "history", "qacc_warmstart", "ctrl", "qfrc_applied")
@@ -37,19 +37,19 @@ class OneByOne:
             self.bind(name)
 
     def bind(self, name: str) -> Array:
-        """A field of MjData, (nsim, …)."""
+        """Return a field of MjData as a live array, (nsim, …)."""
         if name not in self._bound:
             self._bound[name] = np.array([getattr(self._data, name)] * self.nsim)
         return self._bound[name]
 
     def expand(self, name: str) -> Array:
-        """A field of MjModel, or opt.NAME of its options, to be given a value for each simulation, (nsim, …)."""
+        """Return a field of MjModel, or opt.NAME of its options, with a value for each simulation, (nsim, …)."""
         if name not in self._expanded:
             self._expanded[name] = np.array([_field(self._model, name)] * self.nsim)
         return self._expanded[name]
 
     def expanded(self, name: str) -> Array | None:
-        """The same where it has been expanded."""
+        """Return an expanded field; None if it was not expanded."""
         return self._expanded.get(name)
 
     def step(self, ids: Array | None = None, nstep: int = 1) -> None:
@@ -57,11 +57,11 @@ class OneByOne:
         self._call(ids, lambda model, data: mujoco.mj_step(model, data, nstep))
 
     def forward(self, ids: Array | None = None, stage: int = 0) -> None:
-        """Compute what follows from positions and velocities, the one stage that is asked for."""
+        """Compute the quantities that follow from positions and velocities; the only stage that is supported."""
         self._call(ids, mujoco.mj_step1)
 
     def get_data(self, i: int) -> mujoco.MjData:
-        """A copy of one simulation, with what follows from its positions and velocities."""
+        """Return a copy of one simulation, with the quantities that follow from its positions and velocities."""
         self._call(np.array([i]), mujoco.mj_step1)
         return copy.copy(self._data)
 
@@ -88,11 +88,11 @@ else:
         MODEL_FIELDS = {n for n in dir(mujoco.MjModel) if n[0] != "_"} | {f"opt.{n}" for n in dir(mujoco.MjOption)}
 
 
-UNDER_WAY = (0.05, 0.1)  # rad, s: a joint stays behind its ramp by no more
+UNDER_WAY = (0.05, 0.1)  # rad and s at the ramp's speed: a joint stays behind its ramp by no more
 
 
 def _under_way(target: Array, qpos: Array, speed: Array) -> Array:
-    """Where a ramp towards `target` (…, n), rad, has come when the joint is at qpos: as far on as may be."""
+    """Return where a ramp towards `target` (…, n), rad, is when the joint is at qpos: as near to it as possible."""
     most = UNDER_WAY[0] + UNDER_WAY[1] * speed
     return np.asarray(np.clip(target, qpos - most, qpos + most))
 
@@ -107,7 +107,7 @@ def ramped(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> Array:
 
 
 class Condition(NamedTuple):
-    """What a recording was made under: kg, side, s, and gains (n) where they are not the robot's own."""
+    """Condition of a recording: payload, control period, and gains (n) where they are not the robot's own."""
 
     payload_mass: float
     payload_side: str
@@ -117,7 +117,7 @@ class Condition(NamedTuple):
 
     @classmethod
     def of(cls, sequence: Sequence, robot: RobotSpec) -> Condition:
-        """The state in a row of a recording of this robot."""
+        """Return the condition of a recording of this robot."""
         meta, gains = sequence.meta, sequence.meta.recorded_gains
         other = () if robot.with_gains(*gains) is robot else gains
         return cls(meta.payload_mass, meta.payload_side, sequence.dt, *other)
@@ -174,17 +174,17 @@ class BatchSim:
         self.most = self._farthest(speed) if speed.any() else None  # None where servos take targets as they come
 
     def array(self, values: Any) -> Array:
-        """Values as this simulator's arrays are: numpy's here, tensors in sim/warp.py."""
+        """Return values as this simulator's kind of array: numpy's here, tensors in sim/warp.py."""
         return np.asarray(values)
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None) -> None:
         """Put simulations `ids` into a state, (k, n) rad and rad/s.
 
         Args:
-            ids: Which.
+            ids: Simulations.
             qpos, qvel: State, (k, n).
-            past: Targets of the control periods before, newest first, (k, depth, n) rad: what is still under way to
-                servos that are late (robot.delay); only they need it. The oldest counts for all before it.
+            past: Targets of the control periods before, newest first, (k, depth, n) rad, for servos with a delay
+                (robot.delay). The oldest counts for all before it.
         """
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
@@ -272,15 +272,15 @@ class BatchSim:
                 self.servo_model.values[name][:, at] = values.get(name, 0.0)
 
     def _farthest(self, speed: Array) -> Array:
-        """Most that targets move in a period at `speed`, (…, n) rad/s, 0 for no ramp: (num_envs, n) rad."""
+        """Return the largest change of targets per period at `speed`, (…, n) rad/s (0: no limit), (num_envs, n) rad."""
         return np.asarray((self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf))
 
     def state(self) -> dict[str, Array]:
-        """Copies of all that the next step follows from."""
+        """Return copies of the complete state."""
         return {name: x.copy() for name, x in self._state().items()}
 
     def set_state(self, state: dict[str, Array]) -> None:
-        """Undo `state`; entries of other names are not looked at."""
+        """Restore a `state`; entries of other names are ignored."""
         for name, x in self._state().items():
             x[:] = state[name]
 
@@ -295,15 +295,16 @@ class BatchSim:
         return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late | servo | aim
 
     def data(self, env: int) -> mujoco.MjData:
-        """One simulation as MjData, for rendering or forward kinematics."""
+        """Return one simulation as MjData, for rendering or forward kinematics."""
         return self.batch.get_data(env)
 
 
 def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:
-    """Give every model field that differs between simulations its value for each; models (nsim), many the same.
+    """Expand every model field that differs between simulations, and return those fields, live.
 
-    Returns:
-        Those fields, live.
+    Args:
+        batch: nsim simulations.
+        models: Model of each simulation, (nsim); many are the same object.
     """
     unique = list({id(m): m for m in models}.values())
     fields: dict[str, Array] = {}
@@ -320,7 +321,7 @@ def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, 
 
 
 def _field(model: mujoco.MjModel, name: str) -> Any:
-    """A model or option field; numbers among the options as arrays."""
+    """Return a model or option field as an array; None if it is none."""
     if name.startswith("opt."):
         value = getattr(model.opt, name[4:], None)
         return None if value is None or callable(value) else np.asarray(value)
@@ -329,7 +330,7 @@ def _field(model: mujoco.MjModel, name: str) -> Any:
 
 
 class CommandHistory:
-    """MuJoCo's buffer of past commands, of every simulation in a batch. Actuators all have the same length of it.
+    """MuJoCo's buffer of past commands of all simulations in a batch; the same length for all actuators.
 
     Layout of an actuator's part: one user number, the cursor, the samples' times, the samples (mj_initCtrlHistory).
     """

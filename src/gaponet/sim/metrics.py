@@ -1,4 +1,4 @@
-"""How far a simulator is from the robot: the metrics, in free run, grouped as people ask for them.
+"""Metrics of a simulator's rollouts against recordings, by joint, motion, payload and horizon.
 
 e = q_sim − q_real after each step, operated joints only. A motion counts as one whatever its length; a group's
 number is the mean over its sequences.

@@ -29,13 +29,13 @@ Clamped = tuple[tuple[str, float], ...]  # joints and where they stand, rad
 
 
 class Corrector(Protocol):
-    """Turns targets into corrected targets for a batch of simulations; what makes a simulator an aligned one."""
+    """Correction of the targets of a batch of simulations."""
 
     def reset(self, start: ListOf[Sequence]) -> None:
-        """Begin one free run per sequence, simulation i at row 0 of start[i]."""
+        """Begin one rollout per sequence, simulation i at row 0 of start[i]."""
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
-        """Targets to apply over [t, t+1), given the commanded ones and the simulated state; all (k, n), rad."""
+        """Return the targets to apply over [t, t+1), for commanded ones and the simulated state; all (k, n), rad."""
 
 
 def replay(
@@ -47,16 +47,16 @@ def replay(
     lock_idle: bool = False,
     creeps: bool = False,
 ) -> list[SimulatedReplay]:
-    """Step every sequence's commands from its first recorded state; the recording is not looked at again.
+    """Step every sequence's commands from its first recorded state (open loop).
 
     Args:
         sequences: Recordings; payload, period and gains of each are the simulation's.
         robot: The nominal simulator.
-        corrector: Alters targets on the way; None for the nominal simulator.
+        corrector: Corrects targets; None for the nominal simulator.
         nthread: Threads, 0 for all cores.
-        progress: Called now and then.
-        lock_idle: Clamp limbs that no command moves: faster, the same for all others to rounding, home for those.
-        creeps: Friction creeps as MuJoCo's own does, to see what that takes.
+        progress: Called with control steps done and in all.
+        lock_idle: Clamp limbs that no command moves at home: faster, and the same for others up to rounding.
+        creeps: Let friction creep as MuJoCo's own does.
 
     Returns:
         One simulated replay per sequence, in order.
@@ -74,7 +74,7 @@ def replay(
                 progress(before + k, total)
 
         clamped = locked[chunk[0]]
-        runs = _free_run(part, robot, corrector, nthread, tell, clamped, creeps)
+        runs = _roll_out(part, robot, corrector, nthread, tell, clamped, creeps)
         replays |= dict(zip(chunk, runs, strict=True))
         done += sum(len(s) - 1 for s in part)
     return [replays[i] for i in range(len(sequences))]
@@ -95,13 +95,13 @@ def motion_errors(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
 
 
 def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:
-    """Joints of limbs that no command of these sequences moves away from home and that have no operated joint."""
+    """Return the joints of limbs that no command of these sequences moves and that have no operated joint."""
     return tuple(sorted(set.intersection(*map(set, _idle_limbs(sequences, robot))), key=robot.joint_names.index))
 
 
 def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clamped:
-    """Joints that are clamped in a free run, and where, rad: idle limbs at home, and what was not recorded where it was
-    said to stand."""
+    """Return the joints that are clamped in a rollout, and where, rad: idle limbs at home, unrecorded joints where the
+    recording says that they stood."""
     unknown = sequence.meta.unrecorded
     names = tuple(j for j in robot.joint_names if j in idle or j in unknown)
     at = sequence.qpos[0].astype(float)
@@ -111,7 +111,7 @@ def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clampe
 
 
 def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str, ...]]:
-    """The same of each sequence alone."""
+    """Return `idle_limbs` of each sequence."""
     known: dict[frozenset[str], tuple[str, ...]] = {}
     idle = []
     for s in sequences:
@@ -124,7 +124,7 @@ def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str
 
 
 def _chunks(sequences: ListOf[Sequence], locked: list[Clamped]) -> Iterator[list[int]]:
-    """Sequences with the same limbs locked and of like length together, so that few simulations wait for a long one."""
+    """Yield indices of sequences with the same locked joints and similar lengths, so that few wait for a long one."""
     for limbs in dict.fromkeys(locked):
         group = [i for i, mine in enumerate(locked) if mine == limbs]
         group.sort(key=lambda i: -len(sequences[i]))
@@ -132,7 +132,7 @@ def _chunks(sequences: ListOf[Sequence], locked: list[Clamped]) -> Iterator[list
             yield group[start : start + CHUNK]
 
 
-def _free_run(
+def _roll_out(
     sequences: list[Sequence],
     robot: RobotSpec,
     corrector: Corrector | None,
@@ -153,7 +153,7 @@ def _free_run(
 
 
 def _loosen_friction(batch: Batch) -> None:
-    """Undo it in a batch's simulations: friction creeps with MuJoCo's own mobility and impedance."""
+    """Give friction MuJoCo's own mobility and impedance, with which it creeps."""
     batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
     batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
 
@@ -170,8 +170,8 @@ def rollout(
     Args:
         sim: One simulation per sequence.
         sequences: Recordings.
-        corrector: Alters targets on the way.
-        progress: Called now and then with the control steps done.
+        corrector: Corrects targets.
+        progress: Called with the control steps done.
         touch: Rows after which a simulation goes on from the recording, (T, k).
 
     Returns:

@@ -1,10 +1,10 @@
-"""What a servo does that MuJoCo's position actuator and friction loss do not, set before every physics step.
+"""Servo model: terms beyond MuJoCo's position actuator and friction loss, set before every physics step.
 
-The encoder counts in steps; a motor that is told to turn at all turns with a least torque (minimum PWM); friction is
-larger at rest (Stribeck) and grows with what the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024).
-MuJoCo integrates: these laws only move the actuator's bias and the limit of friction, so friction sticks as MuJoCo's
-does. The two terms of friction stand here once: numpy, torch and numba (`advance`, for joint_rollouts.py) compute with
-them; sim/warp.py has this law as a kernel. A model's actuator_user carries the numbers; without, nothing here runs.
+The encoder counts in steps. A motor that turns at all has a least torque (minimum PWM). Friction is larger at rest
+(Stribeck) and grows with the torque that the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024). MuJoCo
+integrates: the model only changes the actuator's bias and the limit of friction, so friction sticks as MuJoCo's does.
+The two terms of friction stand here once: numpy, torch and numba (`advance`, for joint_rollouts.py) compute with them;
+sim/warp.py has the model as a kernel. A MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
 """
 
 from __future__ import annotations
@@ -17,61 +17,61 @@ import numpy as np
 from gaponet.base.arrays import Array, array_module
 from gaponet.robot.spec import SERVO_TERMS
 
-Law = dict[str, Any]  # name of SERVO_TERMS → values that broadcast to the simulations' joints, numpy or torch
+ServoTerms = dict[str, Any]  # name of SERVO_TERMS → values that broadcast to the simulations' joints, numpy or torch
 
 SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
 
 
-def present(law: Law) -> Law:
-    """The part of a law that is not zero everywhere, no speed below SLOWEST; what is not in it is not computed."""
-    return {name: x.clip(min=SLOWEST) if name == "stribeck_speed" else x for name, x in law.items() if x.any()}
+def present(terms: ServoTerms) -> ServoTerms:
+    """Return the terms that are not zero everywhere, with speeds of SLOWEST at least; others are not computed."""
+    return {name: x.clip(min=SLOWEST) if name == "stribeck_speed" else x for name, x in terms.items() if x.any()}
 
 
 def passing_friction(by_motor: Any, by_load: Any, torque: Any, load: Any) -> Any:
-    """What friction takes more, N·m, the more passes the gear: the motor's torque and gravity's."""
+    """Return the friction by the torque that passes the gear, of the motor and of gravity, N·m."""
     return abs(by_motor * torque + by_load * load)
 
 
 def resting_friction(exp: Any, stribeck: Any, speed: Any, qvel: Any) -> Any:
-    """What friction takes more, N·m, the slower a joint turns, rad/s; exp of the arrays' library."""
+    """Return the Stribeck friction at a joint speed, rad/s, in N·m; exp is that of the arrays' library."""
     return stribeck * exp(-abs(qvel) / speed)
 
 
-def friction_limit(law: Law, frictionloss: Any, qvel: Any, torque: Any, load: Any) -> Any:
-    """The most that friction takes, N·m, at a speed, under the motor's torque and gravity's; law as of `present`."""
+def friction_limit(terms: ServoTerms, frictionloss: Any, qvel: Any, torque: Any, load: Any) -> Any:
+    """Return the limit of friction, N·m, at a speed, under the motor's torque and gravity's; terms as of `present`."""
     limit = frictionloss
-    if "friction_motor" in law or "friction_external" in law:
-        by_motor, by_load = law.get("friction_motor", 0.0), law.get("friction_external", 0.0)
+    if "friction_motor" in terms or "friction_external" in terms:
+        by_motor, by_load = terms.get("friction_motor", 0.0), terms.get("friction_external", 0.0)
         limit = limit + passing_friction(by_motor, by_load, torque, load)
-    if "stribeck" in law:
+    if "stribeck" in terms:
         limit = limit + resting_friction(
-            array_module(qvel).exp, law["stribeck"], law.get("stribeck_speed", SLOWEST), qvel
+            array_module(qvel).exp, terms["stribeck"], terms.get("stribeck_speed", SLOWEST), qvel
         )
     return limit
 
 
-def servo_torque(law: Law, kp: Any, aim: Any, qpos: Any) -> Any:
-    """What the servo asks of its motor, N·m, for an angle (rad) that it reads in its encoder's steps."""
+def servo_torque(terms: ServoTerms, kp: Any, aim: Any, qpos: Any) -> Any:
+    """Return the torque that the servo requests, N·m, for an angle (rad) that it reads in its encoder's steps."""
     xp, read, deadband = array_module(qpos), qpos, 0.0
-    if "encoder_step" in law:
-        step = law["encoder_step"]
+    if "encoder_step" in terms:
+        step = terms["encoder_step"]
         fine, deadband = step.clip(min=FINEST), 0.5 * step * kp
         read = xp.where(step > 0, xp.round(qpos / fine) * fine, qpos)
     torque = kp * (aim - read)
-    if "min_torque" not in law:
+    if "min_torque" not in terms:
         return torque
-    return xp.where(abs(torque) > deadband, xp.copysign(xp.maximum(abs(torque), law["min_torque"]), torque), 0.0)
+    return xp.where(abs(torque) > deadband, xp.copysign(xp.maximum(abs(torque), terms["min_torque"]), torque), 0.0)
 
 
 def advance(
-    first: int, last: int, values: Any, law: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
+    first: int, last: int, values: Any, has_terms: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
     lengths: Any, stiffer: Any, kd: Any, stops: Any, periods: Any, count: int, thin: int, out: Any,
 ) -> None:  # fmt: skip
     """Fill out[:, first:last] (k, n·windows, rows) with q_sim − q_real; arrays as JointRollouts keeps them.
 
-    Candidates take each step side by side: none waits for its own last one. numba compiles this; it stands here since a
-    compiled function is made anew when its own file changes, and no other.
+    Candidates take each step side by side, so that none waits for its own last one. numba compiles this function. It
+    stands in this file because numba compiles a function again only when its own file changes.
     """
     k, windows = len(values), qpos.shape[1]
     for item in range(first, last):
@@ -94,7 +94,7 @@ def advance(
                     aim = (1 - share[part, c]) * ctrl[j, p, min(max(at, 0), rows - 1)] + offset[c]
                     aim += share[part, c] * ctrl[j, p, min(max(at + 1, 0), rows - 1)]
                     load = here[3] * q[c] + here[1]
-                    if law:
+                    if has_terms:
                         read = np.round(q[c] / step[c]) * step[c] if step[c] > 0 else q[c]
                         torque = kp[c] * (aim - read)
                         if least[c] > 0:
@@ -121,31 +121,33 @@ def advance(
 
 
 class ServoModel:
-    """The servos of every simulation in a batch, whose actuators stand in the order of its joints.
+    """Servo models of all simulations in a batch, whose actuators are in the order of its joints.
 
     Attributes:
         values: Name of SERVO_TERMS → (nsim, nu); may be written.
-        active: What of them is present, as of the simulations' last reset.
-        frictionloss, bias: The model's, without what is added here, (nsim, nu) N·m; may be written.
-        torque, load: The actuators' torque in the last physics step, and what gravity and Coriolis forces take from it,
-            (nsim, nu) N·m. Together with the batch's own state all that the next step follows from.
+        active: The terms that are present since the last reset.
+        frictionloss, bias: The MuJoCo model's own, without the servo model, (nsim, nu) N·m; may be written.
+        torque, load: Torque of the actuators in the last physics step, and of gravity and Coriolis forces, (nsim, nu)
+            N·m. The next step follows from these and the batch's own state.
     """
 
     def __init__(self, batch: Any, model: mujoco.MjModel) -> None:
-        """Take the model's numbers for all simulations of a mujoco.batch.Batch, or of what has its bind and expand."""
+        """Take the MuJoCo model's parameters for all simulations of a Batch, or of an object with its methods."""
         self.batch, self.model = batch, model
         user = model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(SERVO_TERMS)))
         self._qpos, self._qvel, self._ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         self._force, self._passing = batch.bind("actuator_force"), batch.bind("qfrc_bias")
         self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         self._limit = batch.expand("dof_frictionloss")
-        self.values: Law = {name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(SERVO_TERMS)}
+        self.values: ServoTerms = {
+            name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(SERVO_TERMS)
+        }
         self.frictionloss, self.bias = self._limit.copy(), self._bias[:, :, 0].copy()
         self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
         self.active = present(self.values)
 
     def reset(self, ids: Array, target: Array) -> None:
-        """Simulations `ids` were put into a state, under position targets (k, nu) rad."""
+        """Begin again for simulations `ids`, which were put into a state, under position targets (k, nu) rad."""
         asked = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
         self.torque[ids] = asked.clip(*np.moveaxis(self.force_range[ids], -1, 0))
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
@@ -153,20 +155,20 @@ class ServoModel:
 
     @property
     def force_range(self) -> Array:
-        """Least and most torque of every simulation's actuators, (nsim, nu, 2) N·m."""
+        """Torque limits of every simulation's actuators, (nsim, nu, 2) N·m."""
         own = self.batch.expanded("actuator_forcerange")
         return np.broadcast_to(self.model.actuator_forcerange, (*self._force.shape, 2)) if own is None else own
 
     def before(self) -> None:
         """Set bias and friction for the next physics step."""
-        law, gain, qpos = self.active, self._gain[:, :, 0], self._qpos
-        if "encoder_step" in law or "min_torque" in law:
-            # Of a late servo (MuJoCo delays ctrl behind this) the least torque goes by the target that is under way.
+        terms, gain, qpos = self.active, self._gain[:, :, 0], self._qpos
+        if "encoder_step" in terms or "min_torque" in terms:
+            # MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is under way.
             aim = self._ctrl + self.bias / gain
-            self._bias[:, :, 0] = servo_torque(law, gain, aim, qpos) - gain * (self._ctrl - qpos)
-        self._limit[:] = friction_limit(law, self.frictionloss, self._qvel, self.torque, self.load)
+            self._bias[:, :, 0] = servo_torque(terms, gain, aim, qpos) - gain * (self._ctrl - qpos)
+        self._limit[:] = friction_limit(terms, self.frictionloss, self._qvel, self.torque, self.load)
 
     def after(self, ids: Any = None) -> None:
-        """A physics step of these simulations has passed."""
+        """Store torque and load after a physics step of these simulations."""
         moved = slice(None) if ids is None else ids
         self.torque[moved], self.load[moved] = self._force[moved], self._passing[moved]
