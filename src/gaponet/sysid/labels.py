@@ -1,13 +1,13 @@
-"""Labels that recordings lack, estimated: which payload each carried, and by which unit it was made.
+"""Estimation of missing labels: the payload of each recording, and the unit (one physical robot) that made it.
 
-Recordings in which one joint moves, asked for the same again and again, differ by load and by unit. Held torque at
-equal commands is a + b·m: m is one of the payloads that were in the room, b is common, a is the unit's. Each joint and
-command is fitted on its own, by expectation and maximisation over all pairs of unit and payload, each as likely.
-Recordings that follow each other with equal torque are repetitions of one unit, and units are told by the order of
-their torques, which is thought to be the same at every payload; one joint's first unit need not be another's.
+Recordings in which one joint moves repeat the same commands with several payloads and units. The held torque at equal
+commands is a + b·m: m is one of the given payloads, b is common, a is the unit's. Each joint and command is fitted by
+itself, by expectation maximisation over all pairs of unit and payload. Consecutive recordings with equal torque are
+repetitions of one unit. Units are told apart by the order of their torques, which is assumed to be the same at every
+payload; the first unit of one joint need not be that of another.
 
-Torque also tells the time: it is kp (command − position) − kd velocity of the command in force, so a recording whose
-commands were written down late, or early, shows to a quarter of a period, whatever it carries.
+Torque also shows the time, since it is kp (command − position) − kd velocity of the command in force. A recording whose
+commands were written late or early shows to a quarter of a period, whatever its payload.
 """
 
 from __future__ import annotations
@@ -30,31 +30,33 @@ from gaponet.base.text import format_uncertainty
 from gaponet.data.log import Log
 from gaponet.sysid.torque import Gains, servo_gains
 
-MOVED = 0.05  # rad that a command moves a joint
-SAME_END = 0.05  # of the widest command of a joint: ends that are nearer are one command
-SETTLE = 0.1  # s
-ALIKE = 3.0  # standard deviations of a repetition within which neighbours are repetitions
-LEVER, APART = 0.3, 2.5  # N·m per kg, and bands apart in their widths, from which a joint tells its payload
-FEW, ROUNDS, EXPLAINED = 4, 4, 0.9  # recordings; of the search; of the torque's variance, by the servo's law
-NEAR = 0.5  # kg that a payload may be off its label
-LATE, STEP, WIDEST = 0.015, 0.005, 0.08  # s: beside the others; steps and range of the search
-KILOGRAMS = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
+MIN_MOVE_RAD = 0.05  # of a command that moves a joint
+MAX_END_DIFFERENCE = 0.05  # of two commands that count as one, over the range of a joint's commands
+SETTLE_S = 0.1
+MAX_REPETITION_STD = 3.0  # standard deviations of a repetition within which neighbours are repetitions
+MIN_NM_PER_KG, MIN_BAND_DISTANCE = 0.3, 2.5  # distance in widths of a band, from which a joint tells its payload
+MIN_RECORDINGS, SEARCH_ROUNDS = 4, 4  # of a joint, for the search of lags
+MIN_EXPLAINED = 0.9  # of the torque's variance, by the servo's gains
+MAX_PAYLOAD_ERROR_KG = 0.5  # from a label
+MAX_LAG_S, LAG_STEP_S, LAG_RANGE_S = 0.015, 0.005, 0.08  # beside the others; steps and range of the search
+PAYLOAD_IN_NAME = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
 
 
 @dataclass
 class Labelled:
-    """One recording.
+    """Recording with its estimated labels.
 
     Attributes:
         name: The name that import gives it.
-        joint, command: The joint that moves, and where to, rad.
-        torque: Each row's torque, with its command, (k,) N·m and rad; gain times error where none was recorded.
-        known: kg, where a file's name says it.
-        payload, unit: Estimated, kg and a number from 0 on within the joint; told: whether the joint tells its payload.
-        held: What its torque says of the payload where nobody knows the unit, kg.
-        copy: The name of a recording with the same samples that came before.
+        joint, command: The joint that moves, and its last command, rad.
+        torque: Torque and command of each row, (k,) N·m and rad; gain times error where no torque was recorded.
+        known: Payload in the file's name, kg.
+        payload, unit: Estimates, kg and a number from 0 on within the joint.
+        told: Whether the joint's torque determines its payload.
+        held: Payload estimated from torque without the unit, kg.
+        copy: Name of an earlier recording with the same samples.
         follows: Time, command, position, velocity and torque of each row, (5, k), where torque was recorded.
-        late: How much later its torque follows the command than in the other recordings of the joint, s.
+        late: Lag of the torque behind the command, beside the other recordings of the joint, s.
     """
 
     name: str
@@ -73,7 +75,15 @@ class Labelled:
 
 @dataclass(frozen=True)
 class Cell:
-    """One joint and command: recordings, N·m per kg, bands apart in their widths, N·m of each unit without payload."""
+    """Recordings of one joint and command.
+
+    Attributes:
+        count: Number of recordings.
+        slope: N·m per kg.
+        apart: Distance of the payloads' bands in their widths.
+        units: Torque of each unit without payload, N·m.
+        told: Whether the torque determines the payload.
+    """
 
     joint: str
     command: float
@@ -86,8 +96,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class Labels:
-    """What was estimated; `agreement` is of the recordings whose payload a file's name says, where joints tell it;
-    `gains` are what the torque of a joint's recordings says of its servo, in all and at their ends."""
+    """Estimated labels.
+
+    Attributes:
+        agreement: Shares of the recordings whose payload agrees with that in the file's name.
+        gains: Joint → gains of its servo from torque, of all rows and of the recordings' ends.
+    """
 
     recordings: list[Labelled]
     cells: list[Cell]
@@ -97,16 +111,17 @@ class Labels:
 
     @property
     def remarks(self) -> list[str]:
-        """What is to be said of them, in sentences."""
-        a, late = self.agreement, [r for r in self.recordings if abs(r.late) > LATE]
+        """Return remarks in sentences."""
+        a, late = self.agreement, [r for r in self.recordings if abs(r.late) > MAX_LAG_S]
         told = [
             f"of {a['said']} recordings whose payload the file's name says, {a['within_half_a_kg']:.0%} are within "
             f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
         ] if a else []  # fmt: skip
-        loaded = [r for r in self.recordings if r.told and not r.copy and abs(r.late) <= LATE]
-        near = f"{sum(abs(r.held - r.payload) < NEAR for r in loaded)} of {len(loaded)}"
+        loaded = [r for r in self.recordings if r.told and not r.copy and abs(r.late) <= MAX_LAG_S]
+        near = f"{sum(abs(r.held - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)} of {len(loaded)}"
         if loaded:
-            told += [f"torque alone, whichever the unit, says {near} payloads within {NEAR:g} kg of their label"]
+            limit = f"{MAX_PAYLOAD_ERROR_KG:g} kg"
+            told += [f"torque alone, whichever the unit, says {near} payloads within {limit} of their label"]
         told += [
             f"{joint}: torque is kp (command − position) − kd velocity, kp {format_uncertainty(g.kp, g.error)} "
             f"N·m/rad ({format_uncertainty(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: "
@@ -122,12 +137,12 @@ class Labels:
 
 
 def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: int, gain: dict[str, float]) -> Labels:
-    """Estimate payload and unit of every recording; a file's name is never looked at for that, only to be compared.
+    """Estimate payload and unit of every recording. Payloads in files' names are only compared with the estimates.
 
     Args:
         logs: Name and recording, one moving joint each.
-        payloads: The masses that were in the room, kg.
-        units: How many robots there were.
+        payloads: The masses that were used, kg.
+        units: Number of robots.
         gain: Joint → N·m/rad, for recordings without torque.
 
     Raises:
@@ -146,7 +161,7 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     own = [r for r in found if not r.copy]
     for joint in dict.fromkeys(r.joint for r in own):
         _clocks([r for r in own if r.joint == joint and r.follows is not None])
-    timely = [r for r in own if abs(r.late) <= LATE]
+    timely = [r for r in own if abs(r.late) <= MAX_LAG_S]
     cells = [_fit(part, payloads, units) for part in _by_command(timely)]
     follows: dict[str, list[Array]] = {}
     for r in timely:
@@ -158,7 +173,7 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     said = [r for r in own if r.known is not None and r.told]
     agreement = {}
     if said:
-        near = lambda r, m: abs(r.payload - m) < NEAR  # noqa: E731
+        near = lambda r, m: abs(r.payload - m) < MAX_PAYLOAD_ERROR_KG  # noqa: E731
         masses = {r.known for r in said}
         others = [r for r in own if r.known is None and r.told]
         agreement = {
@@ -167,18 +182,18 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
             "not_said": len(others),
             "taken_for_one_of_these": float(np.mean([r.payload in masses for r in others] or [False])),
         }  # fmt: skip
-    gains = {j: (servo_gains(each), servo_gains(each, 1)) for j, each in follows.items() if len(each) >= FEW}
+    gains = {j: (servo_gains(each), servo_gains(each, 1)) for j, each in follows.items() if len(each) >= MIN_RECORDINGS}
     return Labels(found, cells, tuple(payloads), agreement, gains)
 
 
 def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
     ctrl, qpos = log.channels["ctrl"], log.channels["qpos"]
-    moved = np.flatnonzero(np.ptp(ctrl.values, axis=0) > MOVED)
+    moved = np.flatnonzero(np.ptp(ctrl.values, axis=0) > MIN_MOVE_RAD)
     if len(moved) != 1:
         raise LogError(
             f"{log.source}: {len(moved)} joints are commanded to move; labels are told from recordings of one"
         )
-    j, after = int(moved[0]), SETTLE
+    j, after = int(moved[0]), SETTLE_S
     joint = log.joint_names[j]
     if "tau" in log.channels:
         time, values = log.channels["tau"].time, log.channels["tau"].values[:, j]
@@ -195,18 +210,18 @@ def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
         at = lambda c: np.interp(clock, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
         speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), clock)
         follows = np.stack([clock, ctrl.values[:, j], at("qpos"), speed, at("tau")])
-    kilograms = KILOGRAMS.search(Path(log.source.partition("#")[0]).stem)
+    kilograms = PAYLOAD_IN_NAME.search(Path(log.source.partition("#")[0]).stem)
     known = float(kilograms[1].replace("p", ".")) if kilograms else None
     return Labelled(name, joint, float(ctrl.values[-1, j]), (values[later], told), known, follows=follows)
 
 
 def _clocks(part: list[Labelled]) -> None:
-    """Say of each recording of a joint how much later than in the others its torque follows the command."""
-    shifts = np.arange(-WIDEST, WIDEST + STEP / 2, STEP)
+    """Set the lag of each recording of a joint."""
+    shifts = np.arange(-LAG_RANGE_S, LAG_RANGE_S + LAG_STEP_S / 2, LAG_STEP_S)
 
     def rows(r: Labelled, shift: float) -> Array:  # command − position, −velocity, 1, torque
         time, ctrl, qpos, qvel, tau = r.follows  # type: ignore[misc]
-        inside = (time - WIDEST >= time[0]) & (time + WIDEST <= time[-1])
+        inside = (time - LAG_RANGE_S >= time[0]) & (time + LAG_RANGE_S <= time[-1])
         return np.stack([np.interp(time - shift, time, ctrl) - qpos, -qvel, np.ones_like(tau), tau])[:, inside]
 
     def left(x: Array) -> Array:  # N·m, of each recording and shift
@@ -214,33 +229,33 @@ def _clocks(part: list[Labelled]) -> None:
 
     def law(k: int) -> tuple[float, Array]:  # kp, kd and a constant, of the half that they suit best
         suited = np.arange(len(part))
-        for _ in range(ROUNDS):
+        for _ in range(SEARCH_ROUNDS):
             rows = np.concatenate([every[i][k] for i in suited], axis=1)
             x = np.linalg.lstsq(rows[:3].T, rows[3])[0]
             costs = left(x)[:, k]
-            suited = np.argsort(costs)[: max(FEW, len(part) // 2)]
+            suited = np.argsort(costs)[: max(MIN_RECORDINGS, len(part) // 2)]
         return float(np.median(costs)), x
 
-    if len(part) < FEW:
+    if len(part) < MIN_RECORDINGS:
         return
     every = [np.stack([rows(r, s) for s in shifts]) for r in part]  # (shifts, 4, k) each
     _, x = min((law(k) for k in range(len(shifts))), key=lambda one: one[0])
     late = left(x).argmin(axis=1).tolist()
     rest = np.concatenate([x @ m[k, :3] - m[k, 3] for m, k in zip(every, late, strict=True)])
     torque = np.concatenate([m[0, 3] for m in every])
-    if rest.var() < (1 - EXPLAINED) * torque.var() and x[0] > 0:
+    if rest.var() < (1 - MIN_EXPLAINED) * torque.var() and x[0] > 0:
         for r, k in zip(part, late, strict=True):
             r.late = round(float(shifts[k] - np.median(shifts[late])), 4)
 
 
 def _by_command(recordings: list[Labelled]) -> list[list[Labelled]]:
-    """Recordings of one joint that end in one place, in their order; `command` becomes that of them all."""
+    """Return the recordings by joint and last command, in their order; `command` becomes their mean."""
     parts = []
     for joint in dict.fromkeys(r.joint for r in recordings):
         mine = [r for r in recordings if r.joint == joint]
         ends = np.array([r.command for r in mine])
         order = np.argsort(ends)
-        cut = np.diff(ends[order]) > SAME_END * max(float(np.ptp(ends)), 1.0)
+        cut = np.diff(ends[order]) > MAX_END_DIFFERENCE * max(float(np.ptp(ends)), 1.0)
         for group in np.split(order, np.flatnonzero(cut) + 1):
             part = [mine[i] for i in sorted(group)]
             for r in part:
@@ -250,7 +265,7 @@ def _by_command(recordings: list[Labelled]) -> list[list[Labelled]]:
 
 
 def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
-    """Label the recordings of one joint and command."""
+    """Estimate the labels of the recordings of one joint and command."""
     raw = _at_equal_commands([r.torque for r in part])
     sign = float(np.sign(np.median(raw))) or 1.0
     x = sign * raw  # gravity's torque grows with what hangs on it
@@ -263,12 +278,12 @@ def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
     fits = [_mixture(x, masses, a, slope, 0.5 * width, max(step / 2, 0.04 * slope)) for a in start]
     _, zero, slope, _ = max((f for f in fits if f[2] > 0), key=lambda f: f[0], default=fits[0])
     load = masses[np.abs(x[:, None] - (zero[:, None] + slope * masses).ravel()).argmin(axis=1) % len(masses)]
-    new = (np.abs(np.diff(x)) > ALIKE * max(step, 1e-6)) | (np.diff(load) != 0)
+    new = (np.abs(np.diff(x)) > MAX_REPETITION_STD * max(step, 1e-6)) | (np.diff(load) != 0)
     group = np.concatenate([[0], np.cumsum(new)])
     mean = np.bincount(group, x) / np.bincount(group)
     first = np.unique(group, return_index=True)[1]
     unit, own = _ranked(mean - slope * load[first], load[first], units)
-    told = bool(slope >= LEVER and slope / width >= APART)
+    told = bool(slope >= MIN_NM_PER_KG and slope / width >= MIN_BAND_DISTANCE)
     held = (x - own.mean()) / slope
     for r, g, m, kg in zip(part, group, load, held, strict=True):
         r.payload, r.held = float(m), float(kg)
@@ -277,7 +292,7 @@ def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
 
 
 def _at_equal_commands(recordings: list[tuple[Array, Array]]) -> Array:
-    """Mean torque of each, (k,) N·m, where all were told the same: one may have begun a period later than another."""
+    """Return the mean torque of each at equal commands, (k,) N·m: one may have begun a period later than another."""
     way = 1.0 if np.mean([told[-1] - told[0] for _, told in recordings]) > 0 else -1.0
     risen = [np.maximum.accumulate(way * told) for _, told in recordings]
     low, high = max(r[0] for r in risen), min(r[-1] for r in risen)
@@ -288,9 +303,9 @@ def _at_equal_commands(recordings: list[tuple[Array, Array]]) -> Array:
 
 
 def _ranked(rest: Array, load: Array, units: int) -> tuple[Array, Array]:
-    """Units, (k,), of groups by what payload leaves of their torque, N·m, and that of each unit, (units,).
+    """Return the unit of each group, (k,), by its torque without payload, N·m, and the torque of each unit, (units,).
 
-    At each payload the units stand in one order; where there are not as many groups as units, the nearest one.
+    At each payload the units are in one order; where there are fewer groups than units, the nearest unit is taken.
     """
     bands = [np.flatnonzero(load == m) for m in np.unique(load)]
     whole = [np.sort(rest[b]) for b in bands if len(b) == units]
@@ -309,7 +324,7 @@ def _untold(part: list[Labelled], masses: Array) -> Cell:
 
 
 def _bands(x: Array, masses: Array) -> tuple[float, float, float]:
-    """Width, distance per kg and first of evenly spaced bands, all units together."""
+    """Return width, distance per kg and place of the first of evenly spaced bands, all units together."""
     span = float(np.ptp(x)) / float(np.ptp(masses))
     fits = [
         _mixture(x, masses, np.array([a]), b * span, 0.3 * b * span, 0.02 * b * span)
@@ -323,7 +338,7 @@ def _bands(x: Array, masses: Array) -> tuple[float, float, float]:
 def _mixture(
     x: Array, masses: Array, zero: Array, slope: float, width: float, least: float
 ) -> tuple[float, Array, float, float]:
-    """Expectation and maximisation of normals of one width at zero + slope·masses, all as likely.
+    """Fit normals of one width at zero + slope·masses, all with equal weight, by expectation maximisation.
 
     Args:
         x: Torque of each recording, (k,) N·m.
@@ -349,7 +364,7 @@ def _mixture(
 
 
 def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
-    """logs.toml and labels.csv in a folder, which `gaponet import LOGS --logs FOLDER/logs.toml` takes."""
+    """Write logs.toml and labels.csv into a folder, for `gaponet import LOGS --logs FOLDER/logs.toml`."""
     folder.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     sheet = csv.writer(text)
@@ -360,7 +375,7 @@ def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
             "unit" if r.known is not None else "unit, payload" if r.told else "unit, payload (not told by this joint)"
         )
         sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", what,
-                        "yes" if r.copy or abs(r.late) > LATE else "no"])  # fmt: skip
+                        "yes" if r.copy or abs(r.late) > MAX_LAG_S else "no"])  # fmt: skip
     write_text(folder / "labels.csv", text.getvalue())
     lines = ["# gaponet data labels: units and payloads are estimated from held torque", 'manifest = "labels.csv"']
     lines += [f"rate = {rate:g}"] if rate else []
