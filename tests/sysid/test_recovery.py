@@ -92,4 +92,4 @@ def test_an_arm_that_stays_within_a_hand_of_its_lowest_point_keeps_rows_to_fit(t
     heights = [np.linspace(0.30, 0.33, 50), np.full(40, 0.32)]
     below = table_contact.contact_height(robot, heights)
     assert np.mean(np.concatenate(heights) >= below) >= 0.5
-    assert table_contact.contact_height(robot, [np.r_[0.0, np.full(50, 0.4)]]) == table_contact.CLEARANCE
+    assert table_contact.contact_height(robot, [np.r_[0.0, np.full(50, 0.4)]]) == table_contact.CONTACT_CLEARANCE_M
