@@ -67,6 +67,7 @@ def _on_unit(experiment: UnitExperiment, data: Dataset, robot: RobotSpec, out: P
 
     data.require_robot(robot)
     experiment.require(data)
+    experiment = experiment.quick() if options.quick else experiment
     screen, runs = Out(options.json), experiment.runs
     study, cells = None, list[Cell]()
     if not runs:
@@ -77,10 +78,11 @@ def _on_unit(experiment: UnitExperiment, data: Dataset, robot: RobotSpec, out: P
         if failed:
             raise UsageError(f"{failed[0]}; run it again to retry")
         runs = experiment.evaluated(cells)
-    session = Session.load(experiment, data, robot.nominal or robot, runs, study, tuple(cells))
+    trained_on = data if study is None else study.data
+    session = Session.load(experiment, trained_on, robot.nominal or robot, runs, study, tuple(cells))
     with progress_bar("playing") as update:
         result = experiment.run(session, lambda step, share: update(share, 1.0, step))
-    show_result(result, out, screen)
+    show_result(result, out if study is None else study.out, screen)
 
 
 def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:

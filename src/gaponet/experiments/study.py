@@ -13,6 +13,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool
 from gaponet.data.store import Dataset
 from gaponet.experiments.cells import RESULT_FILE, Cell, plan_cells, read_record
+from gaponet.experiments.quick import LABEL, QUICK_BUDGET, QUICK_SEEDS, quick_config, quick_dataset
 from gaponet.experiments.variant import Variant, parse_variant
 from gaponet.nn.training.budget import Budget
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
@@ -37,6 +38,9 @@ class Options:
     """Number of seeds, counted from --seed."""
     budget: str = DEFAULT_BUDGET
     """Length of each training: time such as 90s or 10m, or control steps."""
+    quick: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Run in minutes, in OUT/quick: a small part of the dataset, 2560 control steps and one seed for each training. The
+    numbers mean nothing."""
     workers: int = 0
     """Trainings at a time, each on --threads (here 1 by default) threads; 0 for as many as there are cores."""
     executor: str = LOCAL
@@ -61,6 +65,7 @@ class Study:
         workers: Trainings at a time; 0 for as many as there are cores.
         executor: Where they run (gaponet.base.executor).
         identified: The identified robot, for words with identified+ in front and as a baseline.
+        quick: True for a quick run, whose numbers mean nothing.
     """
 
     data: Dataset
@@ -73,6 +78,7 @@ class Study:
     workers: int = 0
     executor: str = LOCAL
     identified: RobotSpec | None = None
+    quick: bool = False
 
     def __post_init__(self) -> None:
         if self.seeds < 1 or self.workers < 0:
@@ -90,15 +96,21 @@ class Study:
         Rates are then compared in those comparisons alone that are about rates.
         """
         config, rates = options.config, control_rates(data)
+        budget, seeds = options.budget, options.seeds
         if one_rate and len(rates) > 1 and not config.rates:
             config = replace(config, rates=rates[:1])
-        return cls(data, robot, out, config, options.budget, options.seeds, holdout_units, options.workers,
-                   options.executor)  # fmt: skip
+        if options.quick:
+            out, config, budget, seeds = out / "quick", quick_config(config), QUICK_BUDGET, QUICK_SEEDS
+            data = quick_dataset(data, robot, out / "data")
+            units = {e.meta.unit_id for e in data.entries}
+            holdout_units = tuple(u for u in holdout_units if u in units and len(units) > 1)
+        return cls(data, robot, out, config, budget, seeds, holdout_units, options.workers, options.executor,
+                   quick=options.quick)  # fmt: skip
 
     @property
     def label(self) -> str:
         """The robot's name; "VIRTUAL h1_2" where any recording is virtual."""
-        return robot_label(self.data.entries)
+        return robot_label(self.data.entries) + f" ({LABEL})" * self.quick
 
     @property
     def threads(self) -> int:

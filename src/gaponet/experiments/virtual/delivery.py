@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -70,6 +70,10 @@ class Delivery(UnitExperiment):
     """Goals lie at least so far in front of the robot's base, m."""
     goal_seed: int = 0
     """Seed of the goals."""
+
+    def quick(self) -> Delivery:
+        """Return the experiment with few motions, for a quick run."""
+        return replace(self, goals=10)
 
     def require(self, data: Dataset) -> None:
         """Refuse short holds, and recordings of real robots, which cannot be executed."""

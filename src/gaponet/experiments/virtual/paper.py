@@ -15,6 +15,7 @@ from gaponet.data.store import Dataset
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.outcomes import StudyOutcomes, summarize
 from gaponet.experiments.paper_numbers import CARD, CLAIMS, PAYLOADS, TABLE_1, TABLE_1_METHODS, TABLE_2, Printed
+from gaponet.experiments.quick import QUICK_BUDGET
 from gaponet.experiments.result import Result
 from gaponet.experiments.study import DEFAULT_MODELS, Study, control_rates
 from gaponet.experiments.virtual import delivery, tracking
@@ -37,6 +38,7 @@ OUR_SETTINGS: dict[str, dict[str, str | None]] = {
     "control rate": {},
     "history H": {},
 }
+QUICK_MOTIONS, QUICK_GOALS = 4, 10
 FIGURE_2 = ("joint_ranges", "composition", "torque_temperature")
 
 
@@ -61,6 +63,10 @@ class Paper(UnitExperiment):
         """Refuse given runs, since rows of Table 2 must differ in one setting alone."""
         if self.runs:
             raise UsageError("--runs: experiment paper trains all its models; leave --runs out")
+
+    def quick(self) -> Paper:
+        """Return the experiment with few motions and the budget of a quick run."""
+        return replace(self, count=QUICK_MOTIONS, goals=QUICK_GOALS, paper_budget=QUICK_BUDGET)
 
     def paper_study(self, study: Study) -> Study:
         """Return the study with the setting and training of the paper."""

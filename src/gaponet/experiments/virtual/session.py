@@ -15,6 +15,7 @@ from gaponet.base.result_table import ResultTable
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiments.cells import Cell
+from gaponet.experiments.quick import LABEL
 from gaponet.experiments.result import Result, facts
 from gaponet.experiments.study import DEFAULT_MODELS, Options, Study
 from gaponet.experiments.virtual.play import Progress
@@ -51,6 +52,10 @@ class UnitExperiment:
         units = sorted({e.meta.unit_id for e in data.entries})
         holdout = (self.unit or units[-1],) if len(units) > 1 and (not self.unit or self.unit in units) else ()
         return Study.from_options(data, robot, out, options, holdout_units=holdout)
+
+    def quick(self) -> UnitExperiment:
+        """Return the experiment with few motions, for a quick run."""
+        return self
 
     def cells(self, study: Study) -> list[Cell]:
         """Return the trainings that are needed where no runs are given."""
@@ -141,5 +146,6 @@ class Session:
         runs = [f"{t.method} seed {t.seed} ({t.model.weights_hash()})" for t in self.trained]
         minutes = round((time.monotonic() - self.start) / 60, 1)
         repeat = facts(self.data, sorted({t.seed for t in self.trained}), **setup, runs=runs, **more, minutes=minutes)
-        return Result(name, title, describe_provenance(self.data), repeat, tuple(tables), dict(figures),
+        provenance = describe_provenance(self.data) + f" {LABEL}." * (self.study is not None and self.study.quick)
+        return Result(name, title, provenance, repeat, tuple(tables), dict(figures),
                       tuple(sentences))  # fmt: skip

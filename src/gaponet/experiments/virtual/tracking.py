@@ -70,6 +70,10 @@ class Tracking(UnitExperiment):
     count: int = 10
     """How many motions are made for the experiment."""
 
+    def quick(self) -> Tracking:
+        """Return the experiment with few motions, for a quick run."""
+        return replace(self, count=4)
+
     def measure(self, session: Session, progress: Progress) -> TrackingScores:
         """Execute the motions on the unit; recordings of a real robot allow alignment alone."""
         robot, trained = session.robot, session.trained
