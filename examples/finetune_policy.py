@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from gaponet.testing.unit import VirtualRobot
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
@@ -36,6 +35,7 @@ from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
 from gaponet.sysid.motion.library import Library
 from gaponet.testing.fleet import load_fleet
+from gaponet.testing.virtual_robot import VirtualRobot
 
 Array = np.ndarray
 

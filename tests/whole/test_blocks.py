@@ -13,6 +13,7 @@ from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -162,9 +163,10 @@ def quick(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             original(dataset, out=place / "identified", windows=4, terms=(), table=False, budget="1s")
         shutil.copytree(place / "identified", out)
 
-    def train(dataset: str, *, out: str, budget: str, progress: object) -> GapModel:
+    def train(dataset: str, *, out: str, budget: str, progress: object) -> SimpleNamespace:
         parts = {"train": ("m0", "m1"), "val": ("m2",), "test": ("m3",)}
-        return GapModel.load(untrained(Path(out), load_robot("so101"), Dataset(dataset), **parts))
+        model = GapModel.load(untrained(Path(out), load_robot("so101"), Dataset(dataset), **parts))
+        return SimpleNamespace(model=model)
 
     monkeypatch.setattr(gaponet.api, "identify", identify)
     monkeypatch.setattr(gaponet.api, "train", train)

@@ -264,6 +264,7 @@ def _further_motions(
     )  # fmt: skip
     from gaponet.sysid.motion.library import Library
     from gaponet.sysid.motion.plan import Plan
+    from gaponet.sysid.uncertainty import ParameterUncertainty
 
     uncertainty = ParameterUncertainty.require(spec)
     if payloads[0] < 0 or (payloads[-1] > 0 and not spec.payload_mounts):

@@ -10,7 +10,7 @@ from gaponet.api.results import IdentifyResult
 from gaponet.base.progress import progress_bar
 from gaponet.base.text import format_uncertainty
 from gaponet.cli.options import Flag, Json, Robot, Source, like
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, writes
 from gaponet.cli.torque import show_torque
 from gaponet.report.tables import mrad
 from gaponet.robot.spec import robot_argument
@@ -22,6 +22,7 @@ WIDE = 4  # columns of a table
 UNDETERMINED = "not determined by these logs"
 
 
+@writes("robot")
 @like(api.identify)
 def identify(
     dataset: Source,

@@ -42,8 +42,8 @@ COMMANDS = {
     "doctor": "gaponet.cli.logs:doctor",
     "eval": "gaponet.cli.train:evaluate",
 }  # fmt: skip
+RENAMED_GROUPS = {"warm-start": "pretraining", "warm_start": "pretraining"}  # of options: earlier name → today's
 # Command, or command with its first argument → what replaces it.
-RENAMED_OPTIONS = {"--warm-start.": "--pretraining.", "--warm_start.": "--pretraining."}  # earlier prefix → today's
 REMOVED = {
     "prune": "gaponet push --prune",
     "calibrate": "gaponet adapt",
@@ -99,8 +99,9 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
     if not argv or argv[0] in ("-h", "--help"):
         print(_overview())
         return
-    for earlier, today in RENAMED_OPTIONS.items():
-        argv = [today + word.removeprefix(earlier) if word.startswith(earlier) else word for word in argv]
+    for earlier, today in RENAMED_GROUPS.items():
+        prefix = f"--{earlier}."
+        argv = [f"--{today}.{word.removeprefix(prefix)}" if word.startswith(prefix) else word for word in argv]
     name, completing = argv[0], argv[0].startswith("--tyro-")
     for removed in (name, " ".join(argv[:2])):
         if removed in REMOVED:

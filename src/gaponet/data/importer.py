@@ -229,8 +229,8 @@ class _Source:
 
     def _meta(self, log: Log, motion: str, sha256: str) -> SequenceMeta:
         """Combine what the user and the format state; refuse contradictions and gaps."""
-        stated = {k: tuple(v) if k in ("kp", "kd") else v for k, v in log.meta.get("stated", {}).items()}
-        stated = {k: v for k, v in stated.items() if v is not None}
+        stated = {k: v for k, v in log.meta.get("stated", {}).items() if v is not None}
+        stated |= {k: tuple(stated[k]) for k in ("kp", "kd") if k in stated}
         given = {name: value for name, value in vars(self.labels).items() if value is not None}
         for name, value in given.items():
             if name in stated and stated[name] != value:

@@ -101,7 +101,7 @@ def test_a_joint_at_three_quarters_of_its_range_of_three_radians(tmp_path, arm):
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        ('tme = "t"', r"map\.toml: tme: is not a known field; docs/data-format.md lists the fields"),
+        ('tme = "t"', r"map\.toml: tme: is not a known field; docs/logs.md lists the fields"),
         ('[columns]\n"control.elbow" = "x"', "'control.elbow' is neither time nor ctrl.<joint>, qpos.<joint>"),
         (
             '[columns]\n"ctrl.elbow" = "x"',
@@ -122,7 +122,7 @@ def test_a_broken_column_map_says_what_is_wrong(tmp_path, arm, toml, message):
 
 def test_a_column_map_that_is_not_there_is_named(tmp_path, arm):
     file = write(tmp_path / "wave.csv", arm_columns())
-    with pytest.raises(UsageError, match=r"no\.toml: is missing, or not a file; docs/data-format.md"):
+    with pytest.raises(UsageError, match=r"no\.toml: is missing, or not a file; docs/logs.md"):
         only(file, arm, logs=tmp_path / "no.toml")
 
 

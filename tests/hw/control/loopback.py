@@ -94,9 +94,9 @@ class RobotClock(SimulatedClock):
     def wait_until(self, deadline: float) -> float:
         while 100.0 + self.steps / RATE <= deadline:
             self._now = max(self._now, 100.0 + self.steps / RATE)
-            self.robot._obey(self._now)
+            self.robot._receive(self._now)
             self.robot.live.step()
-            self.robot._speak(self.steps, self._now)
+            self.robot._send_state(self.steps, self._now)
             self.steps += 1
         return super().wait_until(deadline)
 

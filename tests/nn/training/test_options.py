@@ -45,7 +45,7 @@ def test_a_gpu_has_simulations_of_its_own_number_unless_told():
 def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
     heard = []
 
-    def train(dataset, out, budget, config, model, *_):
+    def train(dataset, *, config, model, **_):
         heard.append(replace(config, model=replace(config.model, kind=model)))
         raise UsageError("heard")
 
