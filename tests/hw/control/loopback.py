@@ -71,7 +71,7 @@ class Disobedient(VirtualH12):
             for damping in (self.live.unit._damping, self.live.unit._cold_damping):
                 damping[:, self.live.unit.batch.model.joint("left_elbow_joint").dofadr[0]] = 1000.0
         if wrong and self.way == "weak":
-            kp, kd, effort, torque = self.live._law
+            kp, kd, effort, torque = self.live._gains
             self.live.set_gains(kp, kd, np.where(np.arange(len(kp)) == self._order[left], 0.5, effort), torque)
 
     def _readings(self, fault: str) -> tuple[np.ndarray, ...]:
