@@ -50,7 +50,7 @@ def gap(
 
 
 def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None, reported: bool = False) -> None:
-    """What the errors say, and which command comes next; folder is a robot's or a run, None where there is neither."""
+    """Print the verdict and the next command. The folder is that of a robot or a run, or None."""
     for sentence in verdict(methods):
         out.say(sentence)
     out.say(f"next: {next_step(methods, dataset, folder, reported)}")
@@ -74,7 +74,7 @@ def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GRO
 
 
 def _show_steps(out: Out, found: Mapping[str, Any]) -> None:
-    """What is left after each step, in all and by joint and payload, and what the step removes in all."""
+    """Print the error after each step, in total, by joint and by payload, and its reduction in total."""
     who = "VIRTUAL robot" if found["virtual"] else "real robot"
     kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"
     joints, loads, ends = found["by_joint"], found["by_payload"], ("floor", "unexplained")

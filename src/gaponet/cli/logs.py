@@ -148,7 +148,7 @@ def _cuts(entries: ListOf[Entry]) -> dict[str, list[str]]:
 
 
 def _nonsense(entries: ListOf[Entry]) -> list[str]:
-    """What was nonsense in some rows, a line for each channel (data.describe.plausibility)."""
+    """Return a line for each channel with implausible rows (data.describe.plausibility)."""
     told: dict[str, list[tuple[Entry, dict[str, Any]]]] = {}
     for entry in entries:
         for channel, found in entry.meta.notes.get("nonsense", {}).items():

@@ -1,4 +1,4 @@
-"""What a command prints: tables for people, or exactly one JSON object on stdout."""
+"""Output of commands: tables for people, or exactly one JSON object on stdout."""
 
 from __future__ import annotations
 

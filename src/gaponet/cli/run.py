@@ -70,7 +70,7 @@ class Connection:
 
 @dataclass(frozen=True)
 class ControlArgs:
-    """What playing a motion may be told of robot and loop, as data: the docstrings are the command-line help."""
+    """Options about robot and control loop. The docstrings are the command-line help."""
 
     driver: DriverName = "virtual"
     """virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial), or the driver of
@@ -115,7 +115,7 @@ class Live(LiveConfig):
 
 @dataclass(frozen=True)
 class RunArgs(ControlArgs):
-    """The same, with compensation between targets and commands, and live targets."""
+    """Options of a run: those of ControlArgs, compensation and live targets."""
 
     targets: Literal["zmq", "dds", "stdin"] | None = None
     """Instead of a motion, targets that come while the robot moves: JSON over ZeroMQ or in lines on standard input, or
@@ -170,7 +170,7 @@ def run(
 def perform(
     screen: Out, motion_name: str | None, args: RunArgs, seed: int = 0, folder: Path | None = None
 ) -> tuple[Recording, Motion | None, RobotSpec]:
-    """Make everything, ask, run, and say how it went; live targets are no motion. The seed is of a virtual robot."""
+    """Prepare, ask for consent, run and report. Live targets are no motion. The seed is for a virtual robot."""
     from gaponet.hw.control.clock import MonotonicClock, SimulatedClock
     from gaponet.hw.control.controller import Controller
     from gaponet.hw.control.hardware import hardware_robot, reference_robot, require_plausible, robot_hash

@@ -36,7 +36,7 @@ def show_runs(screen: Out, folder: Path) -> None:
 
 
 def _facts(run: Path, folder: Path) -> dict[str, Any]:
-    """What the files of a run say; None where they do not say it yet."""
+    """Return facts from the files of a run; None for those that are not written yet."""
     config, last = read_config(run), _last(run)
     kind, file = config["model"]["kind"], run / "model" / CARD
     card = GapModel.read_card(file)[0] if file.is_file() else {}

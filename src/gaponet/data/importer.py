@@ -53,7 +53,7 @@ class ImportReport:
 
 @dataclass(frozen=True)
 class _Labels:
-    """What the user states of all recordings; None if the format states it, or for the default."""
+    """Labels that the user gives for all recordings; None if the format states them, or for the default."""
 
     unit_id: str | None
     payload_mass: float | None

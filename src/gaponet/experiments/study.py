@@ -55,7 +55,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Study:
-    """What the cells of an experiment share.
+    """Settings that all cells of an experiment share.
 
     Attributes:
         robot: The simulator that models correct.

@@ -169,7 +169,7 @@ def evaluate(
 
 
 def _command(folders: ListOf[Path], dataset: Path | str, motions: tuple[str, ...]) -> str:
-    """What a shell needs to repeat an evaluation."""
+    """Return the shell command that repeats an evaluation."""
     words = ["gaponet", "eval", str(folders[0]), str(dataset)]
     words += ["--also", *map(str, folders[1:])] if len(folders) > 1 else []
     return shlex.join(words + (["--motions", ",".join(motions)] if motions else []))

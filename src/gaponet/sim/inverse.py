@@ -125,7 +125,7 @@ class ClosedForm:
         return cls(sim.batch, next(iter(sim.models.values())), sim.joint_names, sim.nstep, sim.timestep)
 
     def stand(self, data: mujoco.MjData) -> None:
-        """What else there is in a scene stands as here."""
+        """Copy positions and velocities of a scene, (nq,) and (nv,)."""
         self.qpos[:], self.qvel[:] = data.qpos, data.qvel
 
     def __call__(self, periods: ListOf[Period], near: Array) -> Array:
@@ -174,7 +174,7 @@ class ClosedForm:
         return torque + friction * friction_limit(self.law, self.frictionloss, qvel, torque, load)
 
     def alike(self, other: ClosedForm, limits: Array) -> bool:
-        """Whether two simulators of the same joints, limits (n, 2) rad, are one, by their inverses of any motion."""
+        """Return True if the inverses of two simulators of the same joints, limits (n, 2) rad, agree for any motion."""
         if self.ahead != other.ahead or not np.allclose(self.dt, other.dt):
             return False
         rng, n = np.random.default_rng(0), len(limits)

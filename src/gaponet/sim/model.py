@@ -136,7 +136,7 @@ def qpos_range(model: mujoco.MjModel) -> np.ndarray:
 
 
 def model_hash(robot: RobotSpec) -> str:
-    """What the nominal simulator is, in 12 hex digits: everything in its compiled model that decides how it moves.
+    """Return 12 hex digits of the nominal simulator: every value of its compiled model that determines its motion.
 
     Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written
     (gaponet.robot.fingerprint); reports print it beside every score, since two public MJCFs of one robot can differ by

@@ -1,4 +1,4 @@
-"""What compiles and is still likely a mistake: the simulator is stepped, and each finding says what to write where."""
+"""Checks for robot files that compile and are probably wrong. Each finding says which value to change."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
 
 
 def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
-    """What else moves or holds a joint, and what is missing."""
+    """Find constraints, springs and other elements of the model that move or hold a joint."""
     names = np.array(robot.joint_names)
     for count, kind in ((model.neq, "equality"), (model.ntendon, "tendon")):
         if count:

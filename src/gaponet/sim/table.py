@@ -1,4 +1,4 @@
-"""What the robot touches: tips against a level table, and nothing else; without a table nothing touches anything."""
+"""Contacts of the robot: its tips against a level table. Without a table there is no contact."""
 
 from __future__ import annotations
 

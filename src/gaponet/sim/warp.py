@@ -78,7 +78,7 @@ class _Worlds:
             view.copy_(torch.tensor(x).reshape(view.shape))
 
     def _inputs(self, servos: servo.ServoModel, rows: np.ndarray) -> list[Any]:
-        """What _set_servos is given."""
+        """Return the arguments of _set_servos."""
         m, d, dead = self.model, self.data, 0.5 * servos.values["min_torque"].any()
         stated = np.stack([servos.values[name][rows] for name in SERVO_TERMS], axis=-1)
         own = [warp.array(x[rows], dtype=float) for x in (servos.bias, servos.frictionloss)]

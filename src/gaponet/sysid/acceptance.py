@@ -86,7 +86,7 @@ class Identified:
 
     @property
     def improved(self) -> bool:
-        """Whether the result is another robot than the given one."""
+        """True if the result differs from the given robot."""
         return self.chosen != "given" or bool(self.table_fit and self.table_fit.accepted)
 
     def no_gain_message(self, robot: RobotSpec, given: Array, fitted: Array) -> str:

@@ -115,7 +115,7 @@ class Gains(NamedTuple):
 
     @property
     def trusted(self) -> bool:
-        """Whether the recorded torque is that of a PD servo."""
+        """Return True if the recorded torque is that of a PD servo."""
         return self.explained > MIN_EXPLAINED and self.kp > 0 <= self.kd
 
 

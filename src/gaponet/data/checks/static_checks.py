@@ -1,4 +1,4 @@
-"""What static poses show against gravity and the stated gains: offsets, scales, gains, payload labels, mixed robots.
+"""Checks of static poses against gravity and the stated gains: offsets, scales, gains, payload labels, mixed robots.
 
 At rest, a servo's distance from its command is qpos − ctrl = offset + (scale − 1)·ctrl − softness·G(qpos)/kp −
 stiction·approach. G is the gravity torque of the nominal model with the labelled payload. The four coefficients of a

@@ -1,1 +1,1 @@
-"""What a log means: logs.toml says of its columns, units, signs and clocks; it becomes a Log."""
+"""Meaning of logs: logs.toml describes columns, units, signs and clocks, and the log becomes a Log."""

@@ -190,7 +190,7 @@ def _positions(recording: Recording, channels: dict[str, str]) -> list[str]:
 
 
 def _repeated(recordings: list[Recording], ctrl: str) -> bool:
-    """Whether the first two recordings were commanded the same: a number at their names' end counts repetitions."""
+    """Return True if the first two recordings have equal commands: a final number in their names counts repetitions."""
     told = [_values(recording, ctrl) for recording in recordings[:2]]
     if len(told) < 2 or any(x is None for x in told):
         return True
@@ -199,7 +199,7 @@ def _repeated(recordings: list[Recording], ctrl: str) -> bool:
 
 
 def _pattern(names: list[str], repeated: bool) -> str:
-    """What the names have in common: a payload with its unit, a trailing number."""
+    """Return the pattern of the names: a payload with its unit, and a final number."""
     pattern = "{motion}"
     if all(re.search(r"_\d+(?:[.p]\d+)?kg", n) for n in names):
         pattern += "_{payload:g}kg"

@@ -54,7 +54,7 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
 
 
 def _all_of(name: str, joints: Sequence[str]) -> bool:
-    """Whether these are all joints of a robot of the package."""
+    """Return True if these are all joints of a robot of the package."""
     try:
         return bool([load_robot(name).resolve(joint, "") for joint in joints])
     except JointMismatchError:
@@ -62,5 +62,5 @@ def _all_of(name: str, joints: Sequence[str]) -> bool:
 
 
 def ignored(name: str, patterns: Sequence[str]) -> bool:
-    """Whether a name in the log was said to be no joint of this robot."""
+    """Return True if logs.toml says that a name in the log is no joint of this robot."""
     return not name or any(fnmatchcase(name, pattern) for pattern in patterns)

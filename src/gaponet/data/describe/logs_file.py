@@ -96,7 +96,7 @@ class LogsFile(TypedDict, total=False):
 
 
 def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile, Path | None]:
-    """What logs.toml says, the given one or that in the folder of the logs or beside the file; and where it lies."""
+    """Read logs.toml, the given one or that beside the logs; return its contents and path."""
     beside = (src if src.is_dir() else src.parent) / NAME
     file = Path(given) if given is not None else beside if beside.is_file() else None
     if file is None:
@@ -105,7 +105,7 @@ def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile
 
 
 class Naming:
-    """What the names of recordings say of them: by the pattern `motion`, and by the sheet `manifest`."""
+    """Labels of recordings by their names: from the pattern `motion` and the sheet `manifest`."""
 
     def __init__(self, told: LogsFile, where: Path | None) -> None:
         self.where = str(where or "logs.toml")

@@ -1,4 +1,4 @@
-"""What a log may hold: units become SI, and what no joint of this robot does is refused."""
+"""Plausibility of logs: units become SI, and values that no joint of this robot reaches are refused."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ class Recording:
 
 
 def restated(told: Any, where: str) -> dict[str, Any]:
-    """What an export of ours says of a recording (fields of SequenceMeta), checked."""
+    """Return the checked fields of SequenceMeta that an export of this package states."""
     fields = told if isinstance(told, dict) else {}
     again = "export it again"
     meta = asdict(validated(SequenceMeta, fields | {"robot": "?"}, where, LogError, again))
@@ -174,7 +174,7 @@ def restated(told: Any, where: str) -> dict[str, Any]:
 
 @contextmanager
 def reading(file: Path, what: str) -> Iterator[None]:
-    """Whatever a damaged file makes a library do becomes one error: they raise a dozen kinds, and name none."""
+    """Turn any error of a library on a damaged file into one error with the file name."""
     try:
         yield
     except (LogError, MemoryError, ImportError):
@@ -189,7 +189,7 @@ ENDS = {b"\x89MCAP0\r\n": b"\x89MCAP0\r\n", b"PAR1": b"PAR1"}  # how files begin
 
 
 def _cut_short(file: Path, error: Exception) -> bool:
-    """Whether a file begins as it should, or not at all, and its end is missing."""
+    """Return True if the end of a file is missing, by the error or by its last bytes."""
     if isinstance(error, EOFError) or re.search(r"truncated|unexpected(ly)? end|end.of.file", str(error).lower()):
         return True
     if not file.is_file():

@@ -63,7 +63,7 @@ def module(fmt: str) -> ModuleType:
 
 
 def about(fmt: str) -> str:
-    """What a format is, in a line."""
+    """Return the description of a format in one line."""
     doc = attempt(formats()[fmt], lambda: module(fmt).__doc__, None)
     return (doc or "").split("\n")[0].rstrip(".")
 
@@ -202,7 +202,7 @@ def _loaders(
 
 
 def _recordings(reader: ModuleType, path: Path, told: LogsFile) -> Iterator[Recording]:
-    """What the reader finds, with what the format itself says unless the recording, or `told`, says something else."""
+    """Read the logs. Values of the format apply unless the recording or `told` states others."""
     for recording in reader.recordings(path, reader.DEFAULT | told):
         yield replace(recording, default=cast("LogsFile", reader.DEFAULT | recording.default))
 

@@ -1,4 +1,4 @@
-"""What a LeRobotDataset, v3.0 or v2.1, is made of: info, features, episodes, tasks, each checked."""
+"""Parts of a LeRobotDataset, v3.0 or v2.1: info, features, episodes, tasks, each checked."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Task(TypedDict):
 
 
 class Stated(TypedDict):
-    """What a dataset says of itself."""
+    """Contents of meta/info.json."""
 
     licence: NotRequired[str]
     source: NotRequired[str]

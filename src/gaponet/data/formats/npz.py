@@ -60,7 +60,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
 
 
 def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Recording:
-    """What data.writers.npz wrote: SI, and all that we know of it."""
+    """Read a file that data.writers.npz wrote, in SI units, with all its metadata."""
     told = parse_json(dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again")
     stated = restated(told.get("stated"), f"{file}: {OURS}")
     default = LogsFile(time_unit="s", position_unit="rad")

@@ -26,7 +26,7 @@ MOST_STEPS = 1 << 20  # values of a tree that is walked; shared ones count each 
 
 
 class _RefusedError(Exception):
-    """What stands in the pickle is none of the things that may."""
+    """The pickle holds an object that is not allowed."""
 
 
 class _Type:
@@ -172,7 +172,7 @@ class _Unpickler(pickle._Unpickler):
 
 
 def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None) -> Any:
-    """What a pickle (or an uncompressed or zlib joblib file) holds.
+    """Return the contents of a pickle, or of an uncompressed or zlib joblib file.
 
     Args:
         storage: The storages of a file of torch's: key → the bytes of a storage of tensors, little-endian.

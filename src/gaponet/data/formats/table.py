@@ -74,7 +74,7 @@ def _is_table(file: Path) -> bool:
 
 
 def _delimiter(line: str) -> str:
-    """What stands between cells; a space for any white space."""
+    """Return the separator of cells; a space for any white space."""
     return next((d for d in (",", ";", "\t") if d in line), " ")
 
 

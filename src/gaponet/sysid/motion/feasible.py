@@ -1,4 +1,4 @@
-"""Whether a robot can follow a command, and the nearest command that it can.
+"""Feasibility of commands: can a robot follow one, and which is the nearest that it can.
 
 Four limits: joint range, joint speed, free space between limbs and above floor or table, and torque by inverse dynamics
 of the nominal model at every payload. For a given motion the torque is an affine function of the payload mass (up to
@@ -69,7 +69,7 @@ class Feasibility:
         self.collision = Collision(robot, self.models[0], height, unchecked)
 
     def demand(self, ctrl: Array, dt: float, named: Array | slice = slice(None), need: Array | None = None) -> Demand:
-        """What a command (T, n) rad at period dt asks for.
+        """Return the demand of a command (T, n) rad at period dt.
 
         Args:
             named: The joints that must be within their ranges.
@@ -130,7 +130,7 @@ class Feasibility:
         )
 
     def still(self, posture: Array, need: Array | None = None) -> bool:
-        """Whether a posture (n,) rad can be held at every payload, clear of the body; need as in `demand`."""
+        """Return True if a posture (n,) rad can be held at every payload, clear of the body; need as in `demand`."""
         asks = self.demand(np.repeat(posture[None], 2, axis=0), GRID, need=need)
         return asks.gravity <= STILL_SHARE and asks.clear
 

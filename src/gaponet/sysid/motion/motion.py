@@ -16,7 +16,7 @@ GRID = 0.01  # s: motions are made at 100 Hz; 50 Hz plays every second row
 
 @dataclass(frozen=True)
 class Motion:
-    """What is asked of a robot.
+    """Commands of one motion.
 
     Attributes:
         name: Unique in a recipe.

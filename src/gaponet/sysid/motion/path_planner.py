@@ -68,7 +68,7 @@ def line(a: Array, b: Array) -> Array:
 
 
 def finish_search(search: Search[_T]) -> _T:
-    """What a search finds, whatever time it takes."""
+    """Run a search to its end and return its result."""
     while True:
         try:
             next(search)

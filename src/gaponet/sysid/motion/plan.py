@@ -90,7 +90,7 @@ def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
 
 
 def sheet(robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, known: Path | None = None) -> str:
-    """What to do, and a table to fill in, as Markdown.
+    """Return instructions, and a table to fill in, as Markdown.
 
     Args:
         files: Motion → file.

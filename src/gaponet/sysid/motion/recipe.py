@@ -23,7 +23,7 @@ Names = Annotated[tuple[Name, ...], Len(0, 1000)]
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is played.
+    """Motions, payloads, units, rates and repetitions to be recorded.
 
     Attributes:
         payloads: kg per hand; the heaviest decides how far and fast motions may go.
