@@ -18,7 +18,8 @@ from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
 from gaponet.sysid.uncertainty import FIELD_UNITS
 
-WIDE = 4  # columns of a table
+MAX_COLUMNS = 4  # of a table
+MAX_PRINTED_STD = 1e3  # in the unit of the column; beyond it the logs say nothing about the value
 UNDETERMINED = "not determined by these logs"
 
 
@@ -82,15 +83,15 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         f"({errors['identified'].mean() / errors['nominal'].mean():.2f})"
     )
     shown = [f for f in FIELD_UNITS if any(v.get(f) for v in values.values())]
-    for start in range(0, len(shown), WIDE):
-        part = shown[start : start + WIDE]
+    for start in range(0, len(shown), MAX_COLUMNS):
+        part = shown[start : start + MAX_COLUMNS]
         rows = [
             [j, *(_cell(v.get(f), found.std[j].get(f), FIELD_UNITS[f][1]) for f in part)] for j, v in values.items()
         ]
         for servo in dict.fromkeys(filter(None, (found.robot.servos[i] for i in found.robot.operated_index))):
             known = [_cell(servo.published.get(f), None, FIELD_UNITS[f][1]) for f in part]
             rows += [[f"published for {servo.name}, {servo.source}", *known]] * any(known)
-        title = "Identified servos" if start == 0 else "The same"
+        title = "Identified servos" if start == 0 else "Further parameters"
         screen.table(f"{title}, ± standard error", ["joint", *(FIELD_UNITS[f][0] for f in part)], rows)
     for term in found.comparisons:
         fell, error = (mrad(x) for x in term.gain)
@@ -128,4 +129,6 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
 def _cell(value: float | None, std: float | None, factor: float) -> str:
     if value is None:
         return ""
+    if std is not None and std * factor > MAX_PRINTED_STD:
+        return f"{value * factor:.3g} ± ?"
     return format_uncertainty(value * factor, std * factor) if std else f"{value * factor:.3g}"

@@ -227,7 +227,7 @@ def show(
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
     for start in range(0, len(fields), MAX_COLUMNS):
         part = fields[start : start + MAX_COLUMNS]
-        title = f"{spec.name}, ± standard error" if start == 0 else "The same"
+        title = f"{spec.name}, ± standard error" if start == 0 else "Further parameters"
         screen.table(title, ["joint", *(FIELD_UNITS[f][0] for f in part)], table_rows(known, part))
     for line in sentences(known):
         screen.say(line)
@@ -237,7 +237,9 @@ def show(
         if out.suffix not in (".png", ".svg"):
             raise UsageError(f"--out {out}: a picture is a .png or an .svg")
         with atomic_write(out) as temporary:
-            draw_uncertainty(known, f"{spec.name}: what is known").savefig(temporary, format=out.suffix[1:], dpi=200)
+            draw_uncertainty(known, f"{spec.name}: parameters and standard errors").savefig(
+                temporary, format=out.suffix[1:], dpi=200
+            )
         screen.say(f"picture: {out}")
     screen.result({
         "robot": spec.name, "sources": known.sources, "held": known.validated,

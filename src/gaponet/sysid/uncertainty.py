@@ -34,10 +34,10 @@ MEND = "identify or adapt it again"
 FIELD_UNITS = {  # field → heading, factor from SI
     "kp": ("kp, N·m/rad", 1.0), "kd": ("kd, N·m·s/rad", 1.0), "damping": ("damping, N·m·s/rad", 1.0),
     "frictionloss": ("friction, N·m", 1.0), "armature": ("armature, g·m²", 1e3), "offset": ("offset, mrad", 1e3),
-    "delay": ("delay, ms", 1e3), "target_speed": ("ramp, rad/s", 1.0), "stribeck": ("more at rest, N·m", 1.0),
-    "stribeck_speed": ("until, mrad/s", 1e3), "friction_motor": ("friction, % of motor", 1e2),
-    "friction_external": ("friction, % of load", 1e2), "effort_limit": ("most torque, N·m", 1.0),
-    "min_torque": ("least torque, N·m", 1.0), "encoder_step": ("encoder, mrad", 1e3), "zero": ("zero, mrad", 1e3),
+    "delay": ("delay, ms", 1e3), "target_speed": ("target speed, rad/s", 1.0),
+    "stribeck": ("Stribeck friction, N·m", 1.0), "stribeck_speed": ("Stribeck speed, mrad/s", 1e3),
+    "friction_motor": ("friction, % of motor", 1e2), "friction_external": ("friction, % of load", 1e2), "effort_limit": ("torque limit, N·m", 1.0),
+    "min_torque": ("minimum torque, N·m", 1.0), "encoder_step": ("encoder, mrad", 1e3), "zero": ("zero, mrad", 1e3),
     "stop_low": ("low stop, rad", 1.0), "stop_high": ("high stop, rad", 1.0),
 }  # fmt: skip
 LARGE_VALUE = {"offset": 0.02, "delay": 0.02}  # rad, s: scale of an error; of other fields the value itself
