@@ -36,7 +36,8 @@ FIELD_UNITS = {  # field → heading, factor from SI
     "frictionloss": ("friction, N·m", 1.0), "armature": ("armature, g·m²", 1e3), "offset": ("offset, mrad", 1e3),
     "delay": ("delay, ms", 1e3), "target_speed": ("target speed, rad/s", 1.0),
     "stribeck": ("Stribeck friction, N·m", 1.0), "stribeck_speed": ("Stribeck speed, mrad/s", 1e3),
-    "friction_motor": ("friction, % of motor", 1e2), "friction_external": ("friction, % of load", 1e2), "effort_limit": ("torque limit, N·m", 1.0),
+    "friction_motor": ("friction, % of motor", 1e2), "friction_external": ("friction, % of load", 1e2),
+    "effort_limit": ("torque limit, N·m", 1.0),
     "min_torque": ("minimum torque, N·m", 1.0), "encoder_step": ("encoder, mrad", 1e3), "zero": ("zero, mrad", 1e3),
     "stop_low": ("low stop, rad", 1.0), "stop_high": ("high stop, rad", 1.0),
 }  # fmt: skip
