@@ -126,6 +126,46 @@ def test_live_targets_that_go_for_the_table_are_cut(so101, planner, judge):
     assert np.abs(np.diff(at[199:], axis=0)).max() <= slow + 1e-9
 
 
+@pytest.fixture(scope="module")
+def low(so101: RobotSpec, planner: Planner) -> np.ndarray:
+    """A posture with half of the clearance."""
+    posture = so101.qpos_home.copy()
+    while planner.collision.along(posture[None]).min() > 0.5 * planner.collision.clearance:
+        posture[so101.index(["shoulder_lift"])] += 0.002
+    return posture
+
+
+def test_an_arm_that_started_below_the_clearance_is_brought_back_there(so101, low):
+    controller, _ = virtual(so101, low)
+    recording = controller.run(lambda k, state: so101.qpos_home if k < 100 else None)
+    assert recording.fault is None
+    assert any("back where it was found" in e.text for e in recording.events), [e.text for e in recording.events]
+
+
+def test_a_way_back_that_is_cut_ends_where_the_arm_is_and_says_so(so101, low, monkeypatch):
+    monkeypatch.setattr(CollisionGuard, "allow_start_clearance", lambda guard: None)
+    controller, sent = virtual(so101, low)
+    recording = controller.run(lambda k, state: so101.qpos_home if k < 100 else None)
+    assert recording.fault is None
+    assert "where it is: gripper and the plane at 0 m would come too near" in recording.events[-1].text
+    assert np.abs(sent[-1] - low).max() > 0.02
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_live_targets_reach_a_start_below_the_clearance_only_on_the_way_back(so101, planner, low, allowed):
+    clearance = planner.collision.clearance
+    guard = CollisionGuard(planner, low)
+    for _ in range(200):
+        guard.step(so101.qpos_home, guard.qpos, 0.02)
+    np.testing.assert_allclose(guard.qpos, so101.qpos_home, atol=1e-6)
+    if allowed:
+        guard.allow_start_clearance()
+    for _ in range(400):
+        guard.step(low, guard.qpos, 0.02)
+    free = planner.collision.along(guard.qpos[None]).min()
+    assert free < 0.6 * clearance if allowed else free > clearance - 1e-3
+
+
 def test_of_an_arm_that_sags_the_arm_itself_is_kept_clear(so101, planner):
     down, sag = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0]), np.array([0.0, 0.08, 0.0, 0.0, 0.0, 0.0])
     guard, least = CollisionGuard(planner, so101.qpos_home), np.inf
