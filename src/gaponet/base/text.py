@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 import re
 
+MAX_PRINTED_ERROR = 1e4  # in the unit of the text; the number then says nothing
+
 
 def format_uncertainty(value: float, standard_error: float) -> str:
-    """Format a number and its standard error, rounded to two digits of the error: 0.0 ± 1.3, 320 ± 170."""
+    """Format a number and its standard error, rounded to two digits of the error: 0.0 ± 1.3, 320 ± 170; 5 ± ?."""
+    if standard_error > MAX_PRINTED_ERROR:
+        return f"{value:.3g} ± ?"
     digits = 1 - math.floor(math.log10(standard_error)) if 0 < standard_error < math.inf else 3
     return f"{round(value, digits):.{max(digits, 0)}f} ± {round(standard_error, digits):.{max(digits, 0)}f}"
 

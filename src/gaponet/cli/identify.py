@@ -10,7 +10,7 @@ from gaponet.api.results import IdentifyResult
 from gaponet.base.progress import progress_bar
 from gaponet.base.text import format_uncertainty
 from gaponet.cli.options import Flag, Json, Robot, Source, like
-from gaponet.cli.out import Out, writes
+from gaponet.cli.out import MAX_COLUMNS, Out, writes
 from gaponet.cli.torque import show_torque
 from gaponet.report.tables import mrad
 from gaponet.robot.spec import robot_argument
@@ -18,8 +18,6 @@ from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
 from gaponet.sysid.uncertainty import FIELD_UNITS
 
-MAX_COLUMNS = 4  # of a table
-MAX_PRINTED_STD = 1e3  # in the unit of the column; beyond it the logs say nothing about the value
 UNDETERMINED = "not determined by these logs"
 
 
@@ -129,6 +127,4 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
 def _cell(value: float | None, std: float | None, factor: float) -> str:
     if value is None:
         return ""
-    if std is not None and std * factor > MAX_PRINTED_STD:
-        return f"{value * factor:.3g} ± ?"
     return format_uncertainty(value * factor, std * factor) if std else f"{value * factor:.3g}"

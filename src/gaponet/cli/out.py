@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
+MAX_COLUMNS = 4  # of a table of joints
 WIDTH = 120  # letters of a line in a file or a pipe
 LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
 

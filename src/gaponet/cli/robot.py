@@ -12,7 +12,7 @@ import tyro
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.cli.options import Flag, Folder, Json, Model
-from gaponet.cli.out import Out
+from gaponet.cli.out import MAX_COLUMNS, Out
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
 from gaponet.share.reading import open_dataset
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from gaponet.robot.new import NewRobot
 
 MAX_POSTURES = 300  # of the logs
-MAX_COLUMNS = 4  # of a table
 
 
 def list_robots(json: Json = False) -> None:

@@ -7,12 +7,7 @@ from gaponet.base.text import format_uncertainty
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
 from gaponet.sysid.torque_motors import PASSIVE_FIELDS
-
-UNITS = {
-    "armature": ("armature, g·m²", 1e3),
-    "damping": ("damping, N·m·s/rad", 1.0),
-    "frictionloss": ("friction, N·m", 1.0),
-}
+from gaponet.sysid.uncertainty import FIELD_UNITS
 
 
 def show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
@@ -23,15 +18,15 @@ def show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
         i = spec.operated_index[j]
         values = {f: float(getattr(found.robot, f)[i]) for f in PASSIVE_FIELDS}
         cells = [
-            format_uncertainty(k * values[f], k * found.std[name][f]) if values[f] else "0"
-            for f, (_, k) in UNITS.items()
+            format_uncertainty(FIELD_UNITS[f][1] * v, FIELD_UNITS[f][1] * found.std[name][f]) if v else "0"
+            for f, v in values.items()
         ]
         rows.append([name, *cells, f"{1e3 * found.robot.delay[i]:.0f}", f"{found.bias[j]:+.2g}",
                      *([format_uncertainty(float(found.constant[j]), found.std[name]["constant"])] if current else []),
                      *(f"{x[j]:.3g}" for x in found.torque)])  # fmt: skip
-    columns = ["joint", *(title for title, _ in UNITS.values()), "delay, ms", "bias, N·m"]
+    columns = ["joint", *(FIELD_UNITS[f][0] for f in PASSIVE_FIELDS), "delay, ms", "bias, N·m"]
     columns += ["N·m per unit"] * current + ["torque apart before, N·m", "after"]
-    screen.table("TorqueDrivenFit joints, ± standard error; medians on recordings that were not fitted", columns, rows)
+    screen.table("Torque-driven joints, ± standard error; medians on recordings that were not fitted", columns, rows)
     ahead = (
         f"Angle apart from the {virtual}robot, so long after its state, mrad: before → after, {found.windows} starts"
     )

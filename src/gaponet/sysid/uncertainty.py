@@ -210,11 +210,7 @@ class JointSummary:
         factor = FIELD_UNITS[field][1]
         if self.relative_error(field) > UNOBSERVED_RELATIVE_ERROR and self.values[field] == 0:
             return "none seen"
-        return (
-            format_uncertainty(self.values[field] * factor, self.errors[field] * factor)
-            if self.errors[field] < 1e3
-            else "?"
-        )
+        return format_uncertainty(self.values[field] * factor, self.errors[field] * factor)
 
 
 def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
