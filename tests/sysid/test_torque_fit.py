@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import commands, recordings, write_arm
+from arm import TOML, XML, commands, recordings, write_arm
 from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import RobotError
@@ -20,24 +20,33 @@ from gaponet.sysid.torque import TorqueFit
 
 def moved(robot, metres, hand):
     """The robot with its payload hung elsewhere, and a hand."""
-    mount = robot.payload_mounts[0]
-    return replace(robot, payload_mounts=(replace(mount, pos=(mount.pos[0] + metres, *mount.pos[1:]), mass=hand),))
+    mounts = (replace(m, pos=(m.pos[0] + metres, *m.pos[1:]), mass=hand) for m in robot.payload_mounts)
+    return replace(robot, payload_mounts=tuple(mounts))
 
 
-def test_torque_says_where_the_payload_hangs_and_what_the_hand_weighs(tmp_path):
-    robot = write_arm(tmp_path / "arm")
+POST = '<body name="post" pos="0 1 0"><geom size="0.02" mass="0.1" contype="0" conaffinity="0"/></body>'
+FIRST_MOUNT = '[[payload_mount]]\nside = "post"\nbody = "post"\npos = [0.2, 0.0, 0.0]\n[[payload_mount]]\nside = "hand"'
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_torque_determines_the_payloads_place_and_the_hands_mass_at_the_mount_that_a_joint_carries(tmp_path, second):
+    toml, xml = TOML, XML
+    if second:
+        toml = toml.replace('[[payload_mount]]\nside = "hand"', FIRST_MOUNT)
+        xml = xml.replace("<worldbody>", f"<worldbody>{POST}")
+    robot = write_arm(tmp_path / "arm", toml, xml)
     true = moved(robot, -0.06, 0.1)
     windows = []
     for mass in (0.0, 0.2, 0.4):
         for s in recordings(robot, 2, rows=200):
-            model = build_model(true, mass, "both", s.dt)
+            model = build_model(true, mass, "hand", s.dt)
             qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF)
             qvel = differentiate(qpos, s.dt)
             tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, s.dt))
-            one = replace(s, tau=tau, meta=replace(s.meta, payload_mass=mass))
+            one = replace(s, tau=tau, meta=replace(s.meta, payload_mass=mass, payload_side="hand"))
             windows += [one.rows(slice(a, a + 50)) for a in range(0, 200, 50)]
-    found = TorqueFit(windows, robot).hanging().payload_mounts[0]
-    assert found.pos == pytest.approx(true.payload_mounts[0].pos, abs=0.01)
+    found = TorqueFit(windows, robot).hanging().payload_mounts[-1]
+    assert found.pos == pytest.approx(true.payload_mounts[-1].pos, abs=0.01)
     assert found.mass == pytest.approx(0.1, abs=0.02)
 
 

@@ -214,7 +214,7 @@ class TorqueFit:
         scale, first = np.r_[0.1 * np.ones(3), 1.0, np.ones(n)], np.clip(start, low + 1e-6, high - 1e-6)
         solution = least_squares(residual, first, bounds=(low, high), x_scale=scale, loss="soft_l1").x
         x, y, z, hand = (round(float(v), 3) for v in solution[:4])
-        mounts = tuple(replace(m, pos=(x, y if m is mount else -y, z), mass=hand) for m in robot.payload_mounts)
+        mounts = tuple(replace(m, pos=_place(i, (x, y, z)), mass=hand) for i, m in enumerate(robot.payload_mounts))
         armature = build_model(robot).dof_armature
         servos = {
             robot.joint_names[j]: {"frictionloss": v[0], "armature": float(armature[j]) + v[1], "damping": v[2]}
@@ -225,33 +225,41 @@ class TorqueFit:
     def _balance(self) -> tuple[list[int], Array, Array, Array, Array, Callable[[Array], Array]]:
         """Return the joints; joint, torque, acceleration and speed of each row; and the torque that inverse dynamics
         require for a payload's place and hand x, (4,) m and kg."""
-        robot, mount, rows = self.robot, self.robot.payload_mounts[0], []
-        model = build_model(replace(robot, payload_mounts=tuple(replace(m, mass=0.0) for m in robot.payload_mounts)))
-        data, body, full = mujoco.MjData(model), model.body(mount.body).id, np.empty((model.nv, model.nv))
+        robot, mounts, rows = self.robot, self.robot.payload_mounts, []
+        model = build_model(replace(robot, payload_mounts=tuple(replace(m, mass=0.0) for m in mounts)))
+        data, bodies, full = (
+            mujoco.MjData(model),
+            [model.body(m.body).id for m in mounts],
+            np.empty((model.nv, model.nv)),
+        )
+        jac = np.empty((len(mounts), 2, 3, model.nv))  # of each mount's body: position and rotation
         every = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
         for s in self.sequences:
             assert s.tau is not None
             qacc = differentiate(differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF), s.dt), s.dt)
-            moved = _moved(s, robot)
+            moved, carried = _moved(s, robot), [s.meta.payload_side in ("both", m.side) for m in mounts]
             for t in range(every, len(s) - 1, every) if moved else ():
                 data.qpos[:], data.qvel[:] = s.qpos[t], 0.0
                 mujoco.mj_forward(model, data)
                 mujoco.mj_fullM(model, data, full)
-                frame = data.xmat[body].reshape(3, 3)
+                for body, (shift, turn) in zip(bodies, jac, strict=True):
+                    mujoco.mj_jac(model, data, shift, turn, data.xpos[body], body)
                 rows += [
-                    (j, s.meta.payload_mass, data.qfrc_bias[j] + full[j, j] * qacc[t, j], data.xaxis[j].copy(),
-                     frame.copy(), data.xpos[body] - data.xanchor[j], float(s.tau[t, j]), qacc[t, j],
+                    (j, s.meta.payload_mass * np.array(carried), data.qfrc_bias[j] + full[j, j] * qacc[t, j],
+                     jac[..., j].copy(), data.xmat[bodies].reshape(-1, 3, 3), float(s.tau[t, j]), qacc[t, j],
                      float(s.qvel[t, j]))
                     for j in moved
                 ]  # fmt: skip
         joints = sorted({r[0] for r in rows})
         column = np.array([joints.index(r[0]) for r in rows])
-        mass, bias, axis, frame, arm, tau, qacc, qvel = (np.array([r[i] for r in rows]) for i in range(1, 9))
+        mass, bias, motion, frame, tau, qacc, qvel = (np.array([r[i] for r in rows]) for i in range(1, 8))
 
         def required(x: Array) -> Array:
-            point = np.cross(axis, arm + frame @ x[:3])  # (k, 3) m: how far the payload goes for a radian
-            there = 9.81 * point[:, 2] + np.square(point).sum(axis=1) * qacc
-            return np.asarray(bias + (mass + x[3]) * there)
+            place = np.array([_place(i, x[:3]) for i in range(len(mounts))])
+            # How far each payload moves for a radian, (k, mounts, 3) m: 0 for a joint that does not carry it.
+            point = motion[:, :, 0] + np.cross(motion[:, :, 1], np.einsum("kmij,mj->kmi", frame, place))
+            there = 9.81 * point[..., 2] + np.square(point).sum(axis=-1) * qacc[:, None]
+            return np.asarray(bias + ((mass + x[3]) * there).sum(axis=1))
 
         return joints, column, tau, qacc, qvel, required
 
@@ -288,6 +296,11 @@ class TorqueFit:
         """Return the options whose fit follows these recordings best, and that fit."""
         fits = [(options, self.fit(options)) for options in OPTIONS if self.hangs or not options.place]
         return min(fits, key=lambda one: float(motion_errors(validation, one[1]).mean()))
+
+
+def _place(mount: int, first: ListOf[float] | Array) -> tuple[float, float, float]:
+    """Return the payload's position at a mount for that at the first mount: mirrored, m."""
+    return first[0], first[1] if mount == 0 else -first[1], first[2]
 
 
 def _moved(sequence: Sequence, robot: RobotSpec) -> list[int]:
