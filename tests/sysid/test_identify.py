@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import TOML, recordings, write_arm
+from arm import TOML, commands, record, recordings, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.acceptance import Comparison, Judge
+from gaponet.sysid.acceptance import Comparison, Judge, JudgedFold, cross_validation
 from gaponet.sysid.axes import Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.motion_limits import with_stops
@@ -98,6 +98,26 @@ def test_what_is_told_of_limbs_is_told_of_their_joints():
     np.testing.assert_array_equal(limbs.unpack(limbs.pack(x)), x)
 
 
+def test_one_short_motion_that_shows_nothing_does_not_decide(tmp_path):
+    robot = write_arm(tmp_path)
+    logs, still = recordings(robot, 4, rows=150, kp=0.6), [record(robot, commands(10, 4), "still", kp=1.0)]
+    alone, folds = (
+        identify(logs, robot, still, windows=4, terms=(), table=False, folds=count).chosen for count in (1, 3)
+    )
+    assert (alone, folds) == ("given", "limbs")
+
+
+def test_folds_share_no_motion_and_a_set_of_joints_with_one_motion_is_always_fitted(arm):
+    logs = recordings(arm, 5)
+    logs[4] = replace(logs[4], meta=replace(logs[4].meta, notes={"held_at_home": ("elbow",)}))
+    folds = cross_validation(logs[:3], logs[3:], 3)
+    assert sorted(s.meta.motion for _, out in folds for s in out) == sorted(s.meta.motion for s in logs[:4])
+    for train, out in folds:
+        assert not {s.meta.motion for s in train} & {s.meta.motion for s in out}
+        assert logs[4] in train
+    assert cross_validation(logs[:1], logs[1:4], 3) == [(logs[:1], logs[1:4])]  # three motions validate
+
+
 @pytest.mark.parametrize(
     ("falls", "accepted"),
     [
@@ -120,6 +140,6 @@ def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
     robot, logs = write_arm(tmp_path), recordings(load_robot(tmp_path))[:3]
     again = [*logs, replace(logs[0], meta=replace(logs[0].meta, repetition=1, kp=(18.0, 18.0)))]
     values = Bounds(robot, logs).first
-    once, twice = (Judge(x, robot, -np.inf, 1).errors(values) for x in (logs, again))
+    once, twice = (Judge([JudgedFold(x, robot, -np.inf, 1)]).errors([values]) for x in (logs, again))
     assert len(once) == len(twice) == 3
     np.testing.assert_allclose(twice[1:], once[1:])

@@ -98,13 +98,12 @@ def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_p
     windows = loaded(robot)
     found = identify(windows[:12], robot, windows[12:], terms=())
     (tried,) = found.comparisons
-    assert (found.chosen, tried.name, tried.accepted, len(tried.before)) == ("torque", "torque", True, 2)
+    assert (found.chosen, tried.name, tried.accepted, len(tried.before)) == ("torque", "torque", True, 6)
     assert found.robot.kp == pytest.approx([12.0, 12.0], rel=0.03)
     assert found.robot.payload_mounts[0].mass == pytest.approx(0.3, abs=0.05)
-    assert found.judged_robot is not None
-    assert not (found.judged_robot.kp == found.robot.kp).all()  # fitted once more, to the motions that judged it
+    assert not (found.held_out[0].robot.kp == found.robot.kp).all()  # fitted once more, to the motions that judged it
     silent = identify([replace(s, tau=None) for s in windows[:12]], robot, windows[12:], terms=())
-    assert (silent.judged_robot, silent.comparisons) == (None, ())
+    assert silent.comparisons == ()
     assert found.after < silent.after
 
 
@@ -117,8 +116,9 @@ def test_a_fit_from_torque_that_comes_to_follow_its_judges_worse_stays_as_they_j
         return found.with_servos({"elbow": {"offset": 0.1}}) if len(self.sequences) == len(windows) else found
 
     monkeypatch.setattr(TorqueFit, "fit", astray)
-    found = identify(windows[:12], robot, windows[12:], terms=())
-    assert (found.chosen, found.judged_robot) == ("torque", None)
+    found = identify(windows[:12], robot, windows[12:], terms=(), folds=1)
+    assert found.chosen == "torque"
+    assert found.held_out[0].robot is found.robot
     assert abs(found.robot.offset).max() < 0.05
 
 

@@ -14,6 +14,7 @@ from gaponet.data.store import Dataset
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay
+from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.drift import drift
 from gaponet.sysid.evidence import estimate_uncertainty
 from gaponet.sysid.uncertainty import OLD_KEYS, ParameterUncertainty, from_axes
@@ -97,7 +98,7 @@ def test_what_is_left_of_a_joint_is_of_recordings_that_hold_it_and_of_the_robot_
     assert one["elbow"].residual_rms > 0.5 * both["elbow"].residual_rms  # rows that do not hold it are no zeros
     assert none["elbow"].residual_p90 == none["shoulder"].residual_p90 > 0.0
     off = robot.with_servos({"elbow": {"offset": 0.05}})
-    judged = estimate_uncertainty(robot, judges, judges, judged_robot=off, nthread=1).joints["elbow"]
+    judged = estimate_uncertainty(robot, judges, judges, held_out=[HeldOut(judges, off)], nthread=1).joints["elbow"]
     assert judged.residual_rms > 10 * both["elbow"].residual_rms
     assert judged.values == both["elbow"].values
 

@@ -9,6 +9,7 @@ import pytest
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [6001, 6006])
 def test_identification_is_never_worse_than_the_file_of_a_robot_it_never_met(seed, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))

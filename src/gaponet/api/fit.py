@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.config import Kind
     from gaponet.nn.training.config import TrainConfig
-    from gaponet.sysid.acceptance import Covariance
+    from gaponet.sysid.acceptance import Covariance, HeldOut
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
 Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"]
@@ -54,7 +54,9 @@ def identify(
 ) -> IdentifyResult:
     """Fit the servos of the simulator, and the table under the robot, to the training motions.
 
-    A robot folder is written if it follows the validation motions better than the given robot; otherwise nothing is.
+    A robot folder is written if motions that were not fitted are followed better than by the given robot; otherwise
+    nothing is. Where fewer than three motions validate a set of joints, cross-validation over motions decides, and the
+    robot is then fitted to all of them.
     Recordings made with several gains are fitted together, each in a simulator with its own gains.
 
     Args:
@@ -80,8 +82,7 @@ def identify(
     from gaponet.data.split import split_entries
     from gaponet.nn.training.budget import Budget
     from gaponet.robot.folder import save_robot
-    from gaponet.sim.replay import rollout_errors
-    from gaponet.sysid.acceptance import MIN_RELATIVE_GAIN
+    from gaponet.sysid.acceptance import MIN_RELATIVE_GAIN, HeldOut, held_out_errors
     from gaponet.sysid.identify import identify as fit
 
     data, spec = as_dataset(dataset, robot)
@@ -100,14 +101,17 @@ def identify(
         fitted = fit(
             data.sequences(split["train"]), spec, val, windows, terms, table, shared, threads, progress, seconds, stops
         )
-        given, after = (rollout_errors(val, one, threads) for one in (spec, fitted.judged_robot or fitted.robot))
+        after, given, nominal = (
+            held_out_errors(HeldOut(s, one or own) for s, own in fitted.held_out)
+            for one in (None, spec, spec.nominal or spec)
+        )
         if not fitted.improved or after.mean() > (1 - MIN_RELATIVE_GAIN) * given.mean():
             raise NoGainError(fitted.no_gain_message(spec, given, after))
         save_robot(fitted.robot, folder)
-        nominal = given if spec.nominal is None else rollout_errors(val, spec.nominal, threads)
         errors = {"nominal": nominal, "identified": after}
         _save_origin(folder, data, split, {name: float(e.mean()) for name, e in errors.items()})
-        _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, fitted.judged_robot)
+        judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
+        _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, judges)
     return IdentifyResult(
         robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began
     )  # fmt: skip
@@ -172,14 +176,14 @@ def _save_origin(
 
 def _save_uncertainty(
     folder: Path, sequences: list[Sequence], validation: list[Sequence], covariance: Covariance,
-    before: ParameterUncertainty | None, validated: RobotSpec | None = None,
+    before: ParameterUncertainty | None, held_out: ListOf[HeldOut] = (),
 ) -> None:  # fmt: skip
     """Write the parameter uncertainty of a robot folder."""
     from gaponet.sysid.evidence import estimate_uncertainty
 
     for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
         (folder / name).unlink(missing_ok=True)
-    estimate_uncertainty(load_robot(folder), sequences, validation, covariance, before, validated).save(folder)
+    estimate_uncertainty(load_robot(folder), sequences, validation, covariance, before, held_out).save(folder)
 
 
 def train(

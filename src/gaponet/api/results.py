@@ -181,7 +181,7 @@ class IdentifyResult:
 
     Attributes:
         robot: The robot with identified servos, as written to `folder`.
-        errors: nominal and identified → mean |error| of each whole validation motion, (motions,) rad.
+        errors: nominal and identified → mean |error| of each motion that was not fitted, (motions,) rad.
         fit: Standard errors, terms that were tried, warnings.
         seconds: Duration of the fit.
     """
@@ -194,7 +194,7 @@ class IdentifyResult:
 
     @property
     def val_mpjae(self) -> dict[str, float]:
-        """nominal and identified → mean over the validation motions, rad."""
+        """nominal and identified → mean over the motions that were not fitted, rad."""
         return {name: float(errors.mean()) for name, errors in self.errors.items()}
 
     def values(self) -> dict[str, dict[str, float]]:

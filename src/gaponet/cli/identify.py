@@ -77,9 +77,13 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     found, errors, values = made.fit, made.errors, made.values()
     nominal, left = (f"{mrad(e.mean())} ± {mrad(standard_error(e))}" for e in errors.values())
     screen.say(
-        f"nominal {nominal} → identified {left} mrad on {len(errors['nominal'])} whole validation motion(s) "
+        f"nominal {nominal} → identified {left} mrad on {len(errors['nominal'])} motion(s), not fitted "
         f"({errors['identified'].mean() / errors['nominal'].mean():.2f})"
     )
+    if len(found.held_out) > 1:
+        screen.say(
+            f"few motions validate: cross-validation in {len(found.held_out)} folds chose; the robot is fitted to all"
+        )
     shown = [f for f in FIELD_UNITS if any(v.get(f) for v in values.values())]
     for start in range(0, len(shown), MAX_COLUMNS):
         part = shown[start : start + MAX_COLUMNS]
@@ -96,8 +100,7 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         judges = "motions" if term.name == "torque" else "recordings"
         told = f"{len(term.before)} {judges}; {'not ' * (not term.accepted)}kept"
         screen.say(f"{term.name}: validation error falls by {fell} ± {error} mrad over {told}")
-    if found.judged_robot:
-        screen.say("from torque, then fitted to the validation motions, too: the numbers are from before that")
+    if found.chosen == "torque":
         for m in found.robot.payload_mounts:
             screen.say(
                 f"payload_mount {m.side}: at {m.pos} m of {m.body}, where {m.mass:g} kg hang that the model lacks"

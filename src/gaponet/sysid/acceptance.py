@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
+from gaponet.data.split import hash_order
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import standard_error
+from gaponet.sim.replay import motion_errors
 from gaponet.sysid.axes import Values
 from gaponet.sysid.robot_rollouts import RobotRollouts
 from gaponet.sysid.table_contact import TableFit, tip_heights
@@ -21,7 +25,50 @@ Covariance = dict[str, tuple[list[str], Array]]  # joint → fields (P), (P, P) 
 
 MIN_RELATIVE_GAIN = 0.01  # of the mean error, where several motions judge
 MIN_RELATIVE_GAIN_ONE_MOTION = 0.1
+MIN_JUDGES = 3  # motions of each set of recorded joints; fewer are too few to validate without cross-validation
 CONFIDENCE = 0.84  # one-sided level of Student's t: one standard error where motions are many
+
+
+class HeldOut(NamedTuple):
+    """Recordings, and a robot that was fitted without them."""
+
+    sequences: list[Sequence]
+    robot: RobotSpec
+
+
+def held_out_errors(folds: Iterable[HeldOut]) -> Array:
+    """Return the mean |error| of each motion in rollouts of the robot that was fitted without it, (motions,) rad."""
+    return np.concatenate([motion_errors(sequences, robot) for sequences, robot in folds])
+
+
+Split = tuple[list[Sequence], list[Sequence]]  # recordings to fit, recordings that judge
+
+
+def cross_validation(sequences: ListOf[Sequence], validation: ListOf[Sequence], folds: int) -> list[Split]:
+    """Return folds by motion, or the given split if at least MIN_JUDGES motions validate each set of recorded joints.
+
+    Motions of one set of joints are dealt out to the folds. A set with a single motion is fitted in every fold.
+    """
+    every = [*sequences, *validation]
+    judges, motions = (
+        {joints: hash_order(s.meta.motion for s in part if s.meta.unrecorded == joints)
+         for joints in {s.meta.unrecorded for s in part}} for part in (validation, every)
+    )  # fmt: skip
+    enough = min((len(judges.get(joints, ())) for joints, names in motions.items() if len(names) > 1), default=0)
+    count = min(folds, max(map(len, motions.values())))
+    if not validation or enough >= MIN_JUDGES or count < 2:
+        return [(list(sequences), list(validation))]
+    fold = {
+        (joints, name): i % count for joints, names in motions.items() if len(names) > 1 for i, name in enumerate(names)
+    }
+    place = [fold.get((s.meta.unrecorded, s.meta.motion)) for s in every]
+    return [
+        (
+            [s for s, p in zip(every, place, strict=True) if p != k],
+            [s for s, p in zip(every, place, strict=True) if p == k],
+        )
+        for k in range(count)
+    ]
 
 
 @dataclass(frozen=True)
@@ -67,7 +114,8 @@ class Identified:
         by_joint: Joint → mean |error| before and after, rad.
         covariance: Joint → fields and their covariance; without joints with a shared servo model.
         undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
-        judged_robot: The robot that the validation motions judged, if `robot` was fitted to them as well afterwards.
+        held_out: Recordings that were not fitted and the robot that was fitted without them, one pair for each fold of
+            a cross-validation; `robot` itself where nothing was fitted to them afterwards.
     """
 
     robot: RobotSpec
@@ -82,7 +130,7 @@ class Identified:
     by_joint: dict[str, tuple[float, float]] = field(default_factory=dict)
     covariance: Covariance = field(default_factory=dict)
     undetermined: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    judged_robot: RobotSpec | None = None
+    held_out: tuple[HeldOut, ...] = ()
 
     @property
     def improved(self) -> bool:
@@ -101,8 +149,8 @@ class Identified:
         )
 
 
-class Judge:
-    """Errors of candidates on whole motions in the robot's simulator; repetitions of a motion count as one."""
+class JudgedFold:
+    """Errors of values on whole motions in the robot's simulator; repetitions of a motion count as one."""
 
     def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float, nthread: int) -> None:
         """Judge by sequences; rows with a tip below `contact_height`, m, do not count."""
@@ -115,7 +163,7 @@ class Judge:
         self.motions = [rows for rows in each if rows.any()]
         self._sums_of: dict[bytes, Array] = {}
 
-    def _sums(self, values: Values) -> tuple[Array, Array]:
+    def sums(self, values: Values) -> tuple[Array, Array]:
         """Return the sums of |error| over counted rows, rad, and their numbers, by motion and joint, (motions, n)."""
         key = b"".join(f.encode() + values[f].tobytes() for f in sorted(values))
         if key not in self._sums_of:
@@ -123,21 +171,37 @@ class Judge:
             self._sums_of[key] = np.stack([size[:, rows].sum(axis=1) for rows in self.motions])
         return self._sums_of[key], np.stack([self.rollouts.recorded[:, rows].sum(axis=1) for rows in self.motions])
 
-    def errors(self, values: Values) -> Array:
+
+class Judge:
+    """Errors of candidates on the motions that they were not fitted to.
+
+    A candidate is a list of values (n,): one for each fold, fitted without its motions; then perhaps one that was
+    fitted to all recordings, which no motion judges.
+    """
+
+    def __init__(self, folds: ListOf[JudgedFold]) -> None:
+        self.folds = folds
+
+    def _sums(self, candidate: ListOf[Values]) -> tuple[Array, Array]:
+        """Return the sums of |error| over counted rows, rad, and their numbers, by motion and joint, (motions, n)."""
+        total, count = zip(*(fold.sums(v) for fold, v in zip(self.folds, candidate, strict=False)), strict=True)
+        return np.concatenate(total), np.concatenate(count)
+
+    def errors(self, candidate: ListOf[Values]) -> Array:
         """Return the mean |error| of each motion, (motions,) rad."""
-        total, count = self._sums(values)
+        total, count = self._sums(candidate)
         return np.asarray(total.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
 
-    def errors_by_joint(self, values: Values) -> Array:
+    def errors_by_joint(self, candidate: ListOf[Values]) -> Array:
         """Return the mean |error| of each joint, (n,) rad."""
-        total, count = self._sums(values)
+        total, count = self._sums(candidate)
         return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
 
-    def compare(self, name: str, before: Values, after: Values) -> Comparison:
-        """Compare a candidate with the values before it."""
+    def compare(self, name: str, before: ListOf[Values], after: ListOf[Values]) -> Comparison:
+        """Compare a candidate with the one before it."""
         return Comparison(name, self.errors(before), self.errors(after))
 
-    def best(self, candidates: dict[str, Values]) -> tuple[str, Values]:
+    def best(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
         """Return name and values of the best candidate.
 
         The second candidate is the default. Another one replaces it if it is accepted by `Comparison`, or better by
@@ -148,9 +212,8 @@ class Judge:
         joints = np.array([self.errors_by_joint(v) for v in candidates.values()])
         winner = joints.argmin(axis=0)
         if len(set(winner.tolist())) > 1:
-            fields = set.intersection(*(set(v) for v in candidates.values()))
-            rows = {f: np.stack([v[f] for v in candidates.values()]) for f in fields}
-            candidates = candidates | {"mixed": {f: x[winner, np.arange(len(winner))] for f, x in rows.items()}}
+            mixed = [_by_joint(each, winner) for each in zip(*candidates.values(), strict=True)]
+            candidates = candidates | {"mixed": mixed}
         errors, name = {name: self.errors(v) for name, v in candidates.items()}, default
         for other in (*others, *(candidates.keys() & {"mixed"})):
             limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[name].mean()
@@ -158,6 +221,12 @@ class Judge:
             name = other if much_better or Comparison(other, errors[name], errors[other]).accepted else name
         name = name if errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean() else given
         return name, candidates[name]
+
+
+def _by_joint(candidates: ListOf[Values], winner: Array) -> Values:
+    """Return the values (n,) of candidate winner[i] for joint i."""
+    fields = set.intersection(*map(set, candidates))
+    return {f: np.stack([v[f] for v in candidates])[winner, np.arange(len(winner))] for f in fields}
 
 
 def _contact_rows(sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float) -> Array | None:

@@ -15,7 +15,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import replay
-from gaponet.sysid.acceptance import CONFIDENCE
+from gaponet.sysid.acceptance import CONFIDENCE, HeldOut
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import slopes
@@ -153,7 +153,7 @@ def estimate_uncertainty(
     judges: ListOf[Sequence],
     covariances: Mapping[str, tuple[list[str], Array]] = {},
     before: ParameterUncertainty | None = None,
-    judged_robot: RobotSpec | None = None,
+    held_out: ListOf[HeldOut] = (),
     nthread: int = 0,
 ) -> ParameterUncertainty:
     """Estimate the parameter uncertainty of a robot that was fitted to recordings.
@@ -166,7 +166,8 @@ def estimate_uncertainty(
             from `before`.
         before: Uncertainty of the robot that the fit began from. Its variance grows by how far the values moved beyond
             what both uncertainties explain.
-        judged_robot: The robot that the judges apply to, if `robot` was fitted to them as well afterwards.
+        held_out: Recordings and the robots that were fitted without them, instead of `judges`, if `robot` was fitted to
+            them as well.
         nthread: Threads, 0 for all cores.
     """
     first = first_values(robot)
@@ -178,7 +179,7 @@ def estimate_uncertainty(
         old = np.stack([before.array(j, "overdispersion") for j in robot.operated])
         overdispersion = (before.clusters * old + clusters * overdispersion) / (before.clusters + clusters)
     step, step_covariance = own.gauss_newton_step(np.maximum(overdispersion, 1.0))
-    errors, joints = _errors_by_joint(judges or sequences, judged_robot or robot, nthread), {}
+    errors, joints = _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread), {}
     for i, joint in enumerate(robot.operated):
         covariance = step_covariance[i, :-1, :-1]
         if before:
@@ -194,7 +195,7 @@ def estimate_uncertainty(
         information = own.information[i].sum(axis=0)[:-1, :-1]
         variance = max(np.trace(covariance @ information), 0.0) / max(own.rows[i], 1)
         rms = float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2)))
-        old_joint = before.joints[joint] if before and not judges else None
+        old_joint = before.joints[joint] if before and not (judges or held_out) else None
         joints[joint] = JointUncertainty(
             values=_nested(values[joint]), covariance=_nested(covariance), gauss_newton_step=_nested(step[i]),
             gauss_newton_covariance=_nested(step_covariance[i]), overdispersion=_nested(overdispersion[i]),
@@ -210,13 +211,17 @@ def estimate_uncertainty(
         "seconds": float(sum(s.duration for s in sequences)),
         "values": {j: joints[j].values for j in joints}, "covariance": {j: joints[j].covariance for j in joints},
     }  # fmt: skip
-    return ParameterUncertainty(fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges))
+    return ParameterUncertainty(
+        fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges or held_out)
+    )
 
 
-def _errors_by_joint(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int) -> dict[str, list[Array]]:
+def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Array]]:
     """Return joint → |error| of each rollout that holds it, rad; the worst joint's for joints that none holds."""
-    replays = replay(sequences, robot, nthread=nthread, lock_idle=True)
-    pairs = [(s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:]) for s, t in zip(sequences, replays, strict=True)]
+    pairs, robot = [], folds[0].robot
+    for sequences, judged in folds:
+        replays = replay(sequences, judged, nthread=nthread, lock_idle=True)
+        pairs += [(s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:]) for s, t in zip(sequences, replays, strict=True)]
     errors = {}
     for j, i in zip(robot.operated, robot.operated_index, strict=True):
         if mine := [error[:, i] for unrecorded, error in pairs if j not in unrecorded]:

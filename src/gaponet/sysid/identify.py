@@ -5,7 +5,8 @@ the servo model (sim/servo.py) that validation motions accept. Steps:
 
 1. Fit every joint by itself beside the recording, from several starts (joint_rollouts.py).
 2. Fit all joints together in the simulator of the robot, from there and from the robot's file (robot_rollouts.py).
-3. Choose among the given robot and these fits by validation motions (acceptance.py); add terms one by one.
+3. Choose among the given robot, a delay and an offset by joint, and these fits by motions that were not fitted
+   (acceptance.py); add terms of the servo model one by one. Where few motions validate, cross-validation chooses.
 4. Fit the table under the tips (table_contact.py).
 5. Compare with a fit that begins with recorded torque (torque.py), and with speed-limited targets (motion_limits.py).
 """
@@ -22,7 +23,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.acceptance import Comparison, Identified, Judge
+from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Judge, JudgedFold, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, SINGLE_JOINT_FIELDS, Bounds, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.motion_limits import stop_questions, with_speed_limits, with_stops
@@ -41,10 +42,11 @@ from gaponet.sysid.shared_servo import far_from_published, same_servos, share
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
 from gaponet.sysid.torque import with_torque
 
+FOLDS = 3  # of the cross-validation
 WINDOWS = 40  # of joints by themselves
 ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
 POLISH_ITERATIONS = 2  # of the whole robot with a term of the servo model
-JOINTS_TIME_SHARE, ROBOT_TIME_SHARE = 0.3, 0.4  # of a time budget; terms share the rest
+JOINTS_TIME_SHARE, ROBOT_TIME_SHARE, TERMS_TIME_SHARE = 0.3, 0.4, 0.3  # of a time budget
 TERMS: dict[str, tuple[str, ...]] = {
     "stribeck": ("stribeck", "stribeck_speed"),
     "load": ("friction_motor",),
@@ -61,13 +63,18 @@ Progress = Callable[[float, float, str], None]  # iterations done, in all, what 
 class SearchProgress:
     """Progress of the searches; and the time that each may take, where the time is limited."""
 
-    def __init__(self, seconds: float | None, terms: int, progress: Progress) -> None:
-        """Begin the time of all searches, s; None for no limit."""
+    def __init__(self, seconds: float | None, terms: int, fits: int, progress: Progress) -> None:
+        """Begin the time of the searches of so many terms in so many fits, s; None for no limit."""
+        joints = sum(SEARCH_ITERATIONS)
         robot = sum(ROBOT_ITERATIONS) + CHAIN_ITERATIONS
-        each = [sum(SEARCH_ITERATIONS), robot, *[sum(SEARCH_ITERATIONS) + POLISH_ITERATIONS] * terms]
+        each = [joints, robot] * fits + [joints + POLISH_ITERATIONS] * (fits * terms)
+        term = TERMS_TIME_SHARE / (terms + 1)
+        shares = [JOINTS_TIME_SHARE, ROBOT_TIME_SHARE] * fits + [term] * (fits * terms)
         self._began, self._seconds, self._progress = time.monotonic(), seconds, progress
         self._last_of = np.cumsum(each).tolist()  # number of each search's last iteration
-        self._total, self._done, self._end = self._last_of[-1], 0, np.inf
+        # Of the time that is left when a search begins: as much as of one more term stays.
+        self._shares = [share / (sum(shares[i:]) + fits * term) for i, share in enumerate(shares)]
+        self._total, self._done, self._end, self._search = self._last_of[-1], 0, np.inf, 0
         self.tell(0, "inertias along the recordings")
 
     def tell(self, done: int, what: str) -> None:
@@ -78,12 +85,13 @@ class SearchProgress:
         """Report what is done after the last search; no time limit counts it."""
         self.tell(self._total, what)
 
-    def begin(self, search: int, time_share: float) -> None:
-        """Begin the search of this number, which may take this share of the time that is left."""
+    def begin(self) -> None:
+        """Begin the next search, which may take its share of the time that is left."""
         elapsed = time.monotonic() - self._began
         left = np.inf if self._seconds is None else max(self._seconds - elapsed, 0.0)
-        self._end = elapsed + time_share * left
-        self._done = self._last_of[search - 1] if search else 0
+        self._end = elapsed + self._shares[self._search] * left
+        self._done = self._last_of[self._search - 1] if self._search else 0
+        self._search += 1
 
     def expired(self) -> bool:
         """Return whether the time of the present search is over."""
@@ -112,8 +120,12 @@ def identify(
     progress: Progress = lambda done, total, note: None,
     budget: float | None = None,
     stops: bool = False,
+    folds: int = FOLDS,
 ) -> Identified:
     """Fit the parameters of all operated joints.
+
+    Where fewer than three motions validate a set of joints, all recordings are fitted in the end, and cross-validation
+    over their motions chooses among candidates.
 
     Args:
         sequences: Recordings to fit; validation and test motions stay out.
@@ -127,40 +139,54 @@ def identify(
         progress: Called in each iteration.
         budget: Time of the searches, s, without the table's; results are the same on every machine only without it.
         stops: Give joints that stayed behind several commands a stop there.
+        folds: Folds of the cross-validation, at most; 1 for none.
     """
-    options = (validation, windows, terms, table, shared, nthread, progress, stops)
+    splits = cross_validation(sequences, validation, folds)
+    options = (splits, validation, windows, terms, table, shared, nthread, progress, stops)
 
     def fit(one: RobotSpec, seconds: float | None) -> Identified:
         fitted = fit_robot(sequences, one, *options, seconds)
-        return with_torque(fitted, sequences, validation, one, nthread) if validation else fitted
+        return with_torque(fitted, splits, one, nthread) if validation else fitted
 
-    return with_speed_limits(fit, sequences, robot, validation, budget) if validation else fit(robot, budget)
+    return with_speed_limits(fit, sequences, robot, budget) if validation else fit(robot, budget)
 
 
 def fit_robot(
-    sequences: ListOf[Sequence], robot: RobotSpec, validation: ListOf[Sequence], windows: int, terms: tuple[str, ...],
-    table: bool, shared: bool, nthread: int, progress: Progress, stops: bool, budget: float | None,
+    sequences: ListOf[Sequence], robot: RobotSpec, splits: ListOf[Split], validation: ListOf[Sequence], windows: int,
+    terms: tuple[str, ...], table: bool, shared: bool, nthread: int, progress: Progress, stops: bool,
+    budget: float | None,
 ) -> Identified:  # fmt: skip
     """Fit to positions, with the speed limits that the robot's servos have; arguments as of `identify`."""
-    searches = SearchProgress(budget, len(terms), progress)
     given, robot = robot, with_stops(robot, sequences)  # stops that nobody confirmed are taken back in the end
     heights = tip_heights(sequences, robot)
-    contact, parts = contact_height(robot, heights), cut(sequences, windows)
-    joints = JointFit(JointRollouts(parts, robot, contact, nthread), robot, Bounds(robot, sequences))
-    judge, first = Judge(list(validation) or parts, robot, contact, nthread), joints.bounds.first
-    whole, candidates = _classic_candidates(joints, searches, nthread)
+    contact = contact_height(robot, heights)
+    fitted_sets = [train for train, _ in splits] + [[*sequences, *validation]] * (len(splits) > 1)
+    fits = [
+        JointFit(JointRollouts(cut(train, windows), robot, contact, nthread), robot, Bounds(robot, train))
+        for train in fitted_sets
+    ]
+    judge = Judge([
+        JudgedFold(held_out or fits[0].rollouts.parts, robot, contact, nthread) for _, held_out in splits
+    ])  # fmt: skip
+    searches = SearchProgress(budget, len(terms), len(fits), progress)
+    wholes, each = zip(*(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True)
+    candidates = {name: [one[name] for one in each] for name in each[0]}
     chosen, values = judge.best(candidates)
     base = values if chosen != "given" else candidates["limbs"]
-    comparisons, values = _with_terms(joints, whole, judge, terms, values, base, searches)
+    comparisons, values = _with_terms(fits, wholes, judge, terms, values, base, searches)
     chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
-    errors, common = standard_errors(whole, values), []
+    joints, whole, first, common = fits[-1], wholes[-1], [one.bounds.first for one in fits], []
+    errors = standard_errors(whole, values[-1])
     for servo, places in (same_servos(robot) if shared else {}).items():
-        mine = share(joints.rollouts, values, places, joints.bounds.start["armature"][places].mean())
+        mine = [
+            share(one.rollouts, v, places, one.bounds.start["armature"][places].mean())
+            for one, v in zip(fits, values, strict=True)
+        ]
         common.append(judge.compare(servo, values, mine))
         values, chosen = mine, "whole"
         errors.std |= {robot.operated[i]: {} for i in places}
 
-    fitted, table_fit = joints.robot_with(values) if chosen != "given" else robot, None
+    fitted, table_fit = joints.robot_with(values[-1]) if chosen != "given" else robot, None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, contact), min(h.min() for h in heights)
         tell = lambda error: searches.finish(f"table {error * 1e3:.2f} mrad")  # noqa: E731
@@ -169,9 +195,15 @@ def fit_robot(
     if not stops:
         fitted = replace(fitted, stop_low=given.stop_low, stop_high=given.stop_high)
         fitted = given if chosen == "given" and not (table_fit and table_fit.accepted) else fitted
-    unknown = undetermined(whole, values, errors)
+    held_out = [HeldOut(list(validation), fitted)] if validation else []
+    if len(splits) > 1:
+        robots = [one.robot_with(v) if chosen != "given" else given for one, v in zip(fits, values, strict=True)]
+        held_out = [
+            HeldOut(part, replace(one, table=fitted.table)) for (_, part), one in zip(splits, robots, strict=False)
+        ]
+    unknown = undetermined(whole, values[-1], errors)
     warnings = (
-        *joints.bounds.warnings(values, fitted_fields(values)), *stop_questions(given, robot),
+        *joints.bounds.warnings(values[-1], fitted_fields(values[-1])), *stop_questions(given, robot),
         *far_from_published(fitted), *(text for _, text in unknown.values()),
     )  # fmt: skip
     before, after = (float(judge.errors(v).mean()) for v in (first, values))
@@ -181,45 +213,60 @@ def fit_robot(
         fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit, tuple(common),
         dict(zip(robot.operated, by_joint, strict=True)),
         {j: errors.covariance[j] for j in robot.operated if errors.std[j]},
-        {joint: fields for joint, (fields, _) in unknown.items()},
+        {joint: fields for joint, (fields, _) in unknown.items()}, tuple(held_out),
     )  # fmt: skip
 
 
 def _classic_candidates(joints: JointFit, searches: SearchProgress, nthread: int) -> tuple[RobotFit, dict[str, Values]]:
     """Fit the classic fields, joints by themselves and then together; return the whole robot's fit and candidates."""
     bounds, names = joints.bounds, joints.robot.operated
-    searches.begin(0, JOINTS_TIME_SHARE)
+    searches.begin()
     report = searches.report("joints, each on its own", names, joints.rollouts.rows)
+    late = joints.search(("offset", "delay"), bounds.first, only=True, expired=searches.expired)
     alone = joints.search(CLASSIC, bounds.start, joints.regressed(), report=report, expired=searches.expired)
     joints.prior.update_correlation_time(joints.rollouts, alone)
     whole = joints.robot_fit(nthread)
-    searches.begin(1, ROBOT_TIME_SHARE / (1 - JOINTS_TIME_SHARE))
+    searches.begin()
     report = searches.report("whole robot", names, whole.rollouts.rows)
     together = whole.descend(
         CLASSIC, bounds.start, (alone, bounds.start), ROBOT_ITERATIONS, report=report, expired=searches.expired
     )
     chains = whole.descend_chains(together, lambda names, rows: searches.report("limbs", names, rows), searches.expired)
-    return whole, {"given": bounds.first, "limbs": chains, "joints": alone, "whole": together}
+    return whole, {
+        "given": bounds.first, "limbs": chains, "joints": alone, "whole": together, "delay and offset": late,
+    }  # fmt: skip
 
 
 def _with_terms(
-    joints: JointFit, whole: RobotFit, judge: Judge, terms: tuple[str, ...], values: Values, base: Values,
-    searches: SearchProgress,
-) -> tuple[tuple[Comparison, ...], Values]:  # fmt: skip
+    fits: ListOf[JointFit], wholes: ListOf[RobotFit], judge: Judge, terms: tuple[str, ...], values: list[Values],
+    base: list[Values], searches: SearchProgress,
+) -> tuple[tuple[Comparison, ...], list[Values]]:  # fmt: skip
     """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted."""
-    comparisons, names = list[Comparison](), joints.robot.operated
-    for i, term in enumerate(terms):
-        searches.begin(2 + i, 1 / (len(terms) - i + 1))
-        report = searches.report(term, names, joints.rollouts.rows)
-        start = base | {f: joints.bounds.guess[f] for f in TERMS[term]}
-        richer = joints.search(TERMS[term], start, report=report, expired=searches.expired)
-        if not set(TERMS[term]) & set(SINGLE_JOINT_FIELDS):
-            report = searches.report(f"{term}, whole robot", names, whole.rollouts.rows)
-            polished = whole.descend(
-                robot_fields(richer), richer, (richer,), (POLISH_ITERATIONS,), report=report, expired=searches.expired
-            )
-            richer = min(richer, polished, key=lambda v: float(judge.errors(v).mean()))
+    comparisons = list[Comparison]()
+    for term in terms:
+        each = [_fit_term(term, *one, searches) for one in zip(fits, wholes, base, strict=True)]
+        richer = [together if together is not None else alone for alone, together in each]
+        if each[0][1] is not None:
+            richer = min([alone for alone, _ in each], richer, key=lambda v: float(judge.errors(v).mean()))
         comparisons.append(judge.compare(term, values, richer))
         if comparisons[-1].accepted:  # a term that is zero in every joint only gave the others more iterations
-            values = base = {f: v for f, v in richer.items() if f not in TERMS[term] or richer[TERMS[term][0]].any()}
+            used = any(v[TERMS[term][0]].any() for v in richer)
+            values = base = [{f: x for f, x in v.items() if f not in TERMS[term] or used} for v in richer]
     return tuple(comparisons), values
+
+
+def _fit_term(
+    term: str, joints: JointFit, whole: RobotFit, values: Values, searches: SearchProgress
+) -> tuple[Values, Values | None]:
+    """Fit a term from values (n,): joints by themselves, and from there the whole robot, if it simulates the term."""
+    names = joints.robot.operated
+    searches.begin()
+    report = searches.report(term, names, joints.rollouts.rows)
+    start = values | {f: joints.bounds.guess[f] for f in TERMS[term]}
+    alone = joints.search(TERMS[term], start, report=report, expired=searches.expired)
+    if set(TERMS[term]) & set(SINGLE_JOINT_FIELDS):
+        return alone, None
+    report = searches.report(f"{term}, whole robot", names, whole.rollouts.rows)
+    return alone, whole.descend(
+        robot_fields(alone), alone, (alone,), (POLISH_ITERATIONS,), report=report, expired=searches.expired
+    )

@@ -18,8 +18,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import ramped
-from gaponet.sim.replay import motion_errors
-from gaponet.sysid.acceptance import Comparison, Identified
+from gaponet.sysid.acceptance import Comparison, Identified, held_out_errors
 
 MIN_PERIOD_S, MAX_LAG_S, LAGS = 0.01, 0.3, 16  # of rows that are compared; lags that are tried
 SPEED_RATIOS = np.geomspace(0.7, 1.25, 30)  # ramps that are tried, over a joint's greatest speed
@@ -143,7 +142,6 @@ def with_speed_limits(
     fit: Callable[[RobotSpec, float | None], Identified],
     sequences: ListOf[Sequence],
     robot: RobotSpec,
-    validation: ListOf[Sequence],
     budget: float | None,
 ) -> Identified:
     """Fit the robot, and again with speed limits where recordings show some; return the fit that validation accepts.
@@ -152,7 +150,6 @@ def with_speed_limits(
         fit: Function of the robot to start from and of the time that it may take, s.
         sequences: Recordings that are fitted.
         robot: Start of the fit; speed limits that it has are taken as true.
-        validation: Recordings that choose, motion by motion.
         budget: Time of all fits together, s; None for no limit.
     """
     speeds = {} if robot.target_speed.any() else dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
@@ -161,7 +158,7 @@ def with_speed_limits(
         return fit(robot, budget)
     fits = [fit(r, budget and budget / 2) for r in (robot, robot.with_servos(limits))]
     plain, limited = fits
-    comparison = Comparison("ramp", *(motion_errors(validation, f.judged_robot or f.robot) for f in fits))
+    comparison = Comparison("ramp", *(held_out_errors(f.held_out) for f in fits))
     if not comparison.accepted:
         return replace(plain, comparisons=(*plain.comparisons, comparison))
     listed = ", ".join(f"{joint} {v['target_speed']:.3g}" for joint, v in limits.items())

@@ -153,6 +153,7 @@ class JointFit(FitProblem):
         start: Values,
         others: ListOf[Values] = (),
         *,
+        only: bool = False,
         report: Report = lambda cost: None,
         expired: Expired = lambda: False,
     ) -> Values:
@@ -160,12 +161,14 @@ class JointFit(FitProblem):
 
         Args:
             fields: Fields beside those of `start`.
+            only: Fit no other fields.
             start: First start, (n,); STARTS in all are drawn around it.
             others: At most two starts in place of drawn ones.
             report: Called in each iteration.
             expired: Ends the search early.
         """
-        axes = Axes(self.bounds, fitted_fields(dict.fromkeys([*start, *fields]), encoder=True), start)
+        names = fields if only else fitted_fields(dict.fromkeys([*start, *fields]), encoder=True)
+        axes = Axes(self.bounds, names, start)
         rng = np.random.default_rng(0)
         x = np.repeat(axes.normalize(start)[None], STARTS, axis=0)
         x[1:] += START_STD * rng.standard_normal(x[1:].shape)

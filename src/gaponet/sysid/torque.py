@@ -24,7 +24,7 @@ from gaponet.sim.dynamics import CUTOFF
 from gaponet.sim.metrics import metrics, runs
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import motion_errors, replay
-from gaponet.sysid.acceptance import Comparison, Identified
+from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.adapt import PRIOR_RAD
 from gaponet.sysid.axes import CLASSIC, MAX_DELAY_S, Bounds
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
@@ -58,43 +58,50 @@ OPTIONS = (
 )  # fmt: skip
 
 
-def with_torque(
-    fitted: Identified, sequences: ListOf[Sequence], validation: ListOf[Sequence], given: RobotSpec, nthread: int
-) -> Identified:
-    """Return the fit from torque if validation motions accept it, else `fitted`.
+def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nthread: int) -> Identified:
+    """Return the fit from torque if motions that were not fitted accept it, else `fitted`.
 
-    An accepted fit is repeated with the validation motions as well, and kept if they are followed no worse.
+    An accepted fit is repeated with all recordings. Without cross-validation it is kept only if the validation motions
+    are followed no worse.
 
     Args:
         fitted: Fit to positions.
-        sequences: Recordings that were fitted.
-        validation: Recordings that judge.
+        splits: Recordings to fit and those that judge, fold by fold.
         given: Robot that the fit starts from.
         nthread: Threads, 0 for all cores.
     """
-    torque = TorqueFit(sequences, given)
-    if not torque.trusted or any(s.tau is None for s in validation):
+    every = [*splits[0][0], *splits[0][1]]
+    torques = [TorqueFit(train, given) for train, _ in splits]
+    if not all(t.trusted for t in torques) or any(s.tau is None for s in every):
         return fitted
-    options, judged = torque.best(validation)
-    comparison = Comparison("torque", *(motion_errors(validation, robot) for robot in (fitted.robot, judged)))
+    tried = {
+        options: [HeldOut(part, t.fit(options)) for t, (_, part) in zip(torques, splits, strict=True)]
+        for options in OPTIONS
+        if all(t.hangs for t in torques) or not options.place
+    }
+    options = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
+    comparison = Comparison("torque", *(held_out_errors(folds) for folds in (fitted.held_out, tried[options])))
     if not comparison.accepted:
         return replace(fitted, comparisons=(*fitted.comparisons, comparison))
-    every, after = [*sequences, *validation], float(comparison.after.mean())
-    robot = TorqueFit(every, given).fit(options)
-    again = bool(motion_errors(validation, robot).mean() <= after)
-    robot = robot if again else judged
+    robot, folds, after = TorqueFit(every, given).fit(options), tuple(tried[options]), float(comparison.after.mean())
+    if len(splits) == 1 and motion_errors(splits[0][1], robot).mean() > after:
+        robot = folds[0].robot
     bounds = Bounds(robot, every)
     whole = JointFit(JointRollouts(cut(every, MAX_WINDOWS), robot, nthread=nthread), robot, bounds).robot_fit(nthread)
     values = {f: bounds.first[f] for f in CLASSIC}
     errors = standard_errors(whole, values)
     unknown = undetermined(whole, values, errors)
-    part = runs(validation, [t.qpos for t in replay(validation, judged, nthread=nthread, lock_idle=True)], judged)
+    part = [
+        run
+        for sequences, judged in folds
+        for run in runs(sequences, [t.qpos for t in replay(sequences, judged, nthread=nthread, lock_idle=True)], judged)
+    ]
     by_joint = {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(given.operated)}
     return Identified(
         robot, fitted.before, after, "torque", tuple(text for _, text in unknown.values()), errors.std,
         (*fitted.comparisons, comparison), None, (),
         {j: (before, by_joint[j]) for j, (before, _) in fitted.by_joint.items()}, errors.covariance,
-        {joint: fields for joint, (fields, _) in unknown.items()}, judged if again else None,
+        {joint: fields for joint, (fields, _) in unknown.items()}, folds,
     )  # fmt: skip
 
 
@@ -291,11 +298,6 @@ class TorqueFit:
         fitted = {f: values(x)[f][0] for f in scale}
         joints = enumerate(start.operated)
         return start.with_servos({j: {f: float(f"{v[i]:.6g}") for f, v in fitted.items()} for i, j in joints})
-
-    def best(self, validation: ListOf[Sequence]) -> tuple[TorqueOptions, RobotSpec]:
-        """Return the options whose fit follows these recordings best, and that fit."""
-        fits = [(options, self.fit(options)) for options in OPTIONS if self.hangs or not options.place]
-        return min(fits, key=lambda one: float(motion_errors(validation, one[1]).mean()))
 
 
 def _place(mount: int, first: ListOf[float] | Array) -> tuple[float, float, float]:
