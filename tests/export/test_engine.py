@@ -31,7 +31,8 @@ from gaponet.export.simulator_facts import mjcf_text, simulator_facts
 from gaponet.export.torch_program import delta_step, program
 from gaponet.nn.config import ModelConfig
 from gaponet.robot.fingerprint import model_fingerprint
-from gaponet.robot.spec import SERVO_TERMS, load_robot
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.spec import load_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.servo import friction_limit, servo_torque

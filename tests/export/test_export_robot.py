@@ -21,7 +21,8 @@ from gaponet.export.plain_servos import fit_plain_servos, own_motions, rollout_e
 from gaponet.export.shipped.mujoco_servos import Check, delay_weights, play
 from gaponet.export.simulator_facts import simulator_facts
 from gaponet.robot.folder import save_robot
-from gaponet.robot.spec import SERVO_FIELDS, SERVO_TERMS, load_robot
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
 

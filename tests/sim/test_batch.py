@@ -8,7 +8,7 @@ import pytest
 from arm import XML, write_arm
 
 from gaponet.base.errors import UsageError
-from gaponet.robot.spec import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS
 from gaponet.sim.batch import BatchSim, OneByOne, ramped
 from gaponet.sim.model import build_model
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from arm import write_arm
 
-from gaponet.robot.spec import SERVO_TERMS, load_robot, packaged_robots
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.spec import load_robot, packaged_robots
 from gaponet.sim.batch import BatchSim, Condition
 
 pytest.importorskip("torch")

@@ -8,7 +8,8 @@ from arm import TOML, commands, recordings, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.report.verdict import verdict
-from gaponet.robot.spec import SERVO_TERMS, load_robot
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.spec import load_robot
 from gaponet.sim.metrics import runs, summary
 from gaponet.sim.replay import replay
 from gaponet.sysid import joint_rollouts

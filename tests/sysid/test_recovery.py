@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from arm import TOML, commands, recordings, write_arm
 
-from gaponet.robot.spec import SERVO_TERMS, Table
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.spec import Table
 from gaponet.sim.replay import replay
 from gaponet.sysid import table_contact
 from gaponet.sysid.axes import CLASSIC, Bounds

@@ -7,7 +7,6 @@ Nothing is printed: `progress` is called with done, total and a note, and messag
 from gaponet.api.files import export_network as export_network
 from gaponet.api.files import export_robot as export_robot
 from gaponet.api.files import randomization as randomization
-from gaponet.api.fit import Term as Term
 from gaponet.api.fit import adapt_model as adapt_model
 from gaponet.api.fit import adapt_robot as adapt_robot
 from gaponet.api.fit import identify as identify

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from gaponet.base.files import write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, PROVENANCE_FILE, UNCERTAINTY_FILE
+from gaponet.robot.servo_fields import DEFAULT_TERMS, Term
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
     from gaponet.nn.training.config import TrainConfig
     from gaponet.sysid.acceptance import Covariance, HeldOut
     from gaponet.sysid.uncertainty import ParameterUncertainty
-
-Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"]
 
 MIN_MOTIONS_TO_SPLIT = 3  # with fewer motions, halves of the recordings fit and validate in turn
 
@@ -44,7 +43,7 @@ def identify(
     robot: RobotSpec | Place | None = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
-    terms: tuple[Term, ...] = ("stribeck", "load"),
+    terms: tuple[Term, ...] = DEFAULT_TERMS,
     table: bool = True,
     shared: bool = False,
     threads: int = 0,

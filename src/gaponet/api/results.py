@@ -199,13 +199,13 @@ class IdentifyResult:
 
     def values(self) -> dict[str, dict[str, float]]:
         """Operated joint → servo field → value, SI; fields without information are left out."""
-        from gaponet.sysid.uncertainty import FIELD_UNITS
+        from gaponet.robot.servo_fields import SERVO_FIELDS
 
         robot = self.robot
         return {
             joint: {
                 f: float(getattr(robot, f)[i])
-                for f in FIELD_UNITS
+                for f in SERVO_FIELDS
                 if np.isfinite(getattr(robot, f)[i]) and (f != "effort_limit" or f in self.fit.std[joint])
             }
             for joint, i in zip(robot.operated, robot.operated_index, strict=True)

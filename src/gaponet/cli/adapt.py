@@ -87,11 +87,11 @@ def adapt(
 
 def _show(screen: Out, made: AdaptResult) -> None:
     """Print a unit's servos and its payload."""
+    from gaponet.robot.servo_fields import SERVO_FIELDS
     from gaponet.sysid.adapt import FIELDS
-    from gaponet.sysid.uncertainty import FIELD_UNITS
 
-    screen.table(f"Unit {made.unit_id}", ["joint", *(FIELD_UNITS[f][0] for f in FIELDS)], [
-        [j, *(f"{v[f] * FIELD_UNITS[f][1]:.3g}" for f in FIELDS)] for j, v in made.servos.items()
+    screen.table(f"Unit {made.unit_id}", ["joint", *(SERVO_FIELDS[f].heading for f in FIELDS)], [
+        [j, *(f"{v[f] * SERVO_FIELDS[f].factor:.3g}" for f in FIELDS)] for j, v in made.servos.items()
     ])  # fmt: skip
     if made.payload_mass is not None:
         std = made.payload_std

@@ -13,8 +13,8 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.uncertainty import FIELD_UNITS
 
 MAX_COLUMNS = 4  # of a table
 
@@ -71,8 +71,8 @@ def _show_prediction(screen: Out, name: str, prediction: Prediction) -> None:
     for start in range(0, len(fields), MAX_COLUMNS):
         chosen = fields[start : start + MAX_COLUMNS]
         title = f"{name}: standard errors, now → at best" if start == 0 else "Further parameters"
-        screen.table(title, ["joint", *(FIELD_UNITS[f][0] for f in chosen)], [
-            [j, *(" → ".join(_two_digits(by[j][f] * FIELD_UNITS[f][1]) for by in (before, after)) for f in chosen)]
+        screen.table(title, ["joint", *(SERVO_FIELDS[f].heading for f in chosen)], [
+            [j, *(" → ".join(_two_digits(by[j][f] * SERVO_FIELDS[f].factor) for by in (before, after)) for f in chosen)]
             for j in before
         ])  # fmt: skip
     seconds = prediction.useful_seconds

@@ -14,7 +14,6 @@ from gaponet.cli.attach import attach
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
-from gaponet.sysid.uncertainty import FIELD_UNITS
 
 if TYPE_CHECKING:
     from gaponet.export.randomization import Engine, Scope
@@ -107,7 +106,7 @@ def _show_ranges(screen: Out, robot: Path, out: Path, engine: Engine, scope: Sco
     from gaponet.export.randomization import table_rows
 
     file, made = api.randomization(robot, out=out, engine=engine, scope=scope, units=units)
-    screen.table(f"{made.robot}, {scope}: 9 of 10 units lie within", *table_rows(made, FIELD_UNITS))
+    screen.table(f"{made.robot}, {scope}: 9 of 10 units lie within", *table_rows(made))
     for note in made.notes:
         screen.say(f"  {note}", "note", "cyan")
     if made.unknown:

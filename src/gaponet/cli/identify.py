@@ -13,10 +13,10 @@ from gaponet.cli.options import Flag, Json, Robot, Source, like
 from gaponet.cli.out import MAX_COLUMNS, Out, writes
 from gaponet.cli.torque import show_torque
 from gaponet.report.tables import mrad
+from gaponet.robot.servo_fields import DEFAULT_TERMS, SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
-from gaponet.sysid.uncertainty import FIELD_UNITS
 
 UNDETERMINED = "not determined by these logs"
 
@@ -27,7 +27,7 @@ def identify(
     dataset: Source,
     out: Path,
     windows: int = 40,
-    terms: tuple[api.Term, ...] = ("stribeck", "load"),
+    terms: tuple[Term, ...] = DEFAULT_TERMS,
     table: bool = True,
     shared: Flag = False,
     threads: int = 0,
@@ -84,17 +84,16 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         screen.say(
             f"few motions validate: cross-validation in {len(found.held_out)} folds chose; the robot is fitted to all"
         )
-    shown = [f for f in FIELD_UNITS if any(v.get(f) for v in values.values())]
+    shown = [f for f in SERVO_FIELDS if any(v.get(f) for v in values.values())]
     for start in range(0, len(shown), MAX_COLUMNS):
         part = shown[start : start + MAX_COLUMNS]
-        rows = [
-            [j, *(_cell(v.get(f), found.std[j].get(f), FIELD_UNITS[f][1]) for f in part)] for j, v in values.items()
-        ]
+        rows = [[j, *(_cell(v.get(f), found.std[j].get(f), SERVO_FIELDS[f].factor) for f in part)]
+                for j, v in values.items()]  # fmt: skip
         for servo in dict.fromkeys(filter(None, (found.robot.servos[i] for i in found.robot.operated_index))):
-            known = [_cell(servo.published.get(f), None, FIELD_UNITS[f][1]) for f in part]
+            known = [_cell(servo.published.get(f), None, SERVO_FIELDS[f].factor) for f in part]
             rows += [[f"published for {servo.name}, {servo.source}", *known]] * any(known)
         title = "Identified servos" if start == 0 else "Further parameters"
-        screen.table(f"{title}, ± standard error", ["joint", *(FIELD_UNITS[f][0] for f in part)], rows)
+        screen.table(f"{title}, ± standard error", ["joint", *(SERVO_FIELDS[f].heading for f in part)], rows)
     for term in found.comparisons:
         fell, error = (mrad(x) for x in term.gain)
         judges = "motions" if term.name == "torque" else "recordings"

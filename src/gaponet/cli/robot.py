@@ -215,7 +215,8 @@ def show(
         out: Picture to write, .png or .svg.
     """
     from gaponet.report.figures.identified_robot import draw_uncertainty
-    from gaponet.sysid.uncertainty import FIELD_UNITS, ParameterUncertainty, sentences, summarize, table_rows
+    from gaponet.robot.servo_fields import SERVO_FIELDS
+    from gaponet.sysid.uncertainty import ParameterUncertainty, sentences, summarize, table_rows
 
     screen = Out(json)
     if not (robot / "robot.toml").is_file():
@@ -227,7 +228,7 @@ def show(
     for start in range(0, len(fields), MAX_COLUMNS):
         part = fields[start : start + MAX_COLUMNS]
         title = f"{spec.name}, ± standard error" if start == 0 else "Further parameters"
-        screen.table(title, ["joint", *(FIELD_UNITS[f][0] for f in part)], table_rows(known, part))
+        screen.table(title, ["joint", *(SERVO_FIELDS[f].heading for f in part)], table_rows(known, part))
     for line in sentences(known):
         screen.say(line)
     if out is not None:

@@ -6,8 +6,8 @@ from gaponet.api.results import TorqueResult
 from gaponet.base.text import format_uncertainty
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sysid.torque_motors import PASSIVE_FIELDS
-from gaponet.sysid.uncertainty import FIELD_UNITS
 
 
 def show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
@@ -18,13 +18,13 @@ def show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
         i = spec.operated_index[j]
         values = {f: float(getattr(found.robot, f)[i]) for f in PASSIVE_FIELDS}
         cells = [
-            format_uncertainty(FIELD_UNITS[f][1] * v, FIELD_UNITS[f][1] * found.std[name][f]) if v else "0"
+            format_uncertainty(SERVO_FIELDS[f].factor * v, SERVO_FIELDS[f].factor * found.std[name][f]) if v else "0"
             for f, v in values.items()
         ]
         rows.append([name, *cells, f"{1e3 * found.robot.delay[i]:.0f}", f"{found.bias[j]:+.2g}",
                      *([format_uncertainty(float(found.constant[j]), found.std[name]["constant"])] if current else []),
                      *(f"{x[j]:.3g}" for x in found.torque)])  # fmt: skip
-    columns = ["joint", *(FIELD_UNITS[f][0] for f in PASSIVE_FIELDS), "delay, ms", "bias, N·m"]
+    columns = ["joint", *(SERVO_FIELDS[f].heading for f in PASSIVE_FIELDS), "delay, ms", "bias, N·m"]
     columns += ["N·m per unit"] * current + ["torque apart before, N·m", "after"]
     screen.table("Torque-driven joints, ± standard error; medians on recordings that were not fitted", columns, rows)
     ahead = (

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.inverse import Inertia
 from gaponet.sim.servo import friction_limit, present

@@ -32,6 +32,7 @@ from gaponet.export.shipped import mujoco_servos
 from gaponet.export.simulator_facts import mjcf_text, simulator_facts
 from gaponet.export.urdf_edit import MISSING_FIELDS, edit_urdf, with_urdf_fields
 from gaponet.nn.artifact import GapModel
+from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim import servo
 
@@ -64,7 +65,7 @@ import numpy as np
 ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the joints
 '''
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
-    array_module, servo.present, servo.passing_friction, servo.resting_friction, servo.friction_limit,
+    array_module, servo.present, servo.exp, servo.passing_friction, servo.resting_friction, servo.friction_limit,
     servo.servo_torque,
 )  # fmt: skip
 OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts) import")
@@ -283,10 +284,12 @@ def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
 
 def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
     """Write facts.json and the files of SHIPPED for an engine, with imports that need no gaponet."""
-    limits = f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
-    write_text(
-        folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + limits, *(inspect.getsource(f) for f in SERVO_MODEL)])
+    constants = (
+        f"SERVO_TERMS = {SERVO_TERMS}\n"
+        f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
     )
+    functions = [inspect.getsource(f) for f in SERVO_MODEL]
+    write_text(folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + constants, *functions]))
     for name, file in ({"mujoco_servos.py": "mujoco_servos.py"} | FILES[to]).items():
         text = OWN_IMPORTS.sub(r"from \1 import", (SHIPPED / file).read_text(encoding="utf-8"))
         write_text(folder / name, text.replace("from servo import", "from servo_law import"))

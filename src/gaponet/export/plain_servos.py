@@ -22,7 +22,8 @@ from gaponet.base.structure import read_json
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.report.candidate import read_origin
-from gaponet.robot.spec import SERVO_FIELDS, SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import load_dataset
 from gaponet.sim.batch import Condition, ramped
 from gaponet.sim.model import model_hash

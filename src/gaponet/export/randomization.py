@@ -21,6 +21,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.export.shipped import mujoco_randomization
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, prior_std, to_axes
 
@@ -31,7 +32,6 @@ FOLDER_KIND = "engine"
 FILE = "randomization.json"
 RANGE_SAMPLES, RANGE_PERCENT = 4096, (5, 95)
 UNDETERMINED_STD = 0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
-SIGNED = ("offset",)
 MIN_ROBOTS = 3  # of a type
 
 
@@ -90,7 +90,7 @@ def sample_units(
         error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
         x[:, i] += error
         limit[:, i] *= np.exp(error[:, fields.index("kp")])
-    bounded = [f not in SIGNED and f not in ("kp", "stribeck_speed") for f in fields]
+    bounded = [SERVO_FIELDS[f].axis != "log" and not SERVO_FIELDS[f].signed for f in fields]
     x = np.where(bounded, np.maximum(x, 0.0), x)
     sampled, value = from_axes(fields, x), from_axes(fields, mean)
     ranges: dict[str, dict[str, tuple[float, float, float]]] = {j: {} for j in joints}
@@ -229,15 +229,11 @@ def _rounded(low: float, value: float, high: float) -> tuple[float, float]:
     return float(f"{low:.6g}"), float(f"{high:.6g}")
 
 
-def table_rows(made: Randomization, scales: dict[str, tuple[str, float]]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows: joint, and low … high of each number that is not zero everywhere.
-
-    Args:
-        scales: Field → heading, factor from SI.
-    """
-    fields = [f for f in next(iter(made.ranges.values())) if any(by[f][2] for by in made.ranges.values())]
+def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows: joint, and low … high of each number that is not zero everywhere."""
+    fields = [SERVO_FIELDS[f] for f in next(iter(made.ranges.values())) if any(by[f][2] for by in made.ranges.values())]
     rows: list[list[Any]] = [
-        [j, *(f"{by[f][0] * scales[f][1]:.3g} … {by[f][2] * scales[f][1]:.3g}" for f in fields)]
+        [j, *(f"{by[f.name][0] * f.factor:.3g} … {by[f.name][2] * f.factor:.3g}" for f in fields)]
         for j, by in made.ranges.items()
     ]
-    return ["joint", *(scales[f][0] for f in fields)], rows
+    return ["joint", *(f.heading for f in fields)], rows

@@ -13,15 +13,13 @@ from gaponet.export.shipped.scene_facts import joint_fields, solver_options
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text, set_attributes
-from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import STIFF_MOBILITY, build_model, build_spec, model_hash
 
-UNITS = {
-    "kp": "N·m/rad", "kd": "N·m·s/rad", "effort_limit": "N·m", "armature": "kg·m²", "damping": "N·m·s/rad",
-    "frictionloss": "N·m", "delay": "s", "offset": "rad", "zero": "rad", "home": "rad", "range": "rad", "dt": "s",
-    "payload_mass": "kg", "stribeck": "N·m", "stribeck_speed": "rad/s", "target_speed": "rad/s", "friction_motor": "1",
-    "friction_external": "1", "min_torque": "N·m", "encoder_step": "rad",
-}  # fmt: skip
+UNITS = {"home": "rad", "range": "rad", "dt": "s", "payload_mass": "kg"} | {
+    field.name: field.unit for field in SERVO_FIELDS.values() if field.name not in STOP_FIELDS
+}
 MEANING = {
     "offset": "the servo aims at command + offset",
     "zero": "the MJCF's angle is reading + zero; robot.xml has it as ref",

@@ -20,6 +20,7 @@ from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.report.candidate import Candidate, select_entries
+from gaponet.robot.servo_fields import SERVO_CAUSES, SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Run, metrics, runs, standard_error
 from gaponet.sim.metrics import summary as errors_of
@@ -113,15 +114,7 @@ def _steps(candidate: Candidate, causes: list[tuple[str, RobotSpec]]) -> list[tu
 
 
 # Fields in which an identified simulator differs from the nominal one, in the order of the steps.
-CAUSES = {
-    "gain": ("kp", "kd", "damping", "armature", "delay", "target_speed", "offset", "effort_limit"),
-    "friction": ("frictionloss",),
-    "stribeck": ("stribeck", "stribeck_speed"),
-    "load": ("friction_motor", "friction_external"),
-    "servo": ("min_torque", "encoder_step"),
-    "contact": ("zero", "stop_low", "stop_high"),
-    "hand": (),
-}
+CAUSES = {cause: [f.name for f in SERVO_FIELDS.values() if f.cause == cause] for cause in SERVO_CAUSES} | {"hand": []}
 
 
 def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:

@@ -9,7 +9,8 @@ import numpy as np
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import lock_folder, write_text
-from gaponet.robot.spec import PACKAGE_FOLDER, SERVO_FIELDS, SERVO_TERMS, RobotSpec, load_robot, packaged_robots
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_robots
 
 STORED_ROBOT = "robot"  # subfolder of a run or a dataset
 MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"

@@ -23,20 +23,15 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.base.structure import read_toml
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.toml_file import PayloadMount, RobotTable, ServoType, Table, Tip
 
 __all__ = ["PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "load_robot", "packaged_robots"]
 
 PACKAGE_FOLDER = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
-STOP_FIELDS = ("stop_low", "stop_high")
-MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOP_FIELDS)  # NaN where the MJCF's value stands
-SERVO_TERMS = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
-IDENTIFIED_FIELDS = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *SERVO_TERMS)
 MAX_SUGGESTIONS = 3  # similar joint names in an error
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are equal
-SERVO_FIELDS = ("kp", "kd", "effort_limit", *IDENTIFIED_FIELDS)  # what identification may change
-SIGNED = ("qpos_home", "offset", "zero", *STOP_FIELDS)
 
 
 @dataclass(frozen=True)
@@ -122,11 +117,12 @@ class RobotSpec:
             if np.shape(getattr(self, name)) != (n,):
                 shape = np.shape(getattr(self, name))
                 raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got shape {shape}")
-        for name in ("kp", "kd", "effort_limit", "qpos_home", *IDENTIFIED_FIELDS):
+        for name in ("qpos_home", *SERVO_FIELDS):
             value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
-            if np.isinf(value).any() or (name not in MJCF_FIELDS and np.isnan(value).any()):
+            record = SERVO_FIELDS.get(name)
+            if np.isinf(value).any() or (np.isnan(value).any() and not (record and record.from_mjcf)):
                 raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
-            if name not in SIGNED and (value < 0).any():
+            if record and not record.signed and (value < 0).any():
                 raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
             value.flags.writeable = False
             object.__setattr__(self, name, value)

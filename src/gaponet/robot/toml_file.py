@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from dataclasses import dataclass, field, make_dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval, Len
 
 from gaponet.base.structure import Angle, Name
+from gaponet.robot.servo_fields import SERVO_FIELDS
 
 Gain = Annotated[float, Interval(ge=0, le=1e6)]
-Share = Annotated[float, Interval(ge=0, le=1)]
 Metres = Annotated[float, Interval(ge=-100, le=100)]
 
 
@@ -67,28 +67,12 @@ class _Mount:
     mass: Annotated[float, Interval(ge=0, le=100)]
 
 
-@dataclass(frozen=True)
-class _Servo:
-    """[identified.JOINT]: values that replace those of the MJCF and the nominal gains."""
-
-    kp: Gain | None = None
-    kd: Gain | None = None
-    effort_limit: Gain | None = None
-    damping: Gain | None = None
-    armature: Gain | None = None
-    frictionloss: Gain | None = None
-    delay: Annotated[float, Interval(ge=0, le=1)] | None = None  # s
-    offset: Angle | None = None  # rad
-    zero: Angle | None = None
-    target_speed: Gain | None = None  # rad/s
-    stop_low: Angle | None = None
-    stop_high: Angle | None = None
-    stribeck: Gain | None = None  # N·m
-    stribeck_speed: Gain | None = None  # rad/s
-    friction_motor: Share | None = None
-    friction_external: Share | None = None
-    min_torque: Gain | None = None  # N·m
-    encoder_step: Share | None = None  # rad
+if TYPE_CHECKING:
+    IdentifiedServo = Any
+else:  # [identified.JOINT]: values that replace those of the MJCF and the nominal gains
+    IdentifiedServo = make_dataclass("IdentifiedServo", [
+        (f.name, Annotated[float, Interval(ge=f.limits[0], le=f.limits[1])] | None, None) for f in SERVO_FIELDS.values()
+    ], frozen=True)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -122,7 +106,7 @@ class RobotTable:
     contacts: bool = False  # links collide as the MJCF states; else only tips and table collide
     carries_payload: bool = True  # false: the simulator omits the payload
     gain_scale: Annotated[float, Interval(gt=0, le=1000)] = 1.0  # factor on kp and kd of operated joints in [[joint]]
-    identified: dict[str, _Servo] = field(default_factory=dict)
+    identified: dict[str, IdentifiedServo] = field(default_factory=dict)
     identified_table: Table | None = None
     identified_mount: dict[str, _Mount] = field(default_factory=dict)
     description: str = ""

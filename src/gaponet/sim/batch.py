@@ -13,7 +13,8 @@ import numpy as np
 from gaponet.base.arrays import array_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import SERVO_TERMS, STOP_FIELDS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_TERMS, STOP_FIELDS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo import ServoModel, present
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.robot.spec import SERVO_TERMS
+from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
 from gaponet.sim.servo import friction_limit, present
 

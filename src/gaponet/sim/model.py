@@ -14,7 +14,8 @@ from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot
 from gaponet.robot.freeze import freeze, units_per_si
 from gaponet.robot.mjcf import compile_spec, read_mjcf
-from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.table import add_table, soften_table
 
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the

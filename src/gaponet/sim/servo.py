@@ -3,8 +3,9 @@
 The encoder counts in steps. A motor that turns at all has a least torque (minimum PWM). Friction is larger at rest
 (Stribeck) and grows with the torque that the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024). MuJoCo
 integrates: the model only changes the actuator's bias and the limit of friction, so friction sticks as MuJoCo's does.
-The two terms of friction stand here once: numpy, torch and numba (`advance`, for joint_rollouts.py) compute with them;
-sim/warp.py has the model as a kernel. A MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
+The two terms of friction stand here once, for numpy, torch, Warp and numba (`advance`, for joint_rollouts.py); encoder
+steps and least torque stand in `advance` and in the kernel of sim/warp.py again. A MuJoCo model's actuator_user holds
+the parameters; without, nothing here runs.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array, array_module
-from gaponet.robot.spec import SERVO_TERMS
+from gaponet.robot.servo_fields import SERVO_TERMS
 
 ServoTerms = dict[str, Any]  # name of SERVO_TERMS → values that broadcast to the simulations' joints, numpy or torch
 
@@ -33,8 +34,13 @@ def passing_friction(by_motor: Any, by_load: Any, torque: Any, load: Any) -> Any
     return abs(by_motor * torque + by_load * load)
 
 
-def resting_friction(exp: Any, stribeck: Any, speed: Any, qvel: Any) -> Any:
-    """Return the Stribeck friction at a joint speed, rad/s, in N·m; exp is that of the arrays' library."""
+def exp(x: Any) -> Any:
+    """Return the exponential by the array's library; numba and Warp put their own in its place."""
+    return array_module(x).exp(x)
+
+
+def resting_friction(stribeck: Any, speed: Any, qvel: Any) -> Any:
+    """Return the Stribeck friction at a joint speed, rad/s, in N·m."""
     return stribeck * exp(-abs(qvel) / speed)
 
 
@@ -45,9 +51,7 @@ def friction_limit(terms: ServoTerms, frictionloss: Any, qvel: Any, torque: Any,
         by_motor, by_load = terms.get("friction_motor", 0.0), terms.get("friction_external", 0.0)
         limit = limit + passing_friction(by_motor, by_load, torque, load)
     if "stribeck" in terms:
-        limit = limit + resting_friction(
-            array_module(qvel).exp, terms["stribeck"], terms.get("stribeck_speed", SLOWEST), qvel
-        )
+        limit = limit + resting_friction(terms["stribeck"], terms.get("stribeck_speed", SLOWEST), qvel)
     return limit
 
 
@@ -103,7 +107,7 @@ def advance(
                         torque = min(max(torque - brake[c] * w[c], -limit[c]), limit[c])
                         most = dry[c] + passing_friction(by_motor[c], by_load[c], torque, load)
                         if rest[c] > 0:
-                            most += resting_friction(np.exp, rest[c], speed[c], w[c])
+                            most += resting_friction(rest[c], speed[c], w[c])
                     else:
                         torque, most = min(max(kp[c] * (aim - q[c]) - brake[c] * w[c], -limit[c]), limit[c]), dry[c]
                     net = torque - load - here[2] - own[c] * w[c]

@@ -7,6 +7,7 @@ identification and robots stay on C MuJoCo, from which these simulations part by
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from types import FunctionType
 from typing import Any
 
 import mujoco
@@ -18,7 +19,7 @@ from mujoco.batch import MODEL_FIELDS
 from torch import Tensor
 
 from gaponet.base.errors import UsageError
-from gaponet.robot.spec import SERVO_TERMS
+from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim import servo
 from gaponet.sim.batch import UNDER_WAY, BatchSim, CommandHistory
 
@@ -31,7 +32,16 @@ AIM = {"ctrl": "ctrl"}
 _Floats: Any = warp.array2d(dtype=float)
 _Numbers: Any = warp.array2d(dtype=warp.types.vector(len(SERVO_TERMS), float))  # in the order of SERVO_TERMS
 _Parameters: Any = warp.array2d(dtype=warp.types.vector(10, float))  # of an actuator's gain or bias
-_passing = warp.func(servo.passing_friction)
+
+
+def _warp_function(function: Any) -> Any:
+    """Return a function of sim/servo.py for kernels, with Warp's exponential."""
+    copied = FunctionType(function.__code__, {"exp": warp.exp, "Any": Any}, function.__name__)
+    copied.__annotations__ = function.__annotations__
+    return warp.func(copied)
+
+
+_passing, _resting = _warp_function(servo.passing_friction), _warp_function(servo.resting_friction)
 
 
 @warp.kernel(enable_backward=False)
@@ -42,8 +52,8 @@ def _set_servos(
     """ServoModel.before: bias and friction of servo j of world i for the next physics step."""
     i, j = warp.tid()
     own, kp, q = law[i, j], gain[i, j][0], qpos[i, j]
-    resting = own[0] * warp.exp(-abs(qvel[i, j]) / max(own[1], servo.SLOWEST))
-    limit[i, j] = dry[i, j] + _passing(own[2], own[3], torque[i, j], load[i, j]) + resting
+    limit[i, j] = dry[i, j] + _passing(own[2], own[3], torque[i, j], load[i, j])
+    limit[i, j] += _resting(own[0], max(own[1], servo.SLOWEST), qvel[i, j])
     least, step = own[4], own[5]
     if least > 0.0 or step > 0.0:
         read = warp.where(step > 0.0, warp.rint(q / max(step, servo.FINEST)) * step, q)

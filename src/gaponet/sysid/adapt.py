@@ -20,7 +20,15 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import exceeds_standard_error
 from gaponet.sim.replay import Corrector, rollout_errors
-from gaponet.sysid.axes import MAX_DAMPING_TIME_S, MAX_DELAY_S, MAX_KP_LOG_CHANGE, MAX_OFFSET_RAD, Bounds, Values
+from gaponet.sysid.axes import (
+    MAX_DAMPING_TIME_S,
+    MAX_DELAY_S,
+    MAX_KP_LOG_CHANGE,
+    MAX_OFFSET_RAD,
+    Bounds,
+    Values,
+    large_changes,
+)
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, descend
 from gaponet.sysid.robot_rollouts import WINDOW_S, RobotRollouts, cut
@@ -156,11 +164,7 @@ class _Problem:
     def __init__(self, rollouts: RobotRollouts, first: Values, unknown_payload: bool, kd_slack: Array) -> None:
         self.rollouts, self.unknown, self.first, self.n = rollouts, unknown_payload, first, rollouts.n
         self.size, kp, one = int(rollouts.rows.sum()), first["kp"], np.ones(rollouts.n)
-        self.scale = {
-            "kp": LARGE_KP_LOG_CHANGE * one,
-            "damping": np.maximum(first["damping"], 0.01 * kp),  # a time constant of 10 ms
-            "frictionloss": np.maximum(first["frictionloss"], 0.005 * kp), "offset": 0.02 * one, "delay": 0.02 * one,
-        }  # fmt: skip
+        self.scale = large_changes(first) | {"kp": LARGE_KP_LOG_CHANGE * one}
         least = {
             "kp": -MAX_KP_LOG_CHANGE * one, "damping": -first["damping"] - kd_slack,
             "frictionloss": -first["frictionloss"], "offset": -MAX_OFFSET_RAD * one, "delay": -first["delay"],

@@ -14,30 +14,35 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
-from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
 
 Values = dict[str, Array]  # field → (…, n) of the operated joints
 
-CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
-SINGLE_JOINT_FIELDS = ("effort_limit", "encoder_step")  # only joints by themselves are searched for these
-LOGARITHM = ("kp", "stribeck_speed")
-OVER_KP = ("damping", "frictionloss", "armature", "stribeck", "min_torque", "effort_limit")
-START_DELAY_S, MAX_DELAY_S = 0.02, 0.15  # a start without delay has no slope over it
+CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")  # that every fit has
+START_DELAY_S = 0.02  # a start without delay has no slope over it
 MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
-MAX_KP_LOG_CHANGE, MAX_DAMPING_TIME_S, MAX_ARMATURE_TIME_S, MAX_OFFSET_RAD = 5.0, 1.0, 0.3, 0.2
+MAX_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.3
+MAX_DAMPING_TIME_S, MAX_DELAY_S, MAX_OFFSET_RAD = (
+    bounds[1] for f in ("damping", "delay", "offset") if (bounds := SERVO_FIELDS[f].bounds)
+)
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
 UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")  # of an unexcited joint, fitted as others move it
 BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
-ADVICE = {
-    "kp": "check its unit (N·m/rad) and the stated payload",
-    "damping": "check kp's unit, and that commands are positions",
-    "frictionloss": "check kp's unit, and that nothing held the joint",
-    "armature": "check the masses in the MJCF and kp's unit",
-    "offset": "check the joint's zero and its sign",
-    "delay": "check that commands and states have one clock",
-    "effort_limit": "check effort_limit in robot.toml",
-}
+
+
+def to_axis(field: str, value: Array, kp: Array) -> Array:
+    """Return values of a field on its axis."""
+    axis = SERVO_FIELDS[field].axis
+    return np.log(np.maximum(value, 1e-9)) if axis == "log" else value / kp if axis == "over kp" else value
+
+
+def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
+    """Return values in SI units of fields on their axes; kp is that of `x`, or given."""
+    values = {f: np.exp(v) if SERVO_FIELDS[f].axis == "log" else v for f, v in x.items()}
+    kp = values.get("kp", kp)
+    return {f: v * kp if SERVO_FIELDS[f].axis == "over kp" else v for f, v in values.items()}
 
 
 def first_values(robot: RobotSpec) -> Values:
@@ -46,6 +51,14 @@ def first_values(robot: RobotSpec) -> Values:
     dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
     passive = {f: np.array(getattr(model, f"dof_{f}")[dof]) for f in ("damping", "frictionloss", "armature")}
     return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS)}
+
+
+def large_changes(first: Values) -> Values:
+    """Return a large change of each classic field but kp beside a robot's own values, (n,) in SI units."""
+    kp = first["kp"]
+    least = {"damping": 0.01 * kp, "armature": np.full_like(kp, 1e-3), "frictionloss": 0.005 * kp}
+    fixed = {f: np.full_like(kp, SERVO_FIELDS[f].large_value) for f in ("offset", "delay")}
+    return {f: np.maximum(first[f], x) for f, x in least.items()} | fixed
 
 
 class Bounds:
@@ -84,23 +97,18 @@ class Bounds:
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)
         self.limits: dict[str, tuple[Array, Array, Array]] = {
+            f.name: (f.bounds[0] * one, f.bounds[1] * one, f.bounds[2] * one) for f in SERVO_FIELDS.values() if f.bounds
+        } | {
             "kp": (np.log(kp) - MAX_KP_LOG_CHANGE, np.log(kp) + MAX_KP_LOG_CHANGE, 0.3 * one),
-            "damping": (0 * one, MAX_DAMPING_TIME_S * one, 0.015 * one),
-            "frictionloss": (0 * one, 0.2 * one, 0.005 * one),
             "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
-            "offset": (-MAX_OFFSET_RAD * one, MAX_OFFSET_RAD * one, 0.01 * one),
-            "delay": (0 * one, MAX_DELAY_S * one, 0.005 * one),
-            "stribeck": (0 * one, 0.1 * one, 0.002 * one),
-            "stribeck_speed": (np.log(0.005) * one, 0 * one, 0.3 * one),
-            "friction_motor": (0 * one, 0.8 * one, 0.05 * one),
-            "friction_external": (0 * one, 0.8 * one, 0.05 * one),
-            "min_torque": (0 * one, 0.05 * one, 0.002 * one),
             "effort_limit": (0.05 * limit / kp, 5 * limit / kp, 0.2 * limit / kp),
             "encoder_step": (counts, counts, one),
         }
-        self.guess = {"stribeck": 0.003 * kp, "stribeck_speed": 0.05 * one, "friction_motor": 0.05 * one,
-                      "friction_external": 0.02 * one, "effort_limit": 0.6 * limit,  # one that is too high has no slope
-                      "min_torque": 0.003 * kp, "encoder_step": counts}  # fmt: skip
+        guess = {f.name: f.guess * one for f in SERVO_FIELDS.values() if f.guess is not None}
+        self.guess = from_axis(guess, kp) | {
+            "effort_limit": 0.6 * limit,  # one that is too high has no slope
+            "encoder_step": counts,
+        }
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
@@ -117,8 +125,8 @@ class Bounds:
                 elif f == "damping" and below:
                     what = "none at all; check that commands are what the servo was given, and their clock"
                 else:
-                    end, advice = "least" if below else "most", ADVICE.get(f, "the servo model does not fit")
-                    what = f"{values[f][i]:.4g}, the {end} that is tried; {advice}"
+                    end = "least" if below else "most"
+                    what = f"{values[f][i]:.4g}, the {end} that is tried; {SERVO_FIELDS[f].advice}"
                 found.append(f"{joint}: {f} ended at its bound: {what}")
         return tuple(found)
 
@@ -146,15 +154,12 @@ class Axes:
         return np.clip(self._unclipped(values), self.low, self.high)
 
     def _unclipped(self, values: Values) -> Array:
-        kp = values["kp"]
         own = {f: values[f] + self._kd_slack if f == "damping" else values[f] for f in self.names}
-        columns = [np.log(np.maximum(x, 1e-9)) if f in LOGARITHM else x / kp ** (f in OVER_KP) for f, x in own.items()]
-        return np.stack(columns, axis=-1) / self.unit
+        return np.stack([to_axis(f, x, values["kp"]) for f, x in own.items()], axis=-1) / self.unit
 
     def values(self, x: Array) -> Values:
         """Return values of x on the axes; fields that are not searched stay."""
         own = dict(zip(self.names, np.moveaxis(x * self.unit, -1, 0), strict=True))
-        values = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()} | own
-        values |= {f: np.exp(own[f]) for f in LOGARITHM if f in own}
-        values |= {f: own[f] * values["kp"] for f in OVER_KP if f in own}
+        values = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()}
+        values |= from_axis(own, values["kp"])
         return values | {"damping": values["damping"] - self._kd_slack} if "damping" in own else values

@@ -18,11 +18,11 @@ from scipy.stats import t as student
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.axes import OVER_KP
-from gaponet.sysid.evidence import PLAY, Evidence, evidence, gradient_covariance, inverted, widened
+from gaponet.sysid.evidence import Evidence, evidence, gradient_covariance, inverted, widened
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
-from gaponet.sysid.uncertainty import ParameterUncertainty
+from gaponet.sysid.uncertainty import PLAY, ParameterUncertainty
 
 FALSE_ALARM_RATE = 0.003  # of a robot that did not change, for all its parameters together
 FALSE_CONTRADICTION_RATE = 1e-4  # of recordings that agree
@@ -155,7 +155,7 @@ def directions(uncertainty: ParameterUncertainty, joint: str) -> Array:
     """
     found = np.eye(len(uncertainty.fields) + 1)
     for i, (field, value) in enumerate(zip(uncertainty.fields, uncertainty.joints[joint].values, strict=True)):
-        found[i, uncertainty.fields.index("kp")] -= value * (field in OVER_KP)
+        found[i, uncertainty.fields.index("kp")] -= value * (SERVO_FIELDS[field].axis == "over kp")
     return found
 
 

@@ -12,7 +12,8 @@ from scipy.special import stdtrit
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import replay
 from gaponet.sysid.acceptance import CONFIDENCE, HeldOut
@@ -28,7 +29,6 @@ WINDOWS = 40  # of 8 s
 PLAY_TURN_RAD = 0.002  # servo error at which play has changed sides
 MIN_RELATIVE_INFORMATION = 1e-6  # of a parameter; less counts as none
 BOUND_QUANTILE = 0.9  # of all samples
-PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,8 @@ def estimate_uncertainty(
         nthread: Threads, 0 for all cores.
     """
     first = first_values(robot)
-    fields = before.fields if before else (*CLASSIC, *(f for f in SERVO_TERMS[:-1] if first[f].any()))
+    fitted_fields = (*CLASSIC, *(f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()))
+    fields = before.fields if before else fitted_fields
     own, values = evidence(robot, sequences, fields, nthread=nthread), to_axes(robot, fields)
     grouped = own.by_recording() if len(own.names) >= MIN_CLUSTERS // 4 else own
     overdispersion, clusters = grouped.overdispersion(), grouped.gradients.shape[1]

@@ -22,9 +22,10 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
+from gaponet.robot.servo_fields import DEFAULT_TERMS, SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Judge, JudgedFold, Split, cross_validation
-from gaponet.sysid.axes import CLASSIC, SINGLE_JOINT_FIELDS, Bounds, Values
+from gaponet.sysid.axes import CLASSIC, Bounds, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.motion_limits import stop_questions, with_speed_limits, with_stops
 from gaponet.sysid.problem import (
@@ -47,15 +48,6 @@ WINDOWS = 40  # of joints by themselves
 ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
 POLISH_ITERATIONS = 2  # of the whole robot with a term of the servo model
 JOINTS_TIME_SHARE, ROBOT_TIME_SHARE, TERMS_TIME_SHARE = 0.3, 0.4, 0.3  # of a time budget
-TERMS: dict[str, tuple[str, ...]] = {
-    "stribeck": ("stribeck", "stribeck_speed"),
-    "load": ("friction_motor",),
-    "limit": ("effort_limit",),
-    "external": ("friction_external",),
-    "min_torque": ("min_torque",),
-    "encoder": ("encoder_step",),
-}
-DEFAULT_TERMS = ("stribeck", "load")
 
 Progress = Callable[[float, float, str], None]  # iterations done, in all, what is fitted and its error
 
@@ -113,7 +105,7 @@ def identify(
     robot: RobotSpec,
     validation: ListOf[Sequence] = (),
     windows: int = WINDOWS,
-    terms: tuple[str, ...] = DEFAULT_TERMS,
+    terms: tuple[Term, ...] = DEFAULT_TERMS,
     table: bool = True,
     shared: bool = False,
     nthread: int = 0,
@@ -153,7 +145,7 @@ def identify(
 
 def fit_robot(
     sequences: ListOf[Sequence], robot: RobotSpec, splits: ListOf[Split], validation: ListOf[Sequence], windows: int,
-    terms: tuple[str, ...], table: bool, shared: bool, nthread: int, progress: Progress, stops: bool,
+    terms: tuple[Term, ...], table: bool, shared: bool, nthread: int, progress: Progress, stops: bool,
     budget: float | None,
 ) -> Identified:  # fmt: skip
     """Fit to positions, with the speed limits that the robot's servos have; arguments as of `identify`."""
@@ -238,7 +230,7 @@ def _classic_candidates(joints: JointFit, searches: SearchProgress, nthread: int
 
 
 def _with_terms(
-    fits: ListOf[JointFit], wholes: ListOf[RobotFit], judge: Judge, terms: tuple[str, ...], values: list[Values],
+    fits: ListOf[JointFit], wholes: ListOf[RobotFit], judge: Judge, terms: tuple[Term, ...], values: list[Values],
     base: list[Values], searches: SearchProgress,
 ) -> tuple[tuple[Comparison, ...], list[Values]]:  # fmt: skip
     """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted."""
@@ -264,7 +256,7 @@ def _fit_term(
     report = searches.report(term, names, joints.rollouts.rows)
     start = values | {f: joints.bounds.guess[f] for f in TERMS[term]}
     alone = joints.search(TERMS[term], start, report=report, expired=searches.expired)
-    if set(TERMS[term]) & set(SINGLE_JOINT_FIELDS):
+    if any(SERVO_FIELDS[f].single_joint for f in TERMS[term]):
         return alone, None
     report = searches.report(f"{term}, whole robot", names, whole.rollouts.rows)
     return alone, whole.descend(

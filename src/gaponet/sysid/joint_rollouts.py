@@ -21,15 +21,17 @@ from scipy.optimize import nnls
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
-from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim import servo
 from gaponet.sim.batch import ramped
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import friction_limit, present, servo_torque
 
 try:
-    jitable = import_module("numba.extending").register_jitable  # an extra, eight times as fast as numpy
-    jitable(servo.passing_friction), jitable(servo.resting_friction)
+    numba = import_module("numba.extending")  # an extra, eight times as fast as numpy
+    numba.overload(servo.exp)(lambda x: lambda x: np.exp(x))
+    numba.register_jitable(servo.passing_friction), numba.register_jitable(servo.resting_friction)
     advance: Any = import_module("numba").njit(cache=True, nogil=True, error_model="numpy")(servo.advance)
 except ImportError:
     advance = None

@@ -12,10 +12,11 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.text import format_uncertainty
-from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
 from gaponet.sysid.acceptance import Covariance, Std
-from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, OVER_KP, SINGLE_JOINT_FIELDS, Axes, Bounds, Values
+from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, Axes, Bounds, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import Errors, agreed_slopes, better_half, descend
 from gaponet.sysid.robot_rollouts import RobotRollouts
@@ -278,7 +279,7 @@ def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> 
 
 def robot_fields(values: Values) -> list[str]:
     """Return the fields among values that the fit in the robot's simulator changes."""
-    return [f for f in (*CLASSIC, *SERVO_TERMS) if f in values and f not in SINGLE_JOINT_FIELDS]
+    return [f for f in (*CLASSIC, *SERVO_TERMS) if f in values and not SERVO_FIELDS[f].single_joint]
 
 
 @dataclass
@@ -387,7 +388,7 @@ def undetermined(problem: FitProblem, values: Values, errors: StandardErrors) ->
             if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):
                 wide[f] = f"{f} {format_uncertainty(value, error)}"
                 scaled = errors.scaled.get(joint, {}).get(f, np.inf)
-                if f not in OVER_KP or scaled > MAX_RELATIVE_STD * max(abs(x[i, k]), 1.0):
+                if SERVO_FIELDS[f].axis != "over kp" or scaled > MAX_RELATIVE_STD * max(abs(x[i, k]), 1.0):
                     also_over_kp.append(f)
         if wide:
             as_set = set(also_over_kp) == {"kp"} and len(wide) > 1

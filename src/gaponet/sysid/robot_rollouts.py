@@ -11,7 +11,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import SERVO_TERMS, RobotSpec
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import Corrector, idle_limbs, rollout
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.axes import Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import descend, soft_l1
 
-JOINT_FIELDS = ("offset", "delay", "friction_motor", "friction_external", "encoder_step")  # never shared
-LARGE_CHANGE = {"offset": 0.01, "delay": 0.005, "friction_motor": 0.05, "friction_external": 0.05}
-MAX_CHANGE = {"offset": 0.2, "delay": 0.1, "friction_motor": 0.8, "friction_external": 0.8}  # from the joint's own
+# Fields of a joint's mounting, with the largest change from the joint's own value, and a large one.
+MOUNTING = {f.name: f.bounds[1:] for f in SERVO_FIELDS.values() if f.bounds and not f.shared}
 LARGE_LOG_CHANGE, MAX_LOG_CHANGE = 0.3, 2.5  # of shared fields
 START_LOAD_FRICTION = 0.2  # friction by the motor's torque, in a second start
 ARMATURE_PRICE = 2e-3  # of an armature e times the expected one, per row, in ERROR_SCALE_RAD squared
@@ -62,24 +62,24 @@ def share(rollouts: JointRollouts, values: Values, places: list[int], armature: 
         armature: Expected armature, kg·m²; delay and damping can stand for much of it.
     """
     # Without friction by load the joints that carry the others would need a friction of their own.
-    values = {f: np.zeros_like(values["kp"]) for f in JOINT_FIELDS if f.startswith("friction")} | values
+    values = {f: np.zeros_like(values["kp"]) for f in MOUNTING if SERVO_FIELDS[f].in_servo_model} | values
     m, kp = len(places), values["kp"][places]
     # Over kp, because a motion shows torques over it: what grows together lies on one axis then.
-    powers = {f: float(f not in ("kp", "stribeck_speed")) for f in values if f not in JOINT_FIELDS}
-    own = [f for f in LARGE_CHANGE if f in values]
+    powers = {f: float(SERVO_FIELDS[f].axis == "over kp") for f in values if SERVO_FIELDS[f].shared}
+    own = {f: MOUNTING[f] for f in MOUNTING if f in values}
     each = [np.log(np.maximum(values[f][places], MIN_OVER_KP * kp) / kp**r) for f, r in powers.items()]
     models = np.array(each).T / LARGE_LOG_CHANGE
     models = np.concatenate([models, np.median(models, axis=0, keepdims=True)])
-    mounting = np.concatenate([values[f][places] / LARGE_CHANGE[f] for f in own])
+    mounting = np.concatenate([values[f][places] / large for f, (_, large) in own.items()])
     loaded = mounting.copy()
-    loaded[own.index("friction_motor") * m :][:m] = START_LOAD_FRICTION / LARGE_CHANGE["friction_motor"]
+    loaded[list(own).index("friction_motor") * m :][:m] = START_LOAD_FRICTION / own["friction_motor"][1]
     starts = [np.concatenate([models, np.tile(x, (m + 1, 1))], axis=1) for x in (mounting, loaded)]
     wide = np.concatenate([
         np.full(models.shape[1], MAX_LOG_CHANGE / LARGE_LOG_CHANGE),
-        *(np.full(m, MAX_CHANGE[f] / LARGE_CHANGE[f]) for f in own),
+        *(np.full(m, most / large) for most, large in own.values()),
     ])  # fmt: skip
     least = np.concatenate(
-        [np.full(models.shape[1], -np.inf), *(np.full(m, -np.inf if f == "offset" else 0) for f in own)]
+        [np.full(models.shape[1], -np.inf), *(np.full(m, -np.inf if SERVO_FIELDS[f].signed else 0) for f in own)]
     )
 
     def to_values(x: Array) -> Values:
@@ -89,7 +89,7 @@ def share(rollouts: JointRollouts, values: Values, places: list[int], armature: 
         for f, r in powers.items():
             every[f][:, places] = (common[f] * common["kp"] ** r)[:, None]
         for f, part in zip(own, np.split(x[:, len(powers) :], len(own), axis=1), strict=True):
-            every[f][:, places] = part * LARGE_CHANGE[f]
+            every[f][:, places] = part * own[f][1]
         return every
 
     def errors(xs: Array) -> Array:

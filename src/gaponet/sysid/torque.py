@@ -26,7 +26,7 @@ from gaponet.sim.model import build_model
 from gaponet.sim.replay import motion_errors, replay
 from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.adapt import PRIOR_RAD
-from gaponet.sysid.axes import CLASSIC, MAX_DELAY_S, Bounds
+from gaponet.sysid.axes import CLASSIC, MAX_DELAY_S, Bounds, large_changes
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import descend
 from gaponet.sysid.problem import JointFit, standard_errors, undetermined
@@ -275,11 +275,8 @@ class TorqueFit:
         start = self.hanging(options.friction) if options.place else self.robot
         rollouts = JointRollouts(cut(self.sequences, MAX_WINDOWS), start)
         first = Bounds(start, rollouts.parts).first
-        kp, one = first["kp"], np.ones(len(first["kp"]))
-        scale = {
-            "damping": np.maximum(first["damping"], 0.01 * kp), "armature": np.maximum(first["armature"], 1e-3),
-            "frictionloss": np.maximum(first["frictionloss"], 0.005 * kp), "offset": 0.02 * one, "delay": 0.02 * one,
-        }  # fmt: skip
+        one = np.ones(len(first["kp"]))
+        scale = large_changes(first)
         least = {f: -first[f] / x for f, x in scale.items()} | {"offset": -10 * one}
         most = dict.fromkeys(scale, 200 * one) | {"offset": 10 * one, "delay": (MAX_DELAY_S - first["delay"]) / 0.02}
         low, high = (np.stack([ends[f] for f in scale], axis=1) for ends in (least, most))

@@ -22,26 +22,12 @@ from gaponet.base.files import write_json
 from gaponet.base.structure import read_json, validated
 from gaponet.base.text import format_uncertainty
 from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, UNCERTAINTY_FILE
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.axes import LOGARITHM, OVER_KP, first_values
+from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
-# Prior standard deviations on the axes; of fields that are not logarithms at least the value itself.
-PRIOR_STD = {
-    "kp": 0.5, "stribeck_speed": 1.0, "damping": 0.05, "frictionloss": 0.02, "armature": 2e-4, "offset": 0.03,
-    "delay": 0.02, "stribeck": 0.01, "friction_motor": 0.1, "friction_external": 0.1, "min_torque": 0.003,
-}  # fmt: skip
+PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
 MEND = "identify or adapt it again"
-FIELD_UNITS = {  # field → heading, factor from SI
-    "kp": ("kp, N·m/rad", 1.0), "kd": ("kd, N·m·s/rad", 1.0), "damping": ("damping, N·m·s/rad", 1.0),
-    "frictionloss": ("friction, N·m", 1.0), "armature": ("armature, g·m²", 1e3), "offset": ("offset, mrad", 1e3),
-    "delay": ("delay, ms", 1e3), "target_speed": ("target speed, rad/s", 1.0),
-    "stribeck": ("Stribeck friction, N·m", 1.0), "stribeck_speed": ("Stribeck speed, mrad/s", 1e3),
-    "friction_motor": ("friction, % of motor", 1e2), "friction_external": ("friction, % of load", 1e2),
-    "effort_limit": ("torque limit, N·m", 1.0),
-    "min_torque": ("minimum torque, N·m", 1.0), "encoder_step": ("encoder, mrad", 1e3), "zero": ("zero, mrad", 1e3),
-    "stop_low": ("low stop, rad", 1.0), "stop_high": ("high stop, rad", 1.0),
-}  # fmt: skip
-LARGE_VALUE = {"offset": 0.02, "delay": 0.02}  # rad, s: scale of an error; of other fields the value itself
 UNOBSERVED_RELATIVE_ERROR = 1.0  # a standard error as large says nothing about the value
 MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = 0.9, 0.03  # from which parameters are known only as a set
 OLD_KEYS = {  # of known.json → of uncertainty.json
@@ -176,21 +162,20 @@ def _with_new_keys(table: dict[str, Any]) -> dict[str, Any]:
 def to_axes(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:
     """Return a robot's own values on the axes, (P,) of each operated joint."""
     first = first_values(robot)
-    kp = first["kp"]
-    rows = [np.log(np.maximum(first[f], 1e-9)) if f in LOGARITHM else first[f] / kp ** (f in OVER_KP) for f in fields]
+    rows = [to_axis(f, first[f], first["kp"]) for f in fields]
     return dict(zip(robot.operated, np.stack(rows, axis=-1), strict=True))
 
 
-def from_axes(fields: ListOf[str], x: Array) -> dict[str, Array]:
+def from_axes(fields: ListOf[str], x: Array) -> Values:
     """Return values on the axes, (…, P), as field → (…) in SI units."""
-    values = {f: np.exp(x[..., i]) if f in LOGARITHM else x[..., i] for i, f in enumerate(fields)}
-    return {f: v * values["kp"] if f in OVER_KP else v for f, v in values.items()}
+    return from_axis({f: x[..., i] for i, f in enumerate(fields)})
 
 
 def prior_std(fields: ListOf[str], x: Array) -> Array:
     """Return the prior standard deviations of values (…, P) on the axes, before any log."""
-    least = np.array([PRIOR_STD[f] for f in fields])
-    return np.where(np.isin(fields, LOGARITHM), least, np.maximum(least, np.abs(x)))
+    records = [SERVO_FIELDS[f] for f in fields]
+    least = np.array([r.prior_std for r in records], float)
+    return np.where([r.axis == "log" for r in records], least, np.maximum(least, np.abs(x)))
 
 
 @dataclass(frozen=True)
@@ -202,12 +187,12 @@ class JointSummary:
     sets: tuple[tuple[str, ...], ...] = ()
 
     def relative_error(self, field: str) -> float:
-        """Return the standard error over the value, or over LARGE_VALUE."""
-        return self.errors[field] / max(LARGE_VALUE.get(field, abs(self.values[field])), 1e-9)
+        """Return the standard error over the value, or over the field's large value."""
+        return self.errors[field] / max(SERVO_FIELDS[field].large_value or abs(self.values[field]), 1e-9)
 
     def cell(self, field: str) -> str:
         """Return the value with its uncertainty as text."""
-        factor = FIELD_UNITS[field][1]
+        factor = SERVO_FIELDS[field].factor
         if self.relative_error(field) > UNOBSERVED_RELATIVE_ERROR and self.values[field] == 0:
             return "none seen"
         return format_uncertainty(self.values[field] * factor, self.errors[field] * factor)
@@ -234,13 +219,12 @@ def _groups(connected: Array, fields: tuple[str, ...]) -> tuple[tuple[str, ...],
 
 def format_change(field: str, change: float, uncertainty: ParameterUncertainty, joint: str) -> str:
     """Return a change of a field on its axis, or of play, as text."""
-    if field in ("offset", "play"):
+    if field == PLAY:
         return f"{1e3 * change:+.1f} mrad"
-    if field == "delay":
-        return f"{1e3 * change:+.1f} ms"
-    if field in ("friction_motor", "friction_external"):
-        return f"{1e2 * change:+.1f} % of the load"
-    if field in ("kp", "stribeck_speed"):
+    record = SERVO_FIELDS[field]
+    if record.axis == "value":
+        return f"{record.factor * change:+.1f} {record.shown_unit}"
+    if record.axis == "log":
         return f"× {np.exp(change):.2f}"
     value = uncertainty.joints[joint].values[uncertainty.fields.index(field)]
     return f"{100 * change / value:+.0f} %" if value > 1e-9 else "from none"

@@ -25,9 +25,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaponet.export.shipped.mujoco_servos import SERVO_TERMS, Check, delay_weights, read
+from gaponet.export.shipped.mujoco_servos import Check, delay_weights, read
 from gaponet.export.shipped.scene_facts import require_scene
-from gaponet.sim.servo import friction_limit, present, servo_torque
+from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque
 
 PROGRAM, FACTS, ROBOT = "delta.pt2", "facts.json", "robot.xml"
 

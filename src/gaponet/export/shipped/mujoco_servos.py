@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.sim.servo import friction_limit, present, servo_torque
+from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque
 
-SERVO_TERMS = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
 CHECK_WORLDS = 3
 Motion = dict[str, Any]  # one of check.npz: ctrl, qpos, qvel (T, n) in rad and rad/s, dt in s
 

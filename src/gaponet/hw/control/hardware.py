@@ -14,7 +14,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.robot.collision import read_shapes
-from gaponet.robot.spec import PACKAGE_FOLDER, SERVO_FIELDS, RobotSpec, load_robot
+from gaponet.robot.servo_fields import SERVO_FIELDS
+from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot
 from gaponet.sim.model import model_hash
 
 ROBOT_OF_DRIVER = {"unitree": "h1_2", "so101": "so101"}

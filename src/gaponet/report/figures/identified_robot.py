@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from gaponet.base.files import lock_folder, write_text
 from gaponet.report.figures.style import figure, joint_label, legend, save, styled
 from gaponet.report.methods import colour, shade, title
-from gaponet.sysid.uncertainty import FIELD_UNITS, ParameterUncertainty, summarize
+from gaponet.robot.servo_fields import SERVO_FIELDS
+from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,7 +102,7 @@ def draw_uncertainty(uncertainty: ParameterUncertainty, heading: str) -> Figure:
         ax.set_visible(False)
     y = np.arange(len(joints))[::-1]
     for place, (ax, field) in enumerate(zip(axes.flat, fields, strict=False)):
-        name, factor = FIELD_UNITS[field]
+        name, factor = SERVO_FIELDS[field].heading, SERVO_FIELDS[field].factor
         values = np.array([s.values[field] * factor for s in summaries])
         half = np.array([QUANTILE_90 * s.errors[field] * factor for s in summaries])
         span = max(float(np.ptp(values)), float(np.abs(values).max()) * 0.1, 1e-9)
