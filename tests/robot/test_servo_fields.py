@@ -22,7 +22,7 @@ def test_a_robot_has_an_attribute_with_the_default_of_each_record():
 @pytest.mark.parametrize("name", SERVO_FIELDS)
 def test_a_value_of_each_record_survives_robot_toml(arm, tmp_path, name):
     value = 0.5 * min(SERVO_FIELDS[name].limits[1], 2.0)
-    save_robot(arm.with_servos(dict.fromkeys(arm.joint_names, {name: value})), tmp_path / "out")
+    save_robot(arm.with_servos({joint: {name: value} for joint in arm.joint_names}), tmp_path / "out")
     np.testing.assert_allclose(getattr(load_robot(tmp_path / "out"), name), value)
 
 
