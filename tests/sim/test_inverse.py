@@ -5,7 +5,7 @@ import pytest
 from arm import TOML, XML, commands, record, write_arm
 
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import ClosedForm, Inertia, Period
+from gaponet.sim.inverse import AnalyticInverse, Inertia, Period
 from gaponet.sim.model import build_model
 
 CONDITION = Condition(0.2, "both", 0.02)
@@ -28,7 +28,7 @@ def periods(sequence, friction):
 
 def test_it_gives_back_the_command_where_friction_is_known(tmp_path):
     robot = write_arm(tmp_path, xml=XML.replace('frictionloss="0.05"', 'frictionloss="0"'))
-    sequence, inverse = smooth(robot), ClosedForm.of(BatchSim(robot, [CONDITION]))
+    sequence, inverse = smooth(robot), AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     told = np.concatenate([inverse([p], p.qpos) for p in periods(sequence, 0.0)])
     np.testing.assert_allclose(told, sequence.ctrl[:-1], atol=2e-4)
 
@@ -39,7 +39,7 @@ def test_positions_and_speeds_within_a_period_of_parabolic_speeds(count):
     speed = 0.3 + 0.2 * i - 0.03 * i**2
     position = np.concatenate([[0.0], np.cumsum(h * speed[1:])])
     known = np.array([h * speed[0], h * speed[-1], position[-1]])
-    before, speeds = (weights @ known for weights in ClosedForm.within(count, 12))
+    before, speeds = (weights @ known for weights in AnalyticInverse.within(count, 12))
     np.testing.assert_allclose(before[:count], position[:-1], atol=1e-12)
     np.testing.assert_allclose(speeds[: count + 1] / h, speed, atol=1e-12)
 
@@ -62,6 +62,6 @@ def test_inertia_is_mujocos(tmp_path):
 
 def test_torque_limits_bound_what_is_asked_for(tmp_path):
     weak = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.1"))
-    inverse = ClosedForm.of(BatchSim(weak, [CONDITION]))
+    inverse = AnalyticInverse.of(BatchSim(weak, [CONDITION]))
     still = Period(*np.zeros((5, 1, 2)))
     assert np.abs(inverse([still], still.qpos)).max() <= 0.1 / 20.0 + 1e-12

@@ -11,8 +11,7 @@ from gaponet.base.errors import RobotError
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import Table, load_robot
 from gaponet.sim.batch import BatchSim
-from gaponet.sim.model import build_model, model_hash
-from gaponet.sim.table import write_table
+from gaponet.sim.model import build_model, model_hash, write_table
 
 TIP = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'
 

@@ -146,14 +146,16 @@ def load_toml(kind: str, folder: Path, name_or_path: str | Path) -> tuple[Path, 
     return path, read_toml(dict[str, Any], path, UsageError)
 
 
-def read_npz(path: Path, error: type[GAPONetError], hint: str = "") -> dict[str, np.ndarray]:
+def read_npz(
+    path: Path, error: type[GAPONetError], hint: str = "", max_bytes: int = MAX_ARRAYS_BYTES
+) -> dict[str, np.ndarray]:
     """Read the arrays of an .npz file by name; pickled objects are refused."""
     if not path.is_file():
         raise error(_message(path, "is missing, or not a file", hint))
     try:
         with zipfile.ZipFile(path) as packed:
-            if sum(part.file_size for part in packed.infolist()) > MAX_ARRAYS_BYTES:
-                raise error(_message(path, f"unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB", hint))
+            if sum(part.file_size for part in packed.infolist()) > max_bytes:
+                raise error(_message(path, f"unpacks to more than {max_bytes >> 20} MiB", hint))
         with np.load(path, allow_pickle=False) as file:
             return {name: np.asarray(file[name]) for name in file.files}
     # NumPy parses a header as Python text; zipfile passes on errors of zlib and struct.

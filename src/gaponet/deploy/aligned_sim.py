@@ -17,7 +17,7 @@ from gaponet.deploy.transfer import Inverse, Reference, Transfer, control_period
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import PROBES, ClosedForm, Probed
+from gaponet.sim.inverse import PROBES, AnalyticInverse, ProbingInverse
 
 
 class AlignedSim:
@@ -153,10 +153,10 @@ class AlignedSim:
 
 def _inverse_of(
     sim: BatchSim, robot: RobotSpec, conditions: list[Condition], locked: tuple[str, ...], how: Inverse, nthread: int
-) -> ClosedForm | Probed:
+) -> AnalyticInverse | ProbingInverse:
     """Return the inverse dynamics of a batch of robots; by probes, from copies of each robot without the table."""
     if how == "closed":
-        return ClosedForm.of(BatchSim(robot, conditions, nthread, locked))
+        return AnalyticInverse.of(BatchSim(robot, conditions, nthread, locked))
     count = max(len(PROBES), 1 + sim.n)
     copies = BatchSim(replace(robot, table=None), conditions * count, nthread, locked)
     ahead = int(np.ceil(robot.delay.max() / conditions[0].dt - 1e-9))
@@ -171,4 +171,4 @@ def _inverse_of(
             copies.step(full, rows)
         return copies.qpos[rows].reshape(targets.shape), copies.qvel[rows].reshape(targets.shape)
 
-    return Probed(answer, conditions[0].dt, ahead)
+    return ProbingInverse(answer, conditions[0].dt, ahead)

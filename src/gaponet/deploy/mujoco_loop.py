@@ -15,7 +15,7 @@ from gaponet.nn.artifact import GapModel
 from gaponet.robot.folder import has_stored_robot, stored_robot_holder
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
-from gaponet.sim.inverse import ClosedForm, Probed
+from gaponet.sim.inverse import AnalyticInverse, ProbingInverse
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 GAIN_TOLERANCE = 1e-3  # relative, of kp and kd in a scene
@@ -121,7 +121,7 @@ class MujocoAligner:
         locked = tuple(name for name in robot.joint_names if prefix + name not in driven)
         reference = BatchSim(robot, [condition], 1, locked)
         joints = tuple(prefix + name for name in reference.joint_names)
-        inverse: ClosedForm | Probed
+        inverse: AnalyticInverse | ProbingInverse
         if how == "closed":
             inverse = _of_scene(scene, joints, condition.dt)
             unchanged = (
@@ -129,12 +129,12 @@ class MujocoAligner:
                 if isinstance(model, GapModel)
                 else not robot.has_servo_model
             )
-            if unchanged and inverse.alike(ClosedForm.of(reference), reference.range):
+            if unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range):
                 return
-            self._set_scene = inverse.stand
+            self._set_scene = inverse.set_state
         else:
             copies = _SceneCopies(scene, joints, condition.dt)
-            inverse = Probed(copies, condition.dt)
+            inverse = ProbingInverse(copies, condition.dt)
             self._set_scene = copies.set_scene
         self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
 
@@ -167,10 +167,10 @@ class _SceneCopies:
         return qpos, qvel
 
 
-def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> ClosedForm:
+def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> AnalyticInverse:
     """Return the inverse dynamics of a robot in a scene."""
     model, h = _without_contacts(scene), scene.opt.timestep
-    return ClosedForm(Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h]))
+    return AnalyticInverse(Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h]))
 
 
 def _without_contacts(scene: mujoco.MjModel) -> mujoco.MjModel:

@@ -24,7 +24,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.nn.artifact import RATE_TOLERANCE, GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import ClosedForm, Period, Probed
+from gaponet.sim.inverse import AnalyticInverse, Period, ProbingInverse
 from gaponet.sim.replay import idle_limbs
 
 Inverse = Literal["closed", "probes"]
@@ -47,7 +47,7 @@ class Transfer:
     def __init__(
         self,
         reference: Reference,
-        inverse: ClosedForm | Probed,
+        inverse: AnalyticInverse | ProbingInverse,
         conditions: list[Condition],
         locked: tuple[str, ...] = (),
         nthread: int = 1,
@@ -70,7 +70,7 @@ class Transfer:
         self.inverse, self.num_envs = inverse, len(conditions)
         self.sim = sim = BatchSim(robot, conditions, nthread, locked)
         if not extrapolate:
-            _require_measured(inverse, ClosedForm.of(sim), sim.joint_names)
+            _require_measured(inverse, AnalyticInverse.of(sim), sim.joint_names)
         self.joint_names = sim.joint_names
         self.op = np.array([sim.joint_names.index(name) for name in robot.operated])
         self.periods = 1 if model is None else max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
@@ -156,7 +156,7 @@ class TransferCorrector:
         locked = idle_limbs(start, self.robot)
         own = BatchSim(self.target, [Condition.of(s, self.target) for s in start], locked=locked)
         reference = [Condition.of(s, self.robot) for s in start]
-        self.transfer = Transfer(self.reference, ClosedForm.of(own), reference, locked, 0, self.extrapolate)
+        self.transfer = Transfer(self.reference, AnalyticInverse.of(own), reference, locked, 0, self.extrapolate)
         self.free = self.robot.index(self.transfer.joint_names)
         first = [np.stack([getattr(s, name)[0, self.free] for s in start]) for name in ("qpos", "qvel", "ctrl")]
         self.transfer.reset(slice(None), first[0], first[1], past=first[2][:, None])
@@ -169,10 +169,12 @@ class TransferCorrector:
         return commands
 
 
-def _require_measured(inverse: ClosedForm | Probed, reference: ClosedForm, joints: tuple[str, ...]) -> None:
+def _require_measured(
+    inverse: AnalyticInverse | ProbingInverse, reference: AnalyticInverse, joints: tuple[str, ...]
+) -> None:
     """Refuse a target outside the measured ranges."""
     periods = (inverse.ahead - reference.ahead) * reference.dt
-    extra_delay = periods if isinstance(inverse, Probed) else inverse.delay - reference.delay
+    extra_delay = periods if isinstance(inverse, ProbingInverse) else inverse.delay - reference.delay
     if extra_delay.max() > MAX_EXTRA_DELAY_S:
         joint = joints[extra_delay.argmax() % len(joints)]
         raise ModelError(
@@ -180,7 +182,7 @@ def _require_measured(inverse: ClosedForm | Probed, reference: ClosedForm, joint
             "follow it: the reference moves before this servo receives a target. Make the reference as late (delay in "
             "robot.toml; gaponet identify), or extrapolate (extrapolate=True, --extrapolate)"
         )
-    if isinstance(inverse, Probed):
+    if isinstance(inverse, ProbingInverse):
         return  # its parameters are unknown
     for quantity, values, (low, high) in (
         ("kp, as a ratio to the reference's,", inverse.kp / reference.kp, KP_RATIO_BOUNDS),

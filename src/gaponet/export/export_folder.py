@@ -287,6 +287,7 @@ def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
     constants = (
         f"SERVO_TERMS = {SERVO_TERMS}\n"
         f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
+        f"DEADBAND_STEPS = {servo.DEADBAND_STEPS}\n"
     )
     functions = [inspect.getsource(f) for f in SERVO_MODEL]
     write_text(folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + constants, *functions]))

@@ -26,8 +26,7 @@ from gaponet.base.files import lock_folder
 from gaponet.export.simulator_facts import Joints, ServoFacts
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.model import PAYLOAD_DENSITY, STIFF_SOLIMP, STIFF_SOLREF, TOLERANCE, build_model
-from gaponet.sim.table import TABLE
+from gaponet.sim.model import PAYLOAD_DENSITY, STIFF_SOLIMP, STIFF_SOLREF, TABLE, TOLERANCE, build_model
 
 SERVO_ATTRIBUTES = ("name", "class", "group", "user")  # that a servo keeps
 JOINT_ATTRIBUTES = ("armature", "damping", "frictionloss")  # that are identified

@@ -16,7 +16,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_TERMS, STOP_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model, qpos_range
-from gaponet.sim.servo import ServoModel, present
+from gaponet.sim.servo import ServoModel
 
 Array = np.ndarray
 
@@ -198,7 +198,7 @@ class BatchSim:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._late.fill(ids, past, self.nstep[ids], self.timestep[ids])
         if self.servo_model is not None:
-            rows, self.servo_model.active = np.arange(self.num_envs)[ids], present(self.servo_model.values)
+            rows = np.arange(self.num_envs)[ids]
             self.servo_model.reset(rows, self.qpos[rows] if past is None else past[:, 0])
 
     def step(self, ctrl: Array, ids: Array | None = None) -> None:
@@ -286,14 +286,12 @@ class BatchSim:
             x[:] = state[name]
 
     def _state(self) -> dict[str, Array]:
-        late = {} if self._late is None else {"history": self._late.buffer, "time": self._late.time}
-        servo = (
-            {}
-            if self.servo_model is None
-            else {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
-        )
-        aim = {} if self.most is None else {"ctrl": self.ctrl}
-        return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late | servo | aim
+        state = {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart}
+        if self._late is not None:
+            state |= {"history": self._late.buffer, "time": self._late.time}
+        if self.servo_model is not None:
+            state |= {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
+        return state if self.most is None else state | {"ctrl": self.ctrl}
 
     def data(self, env: int) -> mujoco.MjData:
         """Return one simulation as MjData, for rendering or forward kinematics."""
@@ -344,10 +342,8 @@ class CommandHistory:
         self.cursor, self.times = parts[..., :2], parts[..., 2 : -self.samples]
         self.values = parts[..., -self.samples :]
         self.ago = array_like(time, np.arange(self.samples, 0, -1))  # oldest first
-        self._newest, self._each = (
-            array_like(time, [0.0, self.samples - 1.0]),
-            array_like(time, np.arange(len(time))[:, None]),
-        )
+        self._newest = array_like(time, [0.0, self.samples - 1.0])
+        self._each = array_like(time, np.arange(len(time))[:, None])
 
     def fill(self, ids: Any, past: Any, nstep: Any, timestep: Any) -> None:
         """Write past targets, newest first, each held for nstep (k,) physics steps of timestep (k,) s; time is 0."""

@@ -1,12 +1,11 @@
-"""The inverse of a simulator: the position targets, held for a control period, that lead it along a given motion.
+"""Inverse of a simulator: position targets, held for a control period, that move it along a given motion.
 
-In closed form where the simulator's numbers are known: the mean torque that the period asks for is inverse dynamics at
-its mean acceleration and the mean of the states at which physics steps begin; the position actuator's is the mean of
-kp·(u + offset − q) − kd·v over the physics steps, each as much as the motor can give. What is left is how torques vary
-within a period.
+AnalyticInverse needs the simulator's parameters. The mean torque of a period is inverse dynamics at its mean
+acceleration and at the mean state before its physics steps. A position actuator gives the mean of
+kp·(u + offset − q) − kd·v over the physics steps, each within the motor's limits. The remaining error is the variation
+of torques within a period.
 
-By answers where it is a black box: it is asked where seven targets would lead it, all joints at once; what lies between
-two of them is interpolated, asked again and mended.
+ProbingInverse only simulates: from seven targets for all joints at once it interpolates the target, and refines it.
 """
 
 from __future__ import annotations
@@ -24,15 +23,17 @@ from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
 from gaponet.sim.servo import friction_limit, present
 
+# Agreement of two simulators: largest difference of targets, and number of random motions that are compared.
+MAX_TARGET_DIFFERENCE_RAD, COMPARED_MOTIONS = 1e-4, 32
 PROBES = np.array([-0.4, -0.1, -0.02, 0.0, 0.02, 0.1, 0.4])  # rad, around the target of the period before
-ALIKE, TRIED = 1e-4, 32  # rad: two simulators are one where targets of so many motions differ by less
-NARROW, WIDE = 0.1, 3.0  # as a share of these at least, and so many times what is missing
-MENDED, FINE = 2, 0.1  # times what was interpolated is mended, by so many rad at most
-ALONE, SLIDING = 1e-3, 0.5  # rad by which a joint is asked alone, and rad/s at which all of them slide then
-FLAT, LEAST, STANDS = 0.05, 1e-4, 0.1  # of an answer over a target: none, least, least of what it was
-SAME = 1e-6  # rad: answers that differ by less are the same, as within a friction band
+MIN_PROBE_SCALE, PROBE_SCALE_RATIO = 0.1, 3.0  # of PROBES; scale over the present error
+REFINEMENTS, MAX_REFINEMENT_RAD = 2, 0.1  # of the interpolated target
+SLOPE_STEP_RAD, SLIDING_SPEED = 1e-3, 0.5  # of one joint's target; rad/s of all joints, so that none sticks
+MIN_SLOPE, START_SLOPE, MIN_SLOPE_RATIO = 0.05, 1e-4, 0.1  # of position over target; ratio to the slope before
+POSITION_TOLERANCE_RAD = 1e-6  # positions that differ by less are equal, as within a friction band
 
-Answer = Callable[[Array, Array], tuple[Array, Array]]  # targets (k, num, n) rad, qvel (num, n) → next qpos, qvel
+# Targets (k, num, n) rad and qvel (num, n) rad/s → qpos and qvel at the end of the period, (k, num, n).
+Simulate = Callable[[Array, Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class Period:
     Attributes:
         qpos, qvel: At its start, rad, rad/s.
         next_qpos, next_qvel: At its end.
-        friction: Share of its dry friction that each joint had against it at the end, in [−1, 1]: of a joint at rest,
-            where in the band it stood.
+        friction: Friction against each joint's motion at the end over its limit, in [−1, 1]; of a joint at rest, its
+            place in the friction band.
     """
 
     qpos: Array
@@ -54,7 +55,7 @@ class Period:
 
 
 class Inertia:
-    """The inertia matrix among some degrees of freedom of the simulations of a batch, as of its last call."""
+    """Inertia matrix of some degrees of freedom of a batch's simulations, as of its last call."""
 
     def __init__(self, batch: Batch, model: mujoco.MjModel, dof: Array) -> None:
         place = np.full(model.nv, -1)
@@ -74,11 +75,11 @@ class Inertia:
         return full
 
 
-class ClosedForm:
-    """Targets of position actuators along a motion; no contacts, no joint limits. Its batch is nobody else's.
+class AnalyticInverse:
+    """Targets of position actuators along a motion, without contacts and joint limits.
 
     Attributes:
-        ahead: Control periods of a motion that must be known after the coming one, because servos are late.
+        ahead: Number of control periods after the coming one that a call needs, because servos have a delay.
     """
 
     def __init__(
@@ -86,13 +87,13 @@ class ClosedForm:
     ) -> None:
         """
         Args:
-            batch: Simulations to compute in, one per robot.
-            model: The model of all of them, whatever they carry.
+            batch: Simulations to compute in, one per robot; nothing else may use them.
+            model: The model of all of them; payloads may differ.
             joints: n names.
             nstep, timestep: Physics steps per control period, their length in s; (num,) each.
 
         Raises:
-            UsageError: A joint without exactly one position actuator: ask for answers instead.
+            UsageError: A joint without exactly one position actuator; use ProbingInverse.
         """
         self.batch, self.num = batch, batch.nsim
         self.at = np.array([model.joint(name).qposadr[0] for name in joints])
@@ -103,16 +104,12 @@ class ClosedForm:
         self.offset, self.delay = bias[..., 0] / self.kp, model.actuator_delay[act]
         self.low, self.high = _most_torque(model, joints, act)
         self.frictionloss, self.damping = model.dof_frictionloss[self.dof], model.dof_damping[self.dof]
-        user = (
-            model.actuator_user[act].T
-            if model.nuser_actuator == len(SERVO_TERMS)
-            else np.zeros((len(SERVO_TERMS), len(act)))
-        )
-        self.law = present(dict(zip(SERVO_TERMS, user, strict=True)))
+        has_terms = model.nuser_actuator == len(SERVO_TERMS)
+        self.terms = present(dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True)) if has_terms else {})
         self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER  # kd takes the speed before the step
         self.h, self.dt = timestep[:, None], (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
-        before, speeds = zip(*(self.within(int(n), int(nstep.max())) for n in nstep), strict=True)
+        before, speeds = zip(*(self._within_period(int(n), int(nstep.max())) for n in nstep), strict=True)
         self.before, self.speeds = (np.array(x).transpose(1, 2, 0)[..., None] for x in (before, speeds))
         self.share = (np.arange(nstep.max())[:, None] < nstep) / nstep  # of each physics step, (steps, num)
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
@@ -120,22 +117,22 @@ class ClosedForm:
         self.inertia = Inertia(batch, model, self.dof)
 
     @classmethod
-    def of(cls, sim: BatchSim) -> ClosedForm:
-        """Inverse dynamics in a batch of robots, which must be a batch of its own."""
+    def of(cls, sim: BatchSim) -> AnalyticInverse:
+        """Return the inverse of a simulation that nothing else uses."""
         return cls(sim.batch, next(iter(sim.models.values())), sim.joint_names, sim.nstep, sim.timestep)
 
-    def stand(self, data: mujoco.MjData) -> None:
-        """Copy positions and velocities of a scene, (nq,) and (nv,)."""
+    def set_state(self, data: mujoco.MjData) -> None:
+        """Copy positions and velocities of a scene, (nq,) rad and (nv,) rad/s."""
         self.qpos[:], self.qvel[:] = data.qpos, data.qvel
 
     def __call__(self, periods: ListOf[Period], near: Array) -> Array:
-        """The targets to send, (num, n) rad, not limited to any range.
+        """Return the targets to send, (num, n) rad, not limited to any range.
 
         Args:
             periods: The coming one and `ahead` more.
-            near: Not looked at.
+            near: Unused; ProbingInverse needs it.
         """
-        held = np.stack([self._held(period) for period in periods])  # in force
+        held = np.stack([self._targets_in_force(period) for period in periods])
         if not self.ahead:
             return held[0]
         late = np.broadcast_to(self.delay / self.dt, held[0].shape)
@@ -143,7 +140,7 @@ class ClosedForm:
         first, second = (np.take_along_axis(held, i[None], axis=0)[0] for i in (whole, whole + 1))
         return first + (late - whole) * (second - first)
 
-    def _held(self, period: Period) -> Array:
+    def _targets_in_force(self, period: Period) -> Array:
         way, gain = period.next_qpos - period.qpos, period.next_qvel - period.qvel
         known = np.stack([self.h * period.qvel, self.h * period.next_qvel, way])
         qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self.before, known)  # at which physics steps begin
@@ -152,18 +149,19 @@ class ClosedForm:
         torque = self._torque(mean(qpos), mean(before[:-1]), gain / self.dt, period.friction)
         torque += self.damping * (mean(after) - mean(before[:-1]))
         back = self.kp * (qpos - self.offset) + self.kd * (before[:-1] if self.explicit else after)
-        return self._told(np.clip(torque, self.low, self.high), back, mean)
+        return self._targets(np.clip(torque, self.low, self.high), back, mean)
 
-    def _told(self, torque: Array, back: Array, mean: Callable[[Array], Array]) -> Array:
-        """Targets (num, n) whose kp·u − back, (steps, num, n), is torque (num, n) in the mean, limited step by step."""
+    def _targets(self, torque: Array, back: Array, mean: Callable[[Array], Array]) -> Array:
+        """Return targets u (num, n) for which the mean over steps of kp·u − back, (steps, num, n), within the motors'
+        limits, is torque (num, n)."""
         out = (torque + mean(back)) / self.kp
         for _ in range(len(back)):
-            asked = self.kp * out - back
-            given = np.clip(asked, self.low, self.high)
-            if (given == asked).all():
+            requested = self.kp * out - back
+            applied = np.clip(requested, self.low, self.high)
+            if (applied == requested).all():
                 break
-            free = np.maximum(mean((given == asked).astype(float)), 1 / len(back))
-            out = out + (torque - mean(given)) / (self.kp * free)
+            free = np.maximum(mean((applied == requested).astype(float)), 1 / len(back))
+            out = out + (torque - mean(applied)) / (self.kp * free)
         return out
 
     def _torque(self, qpos: Array, qvel: Array, qacc: Array, friction: Array) -> Array:
@@ -171,27 +169,27 @@ class ClosedForm:
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         load = self.bias[:, self.dof]
         torque = load - self.passive[:, self.dof] + np.einsum("kij,kj->ki", self.inertia.matrix(self.num), qacc)
-        return torque + friction * friction_limit(self.law, self.frictionloss, qvel, torque, load)
+        return torque + friction * friction_limit(self.terms, self.frictionloss, qvel, torque, load)
 
-    def alike(self, other: ClosedForm, limits: Array) -> bool:
+    def agrees_with(self, other: AnalyticInverse, limits: Array) -> bool:
         """Return True if the inverses of two simulators of the same joints, limits (n, 2) rad, agree for any motion."""
         if self.ahead != other.ahead or not np.allclose(self.dt, other.dt):
             return False
         rng, n = np.random.default_rng(0), len(limits)
-        for _ in range(TRIED):
+        for _ in range(COMPARED_MOTIONS):
             low, high = np.clip(limits, -np.pi, np.pi).T
             q = low + (high - low) * rng.random((1, n))
             v, a, friction = (rng.uniform(-top, top, (1, n)) for top in (1.0, 5.0, 1.0))
             ends = q + self.dt * (v + 0.5 * self.dt * a), v + self.dt * a
             period = Period(q, v, *ends, friction)
-            told = [inverse([period] * (1 + inverse.ahead), q) for inverse in (self, other)]
-            if np.abs(told[0] - told[1]).max() > ALIKE:
+            mine, theirs = (inverse([period] * (1 + inverse.ahead), q) for inverse in (self, other))
+            if np.abs(mine - theirs).max() > MAX_TARGET_DIFFERENCE_RAD:
                 return False
         return True
 
     @staticmethod
-    def within(count: int, rows: int) -> tuple[Array, Array]:
-        """Positions before each of `count` physics steps of h, and speeds, from what is known at a period's ends.
+    def _within_period(count: int, rows: int) -> tuple[Array, Array]:
+        """Return positions before each of `count` physics steps of h, and speeds, from the states at a period's ends.
 
         Speeds follow a parabola; MuJoCo's positions follow from the speeds after each step.
 
@@ -208,100 +206,103 @@ class ClosedForm:
         return before, speeds
 
 
-class Probed:
-    """Targets by the simulator's own answers.
+class ProbingInverse:
+    """Targets along a motion from simulations of other targets.
 
-    Joints pull at each other, and each has a friction band and a most torque of its own. So it is asked in each period
-    how all joints answer to each one, while all slide and no motor is near its limit; and what an answer misses is told
-    in rad of each joint's own target: there, a joint at its limit is nobody else's concern.
+    Joints pull at each other, and each has a friction band and a torque limit. So the response of all joints to each
+    joint's target is measured in each period, while all joints slide and no motor is near its limit. Errors are
+    converted by it to errors of each joint's own target: a joint at its limit then has no effect on others.
     """
 
-    def __init__(self, answer: Answer, dt: Array | float, ahead: int = 0) -> None:
+    def __init__(self, simulate: Simulate, dt: Array | float, ahead: int = 0) -> None:
         """
         Args:
-            answer: Where targets, held, would lead each robot, from where it is, with speeds that are given; in free
-                space: a target is not pushed through what it touches.
+            simulate: Simulation of held targets from each robot's present position with given speeds, without
+                contacts.
             dt: Control period, s, one or (num, 1).
-            ahead: Control periods after the coming one at whose end is answered, because servos are late.
+            ahead: Number of control periods after the coming one at whose end `simulate` returns the state, because
+                servos have a delay.
         """
-        self.answer, self.dt, self.ahead = answer, dt, ahead
+        self.simulate, self.dt, self.ahead = simulate, dt, ahead
         self._slope: Array | None = None  # of each joint's answer over each joint's target, (num, n, n)
 
     def __call__(self, periods: ListOf[Period], near: Array) -> Array:
-        """Targets (num, n) rad that lead to where the period ends, the nearest to `near` among those that do so.
+        """Return the targets (num, n) rad nearest to `near` that lead to the end of the period.
 
         Position and speed at the end count together, q + q̇·dt: the speed alone would drift, the position alone ring.
         """
         period, own = periods[-1], np.linalg.inv(self._slopes(periods[0]))
 
-        def missed(targets: Array) -> Array:
-            qpos, qvel = self.answer(targets, periods[0].qvel)
+        def target_errors(targets: Array) -> Array:
+            qpos, qvel = self.simulate(targets, periods[0].qvel)
             return np.einsum("kij,pkj->pki", own, qpos - period.next_qpos + self.dt * (qvel - period.next_qvel))
 
-        left = missed(near[None])[0]
-        wide = np.clip(WIDE * np.abs(left) / PROBES[-1], NARROW, 1.0)
+        error = target_errors(near[None])[0]
+        wide = np.clip(PROBE_SCALE_RATIO * np.abs(error) / PROBES[-1], MIN_PROBE_SCALE, 1.0)
         asked = PROBES[PROBES != 0, None, None] * wide
-        probed = np.insert(missed(near + asked), len(PROBES) // 2, left, axis=0)
+        probed = np.insert(target_errors(near + asked), len(PROBES) // 2, error, axis=0)
         more, slope = _crossing(_rising(probed / wide))
         away = near - periods[0].qpos
-        wound = (slope <= FLAT) & (left * np.sign(away) > FLAT * np.abs(away))  # limited far beyond what is asked for
-        more, moves = np.where(wound, -away, more * wide), wound | (slope > FLAT)
-        told, lefts = [near], [left]
-        for _ in range(1 + MENDED):
-            told.append(told[-1] + more)
-            lefts.append(missed(told[-1][None])[0])
-            steps = np.abs(more) > SAME
-            slope = np.maximum(slope, np.divide(lefts[-1] - lefts[-2], more, out=slope.copy(), where=steps))
-            more = np.where(moves, np.clip(-lefts[-1] / np.maximum(slope, FLAT), -FINE, FINE), 0.0)
-        best = np.abs(lefts).sum(axis=2).argmin(axis=0)
-        return np.array(told)[best, np.arange(len(near))]
+        saturated = (slope <= MIN_SLOPE) & (error * np.sign(away) > MIN_SLOPE * np.abs(away))  # far beyond a limit
+        more, moves = np.where(saturated, -away, more * wide), saturated | (slope > MIN_SLOPE)
+        targets, errors = [near], [error]
+        for _ in range(1 + REFINEMENTS):
+            targets.append(targets[-1] + more)
+            errors.append(target_errors(targets[-1][None])[0])
+            steps = np.abs(more) > POSITION_TOLERANCE_RAD
+            slope = np.maximum(slope, np.divide(errors[-1] - errors[-2], more, out=slope.copy(), where=steps))
+            more = np.where(
+                moves, np.clip(-errors[-1] / np.maximum(slope, MIN_SLOPE), -MAX_REFINEMENT_RAD, MAX_REFINEMENT_RAD), 0.0
+            )
+        best = np.abs(errors).sum(axis=2).argmin(axis=0)
+        return np.array(targets)[best, np.arange(len(near))]
 
     def _slopes(self, period: Period) -> Array:
-        """How all joints answer to each, (num, n, n); of one that does not move, what was known stays."""
+        """Return the response of all joints to each joint's target, (num, n, n); the last one where nothing moves."""
         n = period.qpos.shape[1]
         if self._slope is None:
-            self._slope = np.tile(np.eye(n), (len(period.qpos), 1, 1)) * LEAST
-        told = period.qpos + ALONE * np.concatenate([np.zeros((1, n)), np.eye(n)])[:, None]
-        qpos, qvel = self.answer(told, np.where(period.next_qpos < period.qpos, -SLIDING, SLIDING))
+            self._slope = np.tile(np.eye(n), (len(period.qpos), 1, 1)) * START_SLOPE
+        targets = period.qpos + SLOPE_STEP_RAD * np.concatenate([np.zeros((1, n)), np.eye(n)])[:, None]
+        qpos, qvel = self.simulate(targets, np.where(period.next_qpos < period.qpos, -SLIDING_SPEED, SLIDING_SPEED))
         reached = qpos + self.dt * qvel
-        slope = ((reached[1:] - reached[0]) / ALONE).transpose(1, 2, 0)
-        moves = np.einsum("kjj->kj", slope) > STANDS * np.einsum("kjj->kj", self._slope)
+        slope = ((reached[1:] - reached[0]) / SLOPE_STEP_RAD).transpose(1, 2, 0)
+        moves = np.einsum("kjj->kj", slope) > MIN_SLOPE_RATIO * np.einsum("kjj->kj", self._slope)
         self._slope = np.where(moves[:, None], slope, self._slope)
         return self._slope
 
 
 def _own(batch: Batch, model: mujoco.MjModel, name: str) -> Array:
-    """A field of the model by simulation, (num or 1, …)."""
+    """Return a field of the model by simulation, (num or 1, …)."""
     values = batch.expanded(name)
     return getattr(model, name)[None] if values is None else values
 
 
-def _rising(missed: Array) -> Array:
-    """Values over PROBES, (7, num, n), with what falls again left out, from the middle outwards.
+def _rising(errors: Array) -> Array:
+    """Return errors over PROBES, (7, num, n), made monotonic from the middle outwards.
 
-    A target that asks for more than a motor can give is no answer of its joint, but of those that pull at it.
+    Beyond a motor's limit the error of a joint only shows other joints.
     """
     middle = len(PROBES) // 2
-    below = np.minimum.accumulate(missed[middle::-1], axis=0)[:0:-1]
-    return np.concatenate([below, np.maximum.accumulate(missed[middle:], axis=0)])
+    below = np.minimum.accumulate(errors[middle::-1], axis=0)[:0:-1]
+    return np.concatenate([below, np.maximum.accumulate(errors[middle:], axis=0)])
 
 
-def _crossing(missed: Array) -> tuple[Array, Array]:
-    """Where values that rise over PROBES, (7, num, n), pass zero, and how steeply.
+def _crossing(errors: Array) -> tuple[Array, Array]:
+    """Return the target, rad, at which errors that rise over PROBES, (7, num, n), pass zero, and their slope there.
 
-    Where one of them is as good as zero, or none passes it, the least target of the best: what nothing answers to, by
-    friction or because a motor gives all it can, is not asked for in vain.
+    If one of them is zero, or none passes it, the result is the smallest target with the least error: friction or a
+    motor's limit hides the effect of larger ones.
     """
-    above = np.clip((missed < 0).sum(axis=0), 1, len(PROBES) - 1)
-    low, high = (np.take_along_axis(missed, i[None], axis=0)[0] for i in (above - 1, above))
+    above = np.clip((errors < 0).sum(axis=0), 1, len(PROBES) - 1)
+    low, high = (np.take_along_axis(errors, i[None], axis=0)[0] for i in (above - 1, above))
     rise, wide = np.maximum(high - low, 1e-15), PROBES[above] - PROBES[above - 1]
-    passed = (low < -SAME) & (high > SAME)
-    least = (np.abs(missed) + FLAT * np.abs(PROBES)[:, None, None]).argmin(axis=0)
+    passed = (low < -POSITION_TOLERANCE_RAD) & (high > POSITION_TOLERANCE_RAD)
+    least = (np.abs(errors) + MIN_SLOPE * np.abs(PROBES)[:, None, None]).argmin(axis=0)
     return np.where(passed, PROBES[above - 1] - low / rise * wide, PROBES[least]), rise / wide
 
 
 def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:
-    """The least and the most that motors give, (2, n) N·m; ±inf where there is no limit."""
+    """Return the least and the largest torque of motors, (2, n) N·m; ±inf without a limit."""
     at = np.array([model.joint(name).id for name in joints])
     limits = [(model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators]),
               (model.jnt_actfrclimited[at], model.jnt_actfrcrange[at])]  # fmt: skip
@@ -310,7 +311,7 @@ def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Arra
 
 
 def _position_actuator(model: mujoco.MjModel, joint: str) -> int:
-    """The index of the one actuator of a joint, which must be a position actuator without gear or dynamics."""
+    """Return the index of a joint's only actuator; refuses all but position actuators without gear and dynamics."""
     of_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     mine = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == model.joint(joint).id))
     if len(mine) != 1:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -16,13 +17,14 @@ from gaponet.robot.freeze import freeze, units_per_si
 from gaponet.robot.mjcf import compile_spec, read_mjcf
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.table import add_table, soften_table
+
+if TYPE_CHECKING:
+    from mujoco.batch import Batch
+
 
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
 # torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w
-# is the stiffest that the solver still meets at this tolerance, whatever the armature; it costs 7 % of an environment
-# step of the SO-101 and 12 % of the H1-2, and makes joint stops as much harder. noslip_iterations halve the speed of a
-# humanoid and converge slowly in a light limb.
+# is the stiffest that the solver still meets at this tolerance.
 STIFF_SOLREF = (0.004, 1.0)
 STIFF_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 STIFF_MOBILITY = 0.1
@@ -40,7 +42,7 @@ def build_model(
     locked: tuple[str, ...] = (),
     bare: bool = False,
 ) -> mujoco.MjModel:
-    """The nominal simulator of a robot with a payload.
+    """Return the nominal simulator of a robot with a payload.
 
     Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has, in the
     order of `robot.joint_names`. The physics step is the robot's, stretched a little where it does not divide dt.
@@ -50,10 +52,8 @@ def build_model(
         payload_mass: Mass in each hand named by `payload_side`, kg.
         payload_side: "both" (every mount), or the side of one mount.
         dt: Control period, s; default robot.dt.
-        locked: Joints clamped at home; the model has no degree of freedom for them. On a fixed base, limbs that stand
-            still cost time and change nothing (`idle_joints` finds them).
-        bare: For stepping, not for looking: without geoms that touch nothing and without the bodies of limbs that are
-            locked to the world. Moves the same, a sixth faster.
+        locked: Joints clamped at home, without a degree of freedom (`idle_joints` finds those that change nothing).
+        bare: Leave out geoms that touch nothing and bodies that are locked to the world: faster, same motion.
 
     Raises:
         RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
@@ -67,10 +67,12 @@ def build_model(
             f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(known))}), but robot.toml names "
             f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
         )
-    if not np.array_equal(_qpos_address(model, robot, locked), np.arange(model.nq)):
-        raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
+    address = [model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked]
+    if address != list(range(model.nq)):
+        order = ", ".join(model.joint(i).name for i in range(model.njnt))
+        raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {order}")
     stiffen_friction(model)
-    soften_table(model, robot)
+    _soften_table(model, robot)
     return model
 
 
@@ -87,10 +89,15 @@ def build_spec(
     locked: tuple[str, ...] = (),
     bare: bool = False,
 ) -> mujoco.MjSpec:
-    """The same before compilation, for a scene that holds several robots (report/view/scene.py)."""
-    spec = _read(robot)
+    """Return `build_model` before compilation, for a scene of several robots (report/view/scene.py)."""
+    spec = read_mjcf(robot.mjcf)
+    names = sorted(j.name for j in spec.joints)
+    if missing := [name for name in robot.joint_names if name not in names]:
+        raise RobotError(f"{robot.mjcf}: robot.toml names joint '{missing[0]}', the MJCF has: {', '.join(names)}")
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
-    period = robot.dt if dt is None else _positive(dt)
+    period = robot.dt if dt is None else dt
+    if not period > 0:
+        raise UsageError(f"dt is {dt}; the control period in seconds must be positive")
     spec.option.timestep = period / robot.steps_per(period)
     spec.option.tolerance = TOLERANCE
     for joint in spec.joints:
@@ -99,8 +106,9 @@ def build_spec(
     if not robot.contacts:
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     _set_joints(spec, robot)
-    add_table(spec, robot)
-    _lock(spec, robot, locked)
+    _add_table(spec, robot)
+    for name in locked:
+        freeze(spec, spec.joint(name), robot.qpos_home[robot.joint_names.index(name)])
     _add_actuators(spec, robot, locked)
     if bare:
         spec.compiler.discardvisual = True
@@ -109,20 +117,12 @@ def build_spec(
     return spec
 
 
-def _qpos_address(model: mujoco.MjModel, robot: RobotSpec, locked: tuple[str, ...] = ()) -> np.ndarray:
-    """Index of each of the robot's free joints in qpos, (n − locked,)."""
-    return np.array([model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked])
-
-
 def idle_joints(robot: RobotSpec, moved: tuple[str, ...]) -> tuple[str, ...]:
-    """Joints of the limbs on which no joint moves: with a fixed base they share no dynamics with the rest.
+    """Return the joints of limbs without a moving joint: on a fixed base they share no dynamics with the rest.
 
     Args:
         robot: The robot.
         moved: Names of the joints that a command moves, or holds away from home.
-
-    Returns:
-        Names in the robot's order, to be given to build_model as `locked`.
     """
     model = build_model(robot)
     limb = {name: int(model.dof_treeid[model.joint(name).dofadr[0]]) for name in robot.joint_names}
@@ -139,9 +139,7 @@ def qpos_range(model: mujoco.MjModel) -> np.ndarray:
 def model_hash(robot: RobotSpec) -> str:
     """Return 12 hex digits of the nominal simulator: every value of its compiled model that determines its motion.
 
-    Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written
-    (gaponet.robot.fingerprint); reports print it beside every score, since two public MJCFs of one robot can differ by
-    a factor of 50 in gain.
+    Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written.
     """
     if "_model_hash" not in vars(robot):
         text = [
@@ -183,19 +181,8 @@ def require_same_robot(
     return own
 
 
-def _read(robot: RobotSpec) -> mujoco.MjSpec:
-    spec = read_mjcf(robot.mjcf)
-    known = {j.name for j in spec.joints}
-    missing = [name for name in robot.joint_names if name not in known]
-    if missing:
-        raise RobotError(
-            f"{robot.mjcf}: robot.toml names joint '{missing[0]}', the MJCF has: {', '.join(sorted(known))}"
-        )
-    return spec
-
-
 def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
-    """Identified values over the MJCF's."""
+    """Set identified values in place of the MJCF's."""
     for i, name in enumerate(robot.joint_names):
         joint = spec.joint(name)
         for field in ("armature", "frictionloss"):
@@ -213,13 +200,8 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
 
 
-def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
-    for name in locked:
-        freeze(spec, spec.joint(name), robot.qpos_home[robot.joint_names.index(name)])
-
-
 def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:
-    """Delete what is fixed to a standing body and carries neither a joint nor a payload."""
+    """Delete bodies that are fixed to a standing body and carry neither a joint nor a payload."""
     for child in list(body.bodies):
         limb = [child, *child.find_all("body")]
         if not any(len(part.joints) or part.name in keep for part in limb):
@@ -273,11 +255,63 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
         )  # fmt: skip
 
 
-def _mjcf_order(model: mujoco.MjModel) -> str:
-    return ", ".join(model.joint(i).name for i in range(model.njnt))
+Array = np.ndarray
+
+TABLE = "gaponet_table"
+IMPEDANCE = 0.5  # of the contact: with a constant one its stiffness in N/m does not depend on the posture
+SIZE = 2.0  # m, for looking at
 
 
-def _positive(dt: float) -> float:
-    if not dt > 0:
-        raise UsageError(f"dt is {dt}; the control period in seconds must be positive")
-    return dt
+def _add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
+    """Add a plane, a sphere per tip, and contacts between them alone, if the robot has a table."""
+    if robot.table is None:
+        return
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid's stiffness depends on friction
+    for geom in spec.geoms:
+        geom.contype, geom.conaffinity = 0, 0
+    for pair in list(spec.pairs):
+        spec.delete(pair)
+    # Marked as touching, though by nothing but the pairs below: what touches nothing is not compiled (bare).
+    spec.worldbody.add_geom(
+        name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(SIZE, SIZE, 0.1), pos=(0, 0, robot.table.height),
+        contype=2, conaffinity=0, rgba=(0.55, 0.5, 0.45, 1),
+    )  # fmt: skip
+    for i, tip in enumerate(robot.tips):
+        body = spec.body(tip.body)
+        if body is None:
+            raise RobotError(f"{robot.mjcf}: a [[tip]] names body '{tip.body}', which is missing")
+        name = f"{TABLE}_tip_{i}"
+        body.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(tip.radius, 0, 0), pos=tip.pos, mass=0.0,
+            contype=0, conaffinity=4, rgba=(0.3, 0.3, 0.3, 1),
+        )  # fmt: skip
+        slide = robot.table.friction
+        spec.add_pair(
+            geomname1=name, geomname2=TABLE, condim=3, friction=(slide, slide, 0.005, 1e-4, 1e-4),
+            solimp=(IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0),
+        )  # fmt: skip
+
+
+def _soften_table(model: mujoco.MjModel, robot: RobotSpec) -> None:
+    """Give the contacts of a compiled model the table's stiffness, critically damped."""
+    if robot.table is not None:
+        model.pair_solref[:] = _solref(model, np.array(robot.table.stiffness))
+
+
+def write_table(batch: Batch, model: mujoco.MjModel, height: Array, friction: Array, stiffness: Array) -> None:
+    """Give every simulation of a batch a table of its own, (nsim,) m, 1 and N/m; their model has one."""
+    batch.expand("geom_pos")[:, model.geom(TABLE).id, 2] = height
+    batch.expand("pair_friction")[:, :, :2] = friction[:, None, None]
+    batch.expand("pair_solref")[:] = _solref(model, stiffness)
+
+
+def _solref(model: mujoco.MjModel, stiffness: Array) -> Array:
+    """The pairs' direct solref for stiffnesses (…) in N/m, (…, npair, 2).
+
+    A contact at rest pushes with d²k/((1 − d)·w) N per metre, w the mobility of the bodies that touch.
+    """
+    bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
+    mobility = model.body_invweight0[bodies, 0].sum(axis=0)
+    k = stiffness[..., None] * (1 - IMPEDANCE) * mobility / IMPEDANCE**2
+    return np.stack([-k * IMPEDANCE**2, -2 * np.sqrt(k) * IMPEDANCE], axis=-1)

@@ -55,11 +55,8 @@ def replay(
         corrector: Corrects targets; None for the nominal simulator.
         nthread: Threads, 0 for all cores.
         progress: Called with control steps done and in all.
-        lock_idle: Clamp limbs that no command moves at home: faster, and the same for others up to rounding.
-        creeps: Let friction creep as MuJoCo's own does.
-
-    Returns:
-        One simulated replay per sequence, in order.
+        lock_idle: Clamp limbs that no command moves at home: faster, and equal up to rounding for others.
+        creeps: Use MuJoCo's own friction, which creeps.
     """
     idle: list[tuple[str, ...]] = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
     locked = [_held(s, robot, limbs) for s, limbs in zip(sequences, idle, strict=True)]
@@ -141,7 +138,7 @@ def _roll_out(
     clamped: Clamped,
     creeps: bool,
 ) -> list[SimulatedReplay]:
-    """Sequences that have the same joints clamped."""
+    """Replay sequences that have the same joints clamped."""
     digest, locked, home = model_hash(robot), tuple(j for j, _ in clamped), np.array(robot.qpos_home)
     home[robot.index(locked)] = [at for _, at in clamped]
     robot = replace(robot, qpos_home=home)
@@ -175,8 +172,8 @@ def rollout(
         touch: Rows after which a simulation goes on from the recording, (T, k).
 
     Returns:
-        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad; joints that are locked
-        stand at sim.robot.qpos_home. Rows of a sequence that is over are where it stood, and say nothing.
+        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad. Locked joints stand at
+        sim.robot.qpos_home. Rows after the end of a sequence have no meaning.
     """
     lengths, free = np.array([len(s) for s in sequences]), sim.robot.index(sim.joint_names)
     ctrl = np.zeros((lengths.max(), len(sequences), len(sim.robot.joint_names)))

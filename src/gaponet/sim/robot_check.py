@@ -31,7 +31,7 @@ ARMATURE = 1e-5  # kg·m²; less is none
 BURIED = 1e-4  # m inside each other: they collide
 
 
-class Growth(NamedTuple):
+class _Growth(NamedTuple):
     """Factor by which a small motion grows in a physics step, the joint that moves most, whether it turns back."""
 
     factor: float
@@ -212,7 +212,7 @@ def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Arra
         yield Finding("error", "step", text, (name,), {"growth": growth, "timestep": step, "armature": armature})
 
 
-def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, armature: float = 0.0) -> Growth:
+def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, armature: float = 0.0) -> _Growth:
     """How the worst small motion about a posture goes on, which targets hold against gravity."""
     model = copy(model)
     model.opt.timestep = timestep or model.opt.timestep
@@ -227,11 +227,11 @@ def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, arma
     slopes = np.zeros((2 * model.nv, 2 * model.nv))
     mujoco.mjd_transitionFD(model, data, 1e-6, True, slopes, None, None, None)
     if not np.isfinite(slopes).all():
-        return Growth(np.inf, 0, True)
+        return _Growth(np.inf, 0, True)
     values, vectors = np.linalg.eig(slopes)
     k = int(np.abs(values).argmax())
     joint = int(np.abs(vectors[: model.nv, k]).argmax())
-    return Growth(float(np.abs(values[k])), joint, bool(abs(np.angle(values[k])) > TURNS))
+    return _Growth(float(np.abs(values[k])), joint, bool(abs(np.angle(values[k])) > TURNS))
 
 
 def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:

@@ -3,13 +3,14 @@
 The encoder counts in steps. A motor that turns at all has a least torque (minimum PWM). Friction is larger at rest
 (Stribeck) and grows with the torque that the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024). MuJoCo
 integrates: the model only changes the actuator's bias and the limit of friction, so friction sticks as MuJoCo's does.
-The two terms of friction stand here once, for numpy, torch, Warp and numba (`advance`, for joint_rollouts.py); encoder
-steps and least torque stand in `advance` and in the kernel of sim/warp.py again. A MuJoCo model's actuator_user holds
-the parameters; without, nothing here runs.
+The model stands here twice: of arrays for numpy and torch, and of one joint for numba and Warp (`requested_torque`,
+`joint_friction`), which is faster. A MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
 """
 
 from __future__ import annotations
 
+import functools
+from importlib import import_module
 from typing import Any
 
 import mujoco
@@ -22,6 +23,7 @@ ServoTerms = dict[str, Any]  # name of SERVO_TERMS → values that broadcast to 
 
 SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
+DEADBAND_STEPS = 0.5  # encoder steps: a motor with a least torque rests while it reads a smaller error
 
 
 def present(terms: ServoTerms) -> ServoTerms:
@@ -60,12 +62,54 @@ def servo_torque(terms: ServoTerms, kp: Any, aim: Any, qpos: Any) -> Any:
     xp, read, deadband = array_module(qpos), qpos, 0.0
     if "encoder_step" in terms:
         step = terms["encoder_step"]
-        fine, deadband = step.clip(min=FINEST), 0.5 * step * kp
+        fine, deadband = step.clip(min=FINEST), DEADBAND_STEPS * step * kp
         read = xp.where(step > 0, xp.round(qpos / fine) * fine, qpos)
     torque = kp * (aim - read)
     if "min_torque" not in terms:
         return torque
     return xp.where(abs(torque) > deadband, xp.copysign(xp.maximum(abs(torque), terms["min_torque"]), torque), 0.0)
+
+
+def requested_torque(kp: Any, aim: Any, qpos: Any, least: Any, step: Any, deadband: Any) -> Any:
+    """Return `servo_torque` of one joint, in N·m, for numba and Warp; deadband in encoder steps."""
+    read = qpos
+    if step > 0.0:
+        read = np.rint(qpos / step) * step
+    torque = kp * (aim - read)
+    if abs(torque) > deadband * step * kp:
+        return np.sign(torque) * max(abs(torque), least)
+    return 0.0 * torque
+
+
+def joint_friction(
+    dry: Any, stribeck: Any, speed: Any, by_motor: Any, by_load: Any, qvel: Any, torque: Any, load: Any
+) -> Any:
+    """Return `friction_limit` of one joint, in N·m, for numba and Warp."""
+    limit = dry + passing_friction(by_motor, by_load, torque, load)
+    if stribeck > 0.0:
+        limit += resting_friction(stribeck, speed, qvel)
+    return limit
+
+
+def set_joints(
+    terms: Any, deadband: float, dry: Any, own_bias: Any, gain: Any, ctrl: Any, qpos: Any, qvel: Any, torque: Any,
+    load: Any, bias: Any, limit: Any,
+) -> None:  # fmt: skip
+    """Fill `bias` (unless terms[…, 4:] are zero) and `limit`, (nsim, nu), as ServoModel.before does; numba compiles it.
+
+    Args:
+        terms: In the order of SERVO_TERMS, (nsim, nu, terms).
+    """
+    for i in range(len(qpos)):
+        for j in range(qpos.shape[1]):
+            rest, speed, by_motor, by_load, least, step = terms[i, j]
+            limit[i, j] = joint_friction(
+                dry[i, j], rest, speed, by_motor, by_load, qvel[i, j], torque[i, j], load[i, j]
+            )
+            if least > 0.0 or step > 0.0:
+                kp, q = gain[i, j], qpos[i, j]
+                aim = ctrl[i, j] + own_bias[i, j] / kp
+                bias[i, j] = requested_torque(kp, aim, q, least, step, deadband) - kp * (ctrl[i, j] - q)
 
 
 def advance(
@@ -84,6 +128,7 @@ def advance(
         v, rows = np.ascontiguousarray(values[:, j].T), lengths[p]
         kp, dry, mass, offset, limit = v[0] * stiffer[p, j], v[2], v[3], v[4], v[6]
         rest, speed, by_motor, by_load, least, step = v[7], np.maximum(v[8], SLOWEST), v[9], v[10], v[11], v[12]
+        deadband = DEADBAND_STEPS * (least > 0)
         brake, own = np.maximum(kd[p, j] + np.minimum(v[1], 0.0), 0.0), np.maximum(v[1], 0.0)
         # A part of each command where it changes on the way.
         late = np.arange(count).reshape(-1, 1) / count - v[5] / periods[p]
@@ -99,15 +144,9 @@ def advance(
                     aim += share[part, c] * ctrl[j, p, min(max(at + 1, 0), rows - 1)]
                     load = here[3] * q[c] + here[1]
                     if has_terms:
-                        read = np.round(q[c] / step[c]) * step[c] if step[c] > 0 else q[c]
-                        torque = kp[c] * (aim - read)
-                        if least[c] > 0:
-                            turns = abs(torque) > 0.5 * step[c] * kp[c]
-                            torque = np.copysign(max(abs(torque), least[c]), torque) if turns else 0.0
+                        torque = requested_torque(kp[c], aim, q[c], least[c], step[c], deadband[c])
                         torque = min(max(torque - brake[c] * w[c], -limit[c]), limit[c])
-                        most = dry[c] + passing_friction(by_motor[c], by_load[c], torque, load)
-                        if rest[c] > 0:
-                            most += resting_friction(rest[c], speed[c], w[c])
+                        most = joint_friction(dry[c], rest[c], speed[c], by_motor[c], by_load[c], w[c], torque, load)
                     else:
                         torque, most = min(max(kp[c] * (aim - q[c]) - brake[c] * w[c], -limit[c]), limit[c]), dry[c]
                     net = torque - load - here[2] - own[c] * w[c]
@@ -122,6 +161,25 @@ def advance(
                 q[:], w[:] = qpos[j, p, t + 1], qvel[j, p, t + 1]
             if (t + 1) % thin == 0:
                 out[:, item, (t + 1) // thin] = q - qpos[j, p, t + 1]
+
+
+@functools.cache
+def compiled(function: Any) -> Any:
+    """Return a function of this file compiled by numba; None without numba, which is an extra."""
+    try:
+        numba, extending = import_module("numba"), import_module("numba.extending")
+    except ImportError:
+        return None
+    _extend(extending)
+    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+
+
+@functools.cache
+def _extend(extending: Any) -> None:
+    """Make functions of this file known to numba."""
+    extending.overload(exp)(lambda x: lambda x: np.exp(x))
+    for function in (passing_friction, resting_friction, requested_torque, joint_friction):
+        extending.register_jitable(function)
 
 
 class ServoModel:
@@ -148,10 +206,19 @@ class ServoModel:
         }
         self.frictionloss, self.bias = self._limit.copy(), self._bias[:, :, 0].copy()
         self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
+        self._set_joints = compiled(set_joints)
+        self._take_terms()
+
+    def _take_terms(self) -> None:
+        """Take the present values of the terms for the steps to come."""
         self.active = present(self.values)
+        none = np.zeros(self._force.shape)
+        self._packed = np.stack([self.active.get(name, none) for name in SERVO_TERMS], axis=-1)
+        self._deadband = DEADBAND_STEPS * ("min_torque" in self.active)
 
     def reset(self, ids: Array, target: Array) -> None:
         """Begin again for simulations `ids`, which were put into a state, under position targets (k, nu) rad."""
+        self._take_terms()
         asked = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
         self.torque[ids] = asked.clip(*np.moveaxis(self.force_range[ids], -1, 0))
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
@@ -164,13 +231,21 @@ class ServoModel:
         return np.broadcast_to(self.model.actuator_forcerange, (*self._force.shape, 2)) if own is None else own
 
     def before(self) -> None:
-        """Set bias and friction for the next physics step."""
-        terms, gain, qpos = self.active, self._gain[:, :, 0], self._qpos
-        if "encoder_step" in terms or "min_torque" in terms:
-            # MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is under way.
-            aim = self._ctrl + self.bias / gain
-            self._bias[:, :, 0] = servo_torque(terms, gain, aim, qpos) - gain * (self._ctrl - qpos)
-        self._limit[:] = friction_limit(terms, self.frictionloss, self._qvel, self.torque, self.load)
+        """Set bias and friction for the next physics step.
+
+        MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is under way.
+        """
+        gain, bias, qpos = self._gain[:, :, 0], self._bias[:, :, 0], self._qpos
+        state = (self._qvel, self.torque, self.load)
+        if self._set_joints is not None:
+            self._set_joints(
+                self._packed, self._deadband, self.frictionloss, self.bias, gain, self._ctrl, qpos, *state, bias,
+                self._limit,
+            )  # fmt: skip
+            return
+        if "encoder_step" in self.active or "min_torque" in self.active:
+            bias[:] = servo_torque(self.active, gain, self._ctrl + self.bias / gain, qpos) - gain * (self._ctrl - qpos)
+        self._limit[:] = friction_limit(self.active, self.frictionloss, *state)
 
     def after(self, ids: Any = None) -> None:
         """Store torque and load after a physics step of these simulations."""

@@ -34,32 +34,35 @@ _Numbers: Any = warp.array2d(dtype=warp.types.vector(len(SERVO_TERMS), float))  
 _Parameters: Any = warp.array2d(dtype=warp.types.vector(10, float))  # of an actuator's gain or bias
 
 
-def _warp_function(function: Any) -> Any:
-    """Return a function of sim/servo.py for kernels, with Warp's exponential."""
-    copied = FunctionType(function.__code__, {"exp": warp.exp, "Any": Any}, function.__name__)
+def _warp_function(function: Any, **others: Any) -> Any:
+    """Return a function of sim/servo.py for kernels, with Warp's functions in place of NumPy's."""
+    names = {"np": warp, "exp": warp.exp, "Any": Any} | others
+    copied = FunctionType(function.__code__, names, function.__name__)
     copied.__annotations__ = function.__annotations__
     return warp.func(copied)
 
 
-_passing, _resting = _warp_function(servo.passing_friction), _warp_function(servo.resting_friction)
+_torque = _warp_function(servo.requested_torque)
+_friction = _warp_function(
+    servo.joint_friction,
+    passing_friction=_warp_function(servo.passing_friction),
+    resting_friction=_warp_function(servo.resting_friction),
+)
 
 
 @warp.kernel(enable_backward=False)
 def _set_servos(
-    law: _Numbers, dead: float, offset: _Floats, dry: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats,
+    terms: _Numbers, deadband: float, offset: _Floats, dry: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats,
     qvel: _Floats, torque: _Floats, load: _Floats, bias: _Parameters, limit: _Floats,
 ) -> None:  # fmt: skip
-    """ServoModel.before: bias and friction of servo j of world i for the next physics step."""
+    """Set bias and friction of servo j of world i for the next physics step, as ServoModel.before does."""
     i, j = warp.tid()
-    own, kp, q = law[i, j], gain[i, j][0], qpos[i, j]
-    limit[i, j] = dry[i, j] + _passing(own[2], own[3], torque[i, j], load[i, j])
-    limit[i, j] += _resting(own[0], max(own[1], servo.SLOWEST), qvel[i, j])
-    least, step = own[4], own[5]
+    own, kp, q = terms[i, j], gain[i, j][0], qpos[i, j]
+    speed, least, step = max(own[1], servo.SLOWEST), own[4], own[5]
+    limit[i, j] = _friction(dry[i, j], own[0], speed, own[2], own[3], qvel[i, j], torque[i, j], load[i, j])
     if least > 0.0 or step > 0.0:
-        read = warp.where(step > 0.0, warp.rint(q / max(step, servo.FINEST)) * step, q)
-        asked = kp * (ctrl[i, j] + offset[i, j] / kp - read)
-        turning = warp.sign(asked) * max(abs(asked), least)
-        bias[i, j][0] = warp.where(abs(asked) > dead * step * kp, turning, 0.0) - kp * (ctrl[i, j] - q)
+        aim = ctrl[i, j] + offset[i, j] / kp
+        bias[i, j][0] = _torque(kp, aim, q, least, step, deadband) - kp * (ctrl[i, j] - q)
 
 
 class _Worlds:
@@ -89,19 +92,13 @@ class _Worlds:
 
     def _inputs(self, servos: servo.ServoModel, rows: np.ndarray) -> list[Any]:
         """Return the arguments of _set_servos."""
-        m, d, dead = self.model, self.data, 0.5 * servos.values["min_torque"].any()
-        stated = np.stack([servos.values[name][rows] for name in SERVO_TERMS], axis=-1)
+        model, data = self.model, self.data
+        deadband = servo.DEADBAND_STEPS * servos.values["min_torque"].any()
+        terms = np.stack([servos.values[name][rows] for name in SERVO_TERMS], axis=-1)
         own = [warp.array(x[rows], dtype=float) for x in (servos.bias, servos.frictionloss)]
-        state = [d.ctrl, d.qpos, d.qvel, d.actuator_force, d.qfrc_bias]
-        return [
-            warp.array(stated, dtype=_Numbers.dtype),
-            dead,
-            *own,
-            m.actuator_gainprm,
-            *state,
-            m.actuator_biasprm,
-            m.dof_frictionloss,
-        ]
+        state = [data.ctrl, data.qpos, data.qvel, data.actuator_force, data.qfrc_bias]
+        return [warp.array(terms, dtype=_Numbers.dtype), deadband, *own, model.actuator_gainprm, *state,
+                model.actuator_biasprm, model.dof_frictionloss]  # fmt: skip
 
     def bind(self, name: str) -> Tensor:
         """A live view of a field of all worlds, (nworld, …)."""

@@ -28,6 +28,7 @@ from gaponet.sysid.axes import (
     Bounds,
     Values,
     large_changes,
+    with_values,
 )
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, descend
@@ -211,12 +212,10 @@ class _Problem:
 
     def robot_with(self, x: Array) -> RobotSpec:
         """Return the robot with parameters x (P,); joints that are not operated keep theirs."""
-        values = {f: v[0] for f, v in self.values(x[None]).items() if f in FIELDS}
+        every = self.values(x[None])
+        values: Values = {f: every[f][0] for f in FIELDS}
         values |= {f: np.maximum(values[f], 0.0) for f in ("delay", "frictionloss")}  # a bound is met but for rounding
-        joints = enumerate(self.rollouts.robot.operated)
-        return self.rollouts.robot.with_servos(
-            {j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in joints}
-        )
+        return with_values(self.rollouts.robot, values)
 
     def rms(self, x: Array) -> float:
         """Return the RMS error of the windows, rad."""

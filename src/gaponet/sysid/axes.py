@@ -6,6 +6,7 @@ armature as a time squared, with bounds that hold for any motor. The gains of a 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
 
@@ -51,6 +52,13 @@ def first_values(robot: RobotSpec) -> Values:
     dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
     passive = {f: np.array(getattr(model, f"dof_{f}")[dof]) for f in ("damping", "frictionloss", "armature")}
     return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS)}
+
+
+def with_values(robot: RobotSpec, values: Mapping[str, Array]) -> RobotSpec:
+    """Return the robot with values (n,) of its operated joints, rounded to 6 digits."""
+    return robot.with_servos({
+        j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in enumerate(robot.operated)
+    })  # fmt: skip
 
 
 def large_changes(first: Values) -> Values:

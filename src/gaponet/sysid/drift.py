@@ -132,7 +132,7 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     scatter = trusted * widened(information, overdispersion) + (clusters - 1) * gradient_covariance(grouped.gradients)
     gradients, rows = grouped.gradients.sum(axis=1), own.rows.astype(int).tolist()
     each = [
-        _Joint.of(j, fields, uncertainty, information[i], gradients[i], scatter[i] / freedom, rows[i])
+        _Joint(j, uncertainty, information[i], gradients[i], scatter[i] / freedom, rows[i])
         for i, j in enumerate(joints)
     ]
     moved = [m for f in COMMON_FIELDS if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))]
@@ -159,9 +159,8 @@ def directions(uncertainty: ParameterUncertainty, joint: str) -> Array:
     return found
 
 
-@dataclass
 class _Joint:
-    """Gradient of one joint that changes are to explain.
+    """Gradient of one joint that changes are to explain, beyond that of the identification.
 
     Attributes:
         gradient: (Q,).
@@ -171,36 +170,20 @@ class _Joint:
         min_effect: Least effect that counts, rad.
     """
 
-    name: str
-    fields: tuple[str, ...]
-    gradient: Array
-    columns: Array
-    weight: Array
-    effect: Array
-    min_effect: float
-
-    @classmethod
-    def of(
-        cls,
-        joint: str,
-        fields: tuple[str, ...],
-        uncertainty: ParameterUncertainty,
-        information: Array,
-        gradient: Array,
-        scatter: Array,
+    def __init__(
+        self, name: str, uncertainty: ParameterUncertainty, information: Array, gradient: Array, scatter: Array,
         rows: int,
-    ) -> _Joint:
-        """Make the gradient that remains beyond that of the identification."""
-        step = uncertainty.array(joint, "gauss_newton_step")
-        step_covariance = uncertainty.array(joint, "gauss_newton_covariance")
-        way = directions(uncertainty, joint)
+    ) -> None:  # fmt: skip
+        self.name, self.fields = name, (*uncertainty.fields, PLAY)
+        step_covariance, by_field = uncertainty.array(name, "gauss_newton_covariance"), directions(uncertainty, name)
         variance = scatter + information @ step_covariance @ information
         size = np.sqrt(np.maximum(np.diag(variance), 1e-30))
-        weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
-        effect = ERROR_SCALE_RAD * np.sqrt(np.maximum(np.diag(way.T @ information @ way), 0.0) / max(rows, 1))
-        min_effect = MIN_EFFECT_RATIO * uncertainty.joints[joint].residual_rms
-        rest = -gradient - information @ step
-        return cls(joint, fields, rest, information @ way, weight, effect, min_effect)
+        self.weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
+        squares = np.maximum(np.diag(by_field.T @ information @ by_field), 0.0) / max(rows, 1)
+        self.effect = ERROR_SCALE_RAD * np.sqrt(squares)
+        self.min_effect = MIN_EFFECT_RATIO * uncertainty.joints[name].residual_rms
+        self.gradient = -gradient - information @ uncertainty.array(name, "gauss_newton_step")
+        self.columns = information @ by_field
 
     def explained(self, threshold: float) -> tuple[list[ParameterChange], ParameterChange | None]:
         """Return the significant changes with enough effect, and the largest change of one parameter alone."""

@@ -89,7 +89,7 @@ def widened(information: Array, overdispersion: Array) -> Array:
     return np.asarray(root[..., :, None] * information * root[..., None, :])
 
 
-def clustered(x: Array, window: Array) -> tuple[Array, Array]:
+def _clustered(x: Array, window: Array) -> tuple[Array, Array]:
     """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster, (C,)."""
     cluster, parts = cluster_of_rows(window)
     each = np.zeros((len(x), int(cluster.max()) + 1, *x.shape[2:]))
@@ -135,10 +135,10 @@ def evidence(
     play = 0.5 / ERROR_SCALE_RAD * side * (rollouts.counted & rollouts.recorded[..., None])
     jac = np.concatenate([jac, play.reshape(bounds.n, -1, 1)], axis=-1)
     weight = 1 / np.sqrt(1 + here**2)
-    gradients, window = clustered(jac * (weight * here)[..., None], rollouts.window)
+    gradients, window = _clustered(jac * (weight * here)[..., None], rollouts.window)
     each = ((j[None, :, :, None], (w[:, None] * j)[None, :, None, :]) for j, w in zip(jac, weight, strict=True))
     # A joint at a time, for memory.
-    information = np.concatenate([clustered(a * b, rollouts.window)[0] for a, b in each])
+    information = np.concatenate([_clustered(a * b, rollouts.window)[0] for a, b in each])
     names = [f"{p.meta.motion}{f' ({p.meta.repetition})' * bool(p.meta.repetition)}" for p in parts]
     unique = list(dict.fromkeys(names))
     recording = np.array([unique.index(name) for name in names])

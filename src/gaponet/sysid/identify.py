@@ -25,7 +25,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import DEFAULT_TERMS, SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Judge, JudgedFold, Split, cross_validation
-from gaponet.sysid.axes import CLASSIC, Bounds, Values
+from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.motion_limits import stop_questions, with_speed_limits, with_stops
 from gaponet.sysid.problem import (
@@ -52,7 +52,7 @@ JOINTS_TIME_SHARE, ROBOT_TIME_SHARE, TERMS_TIME_SHARE = 0.3, 0.4, 0.3  # of a ti
 Progress = Callable[[float, float, str], None]  # iterations done, in all, what is fitted and its error
 
 
-class SearchProgress:
+class _SearchProgress:
     """Progress of the searches; and the time that each may take, where the time is limited."""
 
     def __init__(self, seconds: float | None, terms: int, fits: int, progress: Progress) -> None:
@@ -137,13 +137,13 @@ def identify(
     options = (splits, validation, windows, terms, table, shared, nthread, progress, stops)
 
     def fit(one: RobotSpec, seconds: float | None) -> Identified:
-        fitted = fit_robot(sequences, one, *options, seconds)
+        fitted = _fit_robot(sequences, one, *options, seconds)
         return with_torque(fitted, splits, one, nthread) if validation else fitted
 
     return with_speed_limits(fit, sequences, robot, budget) if validation else fit(robot, budget)
 
 
-def fit_robot(
+def _fit_robot(
     sequences: ListOf[Sequence], robot: RobotSpec, splits: ListOf[Split], validation: ListOf[Sequence], windows: int,
     terms: tuple[Term, ...], table: bool, shared: bool, nthread: int, progress: Progress, stops: bool,
     budget: float | None,
@@ -160,7 +160,7 @@ def fit_robot(
     judge = Judge([
         JudgedFold(held_out or fits[0].rollouts.parts, robot, contact, nthread) for _, held_out in splits
     ])  # fmt: skip
-    searches = SearchProgress(budget, len(terms), len(fits), progress)
+    searches = _SearchProgress(budget, len(terms), len(fits), progress)
     wholes, each = zip(*(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True)
     candidates = {name: [one[name] for one in each] for name in each[0]}
     chosen, values = judge.best(candidates)
@@ -178,7 +178,7 @@ def fit_robot(
         values, chosen = mine, "whole"
         errors.std |= {robot.operated[i]: {} for i in places}
 
-    fitted, table_fit = joints.robot_with(values[-1]) if chosen != "given" else robot, None
+    fitted, table_fit = with_values(robot, values[-1]) if chosen != "given" else robot, None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, contact), min(h.min() for h in heights)
         tell = lambda error: searches.finish(f"table {error * 1e3:.2f} mrad")  # noqa: E731
@@ -209,7 +209,9 @@ def fit_robot(
     )  # fmt: skip
 
 
-def _classic_candidates(joints: JointFit, searches: SearchProgress, nthread: int) -> tuple[RobotFit, dict[str, Values]]:
+def _classic_candidates(
+    joints: JointFit, searches: _SearchProgress, nthread: int
+) -> tuple[RobotFit, dict[str, Values]]:
     """Fit the classic fields, joints by themselves and then together; return the whole robot's fit and candidates."""
     bounds, names = joints.bounds, joints.robot.operated
     searches.begin()
@@ -231,7 +233,7 @@ def _classic_candidates(joints: JointFit, searches: SearchProgress, nthread: int
 
 def _with_terms(
     fits: ListOf[JointFit], wholes: ListOf[RobotFit], judge: Judge, terms: tuple[Term, ...], values: list[Values],
-    base: list[Values], searches: SearchProgress,
+    base: list[Values], searches: _SearchProgress,
 ) -> tuple[tuple[Comparison, ...], list[Values]]:  # fmt: skip
     """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted."""
     comparisons = list[Comparison]()
@@ -248,7 +250,7 @@ def _with_terms(
 
 
 def _fit_term(
-    term: str, joints: JointFit, whole: RobotFit, values: Values, searches: SearchProgress
+    term: Term, joints: JointFit, whole: RobotFit, values: Values, searches: _SearchProgress
 ) -> tuple[Values, Values | None]:
     """Fit a term from values (n,): joints by themselves, and from there the whole robot, if it simulates the term."""
     names = joints.robot.operated

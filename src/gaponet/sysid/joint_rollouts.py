@@ -11,8 +11,6 @@ from __future__ import annotations
 import copy
 import os
 from concurrent.futures import ThreadPoolExecutor
-from importlib import import_module
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -28,13 +26,7 @@ from gaponet.sim.batch import ramped
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import friction_limit, present, servo_torque
 
-try:
-    numba = import_module("numba.extending")  # an extra, eight times as fast as numpy
-    numba.overload(servo.exp)(lambda x: lambda x: np.exp(x))
-    numba.register_jitable(servo.passing_friction), numba.register_jitable(servo.resting_friction)
-    advance: Any = import_module("numba").njit(cache=True, nogil=True, error_model="numpy")(servo.advance)
-except ImportError:
-    advance = None
+advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
 ERROR_SCALE_RAD = 0.01  # errors beyond count linearly (soft L1), so that one blocked joint does not decide
 ROW_PERIOD_S = 0.01  # between rows that are compared

@@ -6,7 +6,6 @@ import copy
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -36,23 +35,7 @@ UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
 MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
 
 
-class Rollouts(Protocol):
-    """Simulated windows of recordings for many candidates.
-
-    Attributes:
-        window: Window of each row of the flattened errors, (rows,).
-        rows: Number of rows that count, of each joint, (n,).
-    """
-
-    @property
-    def window(self) -> Array: ...
-    @property
-    def rows(self) -> Array: ...
-    def flat_errors(self, values: Values) -> Array:
-        """Return q_sim − q_real of candidates (k, n), (k, n, rows) rad."""
-
-
-class GainPrior:
+class _GainPrior:
     """Prior of kp and armature around the robot file's values.
 
     Its weight decreases with the residual of the best fit and increases with the residual's correlation time.
@@ -100,28 +83,22 @@ class GainPrior:
 class FitProblem:
     """Least-squares problem of n joints: rollouts of one kind, bounds and the prior."""
 
-    rollouts: Rollouts
+    rollouts: JointRollouts | RobotRollouts
     robot: RobotSpec
     bounds: Bounds
-    prior: GainPrior
+    prior: _GainPrior
     physics_step: float  # s
 
-    def errors(self, values: Values, rollouts: Rollouts | None = None) -> Array:
+    def errors(self, values: Values, rollouts: JointRollouts | None = None) -> Array:
         """Return errors of candidates (k, n), (k, n, rows + 2) in ERROR_SCALE_RAD; the last two are the prior's."""
         errors = (rollouts or self.rollouts).flat_errors(values)
         return np.concatenate(
             [errors / np.float32(ERROR_SCALE_RAD), self.prior.errors(values)], axis=2, dtype=np.float32
         )
 
-    def of_axes(self, axes: Axes, rollouts: Rollouts | None = None) -> Errors:
+    def of_axes(self, axes: Axes, rollouts: JointRollouts | None = None) -> Errors:
         """Return `errors` as a function of values on axes."""
         return lambda x: self.errors(axes.values(x), rollouts)
-
-    def robot_with(self, values: Values) -> RobotSpec:
-        """Return the robot with values (n,)."""
-        return self.robot.with_servos({
-            j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in enumerate(self.robot.operated)
-        })  # fmt: skip
 
 
 Report = Callable[[Array], None]  # called in each iteration with every problem's least cost
@@ -135,7 +112,7 @@ class JointFit(FitProblem):
 
     def __init__(self, rollouts: JointRollouts, robot: RobotSpec, bounds: Bounds) -> None:
         step = rollouts.dt / rollouts.count
-        super().__init__(rollouts, robot, bounds, GainPrior(bounds, rollouts.dt), step)
+        super().__init__(rollouts, robot, bounds, _GainPrior(bounds, rollouts.dt), step)
 
     def regressed(self) -> list[Values]:
         """Return starts that balance the recorded accelerations, with their own and with the file's kp."""

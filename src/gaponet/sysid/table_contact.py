@@ -19,8 +19,8 @@ from gaponet.robot.spec import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.metrics import exceeds_standard_error
+from gaponet.sim.model import write_table
 from gaponet.sim.replay import idle_limbs, rollout, rollout_errors
-from gaponet.sim.table import write_table
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SETTLE_S
 from gaponet.sysid.least_squares import soft_l1
 

@@ -26,7 +26,7 @@ from gaponet.sim.model import build_model
 from gaponet.sim.replay import motion_errors, replay
 from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.adapt import PRIOR_RAD
-from gaponet.sysid.axes import CLASSIC, MAX_DELAY_S, Bounds, large_changes
+from gaponet.sysid.axes import CLASSIC, MAX_DELAY_S, Bounds, large_changes, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import descend
 from gaponet.sysid.problem import JointFit, standard_errors, undetermined
@@ -292,9 +292,7 @@ class TorqueFit:
         x, _ = descend(
             np.zeros((1, *low.shape)) + START_DELAY * (np.array([*scale]) == "delay"), low, high, errors, ITERATIONS
         )
-        fitted = {f: values(x)[f][0] for f in scale}
-        joints = enumerate(start.operated)
-        return start.with_servos({j: {f: float(f"{v[i]:.6g}") for f, v in fitted.items()} for i, j in joints})
+        return with_values(start, {f: values(x)[f][0] for f in scale})
 
 
 def _place(mount: int, first: ListOf[float] | Array) -> tuple[float, float, float]:

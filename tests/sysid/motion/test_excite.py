@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gaponet.sysid.motion.excite import SIGNALS
+from gaponet.sysid.motion.library import SIGNALS
 
 DT = 0.01
 

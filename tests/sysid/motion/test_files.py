@@ -84,7 +84,7 @@ def test_a_stranger_is_named_with_the_valid_joints(arm, tmp_path):
     ("arrays", "message"),
     [
         ({"joint_names": np.array("shoulder")}, "array 'joint_names' must hold text in 1 dimensions"),
-        ({"joint_names": np.array(["shoulder"], object)}, "not a readable npz file"),
+        ({"joint_names": np.array(["shoulder"], object)}, r"not readable \(Object arrays"),
         ({"ctrl": np.array([["x"], ["y"]])}, "array 'ctrl' must hold numbers in 2 dimensions"),
         ({"ctrl": np.full((3, 1), np.nan)}, r"ctrl has shape \(3, 1\) or holds NaN"),
         ({"ctrl": np.full((3, 1), 1e9)}, "command 1 of shoulder is .* must be in radians"),
@@ -107,7 +107,7 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused_unread(arm, tmp_path):
     with pytest.raises(LogError, match=r"bomb\.npz: unpacks to more than 64 MiB"):
         read_motion(tmp_path / "bomb.npz", arm)
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04nothing")
-    with pytest.raises(LogError, match=r"bad\.npz: not a readable npz file \(BadZipFile"):
+    with pytest.raises(LogError, match=r"bad\.npz: not readable \(File is not a zip file"):
         read_motion(tmp_path / "bad.npz", arm)
 
 

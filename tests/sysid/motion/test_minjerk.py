@@ -1,6 +1,6 @@
 import numpy as np
 
-from gaponet.sysid.motion.minjerk import PEAK_SPEED, blend, fade, move_time, through
+from gaponet.sysid.motion.motion import PEAK_SPEED, blend, fade, move_time, through
 
 
 def test_a_move_starts_and_ends_at_rest_and_passes_the_middle_in_the_middle():

@@ -14,7 +14,7 @@ from gaponet.hw.control.output import Context, Output
 from gaponet.hw.control.phases import Phase, Trigger
 from gaponet.hw.control.plan import MAX_START_DRIFT_RAD, MIN_SEARCH_PERIOD_S, CollisionGuard, Plan, advance
 from gaponet.hw.targets.policy import NotYet, Policy
-from gaponet.sysid.motion.minjerk import blend
+from gaponet.sysid.motion.motion import blend
 from gaponet.sysid.motion.path_planner import Search, Trajectory
 
 MIN_GOOD_STATES = 5  # periods in a row without a fault before anything is commanded

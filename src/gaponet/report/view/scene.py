@@ -18,7 +18,7 @@ from gaponet.report.view.side_by_side import SideBySide
 from gaponet.robot.collision import Shapes
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_spec
-from gaponet.sysid.motion.posture import carriers
+from gaponet.sysid.motion.feasible import carriers
 
 PAYLOAD_RGBA = (0.93, 0.60, 0.10, 1.0)
 GHOST_RGBA = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy

@@ -24,9 +24,8 @@ from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 from gaponet.sysid.evidence import evidence
-from gaponet.sysid.motion.excite import SIGNALS
 from gaponet.sysid.motion.feasible import TORQUE_SHARE
-from gaponet.sysid.motion.library import Library, short
+from gaponet.sysid.motion.library import SIGNALS, Library, short
 from gaponet.sysid.motion.motion import GRID, Motion
 from gaponet.sysid.motion.whole_body import ANY
 from gaponet.sysid.uncertainty import ParameterUncertainty

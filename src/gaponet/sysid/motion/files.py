@@ -6,15 +6,14 @@ rad at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: 
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.files import atomic_write, write_text
+from gaponet.base.structure import read_npz
 from gaponet.data.describe.plausibility import require_radians
 from gaponet.data.sequence import MAX_PERIOD_S, MIN_PERIOD_S
 from gaponet.robot.spec import RobotSpec
@@ -54,7 +53,7 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
     require_radians(rows, joints, robot, lambda row: f"{path}: command {row + 1}")
     ctrl = np.repeat(robot.qpos_home[None], len(rows), axis=0)
     ctrl[:, columns] = rows
-    return Motion(path.stem, level_of(ctrl, robot), period, ctrl, joints)
+    return Motion(path.stem, _level_of(ctrl, robot), period, ctrl, joints)
 
 
 def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> None:
@@ -77,7 +76,7 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
     write_text(path, text + "\n")
 
 
-def level_of(ctrl: Array, robot: RobotSpec) -> str:
+def _level_of(ctrl: Array, robot: RobotSpec) -> str:
     """joint when one joint moves, upper_body when only operated joints and torso move, else whole_body."""
     moved = [name for name, span in zip(robot.joint_names, np.ptp(ctrl, axis=0), strict=True) if span > 1e-6]
     if len(moved) <= 1:
@@ -117,23 +116,10 @@ def _text(path: Path) -> tuple[list[str], Array, float | None]:
 
 
 def _npz(path: Path) -> tuple[list[str], Array, float | None]:
-    arrays: dict[str, Any] = {}
-    try:
-        with zipfile.ZipFile(path) as packed:
-            size = sum(part.file_size for part in packed.infolist())
-        if size <= LARGEST:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in ("joint_names", "ctrl", "dt") if name in file}
-    # Nothing in the block is ours. Of a damaged file zipfile, zlib, struct, tokenize and NumPy raise whatever they
-    # stumble over (fuzzing met six kinds), and document none: a list would turn the next kind into a traceback.
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise LogError(f"{path}: not a readable npz file ({reason}); write it again") from None
-    if size > LARGEST:
-        raise LogError(f"{path}: unpacks to more than {LARGEST >> 20} MiB; cut it into shorter motions")
+    arrays = read_npz(path, LogError, "give a motion of at most 10 hours, as gaponet excite writes it", LARGEST)
     for name, kind, dimensions in (("joint_names", "U", 1), ("ctrl", "fiu", 2), ("dt", "fiu", 0)):
         if name not in arrays and name != "dt":
-            raise LogError(f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'no other either'}")
+            raise LogError(f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'nothing'}")
         if name in arrays and (arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions):
             what = "text" if kind == "U" else "numbers"
             raise LogError(f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again")

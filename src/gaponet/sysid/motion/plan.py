@@ -1,8 +1,4 @@
-"""Which motions to play on a robot of which there is no data yet, how long, and the sheet to fill in.
-
-Sized for a network (virtual H1-2): after 9 minutes of recordings a third of the nominal error was left, and 41 minutes
-came within a tenth of 73. Identification needs the first few minutes.
-"""
+"""Plan of the first recordings of a robot: motions, their duration, and a sheet to fill in."""
 
 from __future__ import annotations
 

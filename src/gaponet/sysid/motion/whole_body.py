@@ -10,8 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.sysid.motion.minjerk import fade, through
-from gaponet.sysid.motion.motion import GRID
+from gaponet.sysid.motion.motion import GRID, fade, through
 from gaponet.sysid.motion.upper_body import Kit
 
 DURATION = 8.0  # s
