@@ -121,12 +121,8 @@ def evidence(
     rollouts, bounds = JointRollouts(parts, robot, contact, nthread), Bounds(robot, sequences)
     axes = Axes(bounds, fields, bounds.first)
     x = axes.normalize(bounds.first)
-    here, jac = (
-        y[0]
-        for y in slopes(
-            x[None], axes.high, lambda xs: rollouts.flat_errors(axes.values(xs)) / np.float32(ERROR_SCALE_RAD)
-        )
-    )
+    scaled_errors = lambda xs: rollouts.flat_errors(axes.values(xs)) / np.float32(ERROR_SCALE_RAD)  # noqa: E731
+    here, jac = (y[0] for y in slopes(x[None], axes.high, scaled_errors))
     jac = jac / axes.unit[:, None] * (axes.low < axes.high)[:, None]
     late = np.round(bounds.first["delay"][:, None] / rollouts.periods).astype(int)
     aim = np.array([[np.roll(c, d) for c, d in zip(*j, strict=True)] for j in zip(rollouts.ctrl, late, strict=True)])

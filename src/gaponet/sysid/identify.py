@@ -189,7 +189,7 @@ def _fit_robot(
         fitted = given if chosen == "given" and not (table_fit and table_fit.accepted) else fitted
     held_out = [HeldOut(list(validation), fitted)] if validation else []
     if len(splits) > 1:
-        robots = [one.robot_with(v) if chosen != "given" else given for one, v in zip(fits, values, strict=True)]
+        robots = [with_values(robot, v) if chosen != "given" else given for v in values]
         held_out = [
             HeldOut(part, replace(one, table=fitted.table)) for (_, part), one in zip(splits, robots, strict=False)
         ]

@@ -198,10 +198,8 @@ def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
     if "tau" in log.channels:
         time, values = log.channels["tau"].time, log.channels["tau"].values[:, j]
     else:
-        time, values = (
-            qpos.time,
-            gain[joint] * (ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j]),
-        )
+        time = qpos.time
+        values = gain[joint] * (ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j])
     later = time[: len(values)] >= time[0] + after
     told = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
     follows = None
@@ -371,9 +369,7 @@ def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
     sheet.writerow(["file", "motion", "unit", "payload", "estimated", "leave_out"])
     for r in labels.recordings:
         payload = r.payload if r.known is None else r.known
-        what = (
-            "unit" if r.known is not None else "unit, payload" if r.told else "unit, payload (not told by this joint)"
-        )
+        what = "unit" if r.known is not None else f"unit, payload{'' if r.told else ' (not told by this joint)'}"
         sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", what,
                         "yes" if r.copy or abs(r.late) > MAX_LAG_S else "no"])  # fmt: skip
     write_text(folder / "labels.csv", text.getvalue())

@@ -121,24 +121,20 @@ def fit_table(
     scene = _Scene(_most_wrong(scene, away), with_table, nthread)
     motions = tuple(dict.fromkeys(s.meta.motion for s in scene.parts))
     before = scene.errors(away)
-    heights = (
-        lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
-        if measured is None
-        else np.array([measured.height])
-    )
+    heights = lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
+    if measured is not None:
+        heights = np.array([measured.height])
     guesses = np.repeat(away, len(START_LOG_STIFFNESS) * len(heights), axis=0)
-    guesses[:, 0], guesses[:, 2] = (
-        np.tile(heights, len(START_LOG_STIFFNESS)),
-        np.repeat(START_LOG_STIFFNESS, len(heights)),
-    )
+    guesses[:, 0] = np.tile(heights, len(START_LOG_STIFFNESS))
+    guesses[:, 2] = np.repeat(START_LOG_STIFFNESS, len(heights))
     costs = soft_l1(scene.soft_errors(guesses)).reshape(len(START_LOG_STIFFNESS), -1)
     starts = guesses.reshape(*costs.shape, -1)[np.arange(len(START_LOG_STIFFNESS)), costs.argmin(axis=1)]
     pace, best_first = [np.inf], starts[costs.min(axis=1).argsort()]
     found = [_searched(scene, start, measured is not None, progress, pace) for start in best_first]
     tables = [_with_table(robot, x) for x, _ in found]
-    errors = (
-        [rollout_errors(validation, one, nthread).mean() for one in tables] if validation else [x[1] for x in found]
-    )
+    errors = [cost for _, cost in found]
+    if validation:
+        errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
     best = int(np.argmin(errors))
     without, within = (scene.mean(e)[0] for e in (before, scene.errors(found[best][0][None])))
     accepted = exceeds_standard_error(without - within)

@@ -16,10 +16,10 @@ from gaponet.experiments.virtual.trained_models import TrainedModel
 from gaponet.report.candidate import split_of_run
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
+from gaponet.sysid.motion.coordinated import BUILDERS
 from gaponet.sysid.motion.files import SUFFIXES, read_motion
 from gaponet.sysid.motion.library import Library
 from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.upper_body import BUILDERS
 
 VARIANT = 90  # recipes count from 0 and have no motion of this number
 LIBRARY_SEED = 2026  # recipes have others

@@ -24,10 +24,10 @@ from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 from gaponet.sysid.evidence import evidence
+from gaponet.sysid.motion.coordinated import ANY
 from gaponet.sysid.motion.feasible import TORQUE_SHARE
 from gaponet.sysid.motion.library import SIGNALS, Library, short
 from gaponet.sysid.motion.motion import GRID, Motion
-from gaponet.sysid.motion.whole_body import ANY
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 MOTIONS_OF_ALL_JOINTS, VARIANTS = 24, 4  # candidates with a signal in every joint; of tours and the like
@@ -130,10 +130,11 @@ class ExperimentDesign:
 def candidate_motions(library: Library, progress: Progress = no_progress) -> list[Motion]:
     """Return motions within a robot's limits: single joints, tours, and all joints at once with a signal each."""
     robot = library.robot
-    alone = (
-        [f"{s}-{short(j)}" for j in robot.operated for s in SIGNALS] if len(robot.operated) <= MAX_SINGLE_JOINTS else []
-    )
-    names = [*alone, *(f"{kind.__name__}-all-{v}" for kind in ANY for v in range(VARIANTS))]
+    single = robot.operated if len(robot.operated) <= MAX_SINGLE_JOINTS else ()
+    names = [
+        *(f"{s}-{short(j)}" for j in single for s in SIGNALS),
+        *(f"{kind.__name__}-all-{v}" for kind in ANY for v in range(VARIANTS)),
+    ]
     found = []
     for k in range(len(names) + MOTIONS_OF_ALL_JOINTS):
         progress(k, len(names) + MOTIONS_OF_ALL_JOINTS, "which motions fit the robot's limits")

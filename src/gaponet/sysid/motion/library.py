@@ -11,10 +11,9 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import RobotSpec
+from gaponet.sysid.motion.coordinated import BUILDERS, WHOLE_BODY, Kit, available
 from gaponet.sysid.motion.feasible import MAX_PAYLOAD, Feasibility, Stage, find_stage
 from gaponet.sysid.motion.motion import GRID, Motion, fade, move_time, through
-from gaponet.sysid.motion.upper_body import BUILDERS, Kit
-from gaponet.sysid.motion.whole_body import WHOLE_BODY, available
 
 Signal = Callable[[float, float, np.random.Generator, float], Array]  # (low, high, rng, dt) → (T,) rad
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import RobotSpec
+from gaponet.sysid.motion.coordinated import available
 from gaponet.sysid.motion.library import Library, short
 from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.whole_body import available
 
 FIRST = ("multisine", "steps", "holds", "chirp", "sweep", "trapezoids", "creep")  # what tells most in little time first
 ROUNDS = 50
