@@ -20,16 +20,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import exceeds_standard_error
 from gaponet.sim.replay import Corrector, rollout_errors
-from gaponet.sysid.axes import (
-    MAX_DAMPING_TIME_S,
-    MAX_DELAY_S,
-    MAX_KP_LOG_CHANGE,
-    MAX_OFFSET_RAD,
-    Bounds,
-    Values,
-    large_changes,
-    with_values,
-)
+from gaponet.sysid.axes import MAX_KP_LOG_CHANGE, MAX_ON_AXIS, Bounds, Values, large_changes, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, descend
 from gaponet.sysid.robot_rollouts import WINDOW_S, RobotRollouts, cut
@@ -168,11 +159,11 @@ class _Problem:
         self.scale = large_changes(first) | {"kp": LARGE_KP_LOG_CHANGE * one}
         least = {
             "kp": -MAX_KP_LOG_CHANGE * one, "damping": -first["damping"] - kd_slack,
-            "frictionloss": -first["frictionloss"], "offset": -MAX_OFFSET_RAD * one, "delay": -first["delay"],
+            "frictionloss": -first["frictionloss"], "offset": -MAX_ON_AXIS["offset"] * one, "delay": -first["delay"],
         }  # fmt: skip
         most = {
-            "kp": MAX_KP_LOG_CHANGE * one, "damping": MAX_DAMPING_TIME_S * kp, "frictionloss": kp,
-            "offset": MAX_OFFSET_RAD * one, "delay": MAX_DELAY_S - first["delay"],
+            "kp": MAX_KP_LOG_CHANGE * one, "damping": MAX_ON_AXIS["damping"] * kp, "frictionloss": kp,
+            "offset": MAX_ON_AXIS["offset"] * one, "delay": MAX_ON_AXIS["delay"] - first["delay"],
         }  # fmt: skip
         self.low, self.high = (
             np.append(np.stack([ends[f] / self.scale[f] for f in FIELDS], axis=1), [mass] * unknown_payload)[None]

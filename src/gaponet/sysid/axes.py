@@ -25,9 +25,7 @@ CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")  # th
 START_DELAY_S = 0.02  # a start without delay has no slope over it
 MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
 MAX_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.3
-MAX_DAMPING_TIME_S, MAX_DELAY_S, MAX_OFFSET_RAD = (
-    bounds[1] for f in ("damping", "delay", "offset") if (bounds := SERVO_FIELDS[f].bounds)
-)
+MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
 UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")  # of an unexcited joint, fitted as others move it
 BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it

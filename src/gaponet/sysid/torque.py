@@ -26,7 +26,7 @@ from gaponet.sim.model import build_model
 from gaponet.sim.replay import motion_errors, replay
 from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.adapt import PRIOR_RAD
-from gaponet.sysid.axes import CLASSIC, MAX_DELAY_S, Bounds, large_changes, with_values
+from gaponet.sysid.axes import CLASSIC, MAX_ON_AXIS, Bounds, large_changes, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import descend
 from gaponet.sysid.problem import JointFit, standard_errors, undetermined
@@ -278,7 +278,10 @@ class TorqueFit:
         one = np.ones(len(first["kp"]))
         scale = large_changes(first)
         least = {f: -first[f] / x for f, x in scale.items()} | {"offset": -10 * one}
-        most = dict.fromkeys(scale, 200 * one) | {"offset": 10 * one, "delay": (MAX_DELAY_S - first["delay"]) / 0.02}
+        most = dict.fromkeys(scale, 200 * one) | {
+            "offset": 10 * one,
+            "delay": (MAX_ON_AXIS["delay"] - first["delay"]) / 0.02,
+        }
         low, high = (np.stack([ends[f] for f in scale], axis=1) for ends in (least, most))
 
         def values(x: Array) -> dict[str, Array]:
