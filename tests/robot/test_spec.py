@@ -182,3 +182,11 @@ def test_identified_tables_belong_to_the_identified_robot_only(tmp_path):
     assert load_robot(tmp_path / "both").kp.tolist() == [20.0, 9.0]
     assert load_robot(tmp_path / "nominal").kp.tolist() == [20.0, 20.0]
     assert load_robot(tmp_path / "nominal").payload_mounts == robot.payload_mounts
+
+
+def test_a_saved_robot_has_the_gains_of_its_recordings(arm, tmp_path):
+    recorded = arm.with_gains((30.0, 20.0), (1.5, 0.5))
+    save_robot(recorded.with_servos({"elbow": {"kp": 25.0}}), tmp_path / "fitted")
+    back = load_robot(tmp_path / "fitted")
+    assert (back.nominal.kp.tolist(), back.nominal.kd.tolist()) == ([30.0, 20.0], [1.5, 0.5])
+    assert back.kp.tolist() == [30.0, 25.0]

@@ -56,7 +56,8 @@ def identify(
     A robot folder is written if motions that were not fitted are followed better than by the given robot; otherwise
     nothing is. Where fewer than three motions validate a set of joints, cross-validation over motions decides, and the
     robot is then fitted to all of them.
-    Recordings made with several gains are fitted together, each in a simulator with its own gains.
+    Recordings made with several gains are fitted together, each in a simulator with its own gains. If all state the same
+    gains, the robot folder has these.
 
     Args:
         dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
@@ -93,6 +94,8 @@ def identify(
     left_out = (all_units - set(units) if units else set()) | set(holdout_units)
     split = split_entries(data, tuple(sorted(left_out)))
     began, val, folder = time.monotonic(), data.sequences(split["val"]), Path(out)
+    if len(gains := {e.meta.recorded_gains for e in data.entries}) == 1:
+        spec = spec.with_gains(*gains.pop())
     seconds = None if budget is None else Budget.parse(budget).seconds
     if budget is not None and seconds is None:
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,7 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         raise UsageError(f"{folder}: is the robot's own folder; choose another")
     text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_HEADING)[0]
     text = IDENTIFIED_TABLES.sub("", re.sub(r"(?m)^mjcf\s*=.*\n", "", text)).rstrip() + "\n"
+    text = _with_gains(text, robot.nominal or robot)
     for name, default in (("carries_payload", True), ("gain_scale", 1.0)):
         value, text = getattr(robot, name), re.sub(rf"(?m)^{name}\s*=.*\n", "", text)
         text = text if value == default else f"{name} = {str(value).lower()}\n{text}"
@@ -62,7 +64,8 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         for name, file in copied.items():
             write_text(folder / name, file.read_text(encoding="utf-8"))
         write_text(folder / "robot.toml", text)
-    load_robot(folder)
+    if not np.allclose(load_robot(folder).before_identification.kd, (robot.nominal or robot).kd, rtol=1e-4):
+        raise RobotError(f"{robot.folder}/robot.toml: write each joint as a [[joint]] table of its own")
 
 
 def require_self_contained(folder: Path) -> None:
@@ -94,6 +97,20 @@ def has_stored_robot(holder: Path) -> bool:
 def stored_robot_holder(artifact: Path) -> Path:
     """Return the folder that stores a model's robot: an exported model itself, else its run."""
     return artifact if has_stored_robot(artifact) else artifact.parent
+
+
+def _with_gains(text: str, robot: RobotSpec) -> str:
+    """Return the text of a robot.toml with kp and kd of this robot in its [[joint]] tables where they differ."""
+    file = tomllib.loads(text)
+    scale = np.where(np.isin(robot.joint_names, robot.operated), robot.gain_scale, 1.0)
+    head, *tables = re.split(r"(?m)^(?=\[\[joint\]\])", text)
+    for i, table in enumerate(file["joint"]):
+        for name, values in (("kp", robot.kp), ("kd", robot.kd)):
+            value = float(values[robot.joint_names.index(table["name"])] / scale[i])
+            if not np.isclose(value, table.get(name, 0.0), rtol=1e-6):
+                rest = re.sub(rf"(?m)^{name}\s*=.*\n", "", tables[i])
+                tables[i] = rest.replace("[[joint]]\n", f"[[joint]]\n{name} = {value:.6g}\n", 1)
+    return head + "".join(tables)
 
 
 def _servo(robot: RobotSpec, joint: str) -> str:
