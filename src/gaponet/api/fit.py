@@ -56,8 +56,8 @@ def identify(
     A robot folder is written if motions that were not fitted are followed better than by the given robot; otherwise
     nothing is. Where fewer than three motions validate a set of joints, cross-validation over motions decides, and the
     robot is then fitted to all of them.
-    Recordings made with several gains are fitted together, each in a simulator with its own gains. If all state the same
-    gains, the robot folder has these.
+    Recordings made with several gains are fitted together, each in a simulator with its own gains. If all state
+    the same gains, the robot folder has these.
 
     Args:
         dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
