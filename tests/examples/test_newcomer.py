@@ -54,6 +54,7 @@ def test_the_robot_of_the_page_is_recorded(tmp_path, monkeypatch):
     assert Dataset(tmp_path / "data").entries[0].meta.virtual
 
 
+@pytest.mark.slow
 def test_the_change_of_the_page_reaches_numpy_and_what_numba_compiles(tmp_path):
     said = {}
     shutil.copytree(ROOT / "src" / "gaponet", tmp_path / "gaponet", ignore=shutil.ignore_patterns("__pycache__"))

@@ -49,7 +49,7 @@ def test_identification_finds_a_ramp_and_says_so(tmp_path, servos):
     robot = write_arm(tmp_path)
     servos["shoulder"]["target_speed"] = 0.6
     logs = recorded(robot.with_servos(servos), 7)
-    found = identify(logs[:5], robot, logs[5:], windows=5, terms=(), table=False, nthread=1)
+    found = identify(logs[:5], robot, logs[5:], windows=5, terms=(), table=False, nthread=1, folds=1)
     assert found.robot.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
     assert found.after < 0.1 * found.before
     assert found.comparisons[-1].name == "ramp"

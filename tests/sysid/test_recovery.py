@@ -54,7 +54,7 @@ def test_motors_of_half_the_torque_that_the_file_says_come_back(tmp_path):
     asked = [replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}")) for i, c in enumerate(jumps)]
     weak = robot.with_servos({joint: {"effort_limit": 2.5} for joint in robot.joint_names})
     parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replay(asked, weak), strict=True)]
-    found = identify(parts[:2], robot, parts[2:], windows=2, terms=("limit",), table=False)
+    found = identify(parts[:2], robot, parts[2:], windows=2, terms=("limit",), table=False, folds=1)
     assert [c.name for c in found.comparisons if c.accepted] == ["limit"]
     np.testing.assert_allclose(found.robot.effort_limit, 2.5, rtol=0.05)
     assert found.after < 0.1 * found.before
@@ -66,7 +66,7 @@ def test_a_joint_that_stands_while_another_swings_gives_way_as_it_did(tmp_path):
     swung = [replace(s, ctrl=s.ctrl * [0, 1]) for s in played(robot, robot, 3, 200)]
     true, told = (robot.with_servos({"shoulder": {"damping": d, "kp": 20.0}}) for d in (0.2, 2.0))
     parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(swung, replay(swung, true), strict=True)]
-    found = identify(parts[:2], told, parts[2:], windows=2, terms=(), table=False)
+    found = identify(parts[:2], told, parts[2:], windows=2, terms=(), table=False, folds=1)
     assert found.improved
     assert found.after < 0.1 * found.before
     assert any("shoulder: not determined" in text for text in found.warnings)

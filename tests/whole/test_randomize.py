@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from arm import commands, record, write_arm
 
 from gaponet.cli.main import main
@@ -23,6 +24,7 @@ def logs(robot, place, first, count, **how):
         data.append(replace(one, qpos=one.qpos + noise))
 
 
+@pytest.mark.slow
 def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
     robot = write_arm(tmp_path / "arm")
     logs(robot, tmp_path / "data", 0, 8, kp=0.8, delay=1)
