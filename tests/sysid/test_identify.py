@@ -8,7 +8,8 @@ from arm import TOML, commands, record, recordings, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.acceptance import Comparison, Judge, JudgedFold, cross_validation
+from gaponet.sim.metrics import Comparison
+from gaponet.sysid.acceptance import Judge, JudgedFold, cross_validation
 from gaponet.sysid.axes import Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.motion_limits import with_stops

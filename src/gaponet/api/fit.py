@@ -82,7 +82,8 @@ def identify(
     from gaponet.data.split import split_entries
     from gaponet.nn.training.budget import Budget
     from gaponet.robot.folder import save_robot
-    from gaponet.sysid.acceptance import MIN_RELATIVE_GAIN, HeldOut, held_out_errors
+    from gaponet.sim.metrics import MIN_RELATIVE_GAIN
+    from gaponet.sysid.acceptance import HeldOut, held_out_errors
     from gaponet.sysid.identify import identify as fit
 
     data, spec = as_dataset(dataset, robot)
@@ -333,8 +334,8 @@ def adapt_robot(
     """
     from gaponet.base.files import lock_folder
     from gaponet.robot.folder import save_robot
+    from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sim.replay import rollout_errors
-    from gaponet.sysid.acceptance import MIN_RELATIVE_GAIN
     from gaponet.sysid.adapt import FIELDS, adapt
     from gaponet.sysid.uncertainty import ParameterUncertainty
 

@@ -18,14 +18,14 @@ CUTOFF = 6.0  # Hz: above the joints' bandwidth, below encoder steps at 50 Hz
 
 
 def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Array:
-    """Torque of every joint by inertia, armature, Coriolis, gravity, damping and springs; no limits, no contacts.
+    """Return the torque of every joint by inertia, armature, Coriolis, gravity, damping and springs.
 
     Args:
         model: Nominal simulator with its payload (sim.model.build_model).
         qpos, qvel, qacc: (T, n), rad, rad/s, rad/s².
 
     Returns:
-        (T, n), N·m. Joint friction is left out: at rest its value is anything up to the limit.
+        (T, n), N·m, without limits, contacts and joint friction, which at rest is anything up to its limit.
     """
     data = mujoco.MjData(model)
     flags = model.opt.disableflags
@@ -41,14 +41,14 @@ def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Arra
 
 
 def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:
-    """Torque that holds each posture still, (T, n), N·m."""
+    """Return the torque that holds each posture, (T, n), N·m."""
     zero = np.zeros_like(qpos)
     return inverse_dynamics(model, qpos, zero, zero)
 
 
 def gravity_of(robot: RobotSpec) -> Callable[[Array, float, str], Array]:
-    """Gravity of the nominal model with a payload, as data.offsets wants it; each model is compiled once."""
-    return partial(_gravity, robot, {})  # other processes can be given it
+    """Return the static torque by postures, payload mass and side (data/offsets.py); it can be pickled."""
+    return partial(_gravity, robot, {})
 
 
 def _gravity(
@@ -65,7 +65,7 @@ def _gravity(
 
 
 def tips_of(robot: RobotSpec) -> Callable[[Array], Array] | None:
-    """Lowest point of any tip in postures (k, n), (k,) m; None where robot.toml names no tip."""
+    """Return the height of the lowest tip by postures (k, n), (k,) m; None if robot.toml names no tip."""
     return partial(_lowest_tip, build_model(replace(robot, table=None), bare=True), robot.tips) if robot.tips else None
 
 

@@ -20,6 +20,9 @@ from gaponet.robot.spec import RobotSpec
 
 THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
 HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
+MIN_RELATIVE_GAIN = 0.01  # of the mean error, where several motions judge
+MIN_RELATIVE_GAIN_ONE_MOTION = 0.1
+CONFIDENCE = 0.84  # one-sided level of Student's t: one standard error where motions are many
 _Row = dict[str, float]  # metrics of a sequence, or their means
 
 
@@ -31,9 +34,37 @@ def standard_error(values: Array) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
-def exceeds_standard_error(gains: Array) -> bool:
-    """Return whether the mean of gains (motions,) exceeds its standard error; whether a single gain is positive."""
-    return bool(gains.mean() > np.nan_to_num(standard_error(gains)))
+def confidence_factor(freedom: int) -> float:
+    """Return the standard errors that a mean with so many degrees of freedom needs to be significant (Student's t)."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, CONFIDENCE))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A candidate against another one by the errors of the motions that judge, (motions,) rad."""
+
+    name: str
+    before: Array
+    after: Array
+
+    @property
+    def gain(self) -> tuple[float, float]:
+        """Decrease of the mean error, and its paired standard error over motions, rad."""
+        gains = self.before - self.after
+        return float(gains.mean()), standard_error(gains)
+
+    @property
+    def accepted(self) -> bool:
+        """True if the mean error falls by more than 1 % and the paired relative gain exceeds one standard error
+        (Student's t); of a single motion by more than 10 %."""
+        freedom, least = len(self.before) - 1, MIN_RELATIVE_GAIN
+        if not freedom:
+            least = MIN_RELATIVE_GAIN_ONE_MOTION
+        relative = (self.before - self.after) / np.maximum(self.before + self.after, 1e-12)
+        significant = not freedom or relative.mean() > confidence_factor(freedom) * standard_error(relative)
+        return bool(significant and self.gain[0] > least * self.before.mean())
 
 
 @dataclass(frozen=True)

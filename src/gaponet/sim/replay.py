@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from gaponet.base.executor import LOCAL, open_pool
+from gaponet.base.progress import no_progress
 from gaponet.data.pair import SimulatedReplay
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
@@ -43,7 +44,7 @@ def replay(
     robot: RobotSpec,
     corrector: Corrector | None = None,
     nthread: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     lock_idle: bool = False,
     creeps: bool = False,
 ) -> list[SimulatedReplay]:
@@ -64,15 +65,9 @@ def replay(
     done = 0
     replays: dict[int, SimulatedReplay] = {}
     for chunk in _chunks(sequences, locked):
-        part = [sequences[i] for i in chunk]
-
-        def tell(k: int, before: int = done) -> None:
-            if progress is not None:
-                progress(before + k, total)
-
-        clamped = locked[chunk[0]]
-        runs = _roll_out(part, robot, corrector, nthread, tell, clamped, creeps)
-        replays |= dict(zip(chunk, runs, strict=True))
+        part, clamped = [sequences[i] for i in chunk], locked[chunk[0]]
+        tell = lambda k, before=done: progress(before + k, total)  # noqa: E731
+        replays |= dict(zip(chunk, _roll_out(part, robot, corrector, nthread, tell, clamped, creeps), strict=True))
         done += sum(len(s) - 1 for s in part)
     return [replays[i] for i in range(len(sequences))]
 
@@ -100,24 +95,18 @@ def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clampe
     """Return the joints that are clamped in a rollout, and where, rad: idle limbs at home, unrecorded joints where the
     recording says that they stood."""
     unknown = sequence.meta.unrecorded
-    names = tuple(j for j in robot.joint_names if j in idle or j in unknown)
-    at = sequence.qpos[0].astype(float)
-    return tuple(
-        (j, float(at[i] if j in unknown else robot.qpos_home[i])) for i, j in enumerate(robot.joint_names) if j in names
-    )
+    at = {
+        j: float(sequence.qpos[0, i] if j in unknown else robot.qpos_home[i]) for i, j in enumerate(robot.joint_names)
+    }
+    return tuple((j, angle) for j, angle in at.items() if j in idle or j in unknown)
 
 
 def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str, ...]]:
     """Return `idle_limbs` of each sequence."""
-    known: dict[frozenset[str], tuple[str, ...]] = {}
-    idle = []
-    for s in sequences:
-        away = np.abs(s.ctrl - robot.qpos_home).max(axis=0) > 1e-6
-        moved = frozenset(np.array(robot.joint_names)[away]) | set(robot.operated)
-        if moved not in known:
-            known[moved] = idle_joints(robot, tuple(moved))
-        idle.append(known[moved])
-    return idle
+    away = [np.abs(s.ctrl - robot.qpos_home).max(axis=0) > 1e-6 for s in sequences]
+    moved = [frozenset(np.array(robot.joint_names)[a]) | set(robot.operated) for a in away]
+    idle = {joints: idle_joints(robot, tuple(joints)) for joints in set(moved)}
+    return [idle[joints] for joints in moved]
 
 
 def _chunks(sequences: ListOf[Sequence], locked: list[Clamped]) -> Iterator[list[int]]:
@@ -207,7 +196,7 @@ def rollout(
 def pair_dataset(
     dataset: Dataset,
     robot: RobotSpec,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     entries: list[Entry] | None = None,
     lock_idle: bool = False,
     executor: str | Executor = LOCAL,
@@ -223,7 +212,7 @@ def pair_dataset(
     if not todo:
         return 0
     with dataset.writing_replays():
-        _pair(dataset, robot, todo, progress or (lambda done, total: None), lock_idle, executor)
+        _pair(dataset, robot, todo, progress, lock_idle, executor)
     return len(todo)
 
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import hash_order
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.metrics import standard_error
+from gaponet.sim.metrics import MIN_RELATIVE_GAIN, MIN_RELATIVE_GAIN_ONE_MOTION, Comparison
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.axes import Values
 from gaponet.sysid.robot_rollouts import RobotRollouts
@@ -23,10 +22,7 @@ from gaponet.sysid.table_contact import TableFit, tip_heights
 Std = dict[str, dict[str, float]]  # joint → field → standard error
 Covariance = dict[str, tuple[list[str], Array]]  # joint → fields (P), (P, P) on the axes of uncertainty.py
 
-MIN_RELATIVE_GAIN = 0.01  # of the mean error, where several motions judge
-MIN_RELATIVE_GAIN_ONE_MOTION = 0.1
 MIN_JUDGES = 3  # motions of each set of recorded joints; fewer are too few to validate without cross-validation
-CONFIDENCE = 0.84  # one-sided level of Student's t: one standard error where motions are many
 
 
 class HeldOut(NamedTuple):
@@ -69,32 +65,6 @@ def cross_validation(sequences: ListOf[Sequence], validation: ListOf[Sequence], 
         )
         for k in range(count)
     ]
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A candidate against another one by the errors of the motions that judge, (motions,) rad."""
-
-    name: str
-    before: Array
-    after: Array
-
-    @property
-    def gain(self) -> tuple[float, float]:
-        """Decrease of the mean error, and its paired standard error over motions, rad."""
-        gains = self.before - self.after
-        return float(gains.mean()), standard_error(gains)
-
-    @property
-    def accepted(self) -> bool:
-        """True if the mean error falls by more than 1 % and the paired relative gain exceeds one standard error
-        (Student's t); of a single motion by more than 10 %."""
-        freedom, least = len(self.before) - 1, MIN_RELATIVE_GAIN
-        if not freedom:
-            least = MIN_RELATIVE_GAIN_ONE_MOTION
-        relative = (self.before - self.after) / np.maximum(self.before + self.after, 1e-12)
-        significant = not freedom or relative.mean() > stdtrit(freedom, CONFIDENCE) * standard_error(relative)
-        return bool(significant and self.gain[0] > least * self.before.mean())
 
 
 @dataclass(frozen=True)

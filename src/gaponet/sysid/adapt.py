@@ -18,7 +18,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.metrics import exceeds_standard_error
+from gaponet.sim.metrics import Comparison
 from gaponet.sim.replay import Corrector, rollout_errors
 from gaponet.sysid.axes import MAX_KP_LOG_CHANGE, MAX_ON_AXIS, Bounds, Values, large_changes, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
@@ -48,7 +48,7 @@ class Adapted:
         before, after: RMS error of the windows, rad.
         payload_mass, payload_std: kg in each hand that is said to carry; None unless the payload is unknown.
         judged: Mean |error| of motions before, and with the fit to the other motions, (motions,) rad.
-        accepted: Whether those motions improve by more than the standard error; False for one short motion per joint.
+        accepted: Whether those motions improve significantly (`Comparison`); False for one short motion per joint.
     """
 
     robot: RobotSpec
@@ -93,9 +93,9 @@ def adapt(
         )
     parts = cut(sequences, max(1, round(seconds / WINDOW_S)))
     judged = _cross_validated(parts, robot, corrector, kd_known) if judge else (np.zeros(0), np.zeros(0))
-    accepted, gains = not judge or parts[0].duration > MAX_SHORT_WINDOW_S, judged[0] - judged[1]
-    if len(gains):
-        accepted = exceeds_standard_error(gains)
+    accepted = not judge or parts[0].duration > MAX_SHORT_WINDOW_S
+    if len(judged[0]):
+        accepted = Comparison("adapted", *judged).accepted
         parts = [parts[i] for motions in _motions_that_judge(parts) for motion in motions for i in motion]
     rollouts = RobotRollouts(parts, robot, corrector=corrector)
     kd_slack = np.zeros(rollouts.n) if kd_known else robot.kd[rollouts.op]

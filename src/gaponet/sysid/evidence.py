@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.metrics import standard_error
+from gaponet.sim.metrics import confidence_factor, standard_error
 from gaponet.sim.replay import replay
-from gaponet.sysid.acceptance import CONFIDENCE, HeldOut
+from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import slopes
@@ -236,7 +235,7 @@ def _error_bound(motions: ListOf[Array]) -> float:
     rms, freedom = np.array([np.sqrt(np.square(error).mean()) for error in motions]), len(motions) - 1
     wider = 0.0
     if freedom:
-        wider = float(stdtrit(freedom, CONFIDENCE)) * standard_error(rms) / max(float(rms.mean()), 1e-12)
+        wider = confidence_factor(freedom) * standard_error(rms) / max(float(rms.mean()), 1e-12)
     return float(np.quantile(np.concatenate(motions), BOUND_QUANTILE)) * (1 + wider)
 
 

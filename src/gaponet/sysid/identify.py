@@ -24,7 +24,8 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import DEFAULT_TERMS, SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Judge, JudgedFold, Split, cross_validation
+from gaponet.sim.metrics import Comparison
+from gaponet.sysid.acceptance import HeldOut, Identified, Judge, JudgedFold, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.motion_limits import stop_questions, with_speed_limits, with_stops

@@ -18,7 +18,8 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import ramped
-from gaponet.sysid.acceptance import Comparison, Identified, held_out_errors
+from gaponet.sim.metrics import Comparison
+from gaponet.sysid.acceptance import Identified, held_out_errors
 
 MIN_PERIOD_S, MAX_LAG_S, LAGS = 0.01, 0.3, 16  # of rows that are compared; lags that are tried
 SPEED_RATIOS = np.geomspace(0.7, 1.25, 30)  # ramps that are tried, over a joint's greatest speed

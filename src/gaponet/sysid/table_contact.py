@@ -18,7 +18,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import tips_of
-from gaponet.sim.metrics import exceeds_standard_error
+from gaponet.sim.metrics import Comparison
 from gaponet.sim.model import write_table
 from gaponet.sim.replay import idle_limbs, rollout, rollout_errors
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SETTLE_S
@@ -43,7 +43,7 @@ class TableFit:
 
     Attributes:
         robot: The robot, with the table and the zeros if they are accepted.
-        accepted: Whether they explain the windows better than no table, by more than the standard error.
+        accepted: Whether they explain the windows significantly better than no table (`Comparison`).
         before, after: Mean |error| of the windows without and with table, (windows,) rad.
         motions: Motions in which a tip comes near.
     """
@@ -137,7 +137,7 @@ def fit_table(
         errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
     best = int(np.argmin(errors))
     without, within = (scene.mean(e)[0] for e in (before, scene.errors(found[best][0][None])))
-    accepted = exceeds_standard_error(without - within)
+    accepted = Comparison("table", without, within).accepted
     return TableFit(tables[best] if accepted else robot, accepted, without, within, motions)
 
 

@@ -21,10 +21,10 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import CUTOFF
-from gaponet.sim.metrics import metrics, runs
+from gaponet.sim.metrics import Comparison, metrics, runs
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import motion_errors, replay
-from gaponet.sysid.acceptance import Comparison, HeldOut, Identified, Split, held_out_errors
+from gaponet.sysid.acceptance import HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.adapt import PRIOR_RAD
 from gaponet.sysid.axes import CLASSIC, MAX_ON_AXIS, Bounds, large_changes, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
@@ -207,14 +208,9 @@ def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
     size = np.where(errors > 0, errors, 1.0)
     correlated = (np.abs(covariance / np.outer(size, size)) > MIN_SET_CORRELATION) & (errors > 0)
     loose = np.array([summary.relative_error(f) > MIN_SET_RELATIVE_ERROR for f in fields])
-    return JointSummary(values, summary.errors, _groups(correlated & loose[:, None] & loose[None, :], fields))
-
-
-def _groups(connected: Array, fields: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-    """Return the connected groups of two or more fields."""
-    reach = np.linalg.matrix_power((connected | np.eye(len(fields), dtype=bool)).astype(float), len(fields)) > 0
-    sets = dict.fromkeys(tuple(f for f, r in zip(fields, row, strict=True) if r) for row in reach)
-    return tuple(s for s in sets if len(s) > 1)
+    _, group = connected_components(correlated & loose[:, None] & loose[None, :])
+    sets = (tuple(f for f, g in zip(fields, group, strict=True) if g == k) for k in dict.fromkeys(group))
+    return replace(summary, sets=tuple(s for s in sets if len(s) > 1))
 
 
 def format_change(field: str, change: float, uncertainty: ParameterUncertainty, joint: str) -> str:

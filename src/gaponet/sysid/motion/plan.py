@@ -11,7 +11,6 @@ import numpy as np
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.coordinated import available
 from gaponet.sysid.motion.library import Library, short
 from gaponet.sysid.motion.motion import Motion
 
@@ -77,8 +76,7 @@ def _standing(library: Library, name: str) -> Motion:
 
 def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
     """Motions of many joints, and after each few of them another signal on every joint."""
-    kinds = [f"{kind}-all" for kind in ("tour", "limber") if kind in available(library.kit)]
-    kinds += [f"wander-{side}" for side in library.kit.arms]
+    kinds = ["tour-all", "limber-all", *(f"wander-{side}" for side in library.kit.arms)]
     for k in range(ROUNDS):
         yield from (f"{kind}-{v}" for kind in kinds for v in (2 * k, 2 * k + 1))
         if k + 1 < len(FIRST):

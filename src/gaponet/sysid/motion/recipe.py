@@ -79,7 +79,7 @@ def load_recipe(name_or_path: str | Path) -> Recipe:
 
 
 def takes(recipe: Recipe, names: list[str]) -> list[Take]:
-    """All sequences of a recipe, in the order in which they are written; names are the library's.
+    """Return all sequences of a recipe in order; names are the library's.
 
     Raises:
         UsageError: A pattern matches nothing.
