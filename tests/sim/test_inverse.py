@@ -39,7 +39,7 @@ def test_positions_and_speeds_within_a_period_of_parabolic_speeds(count):
     speed = 0.3 + 0.2 * i - 0.03 * i**2
     position = np.concatenate([[0.0], np.cumsum(h * speed[1:])])
     known = np.array([h * speed[0], h * speed[-1], position[-1]])
-    before, speeds = (weights @ known for weights in AnalyticInverse.within(count, 12))
+    before, speeds = (weights @ known for weights in AnalyticInverse.within_period(count, 12))
     np.testing.assert_allclose(before[:count], position[:-1], atol=1e-12)
     np.testing.assert_allclose(speeds[: count + 1] / h, speed, atol=1e-12)
 

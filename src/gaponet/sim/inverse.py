@@ -109,7 +109,7 @@ class AnalyticInverse:
         self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER  # kd takes the speed before the step
         self.h, self.dt = timestep[:, None], (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
-        before, speeds = zip(*(self._within_period(int(n), int(nstep.max())) for n in nstep), strict=True)
+        before, speeds = zip(*(self.within_period(int(n), int(nstep.max())) for n in nstep), strict=True)
         self.before, self.speeds = (np.array(x).transpose(1, 2, 0)[..., None] for x in (before, speeds))
         self.share = (np.arange(nstep.max())[:, None] < nstep) / nstep  # of each physics step, (steps, num)
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
@@ -188,7 +188,7 @@ class AnalyticInverse:
         return True
 
     @staticmethod
-    def _within_period(count: int, rows: int) -> tuple[Array, Array]:
+    def within_period(count: int, rows: int) -> tuple[Array, Array]:
         """Return positions before each of `count` physics steps of h, and speeds, from the states at a period's ends.
 
         Speeds follow a parabola; MuJoCo's positions follow from the speeds after each step.
