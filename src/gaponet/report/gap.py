@@ -20,7 +20,7 @@ from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.report.candidate import Candidate, select_entries
-from gaponet.robot.servo_fields import SERVO_CAUSES, SERVO_FIELDS
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Run, metrics, runs, standard_error
 from gaponet.sim.metrics import summary as errors_of
@@ -114,7 +114,10 @@ def _steps(candidate: Candidate, causes: list[tuple[str, RobotSpec]]) -> list[tu
 
 
 # Fields in which an identified simulator differs from the nominal one, in the order of the steps.
-CAUSES = {cause: [f.name for f in SERVO_FIELDS.values() if f.cause == cause] for cause in SERVO_CAUSES} | {"hand": []}
+CAUSES = {
+    cause: [f.name for f in SERVO_FIELDS.values() if f.cause == cause]
+    for cause in dict.fromkeys(f.cause for f in SERVO_FIELDS.values())
+} | {"hand": []}
 
 
 def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:

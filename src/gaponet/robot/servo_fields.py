@@ -125,7 +125,6 @@ SERVO_FIELDS: dict[str, ServoField] = {
 }  # fmt: skip
 SERVO_TERMS = tuple(f.name for f in SERVO_FIELDS.values() if f.in_servo_model)
 STOP_FIELDS = ("stop_low", "stop_high")
-SERVO_CAUSES = tuple(dict.fromkeys(f.cause for f in SERVO_FIELDS.values()))
 TERMS: dict[Term, tuple[str, ...]] = {
     term: tuple(f.name for f in SERVO_FIELDS.values() if f.term == term) for term in get_args(Term)
 }
