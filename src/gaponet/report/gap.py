@@ -114,10 +114,8 @@ def _steps(candidate: Candidate, causes: list[tuple[str, RobotSpec]]) -> list[tu
 
 
 # Fields in which an identified simulator differs from the nominal one, in the order of the steps.
-CAUSES = {
-    cause: [f.name for f in SERVO_FIELDS.values() if f.cause == cause]
-    for cause in dict.fromkeys(f.cause for f in SERVO_FIELDS.values())
-} | {"hand": []}
+CAUSES = {cause: [f.name for f in SERVO_FIELDS.values() if f.cause == cause]
+          for cause in (*(f.cause for f in SERVO_FIELDS.values()), "hand")}  # fmt: skip
 
 
 def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:

@@ -54,7 +54,8 @@ def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures
     model = models[payloads[0]]
     if (robot.folder / "collision.toml").is_file():
         Collision(robot, model)  # raises where it is wrong
-    places = _random_postures(robot) if postures is None else postures
+    low, high = np.clip(robot.qpos_range.T, -np.pi, np.pi)
+    places = np.random.default_rng(0).uniform(low, high, (100, len(robot.kp))) if postures is None else postures
     found = [
         *_joints(robot), *_loads(robot, models), *_limits(robot, model), *_couplings(robot, model),
         *_contacts(robot, places, postures is not None), *_steps(robot, models, places),
@@ -77,11 +78,8 @@ def _joints(robot: RobotSpec) -> Iterator[Finding]:
             text = f"{name}: home {robot.qpos_home[i]:g} lies outside its range [{low:.2f}, {high:.2f}]: write home"
             yield Finding("warning", "home", f"{text} in robot.toml, or range in robot.xml", (name,))
         if not np.isfinite(low):
-            text = (
-                f"{name}: has no range in the MJCF; commands are not clipped and doctor cannot judge positions: write "
-                "range in robot.xml"
-            )
-            yield Finding("warning", "range", text, (name,))
+            text = f"{name}: has no range in the MJCF; commands are not clipped and doctor cannot judge positions"
+            yield Finding("warning", "range", f"{text}: write range in robot.xml", (name,))
 
 
 def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Finding]:
@@ -117,11 +115,9 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
         if count:
             text = f"robot.xml has {count} <{kind}> constraint(s): the simulator obeys them; delete what is no part"
             yield Finding("note", "couplings", f"{text} of the robot")
-    springs = names[model.jnt_stiffness > 0]
-    if len(springs):
-        yield Finding(
-            "note", "couplings", f"springs at {abbreviate(springs.tolist())}: stiffness in robot.xml", tuple(springs)
-        )
+    springs = tuple(names[model.jnt_stiffness > 0].tolist())
+    if springs:
+        yield Finding("note", "couplings", f"springs at {abbreviate(springs)}: stiffness in robot.xml", springs)
     if abs(np.linalg.norm(model.opt.gravity) - 9.81) > 0.1:
         text = f"gravity in robot.xml is {model.opt.gravity.tolist()} m/s²: write gravity in <option> if that is not so"
         yield Finding("warning", "couplings", text)
@@ -132,16 +128,14 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     if len(bare):
         text = (
             f"no armature at {abbreviate(bare.tolist())}: geared motors have 0.001 to 0.5 kg·m² (rotor inertia times "
-            "ratio "
-            "squared); write armature in robot.xml, gaponet identify finds it"
+            "ratio squared); write armature in robot.xml, gaponet identify finds it"
         )
         yield Finding("note", "inertia", text, tuple(bare))
     free = names[(model.dof_damping + robot.kd < 1e-9) & (model.dof_frictionloss < 1e-9)]
     if len(free):
         text = (
             f"no damping, kd or friction at {abbreviate(free.tolist())}: it swings for ever; write kd in robot.toml, "
-            "or "
-            "damping and frictionloss in robot.xml"
+            "or damping and frictionloss in robot.xml"
         )
         yield Finding("warning", "damping", text, tuple(free))
 
@@ -276,8 +270,3 @@ def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
     if quiet:
         masses = ", ".join(f"{p:g}" for p in payloads)
         yield Finding("ok", "hold", f"home is held for {SECONDS:g} s with {masses} kg without creeping or swinging")
-
-
-def _random_postures(robot: RobotSpec) -> Array:
-    low, high = np.clip(robot.qpos_range.T, -np.pi, np.pi)
-    return np.random.default_rng(0).uniform(low, high, (100, len(robot.kp)))

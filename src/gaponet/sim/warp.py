@@ -159,10 +159,8 @@ class WarpSim:
             warp.get_device(device)
         except (ValueError, RuntimeError) as error:
             raise UsageError(f"device {device}: Warp finds none ({error}); use cpu") from None
-        self.robot, self.joint_names, self.num_envs, self.n, self.range = (
-            sim.robot, sim.joint_names, sim.num_envs, sim.n, sim.range
-        )  # fmt: skip
-        # One rate's worlds are not stepped with another's, since they take more steps or fewer.
+        self.robot, self.joint_names, self.num_envs = sim.robot, sim.joint_names, sim.num_envs
+        self.n, self.range = sim.n, sim.range
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
         self._worlds = [_Worlds(sim, rows, device) for rows in rates]
         self._late = next(iter(sim.models.values())).nhistory > 0
@@ -181,8 +179,8 @@ class WarpSim:
         self._most = None if sim.most is None else self.array(sim.most)
         if sim.servo_model:
             limits = np.moveaxis(np.array(sim.servo_model.force_range), -1, 0)
-            told = sim.batch.expand("actuator_gainprm")[..., 0], sim.servo_model.bias, *limits
-            self._gain, self._bias, *self._limits = map(self.array, told)
+            gain = sim.batch.expand("actuator_gainprm")[..., 0]
+            self._gain, self._bias, *self._limits = map(self.array, (gain, sim.servo_model.bias, *limits))
         self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
         if self._late:
             model = next(iter(sim.models.values()))

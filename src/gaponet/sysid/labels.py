@@ -193,14 +193,14 @@ def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
         raise LogError(
             f"{log.source}: {len(moved)} joints are commanded to move; labels are told from recordings of one"
         )
-    j, after = int(moved[0]), SETTLE_S
+    j = int(moved[0])
     joint = log.joint_names[j]
     if "tau" in log.channels:
         time, values = log.channels["tau"].time, log.channels["tau"].values[:, j]
     else:
         time = qpos.time
         values = gain[joint] * (ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j])
-    later = time[: len(values)] >= time[0] + after
+    later = time[: len(values)] >= time[0] + SETTLE_S
     told = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
     follows = None
     if "tau" in log.channels:
@@ -269,7 +269,9 @@ def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
     x = sign * raw  # gravity's torque grows with what hangs on it
     masses = np.asarray(payloads, float)
     if len(x) < len(masses):
-        return _untold(part, masses)
+        for r in part:
+            r.payload = float(masses[0])
+        return Cell(part[0].joint, part[0].command, len(part), 0.0, 0.0, np.zeros(0), False)
     step = float(np.median(np.abs(np.diff(x)))) / 0.954  # most neighbours are repetitions
     width, slope, base = _bands(x, masses)
     start = [base + np.array(d) * width for d in itertools.combinations(np.linspace(-2, 2, 9), units)]
@@ -313,12 +315,6 @@ def _ranked(rest: Array, load: Array, units: int) -> tuple[Array, Array]:
         if len(b) == units:
             unit[b[np.argsort(rest[b])]] = np.arange(units)
     return unit, own
-
-
-def _untold(part: list[Labelled], masses: Array) -> Cell:
-    for r in part:
-        r.payload = float(masses[0])
-    return Cell(part[0].joint, part[0].command, len(part), 0.0, 0.0, np.zeros(0), False)
 
 
 def _bands(x: Array, masses: Array) -> tuple[float, float, float]:

@@ -86,9 +86,8 @@ def fit_torque_driven(
     """
     for s in (*train, *judging):
         if s.tau is None or not np.isfinite(s.tau[:, robot.operated_index]).all():
-            raise UsageError(
-                f"{s.meta.motion}: has no torque of every operated joint; say its column as tau in logs.toml"
-            )
+            what = "has no torque of every operated joint; say its column as tau in logs.toml"
+            raise UsageError(f"{s.meta.motion}: {what}")
     if train is judging:
         parts = [
             s.rows(slice(i, i + round(PART_S / s.dt)))
