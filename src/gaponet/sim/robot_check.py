@@ -115,9 +115,9 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
         if count:
             text = f"robot.xml has {count} <{kind}> constraint(s): the simulator obeys them; delete what is no part"
             yield Finding("note", "couplings", f"{text} of the robot")
-    springs = tuple(names[model.jnt_stiffness > 0].tolist())
+    springs = names[model.jnt_stiffness > 0].tolist()
     if springs:
-        yield Finding("note", "couplings", f"springs at {abbreviate(springs)}: stiffness in robot.xml", springs)
+        yield Finding("note", "couplings", f"springs at {abbreviate(springs)}: stiffness in robot.xml", tuple(springs))
     if abs(np.linalg.norm(model.opt.gravity) - 9.81) > 0.1:
         text = f"gravity in robot.xml is {model.opt.gravity.tolist()} m/s²: write gravity in <option> if that is not so"
         yield Finding("warning", "couplings", text)
