@@ -33,7 +33,7 @@ def test_a_batch_is_bit_identical_to_mj_step(tmp_path):
         np.testing.assert_array_equal(sim.qvel[i], data.qvel)
 
 
-def test_few_simulations_step_on_one_thread_unless_more_are_asked_for(tmp_path):
+def test_few_simulations_use_one_thread_by_default(tmp_path):
     pytest.importorskip("mujoco.batch")
     robot, one = write_arm(tmp_path), (0.0, "both", 0.02)
     assert BatchSim(robot, [one] * 5).batch.nthread == 1
@@ -54,7 +54,7 @@ def test_simulations_left_out_of_a_step_stand_still(tmp_path, rates):
     assert (sim.qpos[[0, 2]] != 0).any(axis=1).all()
 
 
-def test_a_late_servo_does_what_a_prompt_one_does_with_commands_of_earlier(tmp_path):
+def test_a_delayed_servo_moves_as_one_without_delay_under_earlier_commands(tmp_path):
     robot = write_arm(tmp_path)
     late = replace(robot, delay=[0.04, 0.0])
     targets = np.random.default_rng(1).uniform(-1, 1, (25, 2))
@@ -76,7 +76,7 @@ def test_a_late_servo_does_what_a_prompt_one_does_with_commands_of_earlier(tmp_p
     np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=2e-3)
 
 
-def test_late_servos_at_two_rates_step_together_as_each_does_alone(tmp_path):
+def test_delayed_servos_at_two_rates_step_together_as_each_does_alone(tmp_path):
     late = replace(write_arm(tmp_path), delay=[0.05, 0.013])
     conditions = [(0.0, "both", 0.02), (0.2, "both", 0.01), (0.0, "both", 0.02006)]
     rng = np.random.default_rng(2)
@@ -93,14 +93,14 @@ def test_late_servos_at_two_rates_step_together_as_each_does_alone(tmp_path):
     np.testing.assert_array_equal(together.qpos, np.concatenate([sim.qpos for sim in alone]))
 
 
-def test_late_servos_want_to_know_what_is_on_its_way(tmp_path):
+def test_delayed_servos_need_past_targets(tmp_path):
     sim = BatchSim(replace(write_arm(tmp_path), delay=0.03), [(0.0, "both", 0.02)])
     with pytest.raises(UsageError, match="past"):
         sim.reset(slice(None), np.zeros((1, 2)), np.zeros((1, 2)))
 
 
 @pytest.mark.parametrize("delay", [(0.0, 0.0), (0.05, 0.013)])
-def test_a_mujoco_without_a_batch_moves_bit_for_bit_the_same(tmp_path, monkeypatch, delay):
+def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, delay):
     """Payloads, rates, laws, late servos, steps of some, forces: all that gaponet writes into a batch."""
     pytest.importorskip("mujoco.batch")
     robot = replace(write_arm(tmp_path), delay=list(delay), stribeck=[0.1, 0.2], friction_motor=[0.1, 0.0])
@@ -133,7 +133,7 @@ def test_a_mujoco_without_a_batch_moves_bit_for_bit_the_same(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("rates", [(0.02, 0.02), (0.01, 0.02)])
-def test_a_servo_with_a_ramp_does_what_another_one_does_with_ramped_commands(tmp_path, rates):
+def test_a_speed_limited_servo_moves_as_another_under_ramped_commands(tmp_path, rates):
     robot = write_arm(tmp_path)
     slow = replace(robot, target_speed=[0.5, 0.0])
     jumps = np.repeat(np.random.default_rng(2).uniform(-1, 1, (3, 2, 2)), 30, axis=0)

@@ -26,7 +26,7 @@ def periods(sequence, friction):
     ]  # fmt: skip
 
 
-def test_it_gives_back_the_command_where_friction_is_known(tmp_path):
+def test_the_inverse_of_a_recording_is_its_command(tmp_path):
     robot = write_arm(tmp_path, xml=XML.replace('frictionloss="0.05"', 'frictionloss="0"'))
     sequence, inverse = smooth(robot), AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     told = np.concatenate([inverse([p], p.qpos) for p in periods(sequence, 0.0)])
@@ -34,7 +34,7 @@ def test_it_gives_back_the_command_where_friction_is_known(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 10])
-def test_positions_and_speeds_within_a_period_of_parabolic_speeds(count):
+def test_states_within_a_period_follow_parabolic_speeds(count):
     h, i = 0.005, np.arange(count + 1)
     speed = 0.3 + 0.2 * i - 0.03 * i**2
     position = np.concatenate([[0.0], np.cumsum(h * speed[1:])])
@@ -60,7 +60,7 @@ def test_inertia_is_mujocos(tmp_path):
     np.testing.assert_allclose(inertia.matrix(1)[0], full, atol=1e-12)
 
 
-def test_torque_limits_bound_what_is_asked_for(tmp_path):
+def test_torque_limits_bound_the_targets(tmp_path):
     weak = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.1"))
     inverse = AnalyticInverse.of(BatchSim(weak, [CONDITION]))
     still = Period(*np.zeros((5, 1, 2)))

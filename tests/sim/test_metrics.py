@@ -53,7 +53,7 @@ def test_horizons_longer_than_the_motion_are_left_out(robot):
     assert result["by_horizon"]["whole"]["mpjae"] == pytest.approx(1.0)
 
 
-def test_a_summary_looks_at_each_run_once(robot):
+def test_a_summary_of_an_iterator_is_that_of_a_list(robot):
     reals = [sequence(robot, np.eye(4, 2) * k, f"m{k % 2}", k % 2) for k in range(4)]
     part = runs(reals, [0.9 * s.qpos for s in reals], robot)
     found = summary(iter(part), robot)

@@ -7,12 +7,13 @@ from arm import commands, record, recordings, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset
+from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sim.model import model_hash
+from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import idle_limbs, pair_dataset, replay
 
 
-def test_the_replay_of_a_nominal_robot_is_itself_bit_for_bit(tmp_path):
+def test_the_replay_of_the_nominal_robot_is_bit_identical(tmp_path):
     robot = write_arm(tmp_path)
     # Rows are stored as float32; a start that float32 holds exactly starts the replay exactly.
     sequences = [
@@ -48,7 +49,7 @@ def test_each_recording_runs_at_its_own_gains(tmp_path):
     assert np.abs(replay([untold], robot)[0].qpos - soft.qpos).max() > 0.01
 
 
-def test_an_identified_gain_goes_with_the_recorded_one(tmp_path):
+def test_an_identified_gain_scales_with_the_recorded_one(tmp_path):
     robot = write_arm(tmp_path)
     found = robot.with_servos({"elbow": {"kp": 16.0}})
     set_to = found.with_gains((10.0, 10.0), None)
@@ -57,7 +58,7 @@ def test_an_identified_gain_goes_with_the_recorded_one(tmp_path):
     assert found.with_gains((20.0, 20.001), (0.0, 0.0)) is found
 
 
-def test_the_recording_after_the_first_row_is_not_looked_at(tmp_path):
+def test_a_replay_uses_only_the_first_recorded_row(tmp_path):
     robot = write_arm(tmp_path)
     weak, strong = (record(robot, commands(50, 3), "m", kp=kp) for kp in (0.5, 2.0))
     np.testing.assert_array_equal(replay([weak], robot)[0].qpos, replay([strong], robot)[0].qpos)
@@ -87,3 +88,22 @@ def test_clamping_idle_limbs_changes_nothing_for_the_others():
     whole, arms = (replay([sequence], robot, lock_idle=lock)[0] for lock in (False, True))
     op = robot.operated_index
     np.testing.assert_allclose(whole.qpos[:, op], arms.qpos[:, op], atol=1e-6)
+
+
+def test_a_simulator_without_payload_ignores_the_recorded_payload(arm):
+    empty, laden = (record(arm, commands(60, 1), "m", payload=p) for p in (0.0, 0.2))
+    bare = replace(arm, carries_payload=False)
+    own, told = (replay([laden], r)[0].qpos for r in (bare, arm))
+    assert np.abs(own - told).max() > 1e-3
+    same = replace(laden, meta=empty.meta, qpos=laden.qpos, qvel=laden.qvel)
+    np.testing.assert_array_equal(own, replay([same], arm)[0].qpos)
+
+
+def test_a_simulator_without_payload_has_another_hash_and_survives_its_folder(arm, tmp_path):
+    bare = replace(arm, carries_payload=False)
+    assert model_hash(bare) != model_hash(arm)
+    save_robot(bare, tmp_path / "bare")
+    again = load_robot(tmp_path / "bare")
+    assert not again.carries_payload
+    assert model_hash(again) == model_hash(bare)
+    assert build_model(again, 0.2).body_mass.sum() == build_model(arm).body_mass.sum()

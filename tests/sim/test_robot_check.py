@@ -30,7 +30,7 @@ def test_a_sound_arm_has_no_warning_at_any_payload(arm):
     assert bad(check_robot(arm, (0.0, 0.5))) == []
 
 
-def test_kp_4000_without_armature_is_an_error_and_each_cure_that_is_named_cures(tmp_path):
+def test_an_unstable_kp_is_an_error_and_each_suggested_cure_works(tmp_path):
     stiff = write_arm(tmp_path / "stiff", STIFF, LIGHT)
     findings = check_robot(stiff)
     (text,) = said(findings, "step", "error")
@@ -88,12 +88,12 @@ def test_postures_of_the_logs_in_which_links_meet_are_counted(tmp_path):
          "couplings", "robot.xml has 1 <equality>"),
     ],
 )  # fmt: skip
-def test_what_else_moves_or_holds_a_joint_is_named(tmp_path, xml, check, words):
+def test_springs_constraints_and_missing_inertia_are_reported(tmp_path, xml, check, words):
     findings = check_robot(write_arm(tmp_path / "arm", TOML, xml))
     assert any(words in f.message for f in findings if f.check == check and f.level != "ok")
 
 
-def test_a_hold_that_swings_or_hangs_is_told(tmp_path):
+def test_a_hold_that_swings_or_sags_is_reported(tmp_path):
     swinging = check_robot(write_arm(tmp_path / "free", TOML, LIGHT))
     assert "does not come to rest" in said(swinging, "hold", "error")[0]
     soft = check_robot(write_arm(tmp_path / "soft", TOML.replace("kp = 20.0", "kp = 5.0"), XML))

@@ -1,4 +1,4 @@
-"""The servo's law: friction by speed and load, least torque, encoder steps; one definition for every simulator."""
+"""The servo's terms: friction by speed and load, least torque, encoder steps; one definition for every simulator."""
 
 import mujoco
 import numpy as np
@@ -9,13 +9,13 @@ from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import build_model
 
 
-def law(robot, **values):
+def servo_model(robot, **values):
     return robot.with_servos(dict.fromkeys(robot.joint_names, values))
 
 
 def pull(robot, torque, seconds=0.3):
     """Speed of the elbow after a steady torque on it, from rest, no gravity, (rad/s)."""
-    sim = BatchSim(law(robot, kp=1e-3), [(0.0, "both", 0.02)], 1)
+    sim = BatchSim(servo_model(robot, kp=1e-3), [(0.0, "both", 0.02)], 1)
     sim.batch.expand("opt.gravity")[:] = 0.0
     sim.reset(slice(None), np.zeros((1, 2)), np.zeros((1, 2)))
     sim.batch.bind("qfrc_applied")[:] = [0.0, torque]
@@ -25,7 +25,7 @@ def pull(robot, torque, seconds=0.3):
 
 
 def test_friction_at_rest_exceeds_that_in_motion(arm):
-    sticky = law(arm, stribeck=0.1, stribeck_speed=0.05)  # frictionloss is 0.05
+    sticky = servo_model(arm, stribeck=0.1, stribeck_speed=0.05)  # frictionloss is 0.05
     assert pull(arm, 0.1) > 0.05
     assert abs(pull(sticky, 0.14)) < 1e-4
     # Once it slides fast the difference is gone: damping 0.5 alone takes what is beyond 0.05 N·m.
@@ -33,7 +33,7 @@ def test_friction_at_rest_exceeds_that_in_motion(arm):
 
 
 def test_a_loaded_motor_has_more_friction(tmp_path):
-    robot = law(write_arm(tmp_path / "arm"), frictionloss=0.0, friction_motor=0.2, damping=3.0)
+    robot = servo_model(write_arm(tmp_path / "arm"), frictionloss=0.0, friction_motor=0.2, damping=3.0)
     sim = BatchSim(robot, [(0.0, "both", 0.02)] * 2, 1)
     home = np.zeros((2, 2))
     sim.reset(slice(None), home, home)
@@ -50,7 +50,7 @@ def test_a_loaded_motor_has_more_friction(tmp_path):
 
 
 def test_a_coarse_encoder_hides_small_errors(arm):
-    robot = law(arm, encoder_step=0.02, frictionloss=0.0, damping=1.0)
+    robot = servo_model(arm, encoder_step=0.02, frictionloss=0.0, damping=1.0)
     sim = BatchSim(robot, [(0.0, "both", 0.02)], 1)
     sim.batch.expand("opt.gravity")[:] = 0.0
     sim.reset(slice(None), np.full((1, 2), 0.008), np.zeros((1, 2)))
@@ -59,11 +59,11 @@ def test_a_coarse_encoder_hides_small_errors(arm):
     np.testing.assert_allclose(sim.qpos, 0.008, atol=1e-9)
 
 
-def test_a_least_torque_overcomes_friction_at_small_errors(arm):
+def test_a_minimum_torque_overcomes_friction_at_small_errors(arm):
     still = {"frictionloss": 0.2, "encoder_step": 0.0015}
     ends = []
     for least in (0.0, 0.4):
-        sim = BatchSim(law(arm, **still, min_torque=least), [(0.0, "both", 0.02)], 1)
+        sim = BatchSim(servo_model(arm, **still, min_torque=least), [(0.0, "both", 0.02)], 1)
         sim.batch.expand("opt.gravity")[:] = 0.0
         sim.reset(slice(None), np.full((1, 2), 0.006), np.zeros((1, 2)))
         for _ in range(100):
@@ -72,7 +72,7 @@ def test_a_least_torque_overcomes_friction_at_small_errors(arm):
     assert ends[0] > 0.005 > 0.003 > ends[1]
 
 
-def test_a_law_of_zeros_is_no_law_bit_for_bit(arm):
+def test_a_servo_model_of_zeros_is_bit_identical_to_none(arm):
     sims = [BatchSim(arm, [(0.5, "both", 0.02)] * 3, 1, servo_model=with_model) for with_model in (False, True)]
     rng = np.random.default_rng(0)
     for sim in sims:
@@ -84,8 +84,8 @@ def test_a_law_of_zeros_is_no_law_bit_for_bit(arm):
     np.testing.assert_array_equal(sims[0].qpos, sims[1].qpos)
 
 
-def test_a_state_put_back_goes_on_the_same(arm):
-    robot = law(arm, stribeck=0.1, stribeck_speed=0.05, friction_motor=0.2, friction_external=0.1)
+def test_a_restored_state_continues_identically(arm):
+    robot = servo_model(arm, stribeck=0.1, stribeck_speed=0.05, friction_motor=0.2, friction_external=0.1)
     sim = BatchSim(robot, [(0.5, "both", 0.02)] * 2, 1)
     sim.reset(slice(None), np.full((2, 2), 0.1), np.zeros((2, 2)))
     for _ in range(20):
@@ -103,7 +103,7 @@ def test_a_state_put_back_goes_on_the_same(arm):
 def test_compiled_and_array_servo_models_agree(arm):
     pytest.importorskip("numba")
     terms = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "friction_external": 0.1}
-    robot = law(arm, **terms, min_torque=0.03, encoder_step=0.002)
+    robot = servo_model(arm, **terms, min_torque=0.03, encoder_step=0.002)
     sims = [BatchSim(robot, [(0.5, "both", 0.02)] * 3, 1) for _ in range(2)]
     for sim in sims:
         for x in sim.servo_model.values.values():
@@ -116,8 +116,8 @@ def test_compiled_and_array_servo_models_agree(arm):
     np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=1e-9)
 
 
-def test_the_compiled_model_carries_the_law(arm):
-    model = build_model(law(arm, stribeck=0.1, stribeck_speed=0.05))
+def test_the_mujoco_model_holds_the_servo_model(arm):
+    model = build_model(servo_model(arm, stribeck=0.1, stribeck_speed=0.05))
     assert model.actuator_user[0].tolist() == [0.1, 0.05, 0.0, 0.0, 0.0, 0.0]
     assert build_model(arm).nuser_actuator == 0
 

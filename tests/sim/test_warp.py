@@ -64,7 +64,7 @@ class Both:
 
 @pytest.mark.parametrize("friction", [False, True])
 @pytest.mark.parametrize("name", packaged_robots())
-def test_a_second_of_motion_is_mujocos(name, friction):
+def test_a_second_of_motion_agrees_with_mujoco(name, friction):
     robot = load_robot(name)
     if not friction:
         robot = replace(robot, delay=np.linspace(0.004, 0.015, len(robot.joint_names)))
@@ -81,7 +81,7 @@ def test_a_second_of_motion_is_mujocos(name, friction):
 
 
 @pytest.mark.parametrize("name", packaged_robots())
-def test_holding_for_ten_seconds_is_mujocos(name):
+def test_holding_for_ten_seconds_agrees_with_mujoco(name):
     robot = load_robot(name)
     both = Both(robot, both_rates=False)
     both.put(slice(None), both.at)
@@ -91,7 +91,7 @@ def test_holding_for_ten_seconds_is_mujocos(name):
 
 
 @pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
-def test_some_step_alone_and_a_state_comes_back(tmp_path, rates):
+def test_some_simulations_step_alone_and_a_state_is_restored(tmp_path, rates):
     robot = replace(write_arm(tmp_path), delay=[0.03, 0.0], target_speed=[0.0, 0.8])
     sim = WarpSim(BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1), "warp-cpu")
     sim.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)), past=np.zeros((3, 4, 2)))
@@ -109,7 +109,7 @@ def test_some_step_alone_and_a_state_comes_back(tmp_path, rates):
 
 @pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
 @pytest.mark.parametrize("delay", [0.0, 0.03])
-def test_servos_with_a_law_are_c_mujocos(tmp_path, rates, delay):
+def test_the_servo_model_agrees_with_mujoco(tmp_path, rates, delay):
     law = {"stribeck": 0.05, "stribeck_speed": 0.2, "friction_motor": 0.1, "friction_external": 0.1}
     robot = replace(write_arm(tmp_path), delay=[delay, 0.0], encoder_step=1e-3, min_torque=0.02, **law)
     robot = robot.with_servos({"elbow": {"offset": 0.1}})
@@ -142,7 +142,7 @@ def test_servos_with_a_law_are_c_mujocos(tmp_path, rates, delay):
 
 
 @pytest.mark.parametrize("parts", [("stribeck", "stribeck_speed"), ("encoder_step",), ("min_torque",), SERVO_TERMS])
-def test_the_law_of_a_physics_step_is_c_mujocos_but_for_rounding(tmp_path, parts):
+def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp_path, parts):
     law = dict(zip(SERVO_TERMS, (0.05, 0.2, 0.1, 0.2, 0.02, 1e-3), strict=True))
     robot = replace(write_arm(tmp_path), timestep=0.02, **{name: law[name] for name in parts})
     robot = robot.with_servos({"elbow": {"offset": 0.1}})

@@ -29,7 +29,7 @@ FIRST = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "of
         {"kd": 1.0},
     ],
 )
-def test_a_joint_on_its_own_moves_as_the_whole_robot(tmp_path, changed):
+def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
     changed = dict(changed)
     kd = f"effort_limit = 5.0\nkd = {changed.pop('kd', 0.0)}"
     robot = write_arm(tmp_path / "arm", TOML.replace("effort_limit = 5.0", kd))
@@ -48,7 +48,7 @@ def test_a_joint_on_its_own_moves_as_the_whole_robot(tmp_path, changed):
         np.testing.assert_allclose(runs._arrays(values)[0, :, 0].T * runs.counted[0][:, None], alone, atol=2e-4)
 
 
-def test_candidates_side_by_side_are_those_one_by_one(tmp_path):
+def test_candidates_do_not_affect_each_other(tmp_path):
     robot = write_arm(tmp_path)
     runs = JointRollouts(recordings(robot, 2, rows=60, kp=0.7), robot)
     law = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "min_torque": 0.1}
@@ -71,7 +71,7 @@ def test_recordings_at_several_gains_have_one_servo(tmp_path):
     assert np.abs(JointRollouts(untold, robot).errors(values)).mean() > 5e-3
 
 
-def test_what_was_not_recorded_stands_still_and_counts_nowhere(tmp_path):
+def test_unrecorded_joints_stand_still_and_are_not_counted(tmp_path):
     """Windows of a second in which one joint moves, the other at an angle that was told: nothing is asked of it."""
     robot = write_arm(tmp_path / "arm")
     windows = []
@@ -94,7 +94,7 @@ def test_what_was_not_recorded_stands_still_and_counts_nowhere(tmp_path):
     assert verdict({"nominal": total})[0].endswith(f"most at {robot.joint_names[1]} ({1e3 * total['mpjae']:.2f}).")
 
 
-def test_no_joint_flies_away_where_gravity_is_stiffer_than_its_servo():
+def test_a_single_joint_rollout_stays_within_the_joints_range():
     """The G1's waist bent, its servos softer and softer: at most from stop to stop."""
     robot = load_robot("g1_29")
     qpos = np.tile(np.float32(robot.qpos_home), (200, 1))
@@ -111,7 +111,7 @@ def test_no_joint_flies_away_where_gravity_is_stiffer_than_its_servo():
         assert np.abs(errors[2]).max() > 0.3  # the softest falls
 
 
-def test_windows_at_several_rates_each_run_at_their_own(tmp_path):
+def test_windows_of_several_control_rates_are_fitted_together(tmp_path):
     """Two seconds of one servo, recorded at 50, at 100 and at 400 Hz: its numbers explain all of them."""
     robot = write_arm(tmp_path)
     acting = robot.with_servos({j: FIRST | {"kp": 14.0, "delay": 0.03, "damping": 0.8} for j in robot.joint_names})

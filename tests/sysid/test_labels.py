@@ -34,7 +34,7 @@ def windows(lever: float, rng: np.random.Generator, apart: float = 0.7) -> list[
     return logs
 
 
-def test_payload_and_unit_are_told_where_the_payload_loads_the_joint():
+def test_payload_and_unit_are_estimated_if_the_payload_loads_the_joint():
     found = estimate(windows(1.5, np.random.default_rng(0)), MASSES, UNITS, {})
     assert [c.told for c in found.cells] == [True, True]
     assert [c.slope for c in found.cells] == [pytest.approx(-2.25, rel=0.1), pytest.approx(-2.85, rel=0.1)]
@@ -45,13 +45,13 @@ def test_payload_and_unit_are_told_where_the_payload_loads_the_joint():
     assert "torque alone, whichever the unit, says 36 of 36 payloads within 0.5 kg of their label" in found.remarks
 
 
-def test_a_joint_that_the_payload_does_not_load_tells_nothing_and_says_so():
+def test_no_payload_is_estimated_from_a_joint_that_it_does_not_load():
     found = estimate(windows(0.02, np.random.default_rng(0), 0.3), MASSES, UNITS, {})
     assert [c.told for c in found.cells] == [False, False]
     assert not found.agreement
 
 
-def test_samples_that_are_there_twice_are_one_recording_and_two_moving_joints_are_refused():
+def test_copies_of_a_recording_are_found_and_two_moving_joints_are_refused():
     logs = windows(1.5, np.random.default_rng(0))
     again = estimate([*logs, ("again", logs[4][1])], MASSES, UNITS, {})
     assert again.recordings[-1].copy == logs[4][0]
@@ -61,7 +61,7 @@ def test_samples_that_are_there_twice_are_one_recording_and_two_moving_joints_ar
         estimate([("both", both)], MASSES, UNITS, {})
 
 
-def test_a_recording_whose_commands_were_written_down_late_is_named_by_its_torque():
+def test_a_recording_with_late_commands_is_found_by_its_torque():
     rng, logs, odd = np.random.default_rng(1), [], {3, 11}
     for i in range(16):
         time = 0.02 * np.arange(60)

@@ -17,7 +17,7 @@ def valley(x):
 ENDS = np.array([[0.3, 1.2, 0.5], [1.5, 0.2, 2.0]])
 
 
-def test_problems_that_share_candidates_find_minima_of_their_own():
+def test_problems_that_share_candidates_have_separate_minima():
     tried = []
     starts = np.random.default_rng(0).uniform(0, 2, (4, 2, 3))
     low, high = np.full((2, 3), -3.0), np.full((2, 3), 3.0)
@@ -28,7 +28,7 @@ def test_problems_that_share_candidates_find_minima_of_their_own():
     assert {shape[1:] for shape in tried} == {(2, 3)}
 
 
-def test_the_better_of_two_minima_is_found_by_a_start_beside_the_worse():
+def test_several_starts_find_the_deeper_minimum():
     waves = lambda x: np.concatenate([0.3 * x, 2 * np.sin(3 * x)], axis=-1)  # noqa: E731
     low, high = np.full((1, 1), -9.0), np.full((1, 1), 9.0)
     one, worse = descend(np.full((1, 1, 1), 6.0), low, high, waves, 30)
@@ -37,13 +37,13 @@ def test_the_better_of_two_minima_is_found_by_a_start_beside_the_worse():
     assert abs(better_half(many, cost)[0].item()) < 1e-2 < abs(one.item())
 
 
-def test_a_step_ends_at_the_edge_and_the_rest_is_solved_anew():
+def test_a_bounded_step_solves_the_free_parameters_again():
     normal = np.array([[2.0, 1.0], [1.0, 2.0]])
     found = step(normal, np.array([-4.0, 0.0]), np.array([-9.0, -9.0]), np.array([1.0, 9.0]), np.array(0.0))
     assert found == pytest.approx([1.0, -0.5], abs=1e-6)
 
 
-def test_a_slope_counts_where_both_sides_agree():
+def test_agreed_slopes_are_zero_where_the_two_sides_differ_in_sign():
     """A joint at the edge of breaking loose goes far to one side: it does not tell the parameter."""
     errors = lambda x: np.concatenate([3 * x, 50 * np.maximum(x, 0), -np.abs(x)], axis=-1)  # noqa: E731
     at, low, high = np.zeros((1, 1, 1)), np.full((1, 1), -9.0), np.full((1, 1), 9.0)

@@ -13,13 +13,13 @@ from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import target_speeds
 
 
-def recorded(robot, count=6, still=()):
+def recorded(robot, count=6, rows=400):
     """What a robot does with jumps and waves, with the noise of an encoder."""
     made, rng = [], np.random.default_rng(5)
     for i in range(count):
-        ctrl = 1.5 * commands(400, i)
-        ctrl[:200] = np.repeat(rng.uniform(-1, 1, (4, 2)), 50, axis=0)
-        start = np.tile(ctrl[0], (400, 1))
+        ctrl = 1.5 * commands(rows, i)
+        ctrl[: rows // 2] = np.repeat(rng.uniform(-1, 1, (4, 2)), rows // 8, axis=0)
+        start = np.tile(ctrl[0], (rows, 1))
         made.append(Sequence(SequenceMeta("arm", "a", f"m{i}", 0.0), robot.joint_names, 0.02, ctrl, start, 0 * start))
     return [
         replace(s, qpos=t.qpos + rng.normal(0, 1e-4, t.qpos.shape).astype(np.float32), qvel=t.qvel)
@@ -32,7 +32,7 @@ def servos():
     return {j: {"kp": 14.0, "delay": 0.02, "damping": 0.8, "armature": 0.02} for j in ("shoulder", "elbow")}
 
 
-def test_the_speed_of_a_ramp_is_read_off_recordings_and_none_where_there_is_none(tmp_path, servos):
+def test_the_speed_of_a_ramp_is_estimated_from_recordings(tmp_path, servos):
     robot = write_arm(tmp_path)
     servos["elbow"]["target_speed"] = 0.7
     assert target_speeds(recorded(robot.with_servos(servos)), robot) == pytest.approx([0.0, 0.7], rel=0.04)
@@ -45,11 +45,11 @@ def test_slow_and_stiff_servos_are_not_taken_for_ramps(tmp_path, servos, wrong):
     assert not target_speeds(recorded(robot.with_servos(servos)), robot).any()
 
 
-def test_identification_finds_a_ramp_and_says_so(tmp_path, servos):
+def test_identification_finds_a_ramp_and_warns(tmp_path, servos):
     robot = write_arm(tmp_path)
     servos["shoulder"]["target_speed"] = 0.6
-    logs = recorded(robot.with_servos(servos), 7)
-    found = identify(logs[:5], robot, logs[5:], windows=5, terms=(), table=False, nthread=1, folds=1)
+    logs = recorded(robot.with_servos(servos), 5, rows=240)
+    found = identify(logs[:3], robot, logs[3:], windows=3, terms=(), table=False, nthread=1, folds=1)
     assert found.robot.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
     assert found.after < 0.1 * found.before
     assert found.comparisons[-1].name == "ramp"
@@ -57,7 +57,7 @@ def test_identification_finds_a_ramp_and_says_so(tmp_path, servos):
     assert found.robot.before_identification.target_speed.max() == 0
 
 
-def test_joints_on_their_own_run_along_ramps_as_the_whole_robot_does(tmp_path, servos):
+def test_single_joint_rollouts_follow_ramps(tmp_path, servos):
     servos["shoulder"]["target_speed"] = 0.6
     robot = write_arm(tmp_path).with_servos(servos)
     runs = JointRollouts(recorded(robot), robot, nthread=1)

@@ -34,7 +34,7 @@ def played(robot, acting, count, rows):
         {"friction_external": 0.25},
     ],
 )
-def test_a_term_of_the_law_comes_back(tmp_path, law):
+def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
     robot = write_arm(tmp_path / "arm")
     parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
     fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
@@ -48,7 +48,7 @@ def test_a_term_of_the_law_comes_back(tmp_path, law):
             assert std[joint][field] < value
 
 
-def test_motors_of_half_the_torque_that_the_file_says_come_back(tmp_path):
+def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):
     robot, template = write_arm(tmp_path / "arm"), recordings(write_arm(tmp_path / "arm"), 1, rows=80)[0]
     jumps = np.random.default_rng(0).uniform(-1, 1, (3, 4, 2)).repeat(20, axis=1)
     asked = [replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}")) for i, c in enumerate(jumps)]
@@ -60,7 +60,7 @@ def test_motors_of_half_the_torque_that_the_file_says_come_back(tmp_path):
     assert found.after < 0.1 * found.before
 
 
-def test_a_joint_that_stands_while_another_swings_gives_way_as_it_did(tmp_path):
+def test_damping_of_an_unmoved_joint_is_recovered_from_the_motion_of_another(tmp_path):
     """The file's damping of the shoulder, which no command moves, is ten times too much."""
     robot = write_arm(tmp_path / "arm")
     swung = [replace(s, ctrl=s.ctrl * [0, 1]) for s in played(robot, robot, 3, 200)]
@@ -75,7 +75,7 @@ def test_a_joint_that_stands_while_another_swings_gives_way_as_it_did(tmp_path):
 TIP = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'
 
 
-def test_a_table_comes_back(tmp_path):
+def test_a_table_is_recovered(tmp_path):
     robot = write_arm(tmp_path / "arm", toml=TOML + TIP)
     parts = played(robot, replace(robot, table=Table(-0.02, 0.3, 2000.0)), 3, 100)
     heights = table_contact.tip_heights(parts, robot)
@@ -88,7 +88,7 @@ def test_a_table_comes_back(tmp_path):
     assert not table_contact.fit_table(free, robot, -0.1, 1, lambda error: None).accepted
 
 
-def test_an_arm_that_stays_within_a_hand_of_its_lowest_point_keeps_rows_to_fit(tmp_path):
+def test_half_of_the_rows_remain_for_motions_close_to_the_table(tmp_path):
     robot = write_arm(tmp_path, toml=TOML + TIP)
     heights = [np.linspace(0.30, 0.33, 50), np.full(40, 0.32)]
     below = table_contact.contact_height(robot, heights)

@@ -25,7 +25,7 @@ def own(robot, parts):
     return {f: x[None] for f, x in Bounds(robot, parts).first.items() if f in CLASSIC}
 
 
-def test_the_robot_as_it_is_errs_as_in_a_replay_and_each_candidate_on_its_own(robot, parts):
+def test_robot_rollouts_agree_with_replays(robot, parts):
     runs, values = RobotRollouts(parts, robot), own(robot, parts)
     both = {f: np.concatenate([x, x * (1.3 if f == "kp" else 1.0)]) for f, x in values.items()}
     errors = runs.flat_errors(both)
@@ -35,7 +35,7 @@ def test_the_robot_as_it_is_errs_as_in_a_replay_and_each_candidate_on_its_own(ro
         np.testing.assert_allclose(errors[0][:, runs.window == window], expected, atol=1e-6)
 
 
-def test_joints_on_their_own_answer_for_themselves_nearly_as_in_company(robot, parts):
+def test_a_joints_error_depends_mostly_on_its_own_parameters(robot, parts):
     runs, values = RobotRollouts(parts, robot), own(robot, parts)
     stiffer = np.array([[1.0, 1.0], [1.02, 1.02], [1.02, 1.0], [1.0, 1.02]])
     errors = runs.flat_errors({f: x * stiffer if f == "kp" else np.repeat(x, 4, axis=0) for f, x in values.items()})
@@ -45,7 +45,7 @@ def test_joints_on_their_own_answer_for_themselves_nearly_as_in_company(robot, p
         assert np.abs(together[joint] - alone).mean() < 0.2 * np.abs(alone).mean()
 
 
-def test_a_run_goes_on_from_the_recording_where_something_may_be_touched(robot, parts):
+def test_a_rollout_restarts_from_the_recording_after_a_possible_contact(robot, parts):
     touch = np.zeros((2, 60), bool)
     touch[0, 30] = True
     free, held, values = RobotRollouts(parts, robot), RobotRollouts(parts, robot, touch=touch), own(robot, parts)

@@ -20,7 +20,7 @@ TWO = (
 )
 
 
-def test_two_equal_servos_are_given_the_law_that_they_have(tmp_path):
+def test_two_equal_servos_get_one_servo_model(tmp_path):
     robot = write_arm(tmp_path, TWO)
     assert same_servos(robot) == {"S1": [0, 1]}
     true = {"kp": 15.0, "damping": 0.6, "frictionloss": 0.1, "armature": 0.02, "offset": 0.0, "delay": 0.0}
@@ -43,14 +43,14 @@ def test_a_value_an_order_of_magnitude_off_is_named(tmp_path):
     assert far_from_published(odd) == ["elbow: armature 0.25 is 12 times the 0.02 published for the S1 (a bench)"]
 
 
-def test_a_servo_that_is_not_described_is_refused(tmp_path):
+def test_an_undefined_servo_type_is_refused(tmp_path):
     with pytest.raises(RobotError, match="joint 'shoulder': servo 'S1' is no"):
         write_arm(tmp_path, TWO.replace(SERVO, ""))
     robot = write_arm(tmp_path / "own", TOML)
     assert same_servos(robot) == {} == same_servos(replace(robot, servos=()))
 
 
-def test_identify_shares_a_law_when_asked_and_says_what_it_costs(tmp_path):
+def test_identify_can_share_a_servo_model(tmp_path):
     robot = write_arm(tmp_path, TWO)
     motions = recordings(robot, 3, rows=80, kp=0.8)
     fit = identify(motions[:2], robot, motions[2:], windows=2, terms=(), shared=True)

@@ -50,7 +50,7 @@ def test_torque_determines_the_payloads_place_and_the_hands_mass_at_the_mount_th
     assert found.mass == pytest.approx(0.1, abs=0.02)
 
 
-def test_torque_says_the_gains_of_the_servo_and_nothing_where_it_is_not_its_law(arm):
+def test_gains_are_estimated_from_torque_of_a_pd_servo_and_from_no_other(arm):
     rng, made = np.random.default_rng(0), []
     for seed in range(4):
         ctrl = wave(200, 2, hertz=0.5 + 0.1 * seed)
@@ -68,7 +68,7 @@ def test_torque_says_the_gains_of_the_servo_and_nothing_where_it_is_not_its_law(
     assert not TorqueFit([replace(s, tau=None) for s in made], arm).trusted
 
 
-def test_noise_of_position_and_speed_softens_no_gain(arm):
+def test_measurement_noise_does_not_lower_the_estimated_gains(arm):
     rng, made = np.random.default_rng(0), []
     for seed in range(12):
         ctrl = wave(120, 2, hertz=0.5 + 0.1 * seed)
@@ -93,7 +93,7 @@ def loaded(robot):
     return windows
 
 
-def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_path):
+def test_the_fit_from_torque_is_used_if_validation_motions_accept_it(tmp_path):
     robot = write_arm(tmp_path / "arm")
     windows = loaded(robot)
     found = identify(windows[:12], robot, windows[12:], terms=())
@@ -107,7 +107,7 @@ def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_p
     assert found.after < silent.after
 
 
-def test_a_fit_from_torque_that_comes_to_follow_its_judges_worse_stays_as_they_judged_it(tmp_path, monkeypatch):
+def test_a_refit_with_the_validation_motions_is_dropped_if_it_follows_them_worse(tmp_path, monkeypatch):
     robot, own = write_arm(tmp_path / "arm"), TorqueFit.fit
     windows = loaded(robot)
 
@@ -122,7 +122,7 @@ def test_a_fit_from_torque_that_comes_to_follow_its_judges_worse_stays_as_they_j
     assert abs(found.robot.offset).max() < 0.05
 
 
-def test_a_hand_and_where_payloads_hang_are_kept_in_the_folder(tmp_path):
+def test_identified_payload_mounts_are_stored_in_the_folder(tmp_path):
     robot = write_arm(tmp_path / "arm")
     true = replace(moved(robot, -0.06, 0.3), nominal=robot)
     save_robot(true, tmp_path / "kept")

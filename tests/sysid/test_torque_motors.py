@@ -57,7 +57,7 @@ def robot(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("unit", "words"), [(1.0, []), (0.08, ["--current"])])
-def test_a_driven_arm_is_found_and_moves_as_the_simulator_does_after(robot, tmp_path, capsys, unit, words):
+def test_a_torque_driven_arm_is_identified(robot, tmp_path, capsys, unit, words):
     data = imported(tmp_path, robot, {f"m{k}": drive(robot, k, unit) for k in range(4)})
     capsys.readouterr()
     assert main(["identify", data, "--out", str(tmp_path / "found"), "--json", *words]) == 0
@@ -86,7 +86,7 @@ def test_a_push_by_hand_is_not_taken_for_friction(robot, tmp_path, capsys):
     assert said["armature"] == pytest.approx(0.05, rel=0.2)
 
 
-def test_commands_for_positions_say_that_there_are_none(robot, tmp_path, capsys):
+def test_commands_that_need_positions_name_identify(robot, tmp_path, capsys):
     data = imported(tmp_path, robot, {"one": drive(robot, 0, rows=1800)})
     for words in (["gap", data], ["train", data, "--out", str(tmp_path / "y")]):
         capsys.readouterr()
@@ -98,7 +98,7 @@ def test_commands_for_positions_say_that_there_are_none(robot, tmp_path, capsys)
     )  # one recording: its parts fit and judge in turn
 
 
-def test_logs_of_positions_alone_have_no_torque_to_fit(robot, tmp_path, capsys):
+def test_logs_without_torque_are_refused(robot, tmp_path, capsys):
     table = drive(robot, 0, rows=300)
     (tmp_path / "logs").mkdir()
     np.savetxt(tmp_path / "logs/a.csv", table[:, :3], delimiter=",", header="time,q_shoulder,q_elbow", comments="")

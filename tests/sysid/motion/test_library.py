@@ -4,7 +4,7 @@ import pytest
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.motion.feasible import MAX_PAYLOAD
-from gaponet.sysid.motion.library import Library, short
+from gaponet.sysid.motion.library import SIGNALS, Library, short
 
 SOME = ["sweep-left_shoulder_roll", "steps-right_elbow", "reach-both-0", "punch-right-1", "wave-left-0", "march-all-0"]
 
@@ -47,7 +47,7 @@ def test_the_same_seed_makes_the_same_motion_and_another_seed_another():
     assert a.shape != c.shape or not np.array_equal(a, c)
 
 
-def test_levels_say_what_moves(library):
+def test_levels_follow_from_the_joints_that_move(library):
     assert library.make("creep-left_elbow").moved(library.robot) == ("left_elbow_joint",)
     assert library.make("creep-left_elbow").level == "joint"
     assert all("hip" not in j for j in library.make("carry-both-0").moved(library.robot))
@@ -76,3 +76,36 @@ def test_a_robot_without_arms_by_name_has_signals_and_tours(arm):
     assert "tour-all-0" in names
     assert not [n for n in names if n.startswith(("reach", "squat"))]
     assert library.limits.demand(library.make("tour-all-0").ctrl, 0.01).met
+
+
+DT = 0.01
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.parametrize("span", [(-1.0, 2.0), (-0.2, 0.25)])
+def test_every_signal_stays_inside_and_starts_and_ends_at_rest(name, span):
+    y = SIGNALS[name](*span, np.random.default_rng(1), DT)
+    assert y.min() >= span[0] - 1e-9
+    assert y.max() <= span[1] + 1e-9
+    assert np.ptp(y) > 0.05
+    assert np.abs(np.diff(y)[[0, -1]]).max() < 1e-9
+
+
+def test_a_creep_is_slow():
+    y = SIGNALS["creep"](-1.0, 2.0, np.random.default_rng(0), DT)
+    assert np.abs(np.diff(y) / DT).max() < 0.101
+
+
+def test_a_chirp_gets_faster():
+    y = SIGNALS["chirp"](-1.0, 1.0, np.random.default_rng(0), DT)
+    moving = y[50:-50] - y[0]
+    crossings = np.flatnonzero(np.diff(np.sign(moving)))
+    gaps = np.diff(crossings) * DT
+    assert gaps[0] > 3 * gaps[-1]
+
+
+def test_trapezoids_cruise_at_constant_speeds():
+    y = SIGNALS["trapezoids"](-2.0, 2.0, np.random.default_rng(3), DT)
+    speed = np.abs(np.diff(y)) / DT
+    cruising = sorted({round(float(v), 1) for v in speed if (np.abs(speed - v) < 0.01).sum() > 30 and v > 0.1})
+    assert cruising == [0.4, 0.7, 1.0, 1.4]

@@ -9,7 +9,6 @@ from contacts import Contacts
 from gaponet.base.errors import UsageError
 from gaponet.cli.main import main
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.motion.feasible import Feasibility
 from gaponet.sysid.motion.files import read_motion, write_motion
 from gaponet.sysid.motion.plan import make_plan
 
@@ -19,16 +18,11 @@ def plan(so101):
     return make_plan(so101, 6.0, (0.0, 0.2))
 
 
-def test_the_plan_is_as_long_as_asked_and_moves_every_joint(so101, plan):
+def test_a_plan_has_the_requested_duration_and_moves_every_joint(so101, plan):
     longest = max(m.duration for m in plan.motions) * 2 / 60
     assert 6.0 <= plan.minutes <= 6.0 + longest
     assert {name for m in plan.motions for name in m.moved(so101)} == set(so101.operated)
     assert any(len(m.moved(so101)) > 1 for m in plan.motions)
-
-
-def test_every_motion_can_be_done_with_the_heaviest_payload(so101, plan):
-    limits = Feasibility(so101, 0.2)
-    assert all(limits.demand(m.ctrl, m.dt).met for m in plan.motions)
 
 
 def test_no_motion_touches_the_arm_or_the_table_and_none_moves_the_gripper(so101, plan):
@@ -38,7 +32,7 @@ def test_no_motion_touches_the_arm_or_the_table_and_none_moves_the_gripper(so101
 
 
 @pytest.mark.parametrize(("suffix", "rate"), [("txt", 50.0), ("csv", 100.0), ("npz", 30.0)])
-def test_a_motion_comes_back_from_its_file(so101, plan, tmp_path, suffix, rate):
+def test_a_motion_survives_its_file(so101, plan, tmp_path, suffix, rate):
     motion = plan.motions[0]
     write_motion(tmp_path / f"m.{suffix}", motion, so101, rate)
     back = read_motion(tmp_path / f"m.{suffix}", so101)

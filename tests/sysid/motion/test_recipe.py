@@ -29,7 +29,7 @@ def test_a_recipe_that_cannot_be_played_is_refused_by_field(tmp_path, old, new, 
         load_recipe(tmp_path / "mine.toml")
 
 
-def test_a_recipe_without_end_is_refused(tmp_path):
+def test_a_recipe_with_too_many_sequences_is_refused(tmp_path):
     units = ", ".join(f'"u{i}"' for i in range(200))
     (tmp_path / "mine.toml").write_text(GOOD.replace('"a"', units) + "repetitions = 10000\n")
     with pytest.raises(UsageError, match="2000000 sequences; at most 1000000 in one recipe"):

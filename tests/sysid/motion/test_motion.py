@@ -3,14 +3,48 @@ import pytest
 
 from gaponet.base.errors import UsageError
 from gaponet.sysid.motion.feasible import MAX_SPEED, TORQUE_SHARE, Feasibility, stretch
-from gaponet.sysid.motion.motion import GRID, Motion
+from gaponet.sysid.motion.motion import GRID, PEAK_SPEED, Motion, blend, fade, move_time, through
+
+
+def test_a_move_starts_and_ends_at_rest_and_passes_the_middle_in_the_middle():
+    s = np.linspace(0, 1, 1001)
+    y = blend(s)
+    speed = np.gradient(y, s)
+    assert y[0] == 0
+    assert y[-1] == 1
+    assert y[500] == 0.5
+    assert abs(speed[0]) < 1e-4
+    assert abs(speed[-1]) < 1e-4
+    assert abs(speed.max() - PEAK_SPEED) < 1e-4
+
+
+def test_via_points_are_reached_and_held():
+    path = through(
+        np.array([[0.0, 1.0], [2.0, -1.0], [0.5, 0.5]]), np.array([1.0, 0.5]), np.array([0.2, 0.3, 0.1]), 0.1
+    )
+    assert path.shape == (2 + 10 + 3 + 5 + 1, 2)
+    assert (path[:2] == [0.0, 1.0]).all()
+    assert np.allclose(path[11:15], [2.0, -1.0])
+    assert np.allclose(path[-1], [0.5, 0.5])
+
+
+def test_move_time_keeps_peak_speed():
+    # 1 rad at 1.5 rad/s peak: 1.875 · 1 / 1.5 = 1.25 s
+    assert move_time(np.array([1.0, 0.01]), 1.5).tolist() == [1.25, 0.5]
+
+
+def test_a_faded_wave_starts_and_ends_at_zero():
+    window = fade(500, 0.01, 1.0)
+    assert window[0] == 0
+    assert window[-1] == 0
+    assert window[250] == 1
 
 
 def still(robot, shoulder, elbow=0.0, rows=50):
     return np.repeat(np.array([[shoulder, elbow]]), rows, axis=0)
 
 
-def test_holding_an_arm_level_asks_for_its_weight(arm):
+def test_torque_demand_of_a_level_arm_is_its_weight(arm):
     # upper 0.3 kg at 0.1 m, fore 0.2 kg at 0.3 m, payload 0.5 kg at 0.4 m, the fore arm's frame turned level
     need = Feasibility(arm, 0.5).demand(still(arm, 0.0), GRID)
     weight = 9.81 * (0.3 * 0.1 + 0.2 * 0.3 + 0.5 * 0.4)
@@ -47,16 +81,10 @@ def test_a_motion_that_is_too_heavy_is_brought_nearer_to_its_start(arm):
     assert fitted.ctrl[-1, 0] > 0.3
 
 
-def test_what_cannot_be_fitted_says_why(arm):
+def test_a_motion_that_cannot_be_fitted_is_refused_with_the_reason(arm):
     limits = Feasibility(arm, 5.0)
     with pytest.raises(UsageError, match=r"'hold' does not fit arm .* shoulder needs .* at 5 kg, .* lighter payload"):
         limits.fit(Motion("hold", "joint", GRID, still(arm, 0.0)))
-
-
-def test_demand_at_payloads_between_is_between(arm):
-    ctrl = np.stack([0.5 * np.sin(np.linspace(0, 6, 300)), 0.3 * np.cos(np.linspace(0, 4, 300))], axis=1)
-    torque = [Feasibility(arm, p).demand(ctrl, GRID).torque for p in (0.0, 0.2, 0.4)]
-    assert torque[0] < torque[1] < torque[2]
 
 
 def test_stretch_keeps_ends():
