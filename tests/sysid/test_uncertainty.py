@@ -229,3 +229,21 @@ def test_another_arm_that_no_parameter_explains_has_drifted(arm, folder, monkeyp
     assert found.verdict == "drifted"
     assert "no number explains how far these logs are from the model" in found.advice
     assert set(found.far) <= set(arm.operated)
+
+
+def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(arm, folder, tmp_path):
+    """A robot that stands 4 mrad elsewhere each time it plays a command: 3 mrad today are nothing."""
+    robot, rng = load_robot(folder), np.random.default_rng(0)
+    today = [replace(s, qpos=s.qpos + np.float32([0.003, 0.0])) for s in played(arm, 50, 6)]
+    seen = {}
+    for repeats in (1, 3):
+        logs = [
+            replace(s, qpos=s.qpos + np.float32(0.004 * (repeats > 1) * rng.standard_normal(2)))
+            for s in played(arm) for _ in range(repeats)
+        ]  # fmt: skip
+        mine = estimate_uncertainty(robot, logs, played(arm, 20, 3), nthread=1)
+        seen[repeats] = drift(robot, mine, today, 1), mine.joints["shoulder"].repeatability
+    (precise, none), (loose, difference) = seen.values()
+    assert (precise.verdict, loose.verdict, none) == ("drifted", "same", 0.0)
+    assert difference == pytest.approx(0.004 * 2**0.5, rel=0.5)
+    assert loose.min_effect["shoulder"] == difference > loose.largest["shoulder"].moves

@@ -17,7 +17,7 @@ from gaponet.robot.spec import load_robot
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 if TYPE_CHECKING:
-    from gaponet.sysid.drift import ParameterChange
+    from gaponet.sysid.drift import Drift, ParameterChange
 
 Robot = Annotated[
     Folder,
@@ -75,9 +75,9 @@ def check(
     named = {m.joint for m in drift.moved}
     screen.table(
         f"{made.recordings} recordings, {drift.seconds:.0f} s: what changed most, in standard deviations",
-        ["joint", "number", "by", "deviations", "moves it, mrad", "left anyway, mrad", ""],
+        ["joint", "number", "by", "deviations", "moves it, mrad", "counts from, mrad", ""],
         [
-            _row(m, uncertainty, m.joint in named)
+            _row(m, uncertainty, drift, m.joint in named)
             for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))
         ],
     )
@@ -119,11 +119,10 @@ def _check_fleet(
         raise SystemExit(1)
 
 
-def _row(m: ParameterChange, known: ParameterUncertainty, counts: bool) -> list[str]:
+def _row(m: ParameterChange, uncertainty: ParameterUncertainty, drift: Drift, counts: bool) -> list[str]:
     from gaponet.sysid.uncertainty import format_change
 
-    mine = [k.residual_rms for j, k in known.joints.items() if m.joint == j or m.joint not in known.joints]
-    left = sum(mine) / len(mine)
-    by = format_change(m.field, m.by, known, m.joint)
-    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * left:.2f}",
+    least = drift.min_effect.get(m.joint) or sum(drift.min_effect.values()) / len(drift.min_effect)
+    by = format_change(m.field, m.by, uncertainty, m.joint)
+    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * least:.2f}",
             "moved" if counts else ""]  # fmt: skip

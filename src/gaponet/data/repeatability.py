@@ -2,19 +2,60 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.data.fingerprint import equal_commands, fingerprint
 from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 
 MAX_COMMAND_DIFFERENCE_RAD = 1e-3  # repetitions whose commands differ by more have another command
+MAX_COMMAND_DIFFERENCE_SHARE = 0.02  # the same, of the command's range, on average: of commands computed twice
+MAX_SHIFT_ROWS, MAX_PAIRS = 5, 100  # by which clocks differ; of recordings that are compared
 MIN_PERIOD_S = 0.5  # of a periodic motion
 MIN_MOTION_RAD = 0.02  # joints that are commanded to move by less are left out
 CHANNELS = ("qpos", "qvel", "tau", "temperature")
+
+
+def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> Array:
+    """Return the RMS difference between the tracking errors of two recordings of one command, (n) rad; 0 if unknown.
+
+    Commands count as one if they agree after a shift of MAX_SHIFT_ROWS rows at most: the clocks of two recordings may
+    differ by that.
+
+    Args:
+        sequences: Recordings; only those of one unit, payload and rate are compared.
+        joints: Names of the n joints.
+    """
+    marks = [fingerprint(s.ctrl, s.dt) for s in sequences]
+    pairs = [(sequences[i], sequences[j]) for i, j in equal_commands(marks)]
+    pairs = [(a, b) for a, b in pairs if a.meta.repetition_key[1:] == b.meta.repetition_key[1:] and a.dt == b.dt]
+    total, count = np.zeros((2, len(joints)))
+    for a, b in pairs[:: max(1, len(pairs) // MAX_PAIRS)]:
+        columns = [i for i, j in enumerate(joints) if j not in (*a.meta.unrecorded, *b.meta.unrecorded)]
+        places = [a.joint_names.index(joints[i]) for i in columns]
+        if columns and (difference := _tracking_difference(a, b, places)) is not None:
+            total[columns] += difference
+            count[columns] += 1
+    return np.sqrt(total / np.maximum(count, 1))
+
+
+def _tracking_difference(a: Sequence, b: Sequence, columns: list[int]) -> Array | None:
+    """Return the mean squared difference of the tracking errors of two recordings, (n) rad²; None for two commands."""
+    one, other = (np.concatenate([s.ctrl[:, columns], s.qpos[:, columns]], axis=1).astype(float) for s in (a, b))
+    rows = np.arange(MAX_SHIFT_ROWS, min(len(a), len(b)) - MAX_SHIFT_ROWS)
+    if not len(rows):
+        return None
+    each = [one[rows] - other[rows + shift] for shift in range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1)]
+    command, position = np.split(min(each, key=lambda x: np.abs(x[:, : len(columns)]).mean()), 2, axis=1)
+    limit = MAX_COMMAND_DIFFERENCE_SHARE * float(np.ptp(a.ctrl[:, columns], axis=0).max())
+    if np.abs(command).mean() > max(MAX_COMMAND_DIFFERENCE_RAD, limit):
+        return None
+    return np.asarray(np.square(position - command).mean(axis=0))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.progress import Progress, no_progress, with_note
-from gaponet.data.repeatability import Repetitions
+from gaponet.data.repeatability import Repetitions, repetition_difference
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
@@ -26,6 +26,8 @@ from gaponet.sim.metrics import Run, metrics, runs, standard_error
 from gaponet.sim.metrics import summary as errors_of
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
+
+MAX_COMPARED = 60  # recordings that are searched for equal commands
 
 
 def gap_by_step(
@@ -154,7 +156,9 @@ def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, di
     """
     groups: dict[Any, Repetitions] = defaultdict(Repetitions)
     angles: list[Array] = []
+    some: list[Sequence] = []
     for s in sequences:
+        some += [s] * (len(some) < MAX_COMPARED)
         angles.append(s.qpos[:, robot.operated_index])
         same = (*s.meta.repetition_key, round(s.dt * 1e6))
         groups[same].add(s)
@@ -162,6 +166,9 @@ def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, di
             groups[*same, "period"].add(period)
     repeated = [g.result() for g in groups.values() if g.count > 1]
     std = Repetitions.summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
+    if not std:  # recordings of one command under several names
+        differences = zip(robot.operated, repetition_difference(some, robot.operated).tolist(), strict=True)
+        std = {joint: difference / np.sqrt(2) for joint, difference in differences if difference}
     floors: dict[str, dict[str, float | None]] = {}
     for i, joint in enumerate(robot.operated):
         encoder = encoder_step([a[:, i] for a in angles]) / 4 or None

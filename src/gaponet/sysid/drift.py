@@ -17,6 +17,7 @@ from scipy.stats import t as student
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
+from gaponet.data.repeatability import repetition_difference
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
@@ -81,6 +82,8 @@ class Drift:
         verdict: same, drifted or contradictory.
         moved: Significant changes.
         largest: Joint → its largest change, significant or not.
+        min_effect: Joint → least effect on its path that counts, rad: a share of the model's error, and at least the
+            RMS difference between two recordings of one command.
         against: Recordings that were set aside since they contradict the others.
         advice: What to do.
         threshold: Standard errors from which a change is significant.
@@ -91,6 +94,7 @@ class Drift:
     verdict: Verdict
     moved: tuple[ParameterChange, ...]
     largest: Mapping[str, ParameterChange]
+    min_effect: Mapping[str, float]
     against: tuple[Contradiction, ...]
     advice: str
     threshold: float
@@ -114,8 +118,12 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     if not own.rows.any():
         raise UsageError("no recording moves an operated joint away from what it may touch; record gaponet excite's")
     fields, joints = (*uncertainty.fields, PLAY), robot.operated
+    repeatability = {
+        j: max(float(today), uncertainty.joints[j].repeatability)
+        for j, today in zip(joints, repetition_difference(sequences, joints), strict=True)
+    }
     times = {
-        j: float(np.median(e)) / max(uncertainty.joints[j].residual_rms, 1e-9)
+        j: float(np.median(e)) / max(uncertainty.joints[j].residual_rms, repeatability[j], 1e-9)
         for j, e in zip(joints, own.window_rms, strict=True)
     }
     far = {j: by for j, by in times.items() if by > FAR_RATIO}
@@ -132,7 +140,7 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     scatter = trusted * widened(information, overdispersion) + (clusters - 1) * gradient_covariance(grouped.gradients)
     gradients, rows = grouped.gradients.sum(axis=1), own.rows.astype(int).tolist()
     each = [
-        _Joint(j, uncertainty, information[i], gradients[i], scatter[i] / freedom, rows[i])
+        _Joint(j, uncertainty, information[i], gradients[i], scatter[i] / freedom, rows[i], repeatability[j])
         for i, j in enumerate(joints)
     ]
     moved = [m for f in COMMON_FIELDS if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))]
@@ -144,8 +152,9 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     verdict: Verdict = "contradictory" if contradictory else "drifted" if moved or far else "same"
     seconds = float(sum(s.duration for s in sequences))
     return Drift(
-        verdict, tuple(moved), largest, against, _advice(verdict, moved, against, joints, far), threshold, seconds, far
-    )
+        verdict, tuple(moved), largest, {one.name: one.min_effect for one in each}, against,
+        _advice(verdict, moved, against, joints, far), threshold, seconds, far,
+    )  # fmt: skip
 
 
 def directions(uncertainty: ParameterUncertainty, joint: str) -> Array:
@@ -172,7 +181,7 @@ class _Joint:
 
     def __init__(
         self, name: str, uncertainty: ParameterUncertainty, information: Array, gradient: Array, scatter: Array,
-        rows: int,
+        rows: int, repeatability: float,
     ) -> None:  # fmt: skip
         self.name, self.fields = name, (*uncertainty.fields, PLAY)
         step_covariance, by_field = uncertainty.array(name, "gauss_newton_covariance"), directions(uncertainty, name)
@@ -181,7 +190,7 @@ class _Joint:
         self.weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
         squares = np.maximum(np.diag(by_field.T @ information @ by_field), 0.0) / max(rows, 1)
         self.effect = ERROR_SCALE_RAD * np.sqrt(squares)
-        self.min_effect = MIN_EFFECT_RATIO * uncertainty.joints[name].residual_rms
+        self.min_effect = max(MIN_EFFECT_RATIO * uncertainty.joints[name].residual_rms, repeatability)
         self.gradient = -gradient - information @ uncertainty.array(name, "gauss_newton_step")
         self.columns = information @ by_field
 

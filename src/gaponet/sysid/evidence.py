@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.data.repeatability import repetition_difference
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
@@ -175,6 +176,7 @@ def estimate_uncertainty(
         old = np.stack([before.array(j, "overdispersion") for j in robot.operated])
         overdispersion = (before.clusters * old + clusters * overdispersion) / (before.clusters + clusters)
     step, step_covariance = own.gauss_newton_step(np.maximum(overdispersion, 1.0))
+    repeatability = repetition_difference(sequences, robot.operated)
     errors, joints = _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread), {}
     for i, joint in enumerate(robot.operated):
         covariance = step_covariance[i, :-1, :-1]
@@ -198,6 +200,7 @@ def estimate_uncertainty(
             parameter_rms=ERROR_SCALE_RAD * float(np.sqrt(variance)),
             residual_rms=max(rms, old_joint.residual_rms if old_joint else 0.0),
             residual_p90=max(_error_bound(errors[joint]), old_joint.residual_p90 if old_joint else 0.0),
+            repeatability=max(float(repeatability[i]), before.joints[joint].repeatability if before else 0.0),
         )  # fmt: skip
     source: Provenance = {
         "made_by": "identify" if judges or covariances else "adapt",

@@ -63,6 +63,7 @@ class JointUncertainty:
         parameter_rms: RMS position error that the covariance alone predicts, rad.
         residual_rms: RMS position error of motions that were not fitted, rad.
         residual_p90: Bound of 90 % of the position errors of other motions, rad.
+        repeatability: RMS difference between the tracking errors of two recordings of one command, rad; 0 if unknown.
     """
 
     values: tuple[float, ...]
@@ -73,6 +74,7 @@ class JointUncertainty:
     parameter_rms: float
     residual_rms: float
     residual_p90: float
+    repeatability: float = 0.0
 
 
 ArrayName = Literal["values", "covariance", "gauss_newton_step", "gauss_newton_covariance", "overdispersion"]
