@@ -36,8 +36,8 @@ def windows(lever: float, rng: np.random.Generator, apart: float = 0.7) -> list[
 
 def test_payload_and_unit_are_estimated_if_the_payload_loads_the_joint():
     found = estimate(windows(1.5, np.random.default_rng(0)), MASSES, UNITS, {})
-    assert [c.told for c in found.cells] == [True, True]
-    assert [c.slope for c in found.cells] == [pytest.approx(-2.25, rel=0.1), pytest.approx(-2.85, rel=0.1)]
+    assert [c.determined for c in found.groups] == [True, True]
+    assert [c.slope for c in found.groups] == [pytest.approx(-2.25, rel=0.1), pytest.approx(-2.85, rel=0.1)]
     for r in found.recordings:
         unit, mass, _ = r.name.split()
         assert (r.payload, r.unit) == (float(mass), int(unit))  # the one that holds more is the later one
@@ -47,14 +47,14 @@ def test_payload_and_unit_are_estimated_if_the_payload_loads_the_joint():
 
 def test_no_payload_is_estimated_from_a_joint_that_it_does_not_load():
     found = estimate(windows(0.02, np.random.default_rng(0), 0.3), MASSES, UNITS, {})
-    assert [c.told for c in found.cells] == [False, False]
+    assert [c.determined for c in found.groups] == [False, False]
     assert not found.agreement
 
 
 def test_copies_of_a_recording_are_found_and_two_moving_joints_are_refused():
     logs = windows(1.5, np.random.default_rng(0))
     again = estimate([*logs, ("again", logs[4][1])], MASSES, UNITS, {})
-    assert again.recordings[-1].copy == logs[4][0]
+    assert again.recordings[-1].copy_of == logs[4][0]
     time, two = logs[0][1].channels["ctrl"].time, np.tile(logs[0][1].channels["ctrl"].values, 2)
     both = Log("arm", ("elbow", "wrist"), {"ctrl": Channel(time, two), "qpos": Channel(time, two)}, "both")
     with pytest.raises(LogError, match="2 joints are commanded to move"):
@@ -75,8 +75,8 @@ def test_a_recording_with_late_commands_is_found_by_its_torque():
         channels["ctrl"] = Channel(time[: 60 - late], ctrl[late:, None])
         logs.append((f"take {i}", Log("arm", ("elbow",), channels, f"motor.npz#{i}")))
     found = estimate(logs, MASSES, UNITS, {})
-    assert {i for i, r in enumerate(found.recordings) if abs(r.late) > 0.01} == odd
-    assert [r.late for r in found.recordings if abs(r.late) > 0.01] == pytest.approx([0.04, 0.04], abs=0.006)
+    assert {i for i, r in enumerate(found.recordings) if abs(r.lag) > 0.01} == odd
+    assert [r.lag for r in found.recordings if abs(r.lag) > 0.01] == pytest.approx([0.04, 0.04], abs=0.006)
     assert [line.partition(":")[0] for line in found.remarks] == ["elbow", "take 3", "take 11"]
     gains, held = found.gains["elbow"]
     assert (gains.kp, gains.kd) == (pytest.approx(40.0, rel=0.02), pytest.approx(1.5, rel=0.1))

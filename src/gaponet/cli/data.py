@@ -174,18 +174,18 @@ def _labels(
     gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
     found = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
     write(found, out, rate)
-    columns = ["joint", "to, rad", "recordings", "N·m a kg", "bands apart", "units, N·m", "payload told"]
+    columns = ["joint", "to, rad", "recordings", "N·m a kg", "bands apart", "units, N·m", "payload determined"]
     screen.table("Held torque at equal commands", columns, [
-        [c.joint, f"{c.command:+.2f}", str(c.count), f"{c.slope:+.2f}", f"{c.apart:.1f}",
-         ", ".join(f"{u:+.2f}" for u in c.units), "yes" if c.told else "no"]
-        for c in found.cells
+        [c.joint, f"{c.command:+.2f}", str(c.count), f"{c.slope:+.2f}", f"{c.band_distance:.1f}",
+         ", ".join(f"{u:+.2f}" for u in c.units), "yes" if c.determined else "no"]
+        for c in found.groups
     ])  # fmt: skip
     for line in found.remarks:
         screen.say(line)
     screen.say(
         f"written: {out / 'labels.csv'!s}; next: gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}"
     )
-    screen.result({"cells": found.cells, "agreement": found.agreement, "recordings": found.recordings})
+    screen.result({"cells": found.groups, "agreement": found.agreement, "recordings": found.recordings})
 
 
 # Each is run while the command line is parsed; what is left to call is nothing.

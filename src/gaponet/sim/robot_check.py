@@ -19,28 +19,26 @@ from gaponet.sim.model import build_model
 
 Array = np.ndarray
 
-SECONDS = 60.0  # of a hold
-NUDGE = 0.01  # rad from home at its start
-RESTS = 0.05  # rad/s: faster in the last ten seconds, it does not rest
-CREEP = 1e-3  # rad in its second half
-SAG = 0.1  # rad
-GROWTH = 1e-3  # of a small motion in one physics step, beyond which it grows
-TURNS = 0.1  # rad a step: an unstable step turns a motion round, one that falls goes on
-POSTURES = 8  # at random, in which small motions are looked at
-ARMATURE = 1e-5  # kg·m²; less is none
-BURIED = 1e-4  # m inside each other: they collide
+HOLD_S, HOLD_START_RAD = 60.0, 0.01  # of a hold at home, and distance from home at its start
+MAX_REST_SPEED = 0.05  # rad/s in the last ten seconds of the hold
+MAX_CREEP_RAD, MAX_SAG_RAD = 1e-3, 0.1  # in the second half of the hold; at its end
+MAX_GROWTH = 1e-3  # relative, of a small motion in one physics step
+MIN_OSCILLATION_RAD = 0.1  # phase per step: an unstable step oscillates, a joint that falls does not
+MAX_POSTURES = 8  # in which small motions are examined
+MIN_ARMATURE = 1e-5  # kg·m²; less is none
+MIN_PENETRATION_M = 1e-4  # of links that collide
 
 
 class _Growth(NamedTuple):
-    """Factor by which a small motion grows in a physics step, the joint that moves most, whether it turns back."""
+    """Factor by which a small motion grows in a physics step, the joint that moves most, and if it oscillates."""
 
     factor: float
     joint: int
-    turns: bool
+    oscillates: bool
 
 
 def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures: Array | None = None) -> list[Finding]:
-    """Step the nominal simulator of a robot and judge it, worst first.
+    """Step the nominal simulator of a robot and return findings, worst first.
 
     Args:
         robot: Loaded by load_robot.
@@ -83,7 +81,7 @@ def _joints(robot: RobotSpec) -> Iterator[Finding]:
 
 
 def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Finding]:
-    """Can each joint hold its home?"""
+    """Find joints whose torque limit is less than the torque that holds home."""
     for mass, model in models.items():
         load = np.abs(static_torque(model, robot.qpos_home[None])[0])
         for i in np.flatnonzero(load > robot.effort_limit):
@@ -96,7 +94,7 @@ def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Fi
 
 
 def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
-    """Torque limits that override each other."""
+    """Find torque limits that override each other."""
     for i, name in enumerate(robot.joint_names):
         j = model.joint(name).id
         most = np.abs(model.jnt_actfrcrange[j]).min() if model.jnt_actfrclimited[j] else np.inf
@@ -124,7 +122,7 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     if (model.body_gravcomp != 0).any():
         text = "gravcomp in robot.xml takes weight off bodies: right where the controller compensates gravity; else "
         yield Finding("note", "couplings", f"{text}delete it")
-    bare = names[model.dof_armature < ARMATURE]
+    bare = names[model.dof_armature < MIN_ARMATURE]
     if len(bare):
         text = (
             f"no armature at {abbreviate(bare.tolist())}: geared motors have 0.001 to 0.5 kg·m² (rotor inertia times "
@@ -141,7 +139,7 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
 
 
 def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Finding]:
-    """Which links lie inside each other?"""
+    """Find links that lie inside each other."""
     model = build_model(replace(robot, contacts=True, table=None))
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         yield Finding("ok", "contacts", "robot.xml has contacts off: nothing touches but tips a table")
@@ -152,17 +150,19 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
     def pairs(qpos: Array) -> set[str]:
         data.qpos[:] = qpos
         mujoco.mj_fwdPosition(model, data)
-        return {" and ".join(sorted((name(c.geom1), name(c.geom2)))) for c in data.contact if c.dist < -BURIED}
+        return {
+            " and ".join(sorted((name(c.geom1), name(c.geom2)))) for c in data.contact if c.dist < -MIN_PENETRATION_M
+        }
 
     home = pairs(robot.qpos_home)
     seen = [pairs(q) for q in postures]
     always = sorted({*home, *(set.intersection(*seen) if seen else ())})
     if always:
-        level, so = "ok", "they do not touch: contacts are off in robot.toml"
+        level, effect = "ok", "they do not touch: contacts are off in robot.toml"
         if robot.contacts:
             level = "warning"
-            so = "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in robot.toml"
-        text = f"at home {abbreviate(always)} lie inside each other; {so}"
+            effect = "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in robot.toml"
+        text = f"at home {abbreviate(always)} lie inside each other; {effect}"
         yield Finding(level, "contacts", text, values={"pairs": always})
     share = float(np.mean([bool(s - set(always)) for s in seen])) if seen else 0.0
     if share and (logged or robot.contacts):
@@ -177,16 +177,16 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
 
 
 def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Array) -> Iterator[Finding]:
-    """Do small motions die away under these gains, inertias and this step? Without friction, which hides it."""
-    thin = [robot.qpos_home, *postures[:: max(1, len(postures) // POSTURES)][:POSTURES]]
+    """Find small motions that grow under gains, inertias and physics step; friction, which hides them, is left out."""
+    thin = [robot.qpos_home, *postures[:: max(1, len(postures) // MAX_POSTURES)][:MAX_POSTURES]]
     cases = [(mass, model, q) for mass, model in models.items() for q in thin]
     found = [_growth(model, q) for _, model, q in cases]
     k = max(range(len(found)), key=lambda k: found[k][0])
-    (growth, joint, turns), mass = found[k], cases[k][0]
+    (growth, joint, oscillates), mass = found[k], cases[k][0]
     name = robot.joint_names[joint]
-    if growth <= 1 + GROWTH:
+    if growth <= 1 + MAX_GROWTH:
         yield Finding("ok", "step", "gains, inertias and physics step go together", values={"growth": growth})
-    elif not turns:
+    elif not oscillates:
         load = f" with {mass:g} kg" if mass else ""
         text = (
             f"{name}: kp {robot.kp[joint]:g} is too little to hold it up{load}: it falls away from its target; check "
@@ -194,7 +194,7 @@ def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Arra
         )
         yield Finding("warning", "step", text, (name,), {"growth": growth})
     else:
-        stable = lambda h, a: all(_growth(m, q, h, a)[0] <= 1 + GROWTH for _, m, q in cases)  # noqa: E731
+        stable = lambda h, a: all(_growth(m, q, h, a)[0] <= 1 + MAX_GROWTH for _, m, q in cases)  # noqa: E731
         step = next((h for h in (robot.timestep / 2**k for k in range(1, 7)) if stable(h, 0.0)), None)
         armature = next((a for a in (1e-4 * 2**k for k in range(14)) if stable(robot.timestep, a)), None)
         cures = [f"timestep = {step:g} in robot.toml"] if step else []
@@ -207,7 +207,7 @@ def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Arra
 
 
 def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, armature: float = 0.0) -> _Growth:
-    """How the worst small motion about a posture goes on, which targets hold against gravity."""
+    """Return the growth of the worst small motion about a posture that targets hold against gravity."""
     model = copy(model)
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -225,16 +225,16 @@ def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, arma
     values, vectors = np.linalg.eig(slopes)
     k = int(np.abs(values).argmax())
     joint = int(np.abs(vectors[: model.nv, k]).argmax())
-    return _Growth(float(np.abs(values[k])), joint, bool(abs(np.angle(values[k])) > TURNS))
+    return _Growth(float(np.abs(values[k])), joint, bool(abs(np.angle(values[k])) > MIN_OSCILLATION_RAD))
 
 
 def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
-    """A minute at home at every payload: does it rest, and where?"""
+    """Hold home for a minute at every payload; find motion, creep and sag."""
     sim = BatchSim(robot, [Condition(mass, "both", robot.dt) for mass in payloads], nthread=1)
     home = np.tile(robot.qpos_home, (len(payloads), 1))
     low, high = robot.qpos_range.T
-    sim.reset(slice(None), np.clip(home + NUDGE, low, high), np.zeros_like(home), past=home[:, None])
-    rows = round(SECONDS / robot.dt)
+    sim.reset(slice(None), np.clip(home + HOLD_START_RAD, low, high), np.zeros_like(home), past=home[:, None])
+    rows = round(HOLD_S / robot.dt)
     speed, full, middle = np.zeros_like(home), np.zeros(home.shape, bool), home
     for t in range(rows):
         sim.step(home)
@@ -246,27 +246,27 @@ def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
     creep, sag = np.abs(sim.qpos - middle), np.abs(sim.qpos - home)
     light = " where its armature is small: write armature = 0.003 or more in robot.xml"
     swings = "check kp and kd; write more damping in robot.xml"
-    if (full & (speed > RESTS)).any():
+    if (full & (speed > MAX_REST_SPEED)).any():
         swings = (
             "its motor gives all it can, one way and the other, and MuJoCo's motors brake no more then: write kd as "
             "damping in robot.xml and kd = 0 in robot.toml, a shorter timestep, or armature"
         )
-    quiet = True
-    for what, amount, most, level, mend in (
-        ("does not come to rest: {:.2g} rad/s after a minute", speed, RESTS, "error", swings),
-        ("creeps {:.2g} rad in half a minute of a hold", creep, CREEP, "warning", f"friction gives way{light}"),
-        ("hangs {:.2g} rad from its target", sag, SAG, "note", "check kp and effort_limit against masses"),
+    clean = True
+    for what, amount, most, level, cure in (
+        ("does not come to rest: {:.2g} rad/s after a minute", speed, MAX_REST_SPEED, "error", swings),
+        ("creeps {:.2g} rad in half a minute of a hold", creep, MAX_CREEP_RAD, "warning", f"friction gives way{light}"),
+        ("hangs {:.2g} rad from its target", sag, MAX_SAG_RAD, "note", "check kp and effort_limit against masses"),
     ):
         wrong = np.argwhere(~(amount <= most))
-        if not len(wrong) or (level != "error" and not quiet):
+        if not len(wrong) or (level != "error" and not clean):
             continue
-        quiet = False
+        clean = False
         p, j = max(wrong, key=lambda k: float(np.nan_to_num(amount[*k], nan=np.inf)))
         names = tuple(dict.fromkeys(robot.joint_names[i] for _, i in wrong))
         load = f" with {payloads[p]:g} kg" if payloads[p] else ""
         more = f" ({len(names) - 1} more joints do)" if len(names) > 1 else ""
-        text = f"{robot.joint_names[j]} {what.format(amount[p, j])}{load}{more}: {mend}"
+        text = f"{robot.joint_names[j]} {what.format(amount[p, j])}{load}{more}: {cure}"
         yield Finding(level, "hold", text, names, {"payload_mass": payloads[p], "amount": float(amount[p, j])})
-    if quiet:
+    if clean:
         masses = ", ".join(f"{p:g}" for p in payloads)
-        yield Finding("ok", "hold", f"home is held for {SECONDS:g} s with {masses} kg without creeping or swinging")
+        yield Finding("ok", "hold", f"home is held for {HOLD_S:g} s with {masses} kg without creeping or swinging")

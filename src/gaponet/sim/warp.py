@@ -1,7 +1,7 @@
-"""BatchSim's simulations on Warp's device by mujoco_warp: thousands side by side on a GPU, or on the CPU, to test that.
+"""Simulations of a BatchSim by mujoco_warp, thousands at once on a GPU; on the CPU for tests.
 
-Numbers are float32 and stay on the device: torch tensors take the place of numpy arrays. For training; scores,
-identification and robots stay on C MuJoCo, from which these simulations part by about 1e-6 rad in a second.
+Arrays are float32 torch tensors on the device. They serve training; scores and identification use C MuJoCo, from which
+these simulations deviate by about 1e-6 rad in a second.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim import servo
 from gaponet.sim.batch import UNDER_WAY, BatchSim, CommandHistory
 
-CONTACTS, ROWS = 48, 4  # of a simulation whose links touch, and constraints of each
+MAX_CONTACTS, CONSTRAINTS_PER_CONTACT = 48, 4  # of a simulation whose links collide
 STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}  # field of Data → name in BatchSim.state
-LATE = {"history": "history", "time": "time"}
+HISTORY = {"history": "history", "time": "time"}
 SERVO = {"actuator_force": "servo_torque", "qfrc_bias": "servo_load"}
-AIM = {"ctrl": "ctrl"}
+TARGET = {"ctrl": "ctrl"}
 
 _Floats: Any = warp.array2d(dtype=float)
 _Numbers: Any = warp.array2d(dtype=warp.types.vector(len(SERVO_TERMS), float))  # in the order of SERVO_TERMS
@@ -66,26 +66,30 @@ def _set_servos(
 
 
 class _Worlds:
-    """Simulations of one rate: mujoco_warp steps all of its worlds or none, and all as often."""
+    """Simulations of one control period: mujoco_warp steps all of its worlds, equally often."""
 
     def __init__(self, sim: BatchSim, rows: np.ndarray, device: str) -> None:
         self.device, self.nstep, self._graphs = warp.get_device(device), int(sim.nstep[rows[0]]), dict[Any, Any]()
         model = next(iter(sim.models.values()))
         own = {name: x[rows] for name in sorted(MODEL_FIELDS) if (x := sim.batch.expanded(name)) is not None}
         timestep = own.pop("opt.timestep", np.full(len(rows), model.opt.timestep))
-        # The others among MuJoCo's fields shorten its arithmetic, or are for looking at.
+        # MuJoCo's other fields are precomputed values or have no effect on motion.
         own = {name: x for name, x in own.items() if name in mujoco_warp.Model.__dataclass_fields__}
-        touching = 0 if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT else CONTACTS
-        most = max(64, 2 * model.nv + ROWS * touching)
+        contacts = 0 if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT else MAX_CONTACTS
+        constraints = max(64, 2 * model.nv + CONSTRAINTS_PER_CONTACT * contacts)
         with warp.ScopedDevice(self.device):
             try:
                 self.model = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(own, len(rows)))
             except (NotImplementedError, ValueError) as error:
-                raise UsageError(f"{sim.robot.name}: mujoco_warp refuses it ({error}); use --device cpu") from None
-            self.data = mujoco_warp.put_data(model, mujoco.MjData(model), len(rows), touching or None, njmax=most)
+                raise UsageError(
+                    f"{sim.robot.name}: mujoco_warp does not support its model ({error}); use --device cpu"
+                ) from None
+            self.data = mujoco_warp.put_data(
+                model, mujoco.MjData(model), len(rows), contacts or None, njmax=constraints
+            )
             self.model.opt.timestep = warp.array(timestep, dtype=float)
             self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
-            self._law = None if sim.servo_model is None else self._inputs(sim.servo_model, rows)
+            self._servo_inputs = None if sim.servo_model is None else self._inputs(sim.servo_model, rows)
         for name, x in own.items():
             view = warp.to_torch(getattr(self.model, name))
             view.copy_(torch.tensor(x).reshape(view.shape))
@@ -101,14 +105,14 @@ class _Worlds:
                 model.actuator_biasprm, model.dof_frictionloss]  # fmt: skip
 
     def bind(self, name: str) -> Tensor:
-        """A live view of a field of all worlds, (nworld, …)."""
+        """Return a live view of a field of all worlds, (nworld, …)."""
         return warp.to_torch(getattr(self.data, name))
 
     def period(self) -> None:
         """Advance by a control period."""
         for _ in range(self.nstep):
-            if self._law is not None:
-                warp.launch(_set_servos, self.data.ctrl.shape, self._law)
+            if self._servo_inputs is not None:
+                warp.launch(_set_servos, self.data.ctrl.shape, self._servo_inputs)
             mujoco_warp.step(self.model, self.data)
 
     def bias_forces(self) -> None:
@@ -126,8 +130,8 @@ class _Worlds:
                 kernels()
 
     def _captured(self, kernels: Callable[[], None]) -> Any:
-        """These kernels as a CUDA graph; compiled by launching them once, which is undone."""
-        moved = [self.bind(name) for name in (*STATE, *LATE, *SERVO) if getattr(self.data, name).size]
+        """Return the kernels as a CUDA graph; they are compiled by a launch that is undone."""
+        moved = [self.bind(name) for name in (*STATE, *HISTORY, *SERVO) if getattr(self.data, name).size]
         before = [x.clone() for x in moved]
         torch.cuda.synchronize()
         kernels()
@@ -141,7 +145,7 @@ class _Worlds:
 
 
 class WarpSim:
-    """The same simulations as a BatchSim's, as it has them now: payloads, rates, gains, friction, delays, state.
+    """Copy of a BatchSim on a device, with its payloads, control periods, servos and state.
 
     `qpos`, `qvel`, `ctrl` and `torque` are live (num_envs, n) float32 tensors on the device: a write is the state at
     the next step.
@@ -158,15 +162,15 @@ class WarpSim:
         try:
             warp.get_device(device)
         except (ValueError, RuntimeError) as error:
-            raise UsageError(f"device {device}: Warp finds none ({error}); use cpu") from None
+            raise UsageError(f"device {device}: Warp has no such device ({error}); use cpu") from None
         self.robot, self.joint_names, self.num_envs = sim.robot, sim.joint_names, sim.num_envs
         self.n, self.range = sim.n, sim.range
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
         self._worlds = [_Worlds(sim, rows, device) for rows in rates]
-        self._late = next(iter(sim.models.values())).nhistory > 0
-        self._kept = STATE | (LATE if self._late else {}) | (SERVO if sim.servo_model else {})
-        self._kept |= {} if sim.most is None else AIM
-        names = [*self._kept, "ctrl", "actuator_force"]
+        self._delayed = next(iter(sim.models.values())).nhistory > 0
+        self._stored = STATE | (HISTORY if self._delayed else {}) | (SERVO if sim.servo_model else {})
+        self._stored |= {} if sim.most is None else TARGET
+        names = [*self._stored, "ctrl", "actuator_force"]
         self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
         if len(self._worlds) == 1:
             self._all = self._views[0]
@@ -182,18 +186,18 @@ class WarpSim:
             gain = sim.batch.expand("actuator_gainprm")[..., 0]
             self._gain, self._bias, *self._limits = map(self.array, (gain, sim.servo_model.bias, *limits))
         self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
-        if self._late:
+        if self._delayed:
             model = next(iter(sim.models.values()))
             self._commands = CommandHistory(self._all["history"], self._all["time"], model)
         self.set_state(sim.state())
 
     def array(self, values: Any) -> Tensor:
-        """Values as the device has them, floats of 32 bits; the host does not wait until they are there."""
+        """Copy values to the device, floats as float32, without waiting."""
         values = torch.as_tensor(values)
         return values.to(self.qpos.device, torch.float32 if values.is_floating_point() else None, non_blocking=True)
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
-        """The same as BatchSim.reset; arrays of any kind."""
+        """Reset as BatchSim.reset does; arrays of any kind."""
         ids = ids if isinstance(ids, slice) else self.array(ids)
         self.qpos[ids], self.qvel[ids] = self.array(qpos), self.array(qvel)
         self._all["qacc_warmstart"][ids] = 0.0
@@ -201,21 +205,21 @@ class WarpSim:
             most = UNDER_WAY[0] + UNDER_WAY[1] * self._most[ids] / (self.nstep * self.timestep)[ids, None]
             here = self.qpos[ids]
             self.ctrl[ids] = here if past is None else torch.clamp(self.array(past)[:, 0], here - most, here + most)
-        if self._late:
+        if self._delayed:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
-        if SERVO.keys() <= self._kept.keys():
+        if SERVO.keys() <= self._stored.keys():
             ahead = 0.0 if past is None else self.array(past)[:, 0] - self.qpos[ids]
             self.torque[ids] = torch.clamp(self._gain[ids] * ahead + self._bias[ids], *(x[ids] for x in self._limits))
             load, before = self._all["qfrc_bias"], self._all["qfrc_bias"].clone()
-            for worlds in self._in_turn():
+            for worlds in self._each_rate():
                 worlds.launch(worlds.bias_forces)
             before[ids] = load[ids]
             load.copy_(before)
 
-    def _in_turn(self) -> Iterator[_Worlds]:
-        """The worlds of each rate with their simulations' state, which is taken back."""
+    def _each_rate(self) -> Iterator[_Worlds]:
+        """Yield the worlds of each control period with their simulations' state, and copy it back."""
         for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
             if views is not self._all:
                 for name, x in views.items():
@@ -226,14 +230,14 @@ class WarpSim:
                     self._all[name][rows] = x
 
     def step(self, ctrl: Any, ids: Any = None) -> None:
-        """The same as BatchSim.step; all are stepped, and those that should not move are put back."""
+        """Step as BatchSim.step does: all are stepped, and the others are restored."""
         before, ctrl = {} if ids is None else self.state(), self.array(ctrl)
         if self._most is not None:
             ctrl = torch.clamp(ctrl, self.ctrl - self._most, self.ctrl + self._most)
         torch.clamp(ctrl, self._low, self._high, out=self.ctrl)
-        for worlds in self._in_turn():
+        for worlds in self._each_rate():
             worlds.launch(worlds.period)
-        if self._late:  # a float32 tells physics steps apart for minutes only, so the clock starts again
+        if self._delayed:  # a float32 tells physics steps apart for minutes only, so the clock starts again
             self._commands.times -= self._commands.time[:, None, None]
             self._commands.time.zero_()
         if ids is not None:
@@ -242,13 +246,13 @@ class WarpSim:
                 x.copy_(before[name].index_copy(0, moved, x[moved]))
 
     def state(self) -> dict[str, Tensor]:
-        """The same as BatchSim.state."""
+        """Return copies of the complete state, as BatchSim.state does."""
         return {name: x.clone() for name, x in self._state().items()}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Undo `state`, of this or of a BatchSim alike."""
+        """Restore a `state` of this object or of a BatchSim."""
         for name, x in self._state().items():
             x.copy_(self.array(state[name]))
 
     def _state(self) -> dict[str, Tensor]:
-        return {name: self._all[field] for field, name in self._kept.items()}
+        return {name: self._all[field] for field, name in self._stored.items()}

@@ -23,6 +23,7 @@ from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim import servo
 from gaponet.sim.batch import ramped
+from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import friction_limit, present, servo_torque
 
@@ -61,14 +62,9 @@ class JointRollouts:
         # Rows of each window from one that is compared to the next, (windows,): multiples of `thin`.
         thins = self.thin * np.maximum(1, np.round(ROW_PERIOD_S / self.periods / self.thin)).astype(int)
         self._thins, rows = thins, max(map(len, parts))
-        loads: dict[tuple[float, str], _LoadAlong] = {}
-        for p in parts:
-            key = (p.meta.payload_mass, p.meta.payload_side)
-            if key not in loads:
-                loads[key] = _LoadAlong(robot, build_model(robot, *key, self.dt, bare=True))
-        along = [
-            loads[p.meta.payload_mass, p.meta.payload_side].follow(p, k) for p, k in zip(parts, thins, strict=True)
-        ]
+        payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in parts]
+        models = {payload: build_model(robot, *payload, self.dt, bare=True) for payload in dict.fromkeys(payloads)}
+        loads = [_loads_along(p, models[x], self.op, k) for p, x, k in zip(parts, payloads, thins, strict=True)]
         low, high = robot.qpos_range[self.op].T
 
         def stacked(xs: list[Array]) -> Array:  # (n, windows, rows), so that a rollout reads contiguous memory
@@ -85,7 +81,7 @@ class JointRollouts:
             self.ctrl = np.ascontiguousarray(np.moveaxis(limited, 0, -1))
         self.qvel = stacked([p.qvel[:, self.op] for p in parts])
         # In the middle of each period: inertia, gravity's torque at an angle of zero, the others' torque, its slope.
-        inertia, weight, pull, slope = (at_middle(stacked([a[i] for a in along])) for i in range(4))
+        inertia, weight, pull, slope = (at_middle(stacked([load[i] for load in loads])) for i in range(4))
         self.tables = np.stack([inertia, weight - slope * at_middle(self.qpos), pull, slope])
         # A rollout stops at the ends of the range or of the recording, so that none diverges.
         reached = self.qpos.min(axis=(1, 2)), self.qpos.max(axis=(1, 2))
@@ -93,7 +89,8 @@ class JointRollouts:
             np.minimum(np.where(np.isfinite(low), low, -UNLIMITED_STOP_RAD), reached[0]),
             np.maximum(np.where(np.isfinite(high), high, UNLIMITED_STOP_RAD), reached[1]),
         ], axis=1).astype(np.float32)  # fmt: skip
-        self.touch = np.stack([_extended(a[4], rows) for a in along]) < contact_height  # (windows, rows)
+        heights = tips_of(robot) or (lambda qpos: np.full(len(qpos), np.inf))
+        self.touch = np.stack([_extended(heights(p.qpos), rows) for p in parts]) < contact_height  # (windows, rows)
         self.lengths = np.array([len(p) for p in parts])
         # Joints that a window does not hold have no error, (n, windows).
         self.recorded = np.array([[j not in p.meta.unrecorded for p in parts] for j in robot.operated])
@@ -244,55 +241,38 @@ class JointRollouts:
         return np.asarray((1 - share) * first + share * then)
 
 
-class _LoadAlong:
-    """Inertia, load and tip height along recordings with one payload."""
+def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) -> Array:
+    """Return the loads of joints `op` along a recording, computed every `thin` rows and interpolated, (4, rows, n).
 
-    def __init__(self, robot: RobotSpec, model: mujoco.MjModel) -> None:
-        self.op, self.model, self.data = robot.operated_index, model, mujoco.MjData(model)
-        self.tips = [(model.body(tip.body).id, np.array(tip.pos), tip.radius) for tip in robot.tips]
-        # Forces at a posture, without those of servos and of a table.
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    These are inertia without armature, kg·m²; torque by gravity and Coriolis forces, N·m; torque by the other joints'
+    accelerations, N·m; slope of the second over the joint's angle, N·m/rad.
+    """
+    data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # no forces of servos and of a table
 
-    def follow(self, part: Sequence, thin: int = 1) -> tuple[Array, ...]:
-        """Compute the load along a recording, every `thin` rows and linearly between them.
+    def bias(qpos: Array, qvel: Array) -> Array:
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        return data.qfrc_bias.copy()
 
-        Returns:
-            Of each operated joint, (rows, n): inertia without armature, kg·m²; torque by gravity and Coriolis forces,
-            N·m; torque by the other joints' accelerations, N·m; slope of the former over the joint's angle, N·m/rad.
-            Then the height of the lowest tip, (rows,) m.
-        """
-        model, data, op = self.model, self.data, self.op
-        smooth = lowpass(part.qpos.astype(float), part.dt, CUTOFF_HZ)
-        qvel = differentiate(smooth, part.dt)
-        qacc = differentiate(qvel, part.dt)
-        at = np.arange(0, len(part) + thin, thin).clip(max=len(part) - 1)
-        inertia, weight, pull, slope = (np.empty((len(at), len(op))) for _ in range(4))
-        tip, full = np.full(len(at), np.inf), np.empty((model.nv, model.nv))
-        for i, t in enumerate(at):
-            here = self._bias(part.qpos[t], qvel[t])
-            mujoco.mj_fullM(model, data, full)
-            own = full.diagonal().copy()
-            inertia[i] = (own - model.dof_armature)[op]
-            weight[i], pull[i] = here[op], (full @ qacc[t] - own * qacc[t])[op]
-            for body, place, radius in self.tips:
-                z = data.xpos[body, 2] + data.xmat[body].reshape(3, 3)[2] @ place - radius
-                tip[i] = min(tip[i], z)
-            if i % GRAVITY_ROWS == 0:
-                for k, j in enumerate(op):
-                    turned = part.qpos[t].astype(float)
-                    turned[j] += GRAVITY_STEP_RAD
-                    slope[i : i + GRAVITY_ROWS, k] = (self._bias(turned, qvel[t])[j] - here[j]) / GRAVITY_STEP_RAD
-        rows = np.arange(len(part))
-        tables = [inertia, weight, pull, slope, tip[:, None]]
-        if thin > 1:
-            tables = [np.stack([np.interp(rows, at, y) for y in x.T], axis=1) for x in tables]
-        return (*(x[: len(part)] for x in tables[:4]), tables[4][: len(part), 0])
-
-    def _bias(self, qpos: Array, qvel: Array) -> Array:
-        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
-        mujoco.mj_fwdPosition(self.model, self.data)
-        mujoco.mj_fwdVelocity(self.model, self.data)
-        return self.data.qfrc_bias.copy()
+    qvel = differentiate(lowpass(part.qpos.astype(float), part.dt, CUTOFF_HZ), part.dt)
+    qacc = differentiate(qvel, part.dt)
+    at = np.arange(0, len(part) + thin, thin).clip(max=len(part) - 1)
+    inertia, weight, pull, slope = loads = np.empty((4, len(at), len(op)))
+    for i, t in enumerate(at):
+        here = bias(part.qpos[t], qvel[t])
+        mujoco.mj_fullM(model, data, full)
+        own = full.diagonal().copy()
+        inertia[i] = (own - model.dof_armature)[op]
+        weight[i], pull[i] = here[op], (full @ qacc[t] - own * qacc[t])[op]
+        if i % GRAVITY_ROWS == 0:
+            for k, j in enumerate(op):
+                turned = part.qpos[t].astype(float)
+                turned[j] += GRAVITY_STEP_RAD
+                slope[i : i + GRAVITY_ROWS, k] = (bias(turned, qvel[t])[j] - here[j]) / GRAVITY_STEP_RAD
+    rows = np.arange(len(part))
+    return loads[:, : len(part)] if thin == 1 else np.apply_along_axis(lambda y: np.interp(rows, at, y), 1, loads)
 
 
 def _filled(x: Array, shape: tuple[int, ...]) -> Array:

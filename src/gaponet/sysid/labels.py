@@ -43,55 +43,55 @@ PAYLOAD_IN_NAME = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
 
 
 @dataclass
-class Labelled:
+class LabelledRecording:
     """Recording with its estimated labels.
 
     Attributes:
         name: The name that import gives it.
         joint, command: The joint that moves, and its last command, rad.
         torque: Torque and command of each row, (k,) N·m and rad; gain times error where no torque was recorded.
-        known: Payload in the file's name, kg.
+        named_payload: Payload in the file's name, kg.
         payload, unit: Estimates, kg and a number from 0 on within the joint.
-        told: Whether the joint's torque determines its payload.
-        held: Payload estimated from torque without the unit, kg.
-        copy: Name of an earlier recording with the same samples.
-        follows: Time, command, position, velocity and torque of each row, (5, k), where torque was recorded.
-        late: Lag of the torque behind the command, beside the other recordings of the joint, s.
+        determined: Whether the joint's torque determines its payload.
+        torque_payload: Payload estimated from torque without the unit, kg.
+        copy_of: Name of an earlier recording with the same samples.
+        servo_rows: Time, command, position, velocity and torque of each row, (5, k), where torque was recorded.
+        lag: Lag of the torque behind the command, beside the other recordings of the joint, s.
     """
 
     name: str
     joint: str
     command: float
     torque: tuple[Array, Array]
-    known: float | None
+    named_payload: float | None
     payload: float = 0.0
     unit: int = 0
-    told: bool = False
-    held: float = 0.0
-    copy: str = ""
-    follows: Array | None = field(default=None, repr=False)
-    late: float = 0.0
+    determined: bool = False
+    torque_payload: float = 0.0
+    copy_of: str = ""
+    servo_rows: Array | None = field(default=None, repr=False)
+    lag: float = 0.0
 
 
 @dataclass(frozen=True)
-class Cell:
+class LabelGroup:
     """Recordings of one joint and command.
 
     Attributes:
         count: Number of recordings.
         slope: N·m per kg.
-        apart: Distance of the payloads' bands in their widths.
+        band_distance: Distance of the payloads' bands in their widths.
         units: Torque of each unit without payload, N·m.
-        told: Whether the torque determines the payload.
+        determined: Whether the torque determines the payload.
     """
 
     joint: str
     command: float
     count: int
     slope: float
-    apart: float
+    band_distance: float
     units: Array
-    told: bool
+    determined: bool
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,8 @@ class Labels:
         gains: Joint → gains of its servo from torque, of all rows and of the recordings' ends.
     """
 
-    recordings: list[Labelled]
-    cells: list[Cell]
+    recordings: list[LabelledRecording]
+    groups: list[LabelGroup]
     payloads: tuple[float, ...]
     agreement: dict[str, float] = field(default_factory=dict)
     gains: dict[str, tuple[Gains, Gains]] = field(default_factory=dict)
@@ -112,25 +112,25 @@ class Labels:
     @property
     def remarks(self) -> list[str]:
         """Return remarks in sentences."""
-        a, late = self.agreement, [r for r in self.recordings if abs(r.late) > MAX_LAG_S]
-        told = [
+        a, late = self.agreement, [r for r in self.recordings if abs(r.lag) > MAX_LAG_S]
+        lines = [
             f"of {a['said']} recordings whose payload the file's name says, {a['within_half_a_kg']:.0%} are within "
             f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
         ] if a else []  # fmt: skip
-        loaded = [r for r in self.recordings if r.told and not r.copy and abs(r.late) <= MAX_LAG_S]
-        near = f"{sum(abs(r.held - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)} of {len(loaded)}"
+        loaded = [r for r in self.recordings if r.determined and not r.copy_of and abs(r.lag) <= MAX_LAG_S]
+        near = f"{sum(abs(r.torque_payload - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)} of {len(loaded)}"
         if loaded:
             limit = f"{MAX_PAYLOAD_ERROR_KG:g} kg"
-            told += [f"torque alone, whichever the unit, says {near} payloads within {limit} of their label"]
-        told += [
+            lines += [f"torque alone, whichever the unit, says {near} payloads within {limit} of their label"]
+        lines += [
             f"{joint}: torque is kp (command − position) − kd velocity, kp {format_uncertainty(g.kp, g.error)} "
             f"N·m/rad ({format_uncertainty(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: "
             f"{g.explained:.1%} of its variance"
             for joint, (g, end) in self.gains.items()
             if g.trusted
         ]
-        return told + [
-            f"{r.name}: its torque follows the command {abs(r.late) * 1e3:.0f} ms {'later' if r.late > 0 else 'sooner'}"
+        return lines + [
+            f"{r.name}: its torque follows the command {abs(r.lag) * 1e3:.0f} ms {'later' if r.lag > 0 else 'sooner'}"
             f" than in the other recordings of {r.joint}: clocks of command and state are apart; it is left out"
             for r in late
         ]
@@ -148,50 +148,54 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     Raises:
         LogError: More than one joint moves.
     """
-    found: list[Labelled] = []
-    seen: dict[tuple[str, str], Labelled] = {}
+    found: list[LabelledRecording] = []
+    seen: dict[tuple[str, str], LabelledRecording] = {}
     for name, log in logs:
-        one = _look(name, log, gain)
+        one = _read(name, log, gain)
         digest = hashlib.sha256(b"".join(log.channels[c].values.tobytes() for c in ("ctrl", "qpos"))).hexdigest()
         first = seen.setdefault((one.joint, digest), one)
         if first is not one:
-            one.copy = first.name
-            first.known = one.known if first.known is None else first.known
+            one.copy_of = first.name
+            first.named_payload = one.named_payload if first.named_payload is None else first.named_payload
         found.append(one)
-    own = [r for r in found if not r.copy]
+    own = [r for r in found if not r.copy_of]
     for joint in dict.fromkeys(r.joint for r in own):
-        _clocks([r for r in own if r.joint == joint and r.follows is not None])
-    timely = [r for r in own if abs(r.late) <= MAX_LAG_S]
-    cells = [_fit(part, payloads, units) for part in _by_command(timely)]
-    follows: dict[str, list[Array]] = {}
+        _estimate_lags([r for r in own if r.joint == joint and r.servo_rows is not None])
+    timely = [r for r in own if abs(r.lag) <= MAX_LAG_S]
+    groups = [_fit(part, payloads, units) for part in _by_command(timely)]
+    torque_rows: dict[str, list[Array]] = {}
     for r in timely:
-        follows.setdefault(r.joint, []).extend([] if r.follows is None else [r.follows[1:]])
+        torque_rows.setdefault(r.joint, []).extend([] if r.servo_rows is None else [r.servo_rows[1:]])
     first_of = {r.name: r for r in own}
     for r in found:
-        if r.copy:
-            r.payload, r.unit, r.told = (getattr(first_of[r.copy], f) for f in ("payload", "unit", "told"))
-    said = [r for r in own if r.known is not None and r.told]
+        if r.copy_of:
+            r.payload, r.unit, r.determined = (
+                getattr(first_of[r.copy_of], f) for f in ("payload", "unit", "determined")
+            )
+    said = [r for r in own if r.named_payload is not None and r.determined]
     agreement = {}
     if said:
         near = lambda r, m: abs(r.payload - m) < MAX_PAYLOAD_ERROR_KG  # noqa: E731
-        masses = {r.known for r in said}
-        others = [r for r in own if r.known is None and r.told]
+        masses = {r.named_payload for r in said}
+        others = [r for r in own if r.named_payload is None and r.determined]
         agreement = {
-            "said": len(said), "within_half_a_kg": float(np.mean([near(r, r.known) for r in said])),
+            "said": len(said), "within_half_a_kg": float(np.mean([near(r, r.named_payload) for r in said])),
             # What a file's name does not list is none of these either, where such files list all of a payload.
             "not_said": len(others),
             "taken_for_one_of_these": float(np.mean([r.payload in masses for r in others] or [False])),
         }  # fmt: skip
-    gains = {j: (servo_gains(each), servo_gains(each, 1)) for j, each in follows.items() if len(each) >= MIN_RECORDINGS}
-    return Labels(found, cells, tuple(payloads), agreement, gains)
+    gains = {
+        j: (servo_gains(each), servo_gains(each, 1)) for j, each in torque_rows.items() if len(each) >= MIN_RECORDINGS
+    }
+    return Labels(found, groups, tuple(payloads), agreement, gains)
 
 
-def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
+def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
     ctrl, qpos = log.channels["ctrl"], log.channels["qpos"]
     moved = np.flatnonzero(np.ptp(ctrl.values, axis=0) > MIN_MOVE_RAD)
     if len(moved) != 1:
         raise LogError(
-            f"{log.source}: {len(moved)} joints are commanded to move; labels are told from recordings of one"
+            f"{log.source}: {len(moved)} joints are commanded to move; labels are estimated from recordings of one"
         )
     j = int(moved[0])
     joint = log.joint_names[j]
@@ -201,52 +205,54 @@ def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
         time = qpos.time
         values = gain[joint] * (ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j])
     later = time[: len(values)] >= time[0] + SETTLE_S
-    told = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
-    follows = None
+    commands = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
+    servo_rows = None
     if "tau" in log.channels:
         clock = ctrl.time
         at = lambda c: np.interp(clock, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
         speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), clock)
-        follows = np.stack([clock, ctrl.values[:, j], at("qpos"), speed, at("tau")])
+        servo_rows = np.stack([clock, ctrl.values[:, j], at("qpos"), speed, at("tau")])
     kilograms = PAYLOAD_IN_NAME.search(Path(log.source.partition("#")[0]).stem)
     known = float(kilograms[1].replace("p", ".")) if kilograms else None
-    return Labelled(name, joint, float(ctrl.values[-1, j]), (values[later], told), known, follows=follows)
+    return LabelledRecording(
+        name, joint, float(ctrl.values[-1, j]), (values[later], commands), known, servo_rows=servo_rows
+    )
 
 
-def _clocks(part: list[Labelled]) -> None:
+def _estimate_lags(part: list[LabelledRecording]) -> None:
     """Set the lag of each recording of a joint."""
     shifts = np.arange(-LAG_RANGE_S, LAG_RANGE_S + LAG_STEP_S / 2, LAG_STEP_S)
 
-    def rows(r: Labelled, shift: float) -> Array:  # command − position, −velocity, 1, torque
-        time, ctrl, qpos, qvel, tau = r.follows  # type: ignore[misc]
+    def rows(r: LabelledRecording, shift: float) -> Array:  # command − position, −velocity, 1, torque
+        time, ctrl, qpos, qvel, tau = r.servo_rows  # type: ignore[misc]
         inside = (time - LAG_RANGE_S >= time[0]) & (time + LAG_RANGE_S <= time[-1])
         return np.stack([np.interp(time - shift, time, ctrl) - qpos, -qvel, np.ones_like(tau), tau])[:, inside]
 
-    def left(x: Array) -> Array:  # N·m, of each recording and shift
+    def residuals(x: Array) -> Array:  # N·m, of each recording and shift
         return np.array([np.abs(np.tensordot(m[:, :3], x, (1, 0)) - m[:, 3]).mean(axis=1) for m in every])
 
-    def law(k: int) -> tuple[float, Array]:  # kp, kd and a constant, of the half that they suit best
-        suited = np.arange(len(part))
+    def fit(k: int) -> tuple[float, Array]:  # kp, kd and a constant, fitted to the best half
+        chosen = np.arange(len(part))
         for _ in range(SEARCH_ROUNDS):
-            rows = np.concatenate([every[i][k] for i in suited], axis=1)
+            rows = np.concatenate([every[i][k] for i in chosen], axis=1)
             x = np.linalg.lstsq(rows[:3].T, rows[3])[0]
-            costs = left(x)[:, k]
-            suited = np.argsort(costs)[: max(MIN_RECORDINGS, len(part) // 2)]
+            costs = residuals(x)[:, k]
+            chosen = np.argsort(costs)[: max(MIN_RECORDINGS, len(part) // 2)]
         return float(np.median(costs)), x
 
     if len(part) < MIN_RECORDINGS:
         return
     every = [np.stack([rows(r, s) for s in shifts]) for r in part]  # (shifts, 4, k) each
-    _, x = min((law(k) for k in range(len(shifts))), key=lambda one: one[0])
-    late = left(x).argmin(axis=1).tolist()
-    rest = np.concatenate([x @ m[k, :3] - m[k, 3] for m, k in zip(every, late, strict=True)])
+    _, x = min((fit(k) for k in range(len(shifts))), key=lambda one: one[0])
+    best = residuals(x).argmin(axis=1).tolist()
+    rest = np.concatenate([x @ m[k, :3] - m[k, 3] for m, k in zip(every, best, strict=True)])
     torque = np.concatenate([m[0, 3] for m in every])
     if rest.var() < (1 - MIN_EXPLAINED) * torque.var() and x[0] > 0:
-        for r, k in zip(part, late, strict=True):
-            r.late = round(float(shifts[k] - np.median(shifts[late])), 4)
+        for r, k in zip(part, best, strict=True):
+            r.lag = round(float(shifts[k] - np.median(shifts[best])), 4)
 
 
-def _by_command(recordings: list[Labelled]) -> list[list[Labelled]]:
+def _by_command(recordings: list[LabelledRecording]) -> list[list[LabelledRecording]]:
     """Return the recordings by joint and last command, in their order; `command` becomes their mean."""
     parts = []
     for joint in dict.fromkeys(r.joint for r in recordings):
@@ -262,7 +268,7 @@ def _by_command(recordings: list[Labelled]) -> list[list[Labelled]]:
     return parts
 
 
-def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
+def _fit(part: list[LabelledRecording], payloads: Sequence[float], units: int) -> LabelGroup:
     """Estimate the labels of the recordings of one joint and command."""
     raw = _at_equal_commands([r.torque for r in part])
     sign = float(np.sign(np.median(raw))) or 1.0
@@ -271,7 +277,7 @@ def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
     if len(x) < len(masses):
         for r in part:
             r.payload = float(masses[0])
-        return Cell(part[0].joint, part[0].command, len(part), 0.0, 0.0, np.zeros(0), False)
+        return LabelGroup(part[0].joint, part[0].command, len(part), 0.0, 0.0, np.zeros(0), False)
     step = float(np.median(np.abs(np.diff(x)))) / 0.954  # most neighbours are repetitions
     width, slope, base = _bands(x, masses)
     start = [base + np.array(d) * width for d in itertools.combinations(np.linspace(-2, 2, 9), units)]
@@ -283,18 +289,20 @@ def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
     mean = np.bincount(group, x) / np.bincount(group)
     first = np.unique(group, return_index=True)[1]
     unit, own = _ranked(mean - slope * load[first], load[first], units)
-    told = bool(slope >= MIN_NM_PER_KG and slope / width >= MIN_BAND_DISTANCE)
+    determined = bool(slope >= MIN_NM_PER_KG and slope / width >= MIN_BAND_DISTANCE)
     held = (x - own.mean()) / slope
     for r, g, m, kg in zip(part, group, load, held, strict=True):
-        r.payload, r.held = float(m), float(kg)
-        r.unit, r.told = int(unit[g]), told
-    return Cell(part[0].joint, part[0].command, len(part), sign * slope, float(slope / width), sign * own, told)
+        r.payload, r.torque_payload = float(m), float(kg)
+        r.unit, r.determined = int(unit[g]), determined
+    return LabelGroup(
+        part[0].joint, part[0].command, len(part), sign * slope, float(slope / width), sign * own, determined
+    )
 
 
 def _at_equal_commands(recordings: list[tuple[Array, Array]]) -> Array:
     """Return the mean torque of each at equal commands, (k,) N·m: one may have begun a period later than another."""
-    way = 1.0 if np.mean([told[-1] - told[0] for _, told in recordings]) > 0 else -1.0
-    risen = [np.maximum.accumulate(way * told) for _, told in recordings]
+    sign = 1.0 if np.mean([ctrl[-1] - ctrl[0] for _, ctrl in recordings]) > 0 else -1.0
+    risen = [np.maximum.accumulate(sign * ctrl) for _, ctrl in recordings]
     low, high = max(r[0] for r in risen), min(r[-1] for r in risen)
     if not high > low:
         return np.array([torque.mean() for torque, _ in recordings])
@@ -364,10 +372,14 @@ def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
     sheet = csv.writer(text)
     sheet.writerow(["file", "motion", "unit", "payload", "estimated", "leave_out"])
     for r in labels.recordings:
-        payload = r.payload if r.known is None else r.known
-        what = "unit" if r.known is not None else f"unit, payload{'' if r.told else ' (not told by this joint)'}"
+        payload = r.payload if r.named_payload is None else r.named_payload
+        what = (
+            "unit"
+            if r.named_payload is not None
+            else f"unit, payload{'' if r.determined else ' (not determined by this joint)'}"
+        )
         sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", what,
-                        "yes" if r.copy or abs(r.late) > MAX_LAG_S else "no"])  # fmt: skip
+                        "yes" if r.copy_of or abs(r.lag) > MAX_LAG_S else "no"])  # fmt: skip
     write_text(folder / "labels.csv", text.getvalue())
     lines = ["# gaponet data labels: units and payloads are estimated from held torque", 'manifest = "labels.csv"']
     lines += [f"rate = {rate:g}"] if rate else []
