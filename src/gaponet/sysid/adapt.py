@@ -20,7 +20,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Comparison
 from gaponet.sim.replay import Corrector, rollout_errors
-from gaponet.sysid.axes import MAX_KP_LOG_CHANGE, MAX_ON_AXIS, Bounds, Values, large_changes, with_values
+from gaponet.sysid.axes import LARGE_KP_LOG_CHANGE, Bounds, Changes, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, descend
 from gaponet.sysid.robot_rollouts import WINDOW_S, RobotRollouts, cut
@@ -33,7 +33,6 @@ SHARED_FIELDS = ("damping", "frictionloss", "delay")  # such a day moves no zero
 ITERATIONS, MIN_DECREASE = 4, 1e-3  # at most; relative decrease of the cost for another one
 MAX_FOLDS = 4  # of motions that judge
 MAX_SHORT_WINDOW_S = 4.0  # a window so short says too little to judge another one
-LARGE_KP_LOG_CHANGE = 0.2
 START_DELAY_S = 0.005  # a delay of zero has no slope
 START_MASSES_KG = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # of an unknown payload
 MAX_MASS_KG = 20.0
@@ -154,21 +153,10 @@ class _Problem:
     """
 
     def __init__(self, rollouts: RobotRollouts, first: Values, unknown_payload: bool, kd_slack: Array) -> None:
-        self.rollouts, self.unknown, self.first, self.n = rollouts, unknown_payload, first, rollouts.n
-        self.size, kp, one = int(rollouts.rows.sum()), first["kp"], np.ones(rollouts.n)
-        self.scale = large_changes(first) | {"kp": LARGE_KP_LOG_CHANGE * one}
-        least = {
-            "kp": -MAX_KP_LOG_CHANGE * one, "damping": -first["damping"] - kd_slack,
-            "frictionloss": -first["frictionloss"], "offset": -MAX_ON_AXIS["offset"] * one, "delay": -first["delay"],
-        }  # fmt: skip
-        most = {
-            "kp": MAX_KP_LOG_CHANGE * one, "damping": MAX_ON_AXIS["damping"] * kp, "frictionloss": kp,
-            "offset": MAX_ON_AXIS["offset"] * one, "delay": MAX_ON_AXIS["delay"] - first["delay"],
-        }  # fmt: skip
-        self.low, self.high = (
-            np.append(np.stack([ends[f] / self.scale[f] for f in FIELDS], axis=1), [mass] * unknown_payload)[None]
-            for ends, mass in ((least, 0.0), (most, MAX_MASS_KG))
-        )
+        self.rollouts, self.unknown, self.n = rollouts, unknown_payload, rollouts.n
+        self.size, self.changes = int(rollouts.rows.sum()), Changes(first, FIELDS, kd_slack)
+        self.low = np.append(self.changes.low, [0.0] * unknown_payload)[None]
+        self.high = np.append(self.changes.high, [MAX_MASS_KG] * unknown_payload)[None]
         price = PRIOR_RAD / ERROR_SCALE_RAD
         single, common = price * np.eye(self.n), price * (1 - SHARED_PRIOR_RATIO) / self.n
         self.prior = np.zeros((len(FIELDS) * self.n, self.low.size))  # errors of the prior over x
@@ -183,11 +171,7 @@ class _Problem:
 
     def start(self, mass: float) -> Array:
         """Return the start: the robot with a delay; an unknown payload is the best mass of START_MASSES_KG."""
-        x = self.own(mass)
-        delay = FIELDS.index("delay")
-        x[delay : self.n * len(FIELDS) : len(FIELDS)] = (
-            np.maximum(START_DELAY_S - self.first["delay"], 0) / self.scale["delay"]
-        )
+        x = np.append(self.changes.start(START_DELAY_S), [mass] * self.unknown)
         if not self.unknown:
             return x
         xs = np.repeat(x[None], len(START_MASSES_KG), axis=0)
@@ -196,17 +180,12 @@ class _Problem:
 
     def values(self, x: Array) -> Values:
         """Return x (k, P) as field → (k, n)."""
-        parts = np.moveaxis(x[:, : self.n * len(FIELDS)].reshape(len(x), self.n, len(FIELDS)), -1, 0)
-        moved = {f: part * self.scale[f] for f, part in zip(FIELDS, parts, strict=True)}
-        rest = {f: np.broadcast_to(v, (len(x), self.n)) for f, v in self.first.items()}
-        return rest | {f: self.first[f] * np.exp(v) if f == "kp" else self.first[f] + v for f, v in moved.items()}
+        return self.changes.values(x[:, : self.n * len(FIELDS)].reshape(len(x), self.n, len(FIELDS)))
 
     def robot_with(self, x: Array) -> RobotSpec:
         """Return the robot with parameters x (P,); joints that are not operated keep theirs."""
-        every = self.values(x[None])
-        values: Values = {f: every[f][0] for f in FIELDS}
-        values |= {f: np.maximum(values[f], 0.0) for f in ("delay", "frictionloss")}  # a bound is met but for rounding
-        return with_values(self.rollouts.robot, values)
+        values = self.values(x[None])
+        return with_values(self.rollouts.robot, {f: values[f][0] for f in FIELDS})
 
     def rms(self, x: Array) -> float:
         """Return the RMS error of the windows, rad."""

@@ -24,7 +24,7 @@ Values = dict[str, Array]  # field → (…, n) of the operated joints
 CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")  # that every fit has
 START_DELAY_S = 0.02  # a start without delay has no slope over it
 MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
-MAX_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.3
+MAX_KP_LOG_CHANGE, LARGE_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.2, 0.3
 MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
 UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")  # of an unexcited joint, fitted as others move it
@@ -59,12 +59,43 @@ def with_values(robot: RobotSpec, values: Mapping[str, Array]) -> RobotSpec:
     })  # fmt: skip
 
 
-def large_changes(first: Values) -> Values:
-    """Return a large change of each classic field but kp beside a robot's own values, (n,) in SI units."""
-    kp = first["kp"]
-    least = {"damping": 0.01 * kp, "armature": np.full_like(kp, 1e-3), "frictionloss": 0.005 * kp}
-    fixed = {f: np.full_like(kp, SERVO_FIELDS[f].large_value) for f in ("offset", "delay")}
-    return {f: np.maximum(first[f], x) for f, x in least.items()} | fixed
+class Changes:
+    """Changes x (…, n, P) of P fields of a robot's own values, in large changes; of kp by its logarithm.
+
+    Attributes:
+        fields: The P fields, out of CLASSIC.
+        low, high: Bounds, (n, P).
+    """
+
+    def __init__(self, first: Values, fields: ListOf[str], kd_slack: Array | float = 0.0) -> None:
+        """first: Own values, (n,); kd_slack: kd that damping may take from the servos, N·m·s/rad."""
+        self.fields, self._first = tuple(fields), first
+        kp, one = first["kp"], np.ones_like(first["kp"])
+        damping, friction, armature, delay = (first[f] for f in ("damping", "frictionloss", "armature", "delay"))
+        # Field → a large change, the lowest and the highest one.
+        ends: dict[str, tuple[Array, Array, Array]] = {
+            "kp": (LARGE_KP_LOG_CHANGE * one, -MAX_KP_LOG_CHANGE * one, MAX_KP_LOG_CHANGE * one),
+            "damping": (np.fmax(damping, 0.01 * kp), -damping - kd_slack, MAX_ON_AXIS["damping"] * kp),
+            "frictionloss": (np.fmax(friction, 0.005 * kp), -friction, kp),
+            "armature": (np.fmax(armature, 1e-3 * one), -armature, MAX_ARMATURE_TIME_S**2 * kp),
+            "offset": (0.02 * one, -MAX_ON_AXIS["offset"] * one, MAX_ON_AXIS["offset"] * one),
+            "delay": (0.02 * one, -delay, MAX_ON_AXIS["delay"] - delay),
+        }
+        self._large, low, high = (np.stack([ends[f][i] for f in fields], axis=1) for i in range(3))
+        self.low, self.high = low / self._large, high / self._large
+
+    def start(self, delay: float) -> Array:
+        """Return no change, but for a delay of at least so many seconds, (n, P)."""
+        more = np.maximum(delay - self._first["delay"], 0)[:, None]
+        return np.asarray(more / self._large * (np.array(self.fields) == "delay"))
+
+    def values(self, x: Array) -> Values:
+        """Return the values of x; fields that are not changed stay. A bound of zero is met exactly."""
+        moved = dict(zip(self.fields, np.moveaxis(x * self._large, -1, 0), strict=True))
+        rest = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self._first.items()}
+        values = {f: self._first[f] * np.exp(v) if f == "kp" else self._first[f] + v for f, v in moved.items()}
+        positive = {f: np.maximum(values[f], 0.0) for f in ("armature", "frictionloss", "delay") if f in values}
+        return rest | values | positive
 
 
 class Bounds:

@@ -26,8 +26,8 @@ from gaponet.sim.model import build_model
 from gaponet.sim.replay import motion_errors, replay
 from gaponet.sysid.acceptance import HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.adapt import PRIOR_RAD
-from gaponet.sysid.axes import CLASSIC, MAX_ON_AXIS, Bounds, large_changes, with_values
-from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
+from gaponet.sysid.axes import CLASSIC, Bounds, Changes, first_values, with_values
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED, JointRollouts
 from gaponet.sysid.least_squares import descend
 from gaponet.sysid.problem import JointFit, standard_errors, undetermined
 from gaponet.sysid.robot_rollouts import cut
@@ -39,7 +39,6 @@ MIN_MOVE_RAD = 0.05  # of a command that excites a joint
 MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
 INSTRUMENTS = 12  # periods whose commands are instruments for what the servo measured
 START_DELAY, ITERATIONS = 0.25, 10  # in 20 ms; of the fit of positions
-SLIP_SPEED = 0.02  # rad/s: friction turns its sign within this
 MAX_HAND_MASS = 5.0  # kg
 
 
@@ -274,28 +273,18 @@ class TorqueFit:
         """Return the robot with values from torque, and near those with values from positions."""
         start = self.hanging(options.friction) if options.place else self.robot
         rollouts = JointRollouts(cut(self.sequences, MAX_WINDOWS), start)
-        first = Bounds(start, rollouts.parts).first
-        one = np.ones(len(first["kp"]))
-        scale = large_changes(first)
-        least = {f: -first[f] / x for f, x in scale.items()} | {"offset": -10 * one}
-        most = dict.fromkeys(scale, 200 * one) | {
-            "offset": 10 * one,
-            "delay": (MAX_ON_AXIS["delay"] - first["delay"]) / 0.02,
-        }
-        low, high = (np.stack([ends[f] for f in scale], axis=1) for ends in (least, most))
-
-        def values(x: Array) -> dict[str, Array]:
-            moved = {f: first[f] + x[..., i] * scale[f] for i, f in enumerate(scale)}  # at the least 0, or −1e-20
-            rest = {f: np.broadcast_to(v, x.shape[:2]) for f, v in first.items()}
-            return rest | {f: v if f == "offset" else np.maximum(v, 0) for f, v in moved.items()}
+        fields = CLASSIC[1:]  # without kp
+        changes = Changes(first_values(start), fields)
 
         def errors(x: Array) -> Array:
-            return np.concatenate([rollouts.flat_errors(values(x)), options.prior * x], axis=2) / ERROR_SCALE_RAD
+            own = rollouts.flat_errors(changes.values(x))
+            return np.concatenate([own, options.prior * x], axis=2) / ERROR_SCALE_RAD
 
-        x, _ = descend(
-            np.zeros((1, *low.shape)) + START_DELAY * (np.array([*scale]) == "delay"), low, high, errors, ITERATIONS
-        )
-        return with_values(start, {f: values(x)[f][0] for f in scale})
+        first = np.zeros((1, *changes.low.shape))
+        first[..., fields.index("delay")] = START_DELAY
+        x, _ = descend(first, changes.low, changes.high, errors, ITERATIONS)
+        values = changes.values(x)
+        return with_values(start, {f: values[f][0] for f in fields})
 
 
 def _place(mount: int, first: ListOf[float] | Array) -> tuple[float, float, float]:
