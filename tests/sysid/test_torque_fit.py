@@ -11,7 +11,7 @@ from gaponet.base.errors import RobotError
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
+from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
@@ -40,7 +40,7 @@ def test_torque_determines_the_payloads_place_and_the_hands_mass_at_the_mount_th
     for mass in (0.0, 0.2, 0.4):
         for s in recordings(robot, 2, rows=200):
             model = build_model(true, mass, "hand", s.dt)
-            qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF)
+            qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ)
             qvel = differentiate(qpos, s.dt)
             tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, s.dt))
             one = replace(s, tau=tau, meta=replace(s.meta, payload_mass=mass, payload_side="hand"))

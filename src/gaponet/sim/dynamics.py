@@ -14,7 +14,7 @@ from gaponet.sim.model import build_model
 
 Array = np.ndarray
 
-CUTOFF = 6.0  # Hz: above the joints' bandwidth, below encoder steps at 50 Hz
+CUTOFF_HZ = 6.0  # Hz: above the joints' bandwidth, below encoder steps at 50 Hz
 
 
 def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Array:

@@ -15,11 +15,10 @@ from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import Corrector, idle_limbs, rollout
+from gaponet.sysid.joint_rollouts import ROW_PERIOD_S, SETTLE_S
 
 WINDOW_S = 8.0  # what is fitted to a second or two does not hold over whole motions
 MIN_WINDOW_S = 0.8
-ROW_PERIOD_S = 0.01  # between rows that count
-SETTLE_S = 0.1  # after a window's start, where velocities are measured ones
 IMMOVABLE_ARMATURE = 1e6  # kg·m², of a joint that stands
 MAX_ERROR_RAD = np.pi  # of a simulation that diverged
 
@@ -102,6 +101,11 @@ class RobotRollouts:
         sim.set_servos(self.robot.operated, {f: np.repeat(x, m, axis=0) for f, x in values.items()})
         for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
             sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
+        return self.simulated_errors(sim, parts)
+
+    def simulated_errors(self, sim: BatchSim, parts: list[Sequence]) -> Array:
+        """Return q_sim − q_real in the rows that count, (k, n, rows) rad, of simulations of k times the windows."""
+        k, m = sim.num_envs // len(self.parts), len(self.parts)
         qpos = rollout(sim, parts, self.corrector, touch=np.tile(self.touch, k))[0, 1:][..., self.op]
         error = (qpos.reshape(len(qpos), k, m, self.n) - self.real[1:, None]).astype(np.float32)
         errors = error.transpose(1, 3, 0, 2)[:, :, self.counted]

@@ -20,9 +20,10 @@ from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.metrics import Comparison
 from gaponet.sim.model import write_table
-from gaponet.sim.replay import idle_limbs, rollout, rollout_errors
-from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SETTLE_S
+from gaponet.sim.replay import rollout_errors
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import soft_l1
+from gaponet.sysid.robot_rollouts import RobotRollouts
 
 CONTACT_CLEARANCE_M = 0.045  # above the lowest tip, or the table, in which a joint's zero may hide a contact
 WINDOW_S = 5.0
@@ -84,9 +85,9 @@ def low_windows(sequences: ListOf[Sequence], heights: ListOf[Array], below: floa
     return sorted(found, key=lambda s: -len(s))
 
 
-def _most_wrong(scene: _Scene, away: Array) -> list[Sequence]:
+def _most_wrong(scene: _TableRollouts, away: Array) -> list[Sequence]:
     """Return at most MAX_WINDOWS, MAX_WINDOWS_PER_MOTION of a motion, whose rollouts with a table `away` are worst."""
-    order = np.argsort(-scene.mean(scene.errors(away))[0])
+    order = np.argsort(-scene.mean(away[0]))
     taken: dict[str, list[int]] = {}
     for i in order.tolist():
         taken.setdefault(scene.parts[i].meta.motion, []).append(i)
@@ -117,10 +118,9 @@ def fit_table(
     n, measured = len(robot.operated), robot.table
     with_table = replace(robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3]))))
     away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
-    scene = _Scene(parts, with_table, nthread)
-    scene = _Scene(_most_wrong(scene, away), with_table, nthread)
+    scene = _TableRollouts(parts, with_table, nthread)
+    scene = _TableRollouts(_most_wrong(scene, away), with_table, nthread)
     motions = tuple(dict.fromkeys(s.meta.motion for s in scene.parts))
-    before = scene.errors(away)
     heights = lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
     if measured is not None:
         heights = np.array([measured.height])
@@ -136,19 +136,19 @@ def fit_table(
     if validation:
         errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
     best = int(np.argmin(errors))
-    without, within = (scene.mean(e)[0] for e in (before, scene.errors(found[best][0][None])))
+    without, within = scene.mean(away[0]), scene.mean(found[best][0])
     accepted = Comparison("table", without, within).accepted
     return TableFit(tables[best] if accepted else robot, accepted, without, within, motions)
 
 
 def _searched(
-    scene: _Scene, start: Array, measured: bool, progress: Callable[[float], None], pace: list[float]
+    scene: _TableRollouts, start: Array, measured: bool, progress: Callable[[float], None], pace: list[float]
 ) -> tuple[Array, float]:
     """Return the best table and zeros (3 + n,) near a start, and their cost. A measured height stays.
 
     The search ends after FIRST_COMPARISON generations if another start cost less by then; `pace` lists such costs.
     """
-    n, rows = len(scene.op), scene.counted.sum() * len(scene.op)
+    n, rows = scene.n, len(scene.window) * scene.n
     unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO_STD_RAD)])
     low = np.array([start[0] - 0.03 * (not measured), FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO_STD_RAD)])
     high = np.array([start[0] + 0.03 * (not measured), FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO_STD_RAD)])
@@ -183,36 +183,25 @@ def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
     return replace(robot.with_servos(servos), table=Table(height, friction, stiffness))
 
 
-class _Scene:
+class _TableRollouts(RobotRollouts):
     """Rollouts of windows with candidates of the table: rows of [height m, friction, log stiffness, zeros rad]."""
 
-    def __init__(self, parts: list[Sequence], robot: RobotSpec, nthread: int) -> None:
-        self.parts, self.robot, self.nthread, self.op = parts, robot, nthread, robot.operated_index
-        self.locked, lengths = idle_limbs(parts, robot), np.array([len(s) for s in parts])
-        self.real = np.zeros((lengths.max(), len(parts), len(self.op)))  # zero where it does not count
-        for i, s in enumerate(parts):
-            self.real[: len(s), i] = s.qpos[:, self.op]
-        time = np.arange(1, lengths.max())[:, None]
-        self.counted = (time >= SETTLE_S / parts[0].dt) & (time < lengths)
-
     def errors(self, xs: Array) -> Array:
-        """Return q_sim − q_real of candidates (k, 3 + n), (rows − 1, k, windows, n) rad."""
-        k, m = len(xs), len(self.parts)
-        conditions = [Condition.of(s, self.robot) for s in self.parts] * k
+        """Return q_sim − q_real of candidates (k, 3 + n), (k, n, rows) rad."""
+        conditions = [Condition.of(s, self.robot) for s in self.parts] * len(xs)
         sim = BatchSim(self.robot, conditions, self.nthread, self.locked)
-        rows = np.repeat(xs, m, axis=0)
+        rows = np.repeat(xs, len(self.parts), axis=0)
         model = sim.models[conditions[0]]
         write_table(sim.batch, model, rows[:, 0], rows[:, 1], np.exp(rows[:, 2]))
         dof = np.array([model.joint(j).dofadr[0] for j in self.robot.operated])
         sim.batch.expand("qpos0")[:, dof] -= rows[:, 3:]
-        qpos = rollout(sim, self.parts * k)[0, 1:][..., self.op]
-        error = qpos.reshape(len(qpos), k, m, -1) - self.real[1:, None]
-        return np.asarray(error * self.counted[:, None, :, None], np.float32)
+        return self.simulated_errors(sim, self.parts * len(xs))
 
     def soft_errors(self, xs: Array) -> Array:
-        """Return the errors of candidates in ERROR_SCALE_RAD, (k, rows)."""
-        return np.asarray(np.moveaxis(self.errors(xs), 1, 0).reshape(len(xs), -1) / np.float32(ERROR_SCALE_RAD))
+        """Return the errors of candidates in ERROR_SCALE_RAD, (k, n · rows)."""
+        return self.errors(xs).reshape(len(xs), -1) / np.float32(ERROR_SCALE_RAD)
 
-    def mean(self, errors: Array) -> Array:
-        """Return the mean |error| by window, (k, windows) rad."""
-        return np.asarray(np.abs(errors).mean(axis=3).sum(axis=0) / self.counted.sum(axis=0))
+    def mean(self, x: Array) -> Array:
+        """Return the mean |error| of a candidate (3 + n,) by window, (windows,) rad."""
+        size = np.abs(self.errors(x[None])[0]).mean(axis=0)
+        return np.bincount(self.window, size) / np.bincount(self.window)

@@ -20,7 +20,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.dynamics import CUTOFF
+from gaponet.sim.dynamics import CUTOFF_HZ
 from gaponet.sim.metrics import Comparison, metrics, runs
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import motion_errors, replay
@@ -242,7 +242,7 @@ class TorqueFit:
         every = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
         for s in self.sequences:
             assert s.tau is not None
-            qacc = differentiate(differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF), s.dt), s.dt)
+            qacc = differentiate(differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ), s.dt), s.dt)
             moved, carried = _moved(s, robot), [s.meta.payload_side in ("both", m.side) for m in mounts]
             for t in range(every, len(s) - 1, every) if moved else ():
                 data.qpos[:], data.qvel[:] = s.qpos[t], 0.0

@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
+from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
 from gaponet.sysid.motion.library import Library
 from gaponet.sysid.motion.motion import Motion
@@ -133,7 +133,7 @@ def _meta(job: Job, take: Take, level: str, notes: dict[str, Any]) -> SequenceMe
     )
 
 
-def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF) -> tuple[Array, Array]:
+def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF_HZ) -> tuple[Array, Array]:
     """Return the torque that the nominal model with the payload needs for a recorded motion.
 
     Args:
