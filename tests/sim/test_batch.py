@@ -9,7 +9,7 @@ from arm import XML, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS
-from gaponet.sim.batch import BatchSim, OneByOne, ramped
+from gaponet.sim.batch import BatchSim, OneByOne, speed_limited
 from gaponet.sim.model import build_model
 
 
@@ -137,7 +137,8 @@ def test_a_speed_limited_servo_moves_as_another_under_ramped_commands(tmp_path, 
     robot = write_arm(tmp_path)
     slow = replace(robot, target_speed=[0.5, 0.0])
     jumps = np.repeat(np.random.default_rng(2).uniform(-1, 1, (3, 2, 2)), 30, axis=0)
-    ramps = np.stack([ramped(jumps[:, i], np.zeros(2), np.array([0.5, np.inf]), dt) for i, dt in enumerate(rates)], 1)
+    speed = np.array([0.5, np.inf])
+    ramps = np.stack([speed_limited(jumps[:, i], np.zeros(2), speed, dt) for i, dt in enumerate(rates)], 1)
     sims = [BatchSim(r, [(0.0, "both", dt) for dt in rates]) for r in (slow, robot)]
     for sim in sims:
         sim.reset(slice(None), np.zeros(2), 0.0, past=jumps[0][:, None])

@@ -25,7 +25,7 @@ from gaponet.report.candidate import read_origin
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import load_dataset
-from gaponet.sim.batch import Condition, ramped
+from gaponet.sim.batch import Condition, speed_limited
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
@@ -158,4 +158,4 @@ def check_motions(recordings: ListOf[Sequence], robot: RobotSpec) -> list[Sequen
     low, high = robot.qpos_range.T
     cut = [s.rows(slice(0, round(MAX_CHECK_MOTION_S / s.dt))) for s in list(first.values())[:MAX_CHECK_MOTIONS]]
     speed = np.where(robot.target_speed > 0, robot.target_speed, np.inf)
-    return [replace(s, ctrl=ramped(np.clip(s.ctrl, low, high), s.qpos[0], speed, s.dt)) for s in cut]
+    return [replace(s, ctrl=speed_limited(np.clip(s.ctrl, low, high), s.qpos[0], speed, s.dt)) for s in cut]

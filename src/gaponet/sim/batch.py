@@ -1,4 +1,4 @@
-"""Many simulations of one robot, one control period per step. The seam behind which another back-end may step."""
+"""Many simulations of one robot, one control period per step; sim/warp.py does the same on a GPU."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import array_like
+from gaponet.base.arrays import array_like, array_module
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_TERMS, STOP_FIELDS
@@ -89,22 +89,21 @@ else:
         MODEL_FIELDS = {n for n in dir(mujoco.MjModel) if n[0] != "_"} | {f"opt.{n}" for n in dir(mujoco.MjOption)}
 
 
-UNDER_WAY = (0.05, 0.1)  # rad and s at the ramp's speed: a joint stays behind its ramp by no more
+MAX_RAMP_LEAD_RAD, MAX_RAMP_LEAD_S = 0.05, 0.1  # of a ramp beyond its joint: fixed, and at the ramp's speed
 
 
-def _under_way(target: Array, qpos: Array, speed: Array) -> Array:
-    """Return where a ramp towards `target` (…, n), rad, is when the joint is at qpos: as near to it as possible."""
-    most = UNDER_WAY[0] + UNDER_WAY[1] * speed
-    return np.asarray(np.clip(target, qpos - most, qpos + most))
+def ramp_start(target: Any, qpos: Any, speed: Any) -> Any:
+    """Return where a ramp towards `target` (…, n), rad, is when the joint is at qpos; numpy or torch."""
+    lead = MAX_RAMP_LEAD_RAD + MAX_RAMP_LEAD_S * speed
+    return array_module(target).clip(target, qpos - lead, qpos + lead)
 
 
-def ramped(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> Array:
+def speed_limited(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> Array:
     """Return targets (T, …), rad, limited to `speed` (…), rad/s, from qpos (…) on; dt in s, one or (…)."""
-    found = np.empty_like(ctrl)
-    aim = _under_way(ctrl[0], qpos, speed)
+    limited, at = np.empty_like(ctrl), ramp_start(ctrl[0], qpos, speed)
     for t, target in enumerate(ctrl):
-        found[t] = aim = np.clip(target, aim - speed * dt, aim + speed * dt)
-    return found
+        limited[t] = at = np.clip(target, at - speed * dt, at + speed * dt)
+    return limited
 
 
 class Condition(NamedTuple):
@@ -149,33 +148,30 @@ class BatchSim:
         robots = {c: robot.with_gains(c.kp, c.kd) for c in dict.fromkeys(conditions)}
         self.models = {c: build_model(r, *c[:3], locked, bare=True) for c, r in robots.items()}
         first = self.models[conditions[0]]
-        stiffer = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
-        self._stiffer = np.array([stiffer[c] for c in conditions])
+        kp_ratio = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
+        self._kp_ratio = np.array([kp_ratio[c] for c in conditions])
         self._kd = np.array([robots[c].kd for c in conditions])
-        threads = nthread or max(1, min(os.cpu_count() or 1, len(conditions) // 16))  # of fewer each most is waiting
+        threads = nthread or max(1, min(os.cpu_count() or 1, len(conditions) // 16))  # fewer each: threads mostly wait
         self.batch = Batch(first, nsim=len(conditions), nthread=threads)
         # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
         self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])
         self.num_envs = len(conditions)
         self.n = len(self.joint_names)
-        self.qpos: Array = self.batch.bind("qpos")
-        self.qvel: Array = self.batch.bind("qvel")
-        self.ctrl: Array = self.batch.bind("ctrl")
-        self.torque: Array = self.batch.bind("actuator_force")
-        self._warmstart: Array = self.batch.bind("qacc_warmstart")
+        bind: Callable[[str], Array] = self.batch.bind
+        self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
+        self.torque, self._warmstart = bind("actuator_force"), bind("qacc_warmstart")
         self.servo_model = ServoModel(self.batch, first) if robot.has_servo_model or servo_model else None
-        late = [self.batch.bind(name) for name in ("history", "time")] if first.nhistory else []
-        self._late = CommandHistory(late[0], late[1], first) if late else None
+        self._history = CommandHistory(bind("history"), bind("time"), first) if first.nhistory else None
         # Physics steps per control period, and their length in s, of each simulation.
         self.nstep = np.array([robot.steps_per(c[2]) for c in conditions])
         self._one_rate = bool((self.nstep == self.nstep[0]).all())
         self.timestep = np.array([self.models[c].opt.timestep for c in conditions])
         self.range = qpos_range(first)
         speed = robot.target_speed[robot.index(self.joint_names)]
-        self.most = self._farthest(speed) if speed.any() else None  # None where servos take targets as they come
+        self.max_change = self._max_change(speed) if speed.any() else None  # None without speed limits
 
     def array(self, values: Any) -> Array:
-        """Return values as this simulator's kind of array: numpy's here, tensors in sim/warp.py."""
+        """Return values as an array of this simulator: numpy here, torch in sim/warp.py."""
         return np.asarray(values)
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None) -> None:
@@ -190,13 +186,13 @@ class BatchSim:
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
         self._warmstart[ids] = 0.0
-        if self.most is not None:
-            speed = self.most[ids] / (self.nstep * self.timestep)[ids, None]
-            self.ctrl[ids] = qpos if past is None else _under_way(past[:, 0], self.qpos[ids], speed)
-        if self._late is not None:
+        if self.max_change is not None:
+            speed = self.max_change[ids] / (self.nstep * self.timestep)[ids, None]
+            self.ctrl[ids] = qpos if past is None else ramp_start(past[:, 0], self.qpos[ids], speed)
+        if self._history is not None:
             if past is None:
-                raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
-            self._late.fill(ids, past, self.nstep[ids], self.timestep[ids])
+                raise UsageError(f"{self.robot.name} has delayed servos: give the targets before as `past`")
+            self._history.fill(ids, past, self.nstep[ids], self.timestep[ids])
         if self.servo_model is not None:
             rows = np.arange(self.num_envs)[ids]
             self.servo_model.reset(rows, self.qpos[rows] if past is None else past[:, 0])
@@ -208,9 +204,9 @@ class BatchSim:
             ctrl: Targets, (num_envs, n), rad; clipped to the joint range, as a servo would.
             ids: Only these simulations move, (k,) sorted; default all.
         """
-        if self.most is not None:
-            on = np.clip(ctrl, self.ctrl - self.most, self.ctrl + self.most)
-            ctrl = on if ids is None else np.where(np.isin(np.arange(self.num_envs), ids)[:, None], on, self.ctrl)
+        if self.max_change is not None:
+            near = np.clip(ctrl, self.ctrl - self.max_change, self.ctrl + self.max_change)
+            ctrl = near if ids is None else np.where(np.isin(np.arange(self.num_envs), ids)[:, None], near, self.ctrl)
         np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
         if self._one_rate:
             self._advance(ids, int(self.nstep[0]))
@@ -248,7 +244,7 @@ class BatchSim:
         at = np.array([model.actuator(j).id for j in joints])  # of the joint and of its degree of freedom too
         own = self.robot.index(joints)
         gain, bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
-        kp = values["kp"] * self._stiffer[:, own]
+        kp = values["kp"] * self._kp_ratio[:, own]
         gain[:, at, 0], bias[:, at, 1] = kp, -kp
         bias[:, at, 0] = kp * values["offset"]
         kd = values.get("kd", self._kd[:, own])
@@ -266,13 +262,13 @@ class BatchSim:
         if "target_speed" in values:
             speed = np.tile(self.robot.target_speed[self.robot.index(self.joint_names)], (self.num_envs, 1))
             speed[:, at] = values["target_speed"]
-            self.most = self._farthest(speed)
+            self.max_change = self._max_change(speed)
         if self.servo_model is not None:
             self.servo_model.bias[:, at], self.servo_model.frictionloss[:, at] = bias[:, at, 0], values["frictionloss"]
             for name in SERVO_TERMS:
                 self.servo_model.values[name][:, at] = values.get(name, 0.0)
 
-    def _farthest(self, speed: Array) -> Array:
+    def _max_change(self, speed: Array) -> Array:
         """Return the largest change of targets per period at `speed`, (…, n) rad/s (0: no limit), (num_envs, n) rad."""
         return np.asarray((self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf))
 
@@ -287,11 +283,11 @@ class BatchSim:
 
     def _state(self) -> dict[str, Array]:
         state = {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart}
-        if self._late is not None:
-            state |= {"history": self._late.buffer, "time": self._late.time}
+        if self._history is not None:
+            state |= {"history": self._history.buffer, "time": self._history.time}
         if self.servo_model is not None:
             state |= {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
-        return state if self.most is None else state | {"ctrl": self.ctrl}
+        return state if self.max_change is None else state | {"ctrl": self.ctrl}
 
     def data(self, env: int) -> mujoco.MjData:
         """Return one simulation as MjData, for rendering or forward kinematics."""

@@ -21,7 +21,7 @@ from torch import Tensor
 from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim import servo
-from gaponet.sim.batch import UNDER_WAY, BatchSim, CommandHistory
+from gaponet.sim.batch import BatchSim, CommandHistory, ramp_start
 
 MAX_CONTACTS, CONSTRAINTS_PER_CONTACT = 48, 4  # of a simulation whose links collide
 STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}  # field of Data → name in BatchSim.state
@@ -169,7 +169,7 @@ class WarpSim:
         self._worlds = [_Worlds(sim, rows, device) for rows in rates]
         self._delayed = next(iter(sim.models.values())).nhistory > 0
         self._stored = STATE | (HISTORY if self._delayed else {}) | (SERVO if sim.servo_model else {})
-        self._stored |= {} if sim.most is None else TARGET
+        self._stored |= {} if sim.max_change is None else TARGET
         names = [*self._stored, "ctrl", "actuator_force"]
         self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
         if len(self._worlds) == 1:
@@ -180,7 +180,7 @@ class WarpSim:
         self.torque = self._all["actuator_force"]
         self._ids = [self.array(rows) for rows in rates]
         self._low, self._high = self.array(self.range.T)
-        self._most = None if sim.most is None else self.array(sim.most)
+        self._max_change = None if sim.max_change is None else self.array(sim.max_change)
         if sim.servo_model:
             limits = np.moveaxis(np.array(sim.servo_model.force_range), -1, 0)
             gain = sim.batch.expand("actuator_gainprm")[..., 0]
@@ -201,13 +201,13 @@ class WarpSim:
         ids = ids if isinstance(ids, slice) else self.array(ids)
         self.qpos[ids], self.qvel[ids] = self.array(qpos), self.array(qvel)
         self._all["qacc_warmstart"][ids] = 0.0
-        if self._most is not None:
-            most = UNDER_WAY[0] + UNDER_WAY[1] * self._most[ids] / (self.nstep * self.timestep)[ids, None]
+        if self._max_change is not None:
+            speed = self._max_change[ids] / (self.nstep * self.timestep)[ids, None]
             here = self.qpos[ids]
-            self.ctrl[ids] = here if past is None else torch.clamp(self.array(past)[:, 0], here - most, here + most)
+            self.ctrl[ids] = here if past is None else ramp_start(self.array(past)[:, 0], here, speed)
         if self._delayed:
             if past is None:
-                raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
+                raise UsageError(f"{self.robot.name} has delayed servos: give the targets before as `past`")
             self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
         if SERVO.keys() <= self._stored.keys():
             ahead = 0.0 if past is None else self.array(past)[:, 0] - self.qpos[ids]
@@ -232,8 +232,8 @@ class WarpSim:
     def step(self, ctrl: Any, ids: Any = None) -> None:
         """Step as BatchSim.step does: all are stepped, and the others are restored."""
         before, ctrl = {} if ids is None else self.state(), self.array(ctrl)
-        if self._most is not None:
-            ctrl = torch.clamp(ctrl, self.ctrl - self._most, self.ctrl + self._most)
+        if self._max_change is not None:
+            ctrl = torch.clamp(ctrl, self.ctrl - self._max_change, self.ctrl + self._max_change)
         torch.clamp(ctrl, self._low, self._high, out=self.ctrl)
         for worlds in self._each_rate():
             worlds.launch(worlds.period)

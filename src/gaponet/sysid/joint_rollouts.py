@@ -22,7 +22,7 @@ from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim import servo
-from gaponet.sim.batch import ramped
+from gaponet.sim.batch import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import friction_limit, present, servo_torque
@@ -77,7 +77,7 @@ class JointRollouts:
         self.ctrl = stacked([np.clip(p.ctrl[:, self.op], low, high) for p in parts])
         if (speed := robot.target_speed[self.op]).any():
             most = np.where(speed > 0, speed, np.inf)[:, None]
-            limited = ramped(np.moveaxis(self.ctrl, -1, 0), self.qpos[..., 0], most, self.periods)
+            limited = speed_limited(np.moveaxis(self.ctrl, -1, 0), self.qpos[..., 0], most, self.periods)
             self.ctrl = np.ascontiguousarray(np.moveaxis(limited, 0, -1))
         self.qvel = stacked([p.qvel[:, self.op] for p in parts])
         # In the middle of each period: inertia, gravity's torque at an angle of zero, the others' torque, its slope.

@@ -17,7 +17,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import ramped
+from gaponet.sim.batch import speed_limited
 from gaponet.sim.metrics import Comparison
 from gaponet.sysid.acceptance import Identified, held_out_errors
 
@@ -93,7 +93,7 @@ def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     error = np.zeros((2, len(SPEED_RATIOS) + len(LAG_TIME_CONSTANTS_S), len(op), LAGS))
     behind_command, rows = np.zeros((2, *tried.shape)), np.zeros(2)
     for i, (ctrl, qpos, dt) in enumerate(parts):
-        ramps = ramped(np.broadcast_to(ctrl[:, None], (len(ctrl), *tried.shape)), qpos[0], tried, dt)
+        ramps = speed_limited(np.broadcast_to(ctrl[:, None], (len(ctrl), *tried.shape)), qpos[0], tried, dt)
         behind = np.abs(ramps - ctrl[:, None])
         squares, most = behind_command
         behind_command = np.stack([squares + (behind**2).sum(axis=0), np.maximum(most, behind.max(axis=0))])
@@ -122,7 +122,7 @@ def _speed_behind(parts: list[tuple[Array, Array, float]], speed: Array) -> Arra
     """Return the median speed of joints well behind a ramp of about `speed` (n,) rad/s: that of the ramp itself."""
     seen = []
     for ctrl, qpos, dt in parts:
-        behind = np.abs(ramped(ctrl, qpos[0], speed, dt) - ctrl)
+        behind = np.abs(speed_limited(ctrl, qpos[0], speed, dt) - ctrl)
         k, late = max(1, round(SPEED_SPAN_S / dt)), round(MIN_RAMP_DELAY_S / 2 / dt)  # then it is as fast as its ramp
         moved = np.abs(qpos[late + k :] - qpos[late:-k]) / (k * dt)
         seen.append(np.where(behind[: len(moved)] > MIN_RAMP_DELAY_S / 2 * speed, moved, np.nan))

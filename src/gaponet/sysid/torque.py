@@ -42,7 +42,7 @@ START_DELAY, ITERATIONS = 0.25, 10  # in 20 ms; of the fit of positions
 MAX_HAND_MASS = 5.0  # kg
 
 
-class TorqueOptions(NamedTuple):
+class _Options(NamedTuple):
     """Options of a fit from torque: payload's place from torque, friction as well, and the prior of the positions' fit
     around it, rad per large change."""
 
@@ -52,8 +52,8 @@ class TorqueOptions(NamedTuple):
 
 
 OPTIONS = (
-    TorqueOptions(True, False, 2.0), TorqueOptions(True, False, PRIOR_RAD), TorqueOptions(True, True, 2.0),
-    TorqueOptions(False, False, PRIOR_RAD),
+    _Options(True, False, 2.0), _Options(True, False, PRIOR_RAD), _Options(True, True, 2.0),
+    _Options(False, False, PRIOR_RAD),
 )  # fmt: skip
 
 
@@ -269,7 +269,7 @@ class TorqueFit:
 
         return joints, column, tau, qacc, qvel, required
 
-    def fit(self, options: TorqueOptions) -> RobotSpec:
+    def fit(self, options: _Options) -> RobotSpec:
         """Return the robot with values from torque, and near those with values from positions."""
         start = self.hanging(options.friction) if options.place else self.robot
         rollouts = JointRollouts(cut(self.sequences, MAX_WINDOWS), start)
