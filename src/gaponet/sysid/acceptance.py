@@ -22,6 +22,7 @@ from gaponet.sysid.table_contact import TableFit, tip_heights
 Std = dict[str, dict[str, float]]  # joint → field → standard error
 Covariance = dict[str, tuple[list[str], Array]]  # joint → fields (P), (P, P) on the axes of uncertainty.py
 
+MIN_CROSS_VALIDATED = 4  # motions; a fit to two of three says little about a fit to all
 MIN_JUDGES = 3  # motions of each set of recorded joints; fewer are too few to validate without cross-validation
 
 
@@ -52,7 +53,8 @@ def cross_validation(sequences: ListOf[Sequence], validation: ListOf[Sequence], 
     )  # fmt: skip
     enough = min((len(judges.get(joints, ())) for joints, names in motions.items() if len(names) > 1), default=0)
     count = min(folds, max(map(len, motions.values())))
-    if not validation or enough >= MIN_JUDGES or count < 2:
+    few = len({s.meta.motion for s in every}) < MIN_CROSS_VALIDATED
+    if not validation or enough >= MIN_JUDGES or count < 2 or few:
         return [(list(sequences), list(validation))]
     fold = {
         (joints, name): i % count for joints, names in motions.items() if len(names) > 1 for i, name in enumerate(names)

@@ -105,6 +105,7 @@ class Bounds:
         first: The given robot's own values.
         start: Start of a search: with a delay, and with as much armature as the physics step resolves.
         stated: Whether all recordings state their kp.
+        kd: The servos' kd, (n,) N·m·s/rad.
         kd_slack: kd that damping may take from the servos, (n,) N·m·s/rad; 0 if all recordings state it.
         unexcited: Joints that no command moves, (n,).
         limits: Field → lowest, highest, a large change, (n,) each, in the axes' units.
@@ -113,14 +114,14 @@ class Bounds:
 
     def __init__(self, robot: RobotSpec, sequences: ListOf[Sequence]) -> None:
         op, self.n = robot.operated_index, len(robot.operated)
-        self._joints, self._kd = robot.operated, robot.kd[op]
+        self._joints, self.kd = robot.operated, robot.kd[op]
         model = build_model(replace(robot, table=None))
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
         kp, limit = robot.kp[op], robot.effort_limit[op]
         self.first = first_values(robot)
         self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
         kd_stated = all(s.meta.recorded_gains[1] is not None for s in sequences)
-        self.kd_slack = np.zeros(self.n) if kd_stated else self._kd.copy()
+        self.kd_slack = np.zeros(self.n) if kd_stated else self.kd.copy()
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
         self.unexcited = excitation < MIN_EXCITATION_RAD
         least_inertia = kp * (MIN_STEPS_PER_RADIAN * model.opt.timestep) ** 2
@@ -157,7 +158,7 @@ class Bounds:
                 below = x[i, k] - axes.low[i, k] < BOUND_TOLERANCE and (f == "damping" or axes.low[i, k] != 0)
                 if fixed or not (below or axes.high[i, k] - x[i, k] < BOUND_TOLERANCE):
                     continue
-                if f == "damping" and below and not self.kd_slack[i] and self._kd[i]:
+                if f == "damping" and below and not self.kd_slack[i] and self.kd[i]:
                     what = "0 beside the kd that the recordings state; less would fit better: check that kd"
                 elif f == "damping" and below:
                     what = "none at all; check that commands are what the servo was given, and their clock"

@@ -29,14 +29,16 @@ MIN_COST_DECREASE, MIN_CHAIN_COST_DECREASE = 2e-3, 2e-4  # relative, for another
 MIN_CLUSTERS = 24  # parts of the recordings that count as independent of each other
 CORRELATION_TIME_BOUNDS_S = (1.0, 4.0)  # least, and the value before it is estimated
 MIN_CORRELATION = 0.05  # of an error with itself later; less counts as none
-PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5}  # of the robot file's values
+PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5, "damping": 1.0}  # of the robot file's values; damping with kd
+PRIORS = len(PRIOR_LOG_STD)
+MIN_SHARE = 1e-3  # of the file's value; less counts as this
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
 UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
 MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
 
 
 class _GainPrior:
-    """Prior of kp and armature around the robot file's values.
+    """Prior of kp, armature and damping around the robot file's values.
 
     Its weight decreases with the residual of the best fit and increases with the residual's correlation time.
 
@@ -50,16 +52,19 @@ class _GainPrior:
         self.correlation_time = np.full(bounds.n, CORRELATION_TIME_BOUNDS_S[1])
         self._row_period = max(row_period, 0.01)
         self._log_std = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
-        self._given = {f: np.where(bounds.first[f] > 0, bounds.first[f], np.nan) for f in self._log_std}
+        self._servo_damping = {"damping": bounds.kd}  # beside the joint's own
+        given = {f: bounds.first[f] + self._servo_damping.get(f, 0.0) for f in self._log_std}
+        self._given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
 
     def error_std(self) -> Array:
         """Return the standard deviation that one row's error has beside the prior, (n,) in ERROR_SCALE_RAD."""
         return np.asarray(self.residual / ERROR_SCALE_RAD * np.sqrt(self.correlation_time / self._row_period))
 
     def errors(self, values: Values) -> Array:
-        """Return the prior's errors of candidates (k, n), (k, n, 2) in ERROR_SCALE_RAD."""
+        """Return the prior's errors of candidates (k, n), (k, n, PRIORS) in ERROR_SCALE_RAD."""
+        own = {f: values[f] + self._servo_damping.get(f, 0.0) for f in self._given}
         far = [
-            np.nan_to_num(np.log(np.maximum(values[f], 1e-9) / given)) * self.error_std() / self._log_std[f]
+            np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given)) * self.error_std() / self._log_std[f]
             for f, given in self._given.items()
         ]
         return np.stack(far, axis=-1)
@@ -90,7 +95,7 @@ class FitProblem:
     physics_step: float  # s
 
     def errors(self, values: Values, rollouts: JointRollouts | None = None) -> Array:
-        """Return errors of candidates (k, n), (k, n, rows + 2) in ERROR_SCALE_RAD; the last two are the prior's."""
+        """Return errors of candidates (k, n), (k, n, rows + PRIORS) in ERROR_SCALE_RAD; the last are the prior's."""
         errors = (rollouts or self.rollouts).flat_errors(values)
         return np.concatenate(
             [errors / np.float32(ERROR_SCALE_RAD), self.prior.errors(values)], axis=2, dtype=np.float32
@@ -286,13 +291,13 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     x = axes.normalize(values)
     here, jac = (y[0] for y in agreed_slopes(x[None], axes.low, axes.high, problem.of_axes(axes)))
     weight = 1 / np.sqrt(1 + here**2)
-    gradient = jac * (weight * here)[..., None]  # (n, rows + 2, P)
+    gradient = jac * (weight * here)[..., None]  # (n, rows + PRIORS, P)
     cluster, _ = cluster_of_rows(problem.rollouts.window)
     clusters = int(cluster.max()) + 1
     each = np.zeros((bounds.n, clusters, len(names)))
-    np.add.at(each, (slice(None), cluster), gradient[:, :-2])  # type: ignore[arg-type]
+    np.add.at(each, (slice(None), cluster), gradient[:, :-PRIORS])  # type: ignore[arg-type]
     each -= each.mean(axis=1, keepdims=True)
-    prior_jac = jac[:, -2:] * prior.error_std()[:, None, None]
+    prior_jac = jac[:, -PRIORS:] * prior.error_std()[:, None, None]
     normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
     few = clusters / max(clusters - len(names), 1)  # squared, as a jackknife of so few clusters has it
     scatter = np.swapaxes(each, -1, -2) @ each * few**2
