@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from arm import TOML, recordings, write_arm
 
-from gaponet.base.errors import RobotError
+from gaponet.base.errors import RobotError, UsageError
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
-from gaponet.sysid.shared_servo import far_from_published, same_servos, share
+from gaponet.sysid.shared_servo import far_from_published, mirrored, same_servos, servos_like, share
 
 SERVO = '[[servo]]\nname = "S1"\nsource = "a bench"\narmature = 0.02\ndamping = 0.5\n'
 TWO = (
@@ -59,3 +59,25 @@ def test_identify_can_share_a_servo_model(tmp_path):
     (law,) = fit.shared
     assert (law.name, law.before.shape, law.after.shape) == ("S1", (3,), (3,))
     assert law.after.mean() < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("joint", "other"),
+    [("left_elbow_joint", "right_elbow_joint"), ("FL_hip_joint", "FR_hip_joint"), ("RH_KFE", "LH_KFE"),
+     ("shoulder_pan", "shoulder_pan")],
+)  # fmt: skip
+def test_a_mirrored_joint_has_the_other_side_in_its_name(joint, other):
+    assert (mirrored(joint), mirrored(other)) == (other, joint)
+
+
+def test_a_joint_starts_from_the_identified_servo_of_its_type_or_mirror_image_and_keeps_its_mounting(tmp_path):
+    robot = write_arm(tmp_path / "a", TWO)
+    identified = robot.with_servos({"elbow": {"kp": 15.0, "frictionloss": 0.2, "offset": 0.03, "delay": 0.01}})
+    stiff = write_arm(tmp_path / "b", TWO.replace("kp = 20.0", "kp = 40.0"))
+    started, sources = servos_like(stiff, identified)
+    assert sources == {"shoulder": "elbow", "elbow": "elbow"}  # the shoulder was not identified
+    assert started.kp.tolist() == [30.0, 30.0]  # the ratio to the nominal gain
+    assert (started.frictionloss.tolist(), started.delay.tolist()) == ([0.2, 0.2], [0.01, 0.01])
+    assert started.offset.tolist() == [0.0, 0.0]
+    with pytest.raises(UsageError, match="no identified joint"):
+        servos_like(stiff, robot)

@@ -41,6 +41,7 @@ def identify(
     out: Place,
     windows: int = 40,
     robot: RobotSpec | Place | None = None,
+    like: RobotSpec | Place | None = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
     terms: tuple[Term, ...] = DEFAULT_TERMS,
@@ -64,6 +65,8 @@ def identify(
         out: Robot folder to write; `train(…, robot=out)` starts from it.
         windows: Number of 8 s rollouts that are fitted, taken evenly from the training motions.
         robot: Start of the fit, if not the robot that the dataset keeps.
+        like: Identified robot whose servos are the start and the prior, by joint name, mirrored name (left, right)
+            or type of servo: another arm, another unit, another robot.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
         terms: Terms of the servo model to try; each is accepted only if validation motions improve.
@@ -75,7 +78,7 @@ def identify(
         progress: Called with done, total and a note.
 
     Raises:
-        DatasetError, UsageError: A unit is not there.
+        DatasetError, UsageError: A unit is not there, or `like` has no joint that corresponds.
         NoGainError: Nothing that was fitted does better; it names the joints and what to record.
     """
     from gaponet.base.files import lock_folder
@@ -85,6 +88,7 @@ def identify(
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sysid.acceptance import HeldOut, held_out_errors
     from gaponet.sysid.identify import identify as fit
+    from gaponet.sysid.shared_servo import servos_like
 
     data, spec = as_dataset(dataset, robot)
     data.require_robot(spec)
@@ -97,18 +101,19 @@ def identify(
     began, val, folder = time.monotonic(), data.sequences(split["val"]), Path(out)
     if len(gains := {e.meta.recorded_gains for e in data.entries}) == 1:
         spec = spec.with_gains(*gains.pop())
+    start, taken = (spec, {}) if like is None else servos_like(spec, as_robot(like))
     seconds = None if budget is None else Budget.parse(budget).seconds
     if budget is not None and seconds is None:
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
     with lock_folder(folder, "robot"):
         fitted = fit(
-            data.sequences(split["train"]), spec, val, windows, terms, table, shared, threads, progress, seconds, stops
+            data.sequences(split["train"]), start, val, windows, terms, table, shared, threads, progress, seconds, stops
         )
         after, given, nominal = (
             held_out_errors(HeldOut(s, one or own) for s, own in fitted.held_out)
             for one in (None, spec, spec.nominal or spec)
         )
-        if not fitted.improved or after.mean() > (1 - MIN_RELATIVE_GAIN) * given.mean():
+        if not (fitted.improved or taken) or after.mean() > (1 - MIN_RELATIVE_GAIN) * given.mean():
             raise NoGainError(fitted.no_gain_message(spec, given, after))
         save_robot(fitted.robot, folder)
         errors = {"nominal": nominal, "identified": after}
@@ -116,7 +121,8 @@ def identify(
         judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
         _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, judges)
     return IdentifyResult(
-        robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began
+        robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began,
+        taken_from=taken,
     )  # fmt: skip
 
 

@@ -184,6 +184,7 @@ class IdentifyResult:
         errors: nominal and identified → mean |error| of each motion that was not fitted, (motions,) rad.
         fit: Standard errors, terms that were tried, warnings.
         seconds: Duration of the fit.
+        taken_from: Joint → joint of `like` whose servo was its start.
     """
 
     robot: RobotSpec
@@ -191,6 +192,7 @@ class IdentifyResult:
     errors: Mapping[str, Array]
     fit: Identified = field(repr=False)
     seconds: float
+    taken_from: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def val_mpjae(self) -> dict[str, float]:
@@ -217,7 +219,8 @@ class IdentifyResult:
 
         fit = self.fit
         return {
-            "chosen": fit.chosen, "joints": self.values(), "std": fit.std, "val_mpjae": self.val_mpjae,
+            "chosen": fit.chosen, "taken_from": dict(self.taken_from), "joints": self.values(), "std": fit.std,
+            "val_mpjae": self.val_mpjae,
             "val_standard_error": {name: standard_error(errors) for name, errors in self.errors.items()},
             "terms": {
                 c.name: {"gain": c.gain[0], "standard_error": c.gain[1], "kept": c.accepted} for c in fit.comparisons

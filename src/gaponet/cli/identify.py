@@ -9,7 +9,8 @@ from gaponet.api.opening import driven_by_torque
 from gaponet.api.results import IdentifyResult
 from gaponet.base.progress import progress_bar
 from gaponet.base.text import format_uncertainty
-from gaponet.cli.options import Flag, Json, Robot, Source, like
+from gaponet.cli import options
+from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import MAX_COLUMNS, Out, writes
 from gaponet.cli.torque import show_torque
 from gaponet.report.tables import mrad
@@ -22,7 +23,7 @@ UNDETERMINED = "not determined by these logs"
 
 
 @writes("robot")
-@like(api.identify)
+@options.like(api.identify)
 def identify(
     dataset: Source,
     out: Path,
@@ -36,6 +37,7 @@ def identify(
     current: Flag = False,
     details: Flag = False,
     robot: Robot = None,
+    like: str | None = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
     json: Json = False,
@@ -64,8 +66,8 @@ def identify(
         return
     with progress_bar("identifying") as update:
         made = api.identify(
-            data, out=out, windows=windows, robot=spec, units=units, holdout_units=holdout_units, terms=terms,
-            table=table, shared=shared, threads=threads, budget=budget, stops=stops, progress=update,
+            data, out=out, windows=windows, robot=spec, like=like, units=units, holdout_units=holdout_units,
+            terms=terms, table=table, shared=shared, threads=threads, budget=budget, stops=stops, progress=update,
         )  # fmt: skip
     _show(screen, made, details)
     screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {robot_argument(out)}")
@@ -83,6 +85,11 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     if len(found.held_out) > 1:
         screen.say(
             f"few motions validate: cross-validation in {len(found.held_out)} folds chose; the robot is fitted to all"
+        )
+    if made.taken_from:
+        taken = ", ".join(f"{joint} from {source}" for joint, source in made.taken_from.items())
+        screen.say(
+            f"start and prior: {taken}; {'fitted' if found.improved else 'no fit did better: taken as they are'}"
         )
     shown = [f for f in SERVO_FIELDS if any(v.get(f) for v in values.values())]
     for start in range(0, len(shown), MAX_COLUMNS):

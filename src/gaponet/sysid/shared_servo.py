@@ -1,4 +1,4 @@
-"""One servo model for servos of one type, and comparison with published values.
+"""One servo model for servos of one type, servos taken over from another robot, and comparison with published values.
 
 The same motor has the same gain, damping, friction and armature in every joint. Mounting stays a joint's own: zero
 offset, delay, and friction by load, which depends on how the joint is borne.
@@ -6,12 +6,16 @@ offset, delay, and friction by load, which depends on how the joint is borne.
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.axes import Values
+from gaponet.sysid.axes import CLASSIC, Values, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import descend, soft_l1
 
@@ -32,6 +36,52 @@ def same_servos(robot: RobotSpec) -> dict[str, list[int]]:
         if (servo := robot.servos[joint]) is not None:
             places.setdefault(servo.name, []).append(place)
     return {name: each for name, each in places.items() if len(each) > 1}
+
+
+def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str, str]]:
+    """Return the robot with the identified servos of another one, and joint → joint that its values come from.
+
+    A joint takes the values of the identified joint of its name, else of its mirror image (left and right), else of
+    the first joint with its type of servo. Zero offsets and what else belongs to a joint's mounting stay; kp keeps its
+    ratio to the nominal kp. Of the same robot the payload's place is taken over too.
+
+    Raises:
+        UsageError: No joint corresponds.
+    """
+    before = like.before_identification
+    now, then = first_values(like), first_values(before)
+    moved = np.any([~np.isclose(now[f], then[f], rtol=1e-3, atol=1e-6) for f in CLASSIC], axis=0)
+    changed = {joint for joint, by in zip(like.operated, moved, strict=True) if by}
+    sources: dict[str, str] = {}
+    for i, joint in zip(robot.operated_index, robot.operated, strict=True):
+        type_of = robot.servos[i]
+        same_type = [j for j in like.joint_names if type_of and like.servos[like.joint_names.index(j)] == type_of]
+        source = next((j for j in (joint, mirrored(joint), *same_type) if j in changed), None)
+        if source:
+            sources[joint] = source
+    if not sources:
+        raise UsageError(
+            f"{like.folder}: no identified joint of it has the name, the mirrored name or the type of servo of a joint "
+            f"of {robot.name}"
+        )
+    taken = [f.name for f in SERVO_FIELDS.values() if (f.shared or f.name == "delay") and f.name != "effort_limit"]
+    servos: dict[str, dict[str, float]] = {}
+    for joint, source in sources.items():
+        i, k = robot.joint_names.index(joint), like.joint_names.index(source)
+        servos[joint] = {f: float(getattr(like, f)[k]) for f in taken}
+        for gain in ("kp", "kd"):
+            own, theirs = (float(getattr(r, gain)[at]) for r, at in ((robot, i), (before, k)))
+            servos[joint][gain] *= own / theirs if own > 0 and theirs > 0 else 1.0
+    mounts = like.payload_mounts if like.name == robot.name else robot.payload_mounts
+    return replace(robot.with_servos(servos), payload_mounts=mounts), sources
+
+
+def mirrored(joint: str) -> str:
+    """Return the joint's name with left and right exchanged; the name itself if it has no side."""
+    sides = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "lf": "rf", "lh": "rh"}
+    other = sides | {b: a for a, b in sides.items()}
+    words = re.split(r"(_)", joint)
+    return "".join((other.get(w.lower(), w).upper() if w.isupper() else other.get(w, w)) for w in words)
 
 
 def far_from_published(robot: RobotSpec) -> list[str]:
