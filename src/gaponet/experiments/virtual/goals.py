@@ -139,7 +139,7 @@ class GoalPlanner:
                 return None
             for ik, place in zip(self.ik, goal, strict=True):
                 q = ik.solve(q, place)
-            if np.abs(self.hand_positions(q) - goal).max() > IK_TOLERANCE_M or not self.limits.still(q):
+            if np.abs(self.hand_positions(q) - goal).max() > IK_TOLERANCE_M or not self.limits.can_hold(q):
                 return None
             postures.append(q)
             goals.append(goal)

@@ -21,7 +21,7 @@ from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig, limit_delta
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import static_torque
-from gaponet.sysid.motion.feasible import STILL_SHARE, Feasibility, stretch
+from gaponet.sysid.motion.feasible import MAX_STATIC_SHARE, Feasibility, stretch
 from gaponet.sysid.motion.motion import GRID, Motion
 from gaponet.sysid.motion.path_planner import Search, Trajectory, find_points, finish_search
 
@@ -244,7 +244,7 @@ class Planner:
         low[columns], high[columns] = self.limits.low[columns], self.limits.high[columns]
         home = np.clip(self.robot.qpos_home, low, high)
         heavy = [np.abs(static_torque(m, np.stack([start, goal]))).max(axis=0) for m in self.limits.models]
-        most = np.maximum(self.limits.limit * STILL_SHARE, np.max(heavy, axis=0) + 1e-6)
+        most = np.maximum(self.limits.limit * MAX_STATIC_SHARE, np.max(heavy, axis=0) + 1e-6)
 
         def free(rows: Array) -> bool:
             if (self.collision.distances(rows) < required).any():

@@ -153,9 +153,9 @@ def _at_once(library: Library, variant: int) -> Motion:
     kinds = list(SIGNALS.values())
     columns = {}
     for joint in robot.operated:
-        i, stage = robot.index([joint])[0], library.stage(joint)
+        i, there = robot.index([joint])[0], library.excitation_range(joint)
         low, high = (
-            library.kit.ready[i] + RANGE_SHARE * (end - library.kit.ready[i]) for end in (stage.low, stage.high)
+            library.kit.ready[i] + RANGE_SHARE * (end - library.kit.ready[i]) for end in (there.low, there.high)
         )
         columns[i] = kinds[rng.integers(len(kinds))](min(low, high), max(low, high), rng, GRID)
     ctrl = np.repeat(library.kit.ready[None], max(map(len, columns.values())), axis=0)

@@ -1,4 +1,4 @@
-"""Feasibility of commands: can a robot follow one, and which is the nearest that it can.
+"""Feasibility of commands, and the nearest feasible one.
 
 Four limits: joint range, joint speed, free space between limbs and above floor or table, and torque by inverse dynamics
 of the nominal model at every payload. For a given motion the torque is an affine function of the payload mass (up to
@@ -23,26 +23,26 @@ from gaponet.sysid.motion.motion import GRID, Motion
 MAX_PAYLOAD = 3.0  # kg per hand: the heaviest of the SimLifter recipe, and the default
 MAX_SPEED = 4.0  # rad/s: under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf)
 RANGE_MARGIN = 0.02  # rad kept from a hard stop
-STILL_SHARE = 0.95  # of the usable torque that may go into standing still; beyond it no time is slow enough
-TORQUE_SHARE = 0.85  # of the effort limit that a command may ask for; the rest is for feedback and heavier real links
+MAX_STATIC_SHARE = 0.95  # of the usable torque, to hold a posture: slower motion does not reduce it
+TORQUE_SHARE = 0.85  # of the effort limit, for commands; the rest is for feedback and heavier links
 
 
 @dataclass(frozen=True)
 class Demand:
-    """The worst that a command asks of any joint: 1.0 is the limit."""
+    """The worst that a command demand of any joint: 1.0 is the limit."""
 
     position: float
     speed: float
     torque: float
-    gravity: float  # the part of torque that remains however slowly the motion is played
+    gravity: float  # torque at rest
     worst_joint: str  # by torque
-    clearance: float  # m of free space where it is least, …
-    nearest: str  # … and between what
-    clear: bool  # whether that is enough
+    clearance: float  # least free space, m
+    nearest: str  # bodies between which it is
+    clear: bool  # whether it is enough
 
     @property
     def met(self) -> bool:
-        """Within all limits."""
+        """True if the command is within all limits."""
         return max(self.position, self.speed, self.torque) <= 1.0 + 1e-9 and self.clear
 
 
@@ -99,58 +99,58 @@ class Feasibility:
     def fit(self, motion: Motion, tries: int = 40, need: Array | None = None) -> Motion:
         """Slow the motion down, or bring it nearer to a posture that is fine, until it fits.
 
-        It is slowed where speed or acceleration asks too much, and brought nearer where even standing still does or
+        It is slowed where speed or acceleration demand too much, and brought nearer where even standing still does or
         where limbs meet: to its own start if that is fine, else to the robot's home. Joints that it does not name stay.
 
         Raises:
-            UsageError: It does not fit after `tries` changes; the message says what it still asks for.
+            UsageError: It does not fit after `tries` changes; the message says what it still demand for.
         """
         named = self.robot.index(motion.named(self.robot))
         low, high = np.full_like(self.low, -np.inf), np.full_like(self.high, np.inf)
         low[named], high[named] = self.low[named], self.high[named]
         ctrl = np.clip(motion.ctrl, low, high)
         anchor = ctrl[0].copy()
-        if not self.still(anchor, need):  # of all joints, those that are only held too
+        if not self.can_hold(anchor, need):  # of all joints, those that are only held too
             anchor[named] = np.clip(self.robot.qpos_home, low, high)[named]
         for _ in range(tries):
-            asks = self.demand(ctrl, motion.dt, named, need)
-            if asks.met:
+            demand = self.demand(ctrl, motion.dt, named, need)
+            if demand.met:
                 return replace(motion, ctrl=ctrl)
-            if asks.gravity > STILL_SHARE or not asks.clear:
+            if demand.gravity > MAX_STATIC_SHARE or not demand.clear:
                 ctrl = anchor + 0.93 * (ctrl - anchor)
             else:
-                ctrl = stretch(ctrl, min(max(asks.speed, asks.torque**0.5, 1.03), 1.5))
+                ctrl = stretch(ctrl, min(max(demand.speed, demand.torque**0.5, 1.03), 1.5))
             ctrl = np.clip(ctrl, low, high)
         raise UsageError(
-            f"motion '{motion.name}' does not fit {self.robot.name} after {tries} changes: {asks.worst_joint} needs "
-            f"{asks.torque:.2f} of its usable torque at {self.max_payload:g} kg, speed is {asks.speed:.2f} of "
-            f"{MAX_SPEED:g} rad/s, {asks.nearest or 'limbs'} come as near as {asks.clearance * 100:.1f} cm (at least "
+            f"motion '{motion.name}' does not fit {self.robot.name} after {tries} changes: {demand.worst_joint} needs "
+            f"{demand.torque:.2f} of its usable torque at {self.max_payload:g} kg, speed is {demand.speed:.2f} of "
+            f"{MAX_SPEED:g} rad/s, {demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at least "
             f"{self.collision.clearance * 100:g}). Start it from a posture that is easier to hold, or collect with a "
             "lighter payload"
         )
 
-    def still(self, posture: Array, need: Array | None = None) -> bool:
+    def can_hold(self, posture: Array, need: Array | None = None) -> bool:
         """Return True if a posture (n,) rad can be held at every payload, clear of the body; need as in `demand`."""
-        asks = self.demand(np.repeat(posture[None], 2, axis=0), GRID, need=need)
-        return asks.gravity <= STILL_SHARE and asks.clear
+        demand = self.demand(np.repeat(posture[None], 2, axis=0), GRID, need=need)
+        return demand.gravity <= MAX_STATIC_SHARE and demand.clear
 
 
 def stretch(ctrl: Array, factor: float) -> Array:
-    """The same path (T, n), `factor` times slower, on the same grid."""
+    """Return the same path (T, n), `factor` times slower, on the same grid."""
     from scipy.interpolate import CubicSpline
 
     rows = round((len(ctrl) - 1) * factor) + 1
     return CubicSpline(np.arange(len(ctrl)), ctrl)(np.linspace(0, len(ctrl) - 1, rows))
 
 
-POINTS = 41  # across the range
-CANDIDATES = 400
-ENOUGH = 0.91  # of the joint's range: stop looking; the margins to the stops take 1 or 2 %
+GRID_POINTS = 41  # across the range
+MAX_POSTURES = 400
+ENOUGH_RANGE_SHARE = 0.91  # of the joint's range: stop looking; the margins to the stops take 1 or 2 %
 GRAVITY_SHARE = 0.9  # of the usable torque: leaves some to accelerate
 
 
 @dataclass(frozen=True)
-class Stage:
+class ExcitationRange:
     """A posture (n,) rad and the interval of one joint that can be held from there at every payload."""
 
     posture: Array
@@ -159,11 +159,10 @@ class Stage:
     share: float  # of the joint's range
 
 
-def find_stage(limits: Feasibility, joint: str, seed: int = 0) -> Stage:
-    """A posture near home from which `joint` reaches all of its range, or the most of it that was found.
+def find_excitation_range(limits: Feasibility, joint: str, seed: int = 0) -> ExcitationRange:
+    """Return a posture near home from which `joint` reaches most of its range, clear of the body, at every payload.
 
-    Home itself is tried first, then the other operated joints of the same limb are varied at random, ever further.
-    Neither gravity at any payload nor the body may be in the way.
+    Home is tried first; then the other operated joints of the limb are varied at random, more and more.
     """
     robot = limits.robot
     j = robot.index([joint])[0]
@@ -173,11 +172,11 @@ def find_stage(limits: Feasibility, joint: str, seed: int = 0) -> Stage:
     low, high = limits.low, limits.high
     home = np.clip(robot.qpos_home, low, high)
     best = _span(limits, home, int(j))
-    for i in range(CANDIDATES):
-        if best.share >= ENOUGH:
+    for i in range(MAX_POSTURES):
+        if best.share >= ENOUGH_RANGE_SHARE:
             break
         posture = home.copy()
-        reach = min(1.0, 1.5 * i / CANDIDATES) * rng.uniform(0, 1, len(columns))  # near home first
+        reach = min(1.0, 1.5 * i / MAX_POSTURES) * rng.uniform(0, 1, len(columns))  # near home first
         posture[columns] += reach * (rng.uniform(low[columns], high[columns]) - home[columns])
         stage = _span(limits, posture, int(j))
         if stage.share > best.share:
@@ -185,26 +184,27 @@ def find_stage(limits: Feasibility, joint: str, seed: int = 0) -> Stage:
     return best
 
 
-def _span(limits: Feasibility, posture: Array, j: int) -> Stage:
-    """Longest run of the joint's range that is feasible from a posture."""
-    grid = np.linspace(limits.low[j], limits.high[j], POINTS)
-    rows = np.repeat(posture[None], POINTS, axis=0)
+def _span(limits: Feasibility, posture: Array, j: int) -> ExcitationRange:
+    """Return the longest feasible interval of the joint's range from a posture."""
+    grid = np.linspace(limits.low[j], limits.high[j], GRID_POINTS)
+    rows = np.repeat(posture[None], GRID_POINTS, axis=0)
     rows[:, j] = grid
+    empty = ExcitationRange(posture, grid[0], grid[0], 0.0)
     fits = limits.collision.distance(rows) >= limits.collision.clearance
-    if np.diff(_longest_run(fits))[0] < POINTS // 2:
-        return Stage(posture, grid[0], grid[0], 0.0)
+    if np.diff(_longest_run(fits))[0] < GRID_POINTS // 2:
+        return empty
     share = np.max([np.abs(static_torque(m, rows)) for m in limits.models], axis=0) / limits.limit
     fits &= (share <= GRAVITY_SHARE).all(axis=1)
     start, stop = _longest_run(fits)
     if stop == start:
-        return Stage(posture, grid[0], grid[0], 0.0)
+        return empty
     low, high = float(grid[start]), float(grid[stop - 1])
     full = np.diff(limits.robot.qpos_range[j])[0]
-    return Stage(posture, low, high, (high - low) / float(full))
+    return ExcitationRange(posture, low, high, (high - low) / float(full))
 
 
 def _longest_run(mask: Array) -> tuple[int, int]:
-    """Start and stop of the longest run of True."""
+    """Return start and stop of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     if not len(edges):
         return 0, 0
@@ -214,14 +214,14 @@ def _longest_run(mask: Array) -> tuple[int, int]:
 
 
 def _limb(model: mujoco.MjModel, operated: tuple[str, ...], joint: str) -> list[str]:
-    """Operated joints on the same chain as `joint`: those it carries and those that carry it."""
+    """Return the operated joints on the chain of `joint`: those that it carries and those that carry it."""
     body = {name: int(model.joint(name).bodyid[0]) for name in operated}
     mine = body[joint]
     return [name for name, b in body.items() if b in carriers(model, mine) or mine in carriers(model, b)]
 
 
 def carriers(model: mujoco.MjModel, body: int) -> set[int]:
-    """The body and all it hangs on, without the world."""
+    """Return a body and its parents, without the world."""
     chain = set()
     while body:
         chain.add(body)

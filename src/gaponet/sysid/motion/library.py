@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.coordinated import BUILDERS, WHOLE_BODY, Kit, available
-from gaponet.sysid.motion.feasible import MAX_PAYLOAD, Feasibility, Stage, find_stage
+from gaponet.sysid.motion.feasible import MAX_PAYLOAD, ExcitationRange, Feasibility, find_excitation_range
 from gaponet.sysid.motion.motion import GRID, Motion, fade, move_time, through
 
 Signal = Callable[[float, float, np.random.Generator, float], Array]  # (low, high, rng, dt) → (T,) rad
@@ -101,7 +101,7 @@ def _about(low: float, high: float, wave: Array, rng: np.random.Generator, dt: f
 
 
 class Library:
-    """Makes motions of one robot by name, and remembers what is costly to find."""
+    """Motions of one robot by name; joints' excitation ranges are cached."""
 
     def __init__(
         self,
@@ -120,11 +120,11 @@ class Library:
         self.seed = seed
         self.limits = Feasibility(robot, max_payload, height, unchecked)
         self.kit = Kit(self.limits)
-        self._stages: dict[str, Stage] = {}
+        self._ranges: dict[str, ExcitationRange] = {}
         self._given: dict[str, Motion] = {}
 
     def add(self, motion: Motion) -> None:
-        """Take in a motion from elsewhere (motion.files); it is fitted to the limits like all others.
+        """Add a motion from elsewhere (motion/files.py), made feasible like all others.
 
         Raises:
             UsageError: It cannot be fitted.
@@ -132,7 +132,7 @@ class Library:
         self._given[motion.name] = self.limits.fit(motion)
 
     def names(self, variants: int = 1) -> list[str]:
-        """All names: <signal>-<joint>, <kind>-<side>-<variant> and <kind>-all-<variant>, and what was added."""
+        """Return all names: <signal>-<joint>, <kind>-<side>-<variant> and <kind>-all-<variant>, and what was added."""
         joint = [f"{signal}-{short(j)}" for j in self.robot.operated for signal in SIGNALS]
         sides = [*self.kit.arms, "both"] if len(self.kit.arms) == 2 else list(self.kit.arms)
         upper = [f"{b}-{side}-{v}" for v in range(variants) for b in BUILDERS for side in sides]
@@ -140,7 +140,7 @@ class Library:
         return joint + upper + whole + list(self._given)
 
     def make(self, name: str) -> Motion:
-        """The motion of that name.
+        """Return the motion of that name.
 
         Raises:
             UsageError: No such motion; the message lists the forms.
@@ -164,11 +164,11 @@ class Library:
             f"or <kind>-all-<variant> with a kind of {', '.join(available(self.kit))}"
         )
 
-    def stage(self, joint: str) -> Stage:
-        """Posture and interval in which a joint is excited."""
-        if joint not in self._stages:
-            self._stages[joint] = find_stage(self.limits, joint, self.seed)
-        return self._stages[joint]
+    def excitation_range(self, joint: str) -> ExcitationRange:
+        """Return posture and interval in which a joint is excited."""
+        if joint not in self._ranges:
+            self._ranges[joint] = find_excitation_range(self.limits, joint, self.seed)
+        return self._ranges[joint]
 
     def _joint(self, name: str, signal: str, joint: str, rng: np.random.Generator) -> Motion:
         full = next((j for j in self.robot.operated if short(j) == joint), None)
@@ -177,19 +177,19 @@ class Library:
                 f"motion '{name}': {self.robot.name} has no operated joint '{joint}'; it has "
                 f"{', '.join(short(j) for j in self.robot.operated)}"
             )
-        stage = self.stage(full)
-        column = SIGNALS[signal](stage.low, stage.high, rng, GRID)
-        ctrl = np.repeat(stage.posture[None], len(column), axis=0)
+        there = self.excitation_range(full)
+        column = SIGNALS[signal](there.low, there.high, rng, GRID)
+        ctrl = np.repeat(there.posture[None], len(column), axis=0)
         ctrl[:, self.robot.index([full])[0]] = column
         return self._fitted(name, "joint", ctrl)
 
     def _fitted(self, name: str, level: str, ctrl: Array) -> Motion:
-        """Within the limits; about the operated joints and those that move."""
+        """Make commands feasible; the motion names the operated joints and those that move."""
         fitted, robot = self.limits.fit(Motion(name, level, GRID, ctrl)), self.robot
         moved = fitted.moved(robot)
         return replace(fitted, joints=tuple(n for n in robot.joint_names if n in robot.operated or n in moved))
 
 
 def short(joint: str) -> str:
-    """A joint's name in motion names: without the suffix _joint."""
+    """Return a joint's name in names of motions: without the suffix _joint."""
     return joint.removesuffix("_joint")

@@ -1,4 +1,4 @@
-"""Ways from one posture to another that keep clear: straight where that is free, else around what is in between."""
+"""Collision-free paths from one posture to another: straight, by way of home, or by random trees."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gaponet.sysid.motion.motion import PEAK_ACCELERATION, blend, move_time
 
 Free = Callable[[Array], bool]  # whether all postures (T, n) rad are
 _T = TypeVar("_T")
-Search = Generator[None, None, _T]  # looks for something in steps of a millisecond or so, one per next()
+Search = Generator[None, None, _T]  # works in steps of about a millisecond, one per next()
 _Straight = Callable[[Array, Array], Search[bool]]
 
-REACH = 0.5  # rad by which a tree grows at once
-GROWTHS = 250  # before it is given up
-CUTS = 60  # attempts to cut a corner
-LEG = 0.5  # s, the least duration of one leg of several
-ROWS = 16  # postures that are looked at in one step of a search
+TREE_STEP_RAD = 0.5  # growth of a tree in one step
+MAX_GROWTHS = 250  # of both trees
+SHORTCUT_ATTEMPTS = 60  # at corners of the path
+MIN_LEG_S = 0.5  # of one leg of several
+ROWS_PER_STEP = 16  # postures that one step of a search checks
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Trajectory:
 
     @classmethod
     def minimum_jerk(cls, points: Array, speed: float, acceleration: float, least: float) -> Trajectory:
-        """The way as fast as peaks of speed (rad/s) and acceleration (rad/s²) allow, in at least `least` s."""
+        """Return the fastest trajectory within peak speed (rad/s) and acceleration (rad/s²), of at least `least` s."""
         far = np.abs(np.diff(points, axis=0)).max(axis=1)
-        legs = move_time(far, speed, least if len(points) == 2 else LEG)
+        legs = move_time(far, speed, least if len(points) == 2 else MIN_LEG_S)
         legs = np.maximum(legs, np.sqrt(PEAK_ACCELERATION * far / acceleration))
         times = np.concatenate([[0.0], legs.cumsum()])
         return cls(points, times * max(1.0, least / times[-1]))
@@ -51,19 +51,19 @@ class Trajectory:
         return float(self.times[-1])
 
     def at(self, time: float) -> Array:
-        """Posture (n,) rad."""
+        """Return the posture at a time, (n,) rad."""
         leg = min(max(int(np.searchsorted(self.times, time)) - 1, 0), len(self.times) - 2)
         (a, b), (since, until) = self.points[leg : leg + 2], self.times[leg : leg + 2]
         return a + float(blend(np.array((time - since) / (until - since)))) * (b - a)
 
     def rows(self, dt: float) -> Array:
-        """(T, n) rad at a period of dt s, both ends included."""
+        """Return postures at a period of dt s, both ends included, (T, n) rad."""
         steps = max(1, round(self.duration / dt))
         return np.array([self.at(self.duration * k / steps) for k in range(steps + 1)])
 
 
 def line(a: Array, b: Array) -> Array:
-    """Postures from a to b (n,) rad, both included, none further than FINE from the next, (T, n)."""
+    """Return postures from a to b (n,) rad, at most POSTURE_STEP_RAD apart, both included, (T, n)."""
     return np.linspace(a, b, max(2, int(np.ceil(np.abs(b - a).max() / POSTURE_STEP_RAD)) + 1))
 
 
@@ -79,10 +79,10 @@ def finish_search(search: Search[_T]) -> _T:
 def find_points(
     free: Free, start: Array, goal: Array, low: Array, high: Array, home: Array, seed: int = 0
 ) -> Search[Array | None]:
-    """Points (k, n) rad of a polygon from start to goal along which all is free, or None where none was found.
+    """Return points (k, n) rad of a free path from start to goal, or None if none was found.
 
-    Straight if possible, else by way of home, else by two random trees that grow towards each other (RRT-Connect,
-    Kuffner & LaValle 2000), with corners cut.
+    It is straight if possible, else by way of home, else by two random trees that grow towards each other (RRT-Connect,
+    Kuffner & LaValle 2000), with shortcuts.
 
     Args:
         start, goal, home: (n,) rad.
@@ -91,8 +91,8 @@ def find_points(
 
     def straight(a: Array, b: Array) -> Search[bool]:
         rows = line(a, b)
-        for at in range(0, len(rows), ROWS):
-            if not free(rows[at : at + ROWS]):
+        for at in range(0, len(rows), ROWS_PER_STEP):
+            if not free(rows[at : at + ROWS_PER_STEP]):
                 return False
             yield
         return True
@@ -110,7 +110,7 @@ def _connect(
     straight: _Straight, start: Array, goal: Array, low: Array, high: Array, rng: np.random.Generator
 ) -> Search[list[Array] | None]:
     trees = [([start], [-1]), ([goal], [-1])]  # postures, and from which each was reached
-    for growth in range(GROWTHS):
+    for growth in range(MAX_GROWTHS):
         (here, came), (there, _) = trees
         reached = yield from _grow(straight, here, came, rng.uniform(low, high), once=growth % 8 > 0)
         if reached is not None:
@@ -125,11 +125,11 @@ def _connect(
 
 
 def _grow(straight: _Straight, tree: list[Array], came: list[int], aim: Array, once: bool) -> Search[int | None]:
-    """Grow a tree towards `aim`, once or as far as it goes; where it got to, None if nowhere."""
+    """Grow a tree towards `aim`, by one step or as far as possible; return the index of the last node, or None."""
     at = int(np.argmin(np.abs(np.array(tree) - aim).max(axis=1)))
     reached = None
     while (far := float(np.abs(aim - tree[at]).max())) > 1e-9:
-        step = tree[at] + min(1.0, REACH / far) * (aim - tree[at])
+        step = tree[at] + min(1.0, TREE_STEP_RAD / far) * (aim - tree[at])
         if not (yield from straight(tree[at], step)):
             break
         tree.append(step)
@@ -141,7 +141,7 @@ def _grow(straight: _Straight, tree: list[Array], came: list[int], aim: Array, o
 
 
 def _back(tree: list[Array], came: list[int], at: int) -> list[Array]:
-    """From a node to the root."""
+    """Return the nodes from one to the root."""
     found = []
     while at >= 0:
         found.append(tree[at])
@@ -150,8 +150,8 @@ def _back(tree: list[Array], came: list[int], at: int) -> list[Array]:
 
 
 def _cut(straight: _Straight, points: list[Array], rng: np.random.Generator) -> Search[Array]:
-    """The same with corners cut."""
-    for _ in range(CUTS):
+    """Return the path with shortcuts."""
+    for _ in range(SHORTCUT_ATTEMPTS):
         if len(points) == 2:
             break
         i, k = sorted(rng.choice(len(points), 2, replace=False))

@@ -14,9 +14,9 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.library import Library, short
 from gaponet.sysid.motion.motion import Motion
 
-FIRST = ("multisine", "steps", "holds", "chirp", "sweep", "trapezoids", "creep")  # what tells most in little time first
-ROUNDS = 50
-BEST, ENOUGH = 41.0, 9.0  # minutes
+SIGNAL_ORDER = ("multisine", "steps", "holds", "chirp", "sweep", "trapezoids", "creep")  # most informative first
+MAX_ROUNDS = 50
+RECOMMENDED_MINUTES, MIN_TRAINING_MINUTES = 41.0, 9.0
 
 
 @dataclass(frozen=True)
@@ -27,22 +27,22 @@ class Plan:
 
     @property
     def motions(self) -> tuple[Motion, ...]:
-        """Each once."""
+        """Return each motion once."""
         return tuple({m.name: m for _, m in self.played}.values())
 
     @property
     def payloads(self) -> tuple[float, ...]:
-        """kg, each once."""
+        """Return each payload once, kg."""
         return tuple(dict.fromkeys(mass for mass, _ in self.played))
 
     @property
     def minutes(self) -> float:
-        """The time of all payloads together."""
+        """Return the duration at all payloads together."""
         return sum(m.duration for _, m in self.played) / 60
 
 
 def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], seed: int = 0) -> Plan:
-    """Motions for so many minutes in all: every joint alone, signal by signal, with motions of many joints between.
+    """Return motions for so many minutes: every joint alone, signal by signal, with motions of many joints between.
 
     Raises:
         UsageError: Too little time for one motion of each joint at each payload, or a payload that cannot be carried.
@@ -50,7 +50,7 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
     if not payloads or min(payloads) < 0 or (max(payloads) > 0 and not robot.payload_mounts):
         raise UsageError(f"--payloads {payloads}: give kg ≥ 0; {robot.name} has {len(robot.payload_mounts)} mounts")
     library = Library(robot, seed, max(payloads))
-    first = [library.make(f"{FIRST[0]}-{short(joint)}") for joint in robot.operated]
+    first = [library.make(f"{SIGNAL_ORDER[0]}-{short(joint)}") for joint in robot.operated]
     least = len(payloads) * sum(m.duration for m in first) / 60
     if least > minutes:
         raise UsageError(
@@ -65,7 +65,7 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
 
 
 def _standing(library: Library, name: str) -> Motion:
-    """The motion with joints that are not operated at home: a humanoid stays on its legs."""
+    """Return the motion with joints that are not operated at home, so that a humanoid stays on its legs."""
     made, robot = library.make(name), library.robot
     if set(made.moved(robot)) <= set(robot.operated):
         return made
@@ -75,12 +75,12 @@ def _standing(library: Library, name: str) -> Motion:
 
 
 def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
-    """Motions of many joints, and after each few of them another signal on every joint."""
+    """Yield names of motions of many joints, and after some of them another signal on every joint."""
     kinds = ["tour-all", "limber-all", *(f"wander-{side}" for side in library.kit.arms)]
-    for k in range(ROUNDS):
+    for k in range(MAX_ROUNDS):
         yield from (f"{kind}-{v}" for kind in kinds for v in (2 * k, 2 * k + 1))
-        if k + 1 < len(FIRST):
-            yield from (f"{FIRST[k + 1]}-{short(joint)}" for joint in robot.operated)
+        if k + 1 < len(SIGNAL_ORDER):
+            yield from (f"{SIGNAL_ORDER[k + 1]}-{short(joint)}" for joint in robot.operated)
 
 
 def sheet(robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, known: Path | None = None) -> str:
@@ -94,11 +94,11 @@ def sheet(robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, know
         f"{short(j)} {robot.kp[i]:g}/{robot.kd[i]:g}" for i, j in enumerate(robot.joint_names) if j in robot.operated
     )
     masses = ", ".join(f"{p:g}" for p in plan.payloads)
-    few = " Enough to identify gains, friction and delay; little to train on." if plan.minutes < ENOUGH else ""
     size = (
-        f"On virtual H1-2 robots {ENOUGH:g} minutes left a third of the simulator's error, {BEST:g} came "
-        f"within a tenth of the best.{few}"
+        f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's error, "
+        f"{RECOMMENDED_MINUTES:g} came within a tenth of the best."
     )
+    size += " Enough to identify gains, friction and delay; little to train on." * (plan.minutes < MIN_TRAINING_MINUTES)
     lines = [
         f"# Recording sheet: {robot.name}",
         "",
