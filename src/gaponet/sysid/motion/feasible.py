@@ -124,9 +124,9 @@ class Feasibility:
         raise UsageError(
             f"motion '{motion.name}' does not fit {self.robot.name} after {tries} changes: {demand.worst_joint} needs "
             f"{demand.torque:.2f} of its usable torque at {self.max_payload:g} kg, speed is {demand.speed:.2f} of "
-            f"{MAX_SPEED:g} rad/s, {demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at least "
-            f"{self.collision.clearance * 100:g}). Start it from a posture that is easier to hold, or collect with a "
-            "lighter payload"
+            f"{MAX_SPEED:g} rad/s, {demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at "
+            f"least {self.collision.clearance * 100:g}). Start it from a posture that is easier to hold, or collect "
+            "with a lighter payload"
         )
 
     def can_hold(self, posture: Array, need: Array | None = None) -> bool:
