@@ -9,6 +9,7 @@ from arm import TOML, commands, record, recordings, write_arm
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import load_robot
 from gaponet.sim.metrics import Comparison
+from gaponet.sim.replay import motion_errors
 from gaponet.sysid.acceptance import Judge, JudgedFold, cross_validation
 from gaponet.sysid.axes import Bounds
 from gaponet.sysid.identify import identify
@@ -144,3 +145,13 @@ def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
     once, twice = (Judge([JudgedFold(x, robot, -np.inf, 1)]).errors([values]) for x in (logs, again))
     assert len(once) == len(twice) == 3
     np.testing.assert_allclose(twice[1:], once[1:])
+
+
+def test_pieces_of_one_recording_are_one_motion(arm):
+    logs = [
+        replace(s, meta=replace(s.meta, motion=f"m{i // 2}@{4 * (i % 2)}s", notes={"from_s": 4.0 * (i % 2)}))
+        for i, s in enumerate(recordings(arm, 10, rows=40))
+    ]
+    for train, held_out in cross_validation(logs[:8], logs[8:], 3):
+        assert not {s.meta.motion[:2] for s in train} & {s.meta.motion[:2] for s in held_out}
+    assert len(motion_errors(logs, arm)) == 5

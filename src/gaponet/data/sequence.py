@@ -76,6 +76,11 @@ class SequenceMeta:
         return (*self.notes.get("posture", {}), *self.notes.get("held_at_home", ()))
 
     @property
+    def independent_motion(self) -> str:
+        """The motion; of a piece of a longer recording (gaponet import --cut) that recording's motion."""
+        return self.motion.rpartition("@")[0] if "from_s" in self.notes else self.motion
+
+    @property
     def repetition_key(self) -> tuple[str, str, float, str]:
         """Recordings in one slot, at one rate, are repetitions of each other."""
         return self.motion, self.unit_id, self.payload_mass, self.payload_side

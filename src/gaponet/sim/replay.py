@@ -81,8 +81,8 @@ def rollout_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int =
 
 
 def motion_errors(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
-    """Return `rollout_errors` averaged over the sequences of each motion, (motions,) rad."""
-    each, motions = rollout_errors(sequences, robot), np.array([s.meta.motion for s in sequences])
+    """Return `rollout_errors` averaged over the sequences of each independent motion, (motions,) rad."""
+    each, motions = rollout_errors(sequences, robot), np.array([s.meta.independent_motion for s in sequences])
     return np.array([each[motions == motion].mean() for motion in dict.fromkeys(motions.tolist())])
 
 

@@ -48,18 +48,18 @@ def cross_validation(sequences: ListOf[Sequence], validation: ListOf[Sequence], 
     """
     every = [*sequences, *validation]
     judges, motions = (
-        {joints: hash_order(s.meta.motion for s in part if s.meta.unrecorded == joints)
+        {joints: hash_order(s.meta.independent_motion for s in part if s.meta.unrecorded == joints)
          for joints in {s.meta.unrecorded for s in part}} for part in (validation, every)
     )  # fmt: skip
     enough = min((len(judges.get(joints, ())) for joints, names in motions.items() if len(names) > 1), default=0)
     count = min(folds, max(map(len, motions.values())))
-    few = len({s.meta.motion for s in every}) < MIN_CROSS_VALIDATED
+    few = len({s.meta.independent_motion for s in every}) < MIN_CROSS_VALIDATED
     if not validation or enough >= MIN_JUDGES or count < 2 or few:
         return [(list(sequences), list(validation))]
     fold = {
         (joints, name): i % count for joints, names in motions.items() if len(names) > 1 for i, name in enumerate(names)
     }
-    place = [fold.get((s.meta.unrecorded, s.meta.motion)) for s in every]
+    place = [fold.get((s.meta.unrecorded, s.meta.independent_motion)) for s in every]
     return [
         (
             [s for s, p in zip(every, place, strict=True) if p != k],
