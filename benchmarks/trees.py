@@ -19,7 +19,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.experiments.real.methods import LEFT_OUT, FittedSim, identified
 from gaponet.experiments.real.questions import Question, train_val
-from gaponet.nn.training.labels import trajectory_labels
+from gaponet.nn.training.pretraining import trajectory_labels
 from gaponet.nn.training.validation import error_reduction
 from gaponet.report.verdict import NetworkGain
 from gaponet.robot.spec import RobotSpec

@@ -12,7 +12,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.executor import open_pool
 from gaponet.data.store import Dataset
 from gaponet.experiments.cells import SETUP_FILE, plan_cells, run_cells
-from gaponet.experiments.train_cell import train_cell
+from gaponet.experiments.outcomes import train_cell
 from gaponet.experiments.variant import parse_variant
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig

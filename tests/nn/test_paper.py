@@ -19,8 +19,7 @@ from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.nn.paper import RENAMED, released_inputs, released_network
 from gaponet.nn.sensor import ProbeOracle
-from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
+from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO
 from gaponet.nn.training.sensor_fit import fit_inputs

@@ -83,7 +83,7 @@ def identify(
     """
     from gaponet.base.files import lock_folder
     from gaponet.data.split import split_entries
-    from gaponet.nn.training.budget import Budget
+    from gaponet.nn.training.config import Budget
     from gaponet.robot.folder import save_robot
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sysid.acceptance import HeldOut, held_out_errors
@@ -235,8 +235,7 @@ def train(
     """
     from gaponet.base.files import lock_folder
     from gaponet.nn.training import ranks
-    from gaponet.nn.training.budget import Budget
-    from gaponet.nn.training.config import TrainConfig
+    from gaponet.nn.training.config import Budget, TrainConfig
     from gaponet.nn.training.trainer import Trainer
 
     config = config or TrainConfig()

@@ -32,15 +32,12 @@ def real(
     """
     from gaponet.experiments.real.bench import Bench, load_method
     from gaponet.experiments.real.cards import data_folder, read_cards
-    from gaponet.experiments.real.methods import METHODS
+    from gaponet.experiments.real.methods import METHODS, network_methods
     from gaponet.experiments.real.page import result_table, write_page
 
     screen = Out(json)
     methods = METHODS | {name: (name, function) for name, function in map(load_method, method)}
-    if networks:
-        from gaponet.experiments.real.networks import networks as trained
-
-        methods |= trained(networks)
+    methods |= network_methods(networks) if networks else {}
     result = Bench(read_cards(), data_folder(data), out, methods, screen.say).run(sets, questions)
     screen.show("Real robots, recordings that no method was fitted to", result_table(result["rows"]))
     for name, remarks in result["labels"].items():

@@ -25,81 +25,28 @@ except ModuleNotFoundError as error:
     raise ModuleNotFoundError(missing_extra(error) or str(error), name=error.name) from None
 
 
-class TrackingEnv(gymnasium.Env):
-    """Follow joint motions on the aligned simulator.
+class TrackingVectorEnv(gymnasium.vector.VectorEnv):
+    """Follow joint motions in all worlds of one AlignedSim; a world starts a new one in the step after the end of one.
 
     Observation [q | q̇ | r_t+1 − q | r_t+2 − q … ], float32, of the operated joints, r the reference. Action in [−1, 1]:
     offset of the target from r_t+1, times `reach`. Reward −mean (q − r)² / 0.01 after the step, so −1 is 0.1 rad.
     """
-
-    def __init__(
-        self, sim: AlignedSim, references: ListOf[Array], reach: float = 0.2, preview: int = 2, seed: int = 0
-    ) -> None:
-        """
-        Args:
-            sim: One simulation (num_envs None).
-            references: Joint motions to follow, (T, n) rad each, in the order of sim.joint_names, one row per period.
-            reach: Offset of the target for action 1, rad.
-            preview: Number of reference rows in the observation.
-            seed: Seed of the choice of motions.
-        """
-        if not sim.single or not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
-            raise UsageError(f"TrackingEnv needs one simulation and motions (T, {sim.n}) of at least 3 rows")
-        self.sim, self.references, self.reach, self.preview = sim, list(references), reach, preview
-        n = len(sim.op)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, ((2 + preview) * n,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n,), np.float32)
-        self.np_random = np.random.default_rng(seed)
-        self.motion, self.t = 0, 0
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
-        """Start a motion at its first row: a random one, or options {"motion": 3}."""
-        super().reset(seed=seed)
-        choice = (options or {}).get("motion")
-        self.motion = int(self.np_random.integers(len(self.references))) if choice is None else int(choice)
-        self.t = 0
-        self.sim.reset(self.references[self.motion][0])
-        return self._observe(), {"motion": self.motion}
-
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Step one control period; a motion's end truncates, nothing terminates."""
-        op = self.sim.op
-        target = self._row(1).copy()
-        target[op] += self.reach * np.clip(action, -1.0, 1.0)
-        self.sim.step(target)
-        self.t += 1
-        error = self.sim.qpos[op] - self._row(0)[op]
-        info = {"error": error, "delta": self.sim.delta}
-        return (
-            self._observe(),
-            -float(np.mean(error**2)) / 0.01,
-            False,
-            self.t >= len(self.references[self.motion]) - 2,
-            info,
-        )
-
-    def _row(self, ahead: int) -> Array:
-        reference = self.references[self.motion]
-        return reference[min(self.t + ahead, len(reference) - 1)]
-
-    def _observe(self) -> Array:
-        op = self.sim.op
-        q = self.sim.qpos[op]
-        ahead = [self._row(k)[op] - q for k in range(1, self.preview + 1)]
-        return np.concatenate([q, self.sim.qvel[op], *ahead]).astype(np.float32)
-
-
-class TrackingVectorEnv(gymnasium.vector.VectorEnv):
-    """TrackingEnv in all worlds of one AlignedSim. A world starts another motion in the step after the end of one."""
 
     metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self, sim: AlignedSim, references: ListOf[Array], reach: float = 0.2, preview: int = 2, seed: int = 0
     ) -> None:
-        """Arguments as of TrackingEnv; the simulator has any number of worlds."""
+        """
+        Args:
+            sim: Any number of simulations.
+            references: Joint motions to follow, (T, n) rad each, in the order of sim.joint_names, one row per period.
+            reach: Offset of the target for action 1, rad.
+            preview: Number of reference rows in the observation.
+            seed: Seed of the choice of motions.
+        """
         if not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
-            raise UsageError(f"TrackingVectorEnv needs motions (T, {sim.n}) of at least 3 rows")
+            raise UsageError(f"give motions (T, {sim.n}) of at least 3 rows")
         self.sim, self.reach, self.preview, self.num_envs = sim, reach, preview, sim.num_envs
         self.last = np.array([len(r) - 1 for r in references])
         rows = np.minimum(np.arange(self.last.max() + 1), self.last[:, None])
@@ -148,6 +95,32 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv):
         op, (q, v) = self.sim.op, map(np.atleast_2d, (self.sim.qpos, self.sim.qvel))
         ahead = [self._row(k)[:, op] - q[:, op] for k in range(1, self.preview + 1)]
         return np.concatenate([q[:, op], v[:, op], *ahead], axis=1).astype(np.float32)
+
+
+class TrackingEnv(gymnasium.Env):
+    """TrackingVectorEnv with a single world, whose simulator has num_envs None. A motion's end truncates."""
+
+    def __init__(
+        self, sim: AlignedSim, references: ListOf[Array], reach: float = 0.2, preview: int = 2, seed: int = 0
+    ) -> None:
+        """Arguments as of TrackingVectorEnv."""
+        if not sim.single:
+            raise UsageError("TrackingEnv has a single simulation: leave num_envs out, or use TrackingVectorEnv")
+        self.sim, self.worlds = sim, TrackingVectorEnv(sim, references, reach, preview, seed)
+        self.observation_space = self.worlds.single_observation_space
+        self.action_space = self.worlds.single_action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Start a motion at its first row: a random one, or options {"motion": 3}."""
+        super().reset(seed=seed)
+        observation, info = self.worlds.reset(seed=seed, options=options)
+        return observation[0], {"motion": int(info["motion"][0])}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Step one control period; nothing terminates."""
+        observation, reward, _, truncated, info = self.worlds.step(action)
+        info = {"error": info["error"][0], "delta": self.sim.delta}
+        return observation[0], float(reward[0]), False, bool(truncated[0]), info
 
 
 def _tracking(

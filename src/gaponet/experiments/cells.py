@@ -25,8 +25,7 @@ from gaponet.base.progress import Running
 from gaponet.base.structure import read_json
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.experiments.variant import Variant
-from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import RENAMED_FIELDS, TrainConfig
+from gaponet.nn.training.config import RENAMED_FIELDS, Budget, TrainConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import model_hash
 

@@ -15,10 +15,9 @@ import tyro
 from gaponet.base.result_table import ResultTable, format_cell
 from gaponet.data.split import split_entries
 from gaponet.experiments.cells import Cell
-from gaponet.experiments.outcomes import BASELINES, Show, StudyOutcomes, summarize, train_all
+from gaponet.experiments.outcomes import BASELINES, Outcome, Show, StudyOutcomes, summarize, train_all
 from gaponet.experiments.result import Result
 from gaponet.experiments.study import DEFAULT_MODELS, Study
-from gaponet.experiments.train_cell import Outcome
 from gaponet.report.candidate import select_entries
 from gaponet.report.figures.charts import bars
 from gaponet.report.figures.style import joint_label

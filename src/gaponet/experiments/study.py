@@ -11,15 +11,55 @@ import tyro
 
 from gaponet.base.errors import UsageError
 from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool
-from gaponet.data.store import Dataset
+from gaponet.data.split import hash_order
+from gaponet.data.store import Dataset, Entry
 from gaponet.experiments.cells import RESULT_FILE, Cell, plan_cells, read_record
-from gaponet.experiments.quick import LABEL, QUICK_BUDGET, QUICK_SEEDS, quick_config, quick_dataset
 from gaponet.experiments.variant import Variant, parse_variant
-from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.report.evaluate import evenly_spaced
 from gaponet.report.methods import IDENTIFIED
 from gaponet.report.provenance import robot_label
 from gaponet.robot.spec import RobotSpec
+
+QUICK_BUDGET, QUICK_SEEDS = "2560", 1  # control steps of a training
+QUICK_LABEL = "QUICK RUN, numbers mean nothing"
+QUICK_PRETRAINING = PretrainingConfig(
+    rounds=2, num_envs=16, steps=80, gradient_steps=40, batch_size=256, sensor_states=256
+)  # fmt: skip
+QUICK_PPO = PPOConfig(num_envs=32, num_steps=16, epochs=1, critic_warmup=1)
+QUICK_SENSOR_HIDDEN = (32,)  # hidden layers of the predictor, whose fit takes most of a short training
+QUICK_MOTIONS, QUICK_PAYLOADS, QUICK_UNITS = 6, 3, 2  # a split of six motions has 3 + 1 + 2
+QUICK_RECORDING_S = 2.0
+
+
+def quick_config(config: TrainConfig) -> TrainConfig:
+    """Return the settings with small networks and rounds."""
+    model = replace(config.model, sensor_hidden=QUICK_SENSOR_HIDDEN)
+    return replace(config, model=model, pretraining=QUICK_PRETRAINING, ppo=QUICK_PPO)
+
+
+def quick_dataset(data: Dataset, robot: RobotSpec, out: Path) -> Dataset:
+    """Write the first seconds of a few recordings as a dataset; the same call again finds it."""
+    part = Dataset.create(out, robot)
+    for entry in _few(data):
+        start = data.read(entry).rows(slice(0, round(QUICK_RECORDING_S / entry.dt)))
+        if part.find(start.content_hash()) is None:
+            part.append(start)
+    return part
+
+
+def _few(data: Dataset) -> list[Entry]:
+    """Return few motions, payloads and units, one repetition, all rates: every group stays represented."""
+    payloads = evenly_spaced(sorted({e.meta.payload_mass for e in data.entries}), QUICK_PAYLOADS)
+    units = sorted({e.meta.unit_id for e in data.entries})[:QUICK_UNITS]
+    motions = hash_order(e.meta.motion for e in data.entries)[:QUICK_MOTIONS]
+    first = min(e.meta.repetition for e in data.entries)
+    return [
+        e for e in data.entries
+        if e.meta.motion in motions and e.meta.payload_mass in payloads and e.meta.unit_id in units
+        and e.meta.repetition == first
+    ]  # fmt: skip
+
 
 # Small rounds, fitted until the labels are fitted (progress.jsonl: label_rmse). With 200 gradient steps a product
 # network has the advantage.
@@ -60,7 +100,7 @@ class Study:
     Attributes:
         robot: The simulator that models correct.
         out: Folder of the results.
-        budget: Control steps or time of each training, as gaponet.nn.training.budget reads it.
+        budget: Control steps or time of each training, as gaponet.nn.training.config reads it.
         seeds: Number of seeds, counted from config.seed.
         workers: Trainings at a time; 0 for as many as there are cores.
         executor: Where they run (gaponet.base.executor).
@@ -110,7 +150,7 @@ class Study:
     @property
     def label(self) -> str:
         """The robot's name; "VIRTUAL h1_2" where any recording is virtual."""
-        return robot_label(self.data.entries) + f" ({LABEL})" * self.quick
+        return robot_label(self.data.entries) + f" ({QUICK_LABEL})" * self.quick
 
     @property
     def threads(self) -> int:

@@ -9,7 +9,7 @@ from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
-from gaponet.experiments.real import networks as module
+from gaponet.experiments.real import methods as module
 from gaponet.experiments.real.bench import Bench, load_method
 from gaponet.experiments.real.cards import CARDS, ROBOTS, read_cards
 from gaponet.experiments.real.methods import LEFT_OUT, METHODS
@@ -75,7 +75,7 @@ def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(ar
 def test_networks_are_trained_once_and_rejected_without_a_gain_over_identification(arm, played, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "ONE_ROUND", replace(module.ONE_ROUND, num_envs=12, gradient_steps=0, sensor_states=16))
     (question,) = questions("new motions", played, arm, None)
-    methods = {title: method for title, method in module.networks(240).values() if "MLP" not in title}
+    methods = {title: method for title, method in module.network_methods(240).values() if "MLP" not in title}
     with pytest.raises(UsageError, match="networks need a folder"):
         methods["GAPONet"](question)
     question = replace(question, work=tmp_path)

@@ -6,8 +6,15 @@ from arm import write_arm
 from weak_arm import session, trained, weak_unit
 
 from gaponet.base.errors import UsageError
-from gaponet.experiments.virtual.delivery import Delivery, DeliveryErrors, offset_table, result, sentences
-from gaponet.experiments.virtual.delivery_runs import HoldError, deliver
+from gaponet.experiments.virtual.delivery import (
+    Delivery,
+    DeliveryErrors,
+    HoldError,
+    deliver,
+    offset_table,
+    result,
+    sentences,
+)
 from gaponet.experiments.virtual.goals import GoalPlanner
 from gaponet.experiments.virtual.session import Session
 

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gaponet.experiments.paper_numbers import TABLE_2
 from gaponet.experiments.variant import parse_variant
-from gaponet.experiments.virtual.delivery_runs import HoldError
-from gaponet.experiments.virtual.paper import Paper, claim_table, ratio_table, table_2_rows
-from gaponet.experiments.virtual.tracking_runs import Score
+from gaponet.experiments.virtual.delivery import HoldError
+from gaponet.experiments.virtual.paper import TABLE_2, Paper, claim_table, ratio_table, table_2_rows
+from gaponet.experiments.virtual.tracking import Score
 from gaponet.nn.training.config import TrainConfig
 
 PAPER = replace(TrainConfig(), model=replace(TrainConfig().model, kind="paper", payload_input=False))

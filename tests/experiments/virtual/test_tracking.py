@@ -5,8 +5,7 @@ import pytest
 from arm import commands, write_arm
 from weak_arm import session, trained, weak_unit
 
-from gaponet.experiments.virtual.tracking import TrackingScores, by_payload, joint_sets, result, sentences
-from gaponet.experiments.virtual.tracking_runs import Score, track
+from gaponet.experiments.virtual.tracking import Score, TrackingScores, by_payload, joint_sets, result, sentences, track
 from gaponet.experiments.virtual.unseen_motions import UnseenMotion
 
 

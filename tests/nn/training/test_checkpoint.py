@@ -12,9 +12,8 @@ from arm import recordings, write_arm
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.budget import Budget
 from gaponet.nn.training.checkpoint import RENAMED
-from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
 
 TINY = TrainConfig(

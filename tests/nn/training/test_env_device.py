@@ -11,8 +11,7 @@ from torch.overrides import TorchFunctionMode
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
+from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.trainer import Trainer
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from arm import TOML, recordings, write_arm
 
-from gaponet.nn.training.labels import trajectory_labels
+from gaponet.nn.training.pretraining import trajectory_labels
 from gaponet.robot.spec import Table
 from gaponet.sim.replay import replay
 

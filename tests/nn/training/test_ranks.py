@@ -14,7 +14,7 @@ from two_ranks import CONFIG, STEPS
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
 from gaponet.nn.training import ranks
-from gaponet.nn.training.budget import Budget
+from gaponet.nn.training.config import Budget
 from gaponet.nn.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="Ctrl-C reaches no single process on Windows")

@@ -13,8 +13,7 @@ from gaponet.data.split import split_entries, write_split
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
 from gaponet.nn.training.validation import Validator
 from gaponet.report.evaluate import ORDER, evaluate

@@ -15,9 +15,8 @@ from gaponet.base.result_table import ResultTable
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiments.cells import Cell
-from gaponet.experiments.quick import LABEL
 from gaponet.experiments.result import Result, facts
-from gaponet.experiments.study import DEFAULT_MODELS, Options, Study
+from gaponet.experiments.study import DEFAULT_MODELS, QUICK_LABEL, Options, Study
 from gaponet.experiments.virtual.play import Progress
 from gaponet.experiments.virtual.trained_models import TrainedModel, load_trained
 from gaponet.report.provenance import describe_provenance
@@ -146,6 +145,6 @@ class Session:
         runs = [f"{t.method} seed {t.seed} ({t.model.weights_hash()})" for t in self.trained]
         minutes = round((time.monotonic() - self.start) / 60, 1)
         repeat = facts(self.data, sorted({t.seed for t in self.trained}), **setup, runs=runs, **more, minutes=minutes)
-        provenance = describe_provenance(self.data) + f" {LABEL}." * (self.study is not None and self.study.quick)
+        provenance = describe_provenance(self.data) + f" {QUICK_LABEL}." * (self.study is not None and self.study.quick)
         return Result(name, title, provenance, repeat, tuple(tables), dict(figures),
                       tuple(sentences))  # fmt: skip

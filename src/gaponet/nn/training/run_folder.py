@@ -20,9 +20,8 @@ from gaponet.data.split import Splits, resolve_splits, stratified_subset
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training import ranks
-from gaponet.nn.training.budget import Budget
 from gaponet.nn.training.checkpoint import CHECKPOINT
-from gaponet.nn.training.config import TrainConfig, command
+from gaponet.nn.training.config import Budget, TrainConfig, command
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot, save_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition

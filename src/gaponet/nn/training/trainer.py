@@ -28,14 +28,12 @@ from gaponet.nn.layers import DeltaNet
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export
 from gaponet.nn.training import ranks
-from gaponet.nn.training.budget import Budget, Status
 from gaponet.nn.training.checkpoint import Checkpoint, StateDict
-from gaponet.nn.training.config import TrainConfig
+from gaponet.nn.training.config import Budget, Status, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.labels import trajectory_labels
 from gaponet.nn.training.loggers import Loggers
 from gaponet.nn.training.ppo import PPO, Update
-from gaponet.nn.training.pretraining import Pretraining, pretraining_config
+from gaponet.nn.training.pretraining import Pretraining, pretraining_config, trajectory_labels
 from gaponet.nn.training.run_folder import RunFolder, TrainingData
 from gaponet.nn.training.sensor_fit import fit_inputs, refit_sensors
 from gaponet.nn.training.validation import Validator, choose_gain

@@ -1,6 +1,6 @@
 """The part of a dataset of a quick run: every group represented, made again without harm."""
 
-from gaponet.experiments.quick import quick_dataset
+from gaponet.experiments.study import quick_dataset
 
 
 def test_few_motions_and_every_kind_of_group(make_study, arm, tmp_path):
