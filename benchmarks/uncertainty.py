@@ -28,7 +28,7 @@ from gaponet.data.store import Dataset
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import replay
-from gaponet.sysid.axes import CLASSIC, Bounds
+from gaponet.sysid.axes import CLASSIC, Bounds, with_values
 from gaponet.sysid.drift import drift
 from gaponet.sysid.evidence import estimate_uncertainty
 from gaponet.sysid.joint_rollouts import JointRollouts
@@ -130,7 +130,7 @@ def _evaluated(
     bounds = Bounds(robot, train)
     fit = JointFit(JointRollouts(cut(train, 12), robot, nthread=1), robot, bounds)
     values = fit.search(CLASSIC, bounds.start)
-    right = fit.robot_with(values)
+    right = with_values(robot, values)
     mine = estimate_uncertainty(right, train, val, standard_errors(fit, values).covariance, nthread=1)
     op = robot.operated_index
     truth = {
