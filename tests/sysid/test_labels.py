@@ -42,7 +42,7 @@ def test_payload_and_unit_are_estimated_if_the_payload_loads_the_joint():
         unit, mass, _ = r.name.split()
         assert (r.payload, r.unit) == (float(mass), int(unit))  # the one that holds more is the later one
     assert (found.agreement["within_half_a_kg"], found.agreement["taken_for_one_of_these"]) == (1.0, 0.0)
-    assert "torque alone, whichever the unit, says 36 of 36 payloads within 0.5 kg of their label" in found.remarks
+    assert "torque alone, without the unit, gives 36 of 36 payloads within 0.5 kg of their label" in found.remarks
 
 
 def test_no_payload_is_estimated_from_a_joint_that_it_does_not_load():

@@ -45,7 +45,7 @@ def test_torque_determines_the_payloads_place_and_the_hands_mass_at_the_mount_th
             tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, s.dt))
             one = replace(s, tau=tau, meta=replace(s.meta, payload_mass=mass, payload_side="hand"))
             windows += [one.rows(slice(a, a + 50)) for a in range(0, 200, 50)]
-    found = TorqueFit(windows, robot).hanging().payload_mounts[-1]
+    found = TorqueFit(windows, robot).payload_placed().payload_mounts[-1]
     assert found.pos == pytest.approx(true.payload_mounts[-1].pos, abs=0.01)
     assert found.mass == pytest.approx(0.1, abs=0.02)
 

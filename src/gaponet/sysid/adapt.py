@@ -1,8 +1,8 @@
 """Adaptation of a robot's servo parameters to one robot id or day, from half a minute of its log.
 
 A prior keeps parameters that so little log does not determine at the robot's values; with a corrector, the fit is made
-under it. Half a minute says little about one joint and more about all of them. So a change that all joints share costs
-less than a change of one joint.
+under it. Half a minute has more information about all joints together than about one. So a change that all joints share
+costs less than a change of one joint.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SHARED_PRIOR_RATIO = 0.05  # the same where all joints change by the same share:
 SHARED_FIELDS = ("damping", "frictionloss", "delay")  # such a day moves no zeros and softens no gains
 ITERATIONS, MIN_DECREASE = 4, 1e-3  # at most; relative decrease of the cost for another one
 MAX_FOLDS = 4  # of motions that judge
-MAX_SHORT_WINDOW_S = 4.0  # a window so short says too little to judge another one
+MAX_SHORT_WINDOW_S = 4.0  # too short to validate another window
 START_DELAY_S = 0.005  # a delay of zero has no slope
 START_MASSES_KG = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # of an unknown payload
 MAX_MASS_KG = 20.0
@@ -45,7 +45,7 @@ class Adapted:
     Attributes:
         robot: The robot with fitted parameters.
         before, after: RMS error of the windows, rad.
-        payload_mass, payload_std: kg in each hand that is said to carry; None unless the payload is unknown.
+        payload_mass, payload_std: kg in each hand that carries; None unless the payload is unknown.
         judged: Mean |error| of motions before, and with the fit to the other motions, (motions,) rad.
         accepted: Whether those motions improve significantly (`Comparison`); False for one short motion per joint.
     """
@@ -101,13 +101,13 @@ def adapt(
     problem = _Problem(rollouts, Bounds(robot, sequences).first, unknown_payload, kd_slack)
     done = 0
 
-    def tell(cost: Array) -> None:
+    def report(cost: Array) -> None:
         nonlocal done
         done += 1
         progress(done, ITERATIONS, ERROR_SCALE_RAD * float(np.sqrt(2 * cost[0] / problem.size)))
 
     x, _ = descend(
-        problem.start(payloads[0])[None, None], problem.low, problem.high, problem.errors, ITERATIONS, tell,
+        problem.start(payloads[0])[None, None], problem.low, problem.high, problem.errors, ITERATIONS, report,
         min_decrease=MIN_DECREASE, derive=problem.slopes,
     )  # fmt: skip
     before, after = (problem.rms(p) for p in (problem.own(float(np.mean(payloads))), x[0, 0]))

@@ -158,7 +158,7 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
 
 
 def directions(uncertainty: ParameterUncertainty, joint: str) -> Array:
-    """Return the change of the axes and play by each parameter alone in SI units, column by column, (Q, Q).
+    """Return the change of the axes and play by a change of one parameter in SI units, column by column, (Q, Q).
 
     A softer motor has the friction that it had, so its friction over kp is larger.
     """
@@ -298,9 +298,9 @@ def _advice(
             "on the way; check them apart, adapt with none of this"
         )
     if not moved:
-        told = ", ".join(f"{j} {by:.1f} times" for j, by in far.items())
+        times = ", ".join(f"{j} {by:.1f} times" for j, by in far.items())
         return (
-            f"no number explains how far these logs are from the model ({told} what it left): another robot, payload "
+            f"no number explains how far these logs are from the model ({times} the residual): another robot, payload "
             "or controller, or a part that gives way; look at it, then identify again"
         )
     by = {j: [m for m in moved if m.joint == j] for j in joints}

@@ -3,7 +3,7 @@
 Recordings in which one joint moves repeat the same commands with several payloads and units. The held torque at equal
 commands is a + b·m: m is one of the given payloads, b is common, a is the unit's. Each joint and command is fitted by
 itself, by expectation maximisation over all pairs of unit and payload. Consecutive recordings with equal torque are
-repetitions of one unit. Units are told apart by the order of their torques, which is assumed to be the same at every
+repetitions of one unit. Units are distinguished by the order of their torques, which is assumed to be the same at every
 payload; the first unit of one joint need not be that of another.
 
 Torque also shows the time, since it is kp (command − position) − kd velocity of the command in force. A recording whose
@@ -34,7 +34,7 @@ MIN_MOVE_RAD = 0.05  # of a command that moves a joint
 MAX_END_DIFFERENCE = 0.05  # of two commands that count as one, over the range of a joint's commands
 SETTLE_S = 0.1
 MAX_REPETITION_STD = 3.0  # standard deviations of a repetition within which neighbours are repetitions
-MIN_NM_PER_KG, MIN_BAND_DISTANCE = 0.3, 2.5  # distance in widths of a band, from which a joint tells its payload
+MIN_NM_PER_KG, MIN_BAND_DISTANCE = 0.3, 2.5  # distance in widths of a band, from which a joint determines its payload
 MIN_RECORDINGS, SEARCH_ROUNDS = 4, 4  # of a joint, for the search of lags
 MIN_EXPLAINED = 0.9  # of the torque's variance, by the servo's gains
 MAX_PAYLOAD_ERROR_KG = 0.5  # from a label
@@ -114,14 +114,14 @@ class Labels:
         """Return remarks in sentences."""
         a, late = self.agreement, [r for r in self.recordings if abs(r.lag) > MAX_LAG_S]
         lines = [
-            f"of {a['said']} recordings whose payload the file's name says, {a['within_half_a_kg']:.0%} are within "
+            f"of {a['said']} recordings with a payload in the file's name, {a['within_half_a_kg']:.0%} are within "
             f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
         ] if a else []  # fmt: skip
         loaded = [r for r in self.recordings if r.determined and not r.copy_of and abs(r.lag) <= MAX_LAG_S]
         near = f"{sum(abs(r.torque_payload - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)} of {len(loaded)}"
         if loaded:
             limit = f"{MAX_PAYLOAD_ERROR_KG:g} kg"
-            lines += [f"torque alone, whichever the unit, says {near} payloads within {limit} of their label"]
+            lines += [f"torque alone, without the unit, gives {near} payloads within {limit} of their label"]
         lines += [
             f"{joint}: torque is kp (command − position) − kd velocity, kp {format_uncertainty(g.kp, g.error)} "
             f"N·m/rad ({format_uncertainty(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: "
@@ -213,9 +213,9 @@ def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
         speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), clock)
         servo_rows = np.stack([clock, ctrl.values[:, j], at("qpos"), speed, at("tau")])
     kilograms = PAYLOAD_IN_NAME.search(Path(log.source.partition("#")[0]).stem)
-    known = float(kilograms[1].replace("p", ".")) if kilograms else None
+    payload = float(kilograms[1].replace("p", ".")) if kilograms else None
     return LabelledRecording(
-        name, joint, float(ctrl.values[-1, j]), (values[later], commands), known, servo_rows=servo_rows
+        name, joint, float(ctrl.values[-1, j]), (values[later], commands), payload, servo_rows=servo_rows
     )
 
 

@@ -157,7 +157,7 @@ def _searched(
         """Return the costs of tables and zeros, (3 + n, k)."""
         return soft_l1(scene.soft_errors(xs.T)) + ZERO_PRICE * rows * np.square(xs[3:] / ZERO_STD_RAD).sum(axis=0)
 
-    def tell(intermediate_result: OptimizeResult) -> None:
+    def report(intermediate_result: OptimizeResult) -> None:
         progress(ERROR_SCALE_RAD * float(np.sqrt(2 * intermediate_result.fun / rows)))
         if intermediate_result.nit == FIRST_COMPARISON:
             if intermediate_result.fun > min(pace):
@@ -170,7 +170,7 @@ def _searched(
     population[0] = start
     found = differential_evolution(
         cost, Bounds(low, high), init=np.clip(population, low, high), maxiter=GENERATIONS, tol=0, polish=False,
-        vectorized=True, updating="deferred", callback=tell, rng=rng,
+        vectorized=True, updating="deferred", callback=report, rng=rng,
     )  # fmt: skip
     return found.x, float(found.fun)
 

@@ -1,4 +1,4 @@
-"""Identification from recorded torque, for windows so short that positions do not tell a gain from a load.
+"""Identification from recorded torque, for windows so short that positions do not separate a gain from a load.
 
 A servo's torque is kp (command − position) − kd velocity, which gives its gains. The torque that the model does not
 explain gives the payload's place and the mass of a hand that the model lacks, by least squares. Positions give damping,
@@ -33,11 +33,11 @@ from gaponet.sysid.problem import JointFit, standard_errors, undetermined
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
-ROW_STEP, MAX_ROWS = 5, 6000  # between rows that tell where a payload hangs, and how many
+ROW_STEP, MAX_ROWS = 5, 6000  # between rows for the payload's place, and how many
 MOUNT_PRIOR_NM_PER_M = 3.0  # price of moving the payload
 MIN_MOVE_RAD = 0.05  # of a command that excites a joint
 MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
-INSTRUMENTS = 12  # periods whose commands are instruments for what the servo measured
+INSTRUMENTS = 12  # periods whose commands are instruments for measured position and speed
 START_DELAY, ITERATIONS = 0.25, 10  # in 20 ms; of the fit of positions
 MAX_HAND_MASS = 5.0  # kg
 
@@ -76,7 +76,7 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
     tried = {
         options: [HeldOut(part, t.fit(options)) for t, (_, part) in zip(torques, splits, strict=True)]
         for options in OPTIONS
-        if all(t.hangs for t in torques) or not options.place
+        if all(t.several_payloads for t in torques) or not options.place
     }
     options = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
     comparison = Comparison("torque", *(held_out_errors(folds) for folds in (fitted.held_out, tried[options])))
@@ -168,7 +168,7 @@ class TorqueFit:
     Attributes:
         robot: The robot with gains from torque.
         trusted: Whether gains follow from the torque of some joint, and all recordings have torque.
-        hangs: Whether recordings with several payloads tell where these hang.
+        several_payloads: Whether recordings have several payloads, which determine where these hang.
     """
 
     def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec) -> None:
@@ -184,7 +184,7 @@ class TorqueFit:
         if self.trusted:
             self.robot = robot.with_servos(trusted)
         masses = {s.meta.payload_mass for s in self.sequences}
-        self.hangs = bool(robot.payload_mounts) and len(masses) > 1
+        self.several_payloads = bool(robot.payload_mounts) and len(masses) > 1
 
     def gains(self) -> dict[str, Gains]:
         """Return joint → gains; without joints whose command never moves."""
@@ -195,7 +195,7 @@ class TorqueFit:
                 parts.setdefault(j, []).append(np.stack([x[:, j] for x in (s.ctrl, s.qpos, s.qvel, s.tau)]))
         return {self.nominal.joint_names[j]: servo_gains(each) for j, each in parts.items()}
 
-    def hanging(self, friction: bool = False) -> RobotSpec:
+    def payload_placed(self, friction: bool = False) -> RobotSpec:
         """Return the robot with the payload's place and the mass of the hand, by least squares on recorded torque.
 
         A joint's torque is that of the model, that of (payload + hand) at the mount, and that of the joint's own
@@ -213,7 +213,7 @@ class TorqueFit:
             np.r_[np.array(mount.pos) + a, m, np.full(n, z)] for a, m, z in ((-0.3, 0, 0), (0.3, MAX_HAND_MASS, 20))
         )
 
-        def residual(x: Array) -> Array:  # a place that torque does not tell stays
+        def residual(x: Array) -> Array:  # a place that torque does not determine stays
             mine = (x[4:].reshape(3, -1)[:, column] * own).sum(axis=0)
             return np.r_[required(x) + mine - tau, MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])]
 
@@ -271,7 +271,7 @@ class TorqueFit:
 
     def fit(self, options: _Options) -> RobotSpec:
         """Return the robot with values from torque, and near those with values from positions."""
-        start = self.hanging(options.friction) if options.place else self.robot
+        start = self.payload_placed(options.friction) if options.place else self.robot
         rollouts = JointRollouts(cut(self.sequences, MAX_WINDOWS), start)
         fields = CLASSIC[1:]  # without kp
         changes = Changes(first_values(start), fields)

@@ -25,7 +25,7 @@ from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model
 
 DIFFERENTIATION_CUTOFF_HZ, CUTOFF_HZ = 25.0, 8.0  # before differentiating; of every column
-MIN_SPEED = 0.05  # rad/s below which a row says nothing about friction
+MIN_SPEED = 0.05  # rad/s of rows that show friction
 DELAYS_S = np.arange(0.0, 0.0405, 0.001)
 JACKKNIFE_BLOCKS = 10  # of the rows, each left out once
 HORIZONS_S = (0.1, 0.5, 1.0)
@@ -55,8 +55,8 @@ class TorqueDrivenFit:
         constant: N·m per unit of the recorded torque; 1 if it is taken as N·m.
         bias: Mean residual, N·m: gravity that the file lacks, or the sensor's.
         std: Joint → field → standard error.
-        torque: Median |residual| of rows that were not fitted, N·m: of the file, of the robot. A median, since a push
-            by hand says nothing about the robot.
+        torque: Median |residual| of rows that were not fitted, N·m: of the file, of the robot. A median, so that a push
+            by hand has no effect.
         angle: Horizon, s → median |error| when driven by the torque, rad: of the file, of the robot.
         windows: Number of starts of these rollouts.
     """
@@ -102,9 +102,9 @@ def fit_torque_driven(
     factor, bias = np.ones(len(names)), np.zeros(len(names))
     for j, name in enumerate(names):
         x, lag = _joint(fit, j, constant)
-        spread = _jackknife(fit, j, constant, lag)
+        errors = _jackknife(fit, j, constant, lag)
         servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True)) | {"delay": float(DELAYS_S[lag])}
-        std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), spread.tolist(), strict=True))
+        std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), errors.tolist(), strict=True))
         bias[j], factor[j] = x[3], x[4]
     fitted = robot.with_servos(servos)
     angles = [_ahead(judging, r, k) for r, k in ((robot, np.ones_like(factor)), (fitted, factor))]

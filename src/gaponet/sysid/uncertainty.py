@@ -29,7 +29,7 @@ from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
 PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
 MEND = "identify or adapt it again"
-UNOBSERVED_RELATIVE_ERROR = 1.0  # a standard error as large says nothing about the value
+UNOBSERVED_RELATIVE_ERROR = 1.0  # from which a value of zero means that no effect was seen
 MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = 0.9, 0.03  # from which parameters are known only as a set
 OLD_KEYS = {  # of known.json → of uncertainty.json
     "step": "gauss_newton_step", "step_covariance": "gauss_newton_covariance", "scatter": "overdispersion",

@@ -110,7 +110,7 @@ def test_kp_of_unloaded_joints_is_reported_as_undetermined(tmp_path, robot, pool
     unsure = replace(slow, covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0])
     said = undetermined_gains(free, mine, unsure, motions, (0.0,))
     assert set(said) == {"shoulder", "elbow"}
-    assert all("so no motion tells kp from friction and damping" in why for why in said.values())
+    assert all("so no motion separates kp from friction and damping" in why for why in said.values())
 
 
 def test_excite_writes_motions_and_expected_errors(robot, tmp_path, capsys):

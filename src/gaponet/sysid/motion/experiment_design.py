@@ -199,7 +199,7 @@ def undetermined_gains(
 
 def _advice(error: float, loaded: float | None, mass: float | None, hand: bool, most: float) -> str:
     """Return what to do about a joint's kp: its error after all motions, and with a payload `mass` in the hand."""
-    why = f"nothing loads it, so no motion tells kp from friction and damping (± {error:.0%} after all of them)"
+    why = f"nothing loads it, so no motion separates kp from friction and damping (± {error:.0%} after all of them)"
     if loaded is not None and loaded < min(MAX_KP_ERROR, 0.5 * error):
         return f"{why}; {mass:g} kg in the hand would, to ± {loaded:.0%}: weigh it, --payloads 0 {mass:g}"
     if mass is not None:
