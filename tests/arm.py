@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.store import Dataset
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 
@@ -87,6 +88,14 @@ def record(
         mujoco.mj_step(model, data, robot.decimation)
     meta = SequenceMeta(robot.name, unit, motion, payload, virtual=True)
     return Sequence(meta, robot.joint_names, robot.dt, ctrl, np.array(qpos), np.array(qvel))
+
+
+def write_dataset(folder: Path, robot: RobotSpec, sequences: list[Sequence]) -> Dataset:
+    """Return a dataset of these recordings."""
+    data = Dataset.create(folder, robot)
+    for sequence in sequences:
+        data.append(sequence)
+    return data
 
 
 def recordings(robot: RobotSpec, count: int = 6, rows: int = 150, **how: float) -> list[Sequence]:

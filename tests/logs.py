@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.store import Dataset
 from gaponet.robot.spec import RobotSpec
 
 SERVO_NAMES = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
@@ -121,6 +123,19 @@ def arm_sequence(
     meta = SequenceMeta(robot.name, str(fields.pop("unit", "a")), motion, payload, notes=notes)  # type: ignore[arg-type]
     qvel = fields.pop("qvel", np.gradient(qpos, robot.dt, axis=0))
     return Sequence(meta, robot.joint_names, robot.dt, ctrl, qpos, qvel, **fields)  # type: ignore[arg-type]
+
+
+def repeated_motions(folder: Path, robot: RobotSpec) -> Dataset:
+    """A dataset of four motions by two units, each three times."""
+    data = Dataset.create(folder, robot)
+    for motion in range(4):
+        for unit in ("a", "b"):
+            for k in range(3):
+                ctrl = wave(120, 2, hertz=0.4 + 0.2 * motion)
+                qpos = late(ctrl, 2 + (unit == "b")) + 0.002 * k
+                one = arm_sequence(robot, ctrl, qpos, f"m{motion}", unit=unit, payload=0.5 * (unit == "b"))
+                data.append(replace(one, meta=replace(one.meta, repetition=k)))
+    return data
 
 
 def write_bam(file: Path, rows: int = 60, off: int | None = None, **changes: object) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +14,33 @@ from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export, sample_inputs
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
+
+TINY_TRAINING = TrainConfig(
+    model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
+    pretraining=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
+    ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
+    episode_s=0.5,
+    validate_every=2,
+)
+
+
+def read_checkpoint(run: Path) -> dict[str, Any]:
+    """The state that a run stored last."""
+    return torch.load(run / "checkpoint.pt", weights_only=True)
+
+
+def differences(a: Any, b: Any, where: str = "") -> list[str]:
+    """Paths at which two nested states differ, times in seconds aside."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        return [d for k in a for d in differences(a[k], b[k], f"{where}/{k}")]
+    if isinstance(a, (list, tuple)):
+        return [d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{where}/{i}")]
+    same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b or (a != a and b != b)
+    return [] if same or where.endswith("/seconds") else [where]
 
 
 def untrained(folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gaponet", **parts: tuple[str, ...]) -> Path:

@@ -11,22 +11,14 @@ import sys
 from pathlib import Path
 
 import torch
+from runs import TINY_TRAINING
 
 from gaponet import api
 from gaponet.base.errors import ModelError
-from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import Standardise
 from gaponet.nn.training import ranks
-from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
 
-CONFIG = TrainConfig(
-    model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-    pretraining=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
-    ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
-    episode_s=0.5,
-    validate_every=2,
-)
 STEPS = 2 * 8 * 30 + 4 * 8 * 8
 digests: list[str] = []
 written: list[str] = []
@@ -76,7 +68,7 @@ def together(rank: int) -> dict:
 
 def train(place: Path, name: str, resume: bool = False) -> dict:
     return api.train(
-        place / "data", out=place / name, budget=str(STEPS), config=CONFIG, robot=place / "arm", resume=resume
+        place / "data", out=place / name, budget=str(STEPS), config=TINY_TRAINING, robot=place / "arm", resume=resume
     ).card
 
 

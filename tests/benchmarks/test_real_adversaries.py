@@ -1,29 +1,13 @@
 """benchmarks/real_adversaries.py changes what it says and nothing else."""
 
-from dataclasses import replace
-
 import pytest
-from logs import arm_sequence, late, wave
+from logs import repeated_motions
 
-from gaponet.data.store import Dataset
 from gaponet.experiments.real.questions import questions
 
 
-@pytest.fixture
-def played(arm, tmp_path):
-    """Four motions by two units, each three times."""
-    data = Dataset.create(tmp_path / "data", arm)
-    for motion in range(4):
-        for unit in ("a", "b"):
-            for k in range(3):
-                ctrl = wave(120, 2, hertz=0.4 + 0.2 * motion)
-                qpos = late(ctrl, 2 + (unit == "b")) + 0.002 * k
-                one = arm_sequence(arm, ctrl, qpos, f"m{motion}", unit=unit, payload=0.5 * (unit == "b"))
-                data.append(replace(one, meta=replace(one.meta, repetition=k)))
-    return data
-
-
-def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, played, load):
+def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, tmp_path, load):
+    played = repeated_motions(tmp_path / "data", arm)
     (question,) = questions("new motions", played, arm, None)
     changed = {name: change(question) for name, change in load("real_adversaries").ADVERSARIES.items()}
     mixed = changed["labels"]

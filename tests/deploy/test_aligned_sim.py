@@ -131,16 +131,3 @@ def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
     aligned, nominal = np.mean(apart, axis=0)
     assert aligned < 0.1 * nominal
     assert MujocoAligner(robot, mj_model, 0.02, 0.2).transfer is None  # it moves so of itself
-
-
-def test_late_servos_follow_the_target_that_was_in_force_before_a_reset(arm):
-    late = arm.with_servos({joint: {"delay": 0.06} for joint in arm.joint_names})
-    places = {}
-    for name, before in (("none", None), ("where it is", late.qpos_home), ("elsewhere", late.qpos_home + 0.3)):
-        sim = AlignedSim(late)
-        sim.reset(ctrl=before)
-        for _ in range(2):
-            sim.step(late.qpos_home)
-        places[name] = np.array(sim.qpos)
-    np.testing.assert_array_equal(places["none"], places["where it is"])
-    assert (places["elsewhere"] > places["none"] + 1e-3).any()

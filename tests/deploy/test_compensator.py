@@ -185,7 +185,7 @@ def test_a_lead_makes_up_for_dead_time(robot, model):
     assert late[3] < 0.4 * late[0]
 
 
-def test_a_payload_that_nobody_announced_is_found(robot, model):
+def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     targets = np.repeat([[0.3, -0.2]], 500, axis=0)
     arm, compensator = WeakArm(robot), Compensator(robot, model, NOW, payload_step=0.1)
     q, _ = play(arm, targets, compensator, None, {100: lambda: arm.load(1)})
@@ -197,7 +197,7 @@ def test_a_payload_that_nobody_announced_is_found(robot, model):
 @pytest.mark.parametrize(
     ("held", "told", "doubted"), [(0, 0.4, True), (1, 0.0, True), (0, 0.0, False), (1, 0.4, False)]
 )
-def test_a_payload_that_was_told_is_compared_with_what_the_servos_give(robot, model, held, told, doubted):
+def test_a_stated_payload_is_compared_with_the_servo_torques(robot, model, held, told, doubted):
     arm, compensator = WeakArm(robot, WeakArm.masses[held]), Compensator(robot, model, NOW, payload_step=0.1)
     play(arm, np.repeat([[0.3, -0.2]], 200, axis=0), compensator, told)
     assert (f"{told:g} kg were stated, but the torques are those of about" in compensator.doubt) == doubted
@@ -261,6 +261,8 @@ def test_a_step_before_a_start_is_refused(robot):
 def test_other_arrays_and_robots_are_refused(robot, model):
     with pytest.raises(UsageError, match="all 2 joints of arm"):
         Compensator(robot, model).reset(np.zeros(3), 0.0)
+    with pytest.raises(UsageError, match="target to begin at"):
+        Compensator(robot, model).reset(np.array([0.0, np.nan]), 0.0)
     with pytest.raises(UsageError, match="gain must be"):
         CompensatorConfig(gain=0.0)
 
@@ -318,7 +320,7 @@ def test_without_a_model_servos_with_other_gains_and_absurd_payloads_are_refused
             compensator.reset(np.zeros(2), mass)
 
 
-def test_payloads_beyond_those_trained_on_are_refused_unless_told(robot):
+def test_payloads_beyond_the_training_data_are_refused_without_extrapolate(robot):
     def trained(*seen):
         return GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02], payload_seen=seen), CONFIG, Exact())
 
@@ -364,12 +366,7 @@ def test_what_is_not_a_number_is_forgotten_at_once(robot, model, payload, bad):
     assert np.isfinite(one.payload_mass).all()
 
 
-def test_a_start_that_is_not_a_number_is_refused(robot, model):
-    with pytest.raises(UsageError, match="target to begin at"):
-        Compensator(robot, model).reset(np.array([0.0, np.nan]), 0.0)
-
-
-def test_a_adapted_unit_follows_where_the_model_alone_does_not(robot):
+def test_an_adapted_unit_follows_where_the_model_alone_does_not(robot):
     ignorant = GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02]), CONFIG, Nothing())
     targets = np.tile([0.4, 0.8], (200, 1))
     still = replace(NOW, feedback=0.0)
@@ -382,7 +379,7 @@ def test_a_adapted_unit_follows_where_the_model_alone_does_not(robot):
     assert error["unit"] < 0.2 * error["common"]
 
 
-def test_servos_with_other_gains_than_the_data_are_refused_unless_told(robot):
+def test_servos_with_other_gains_than_the_data_are_refused_without_extrapolate(robot):
     card = make_card(CONFIG, robot, dt=[0.02], recorded={"kp": [20.0, 20.0], "kd": None})
     model = GapModel(Path("exact"), card, CONFIG, Exact())
     joints, kd = robot.joint_names, np.zeros(2)

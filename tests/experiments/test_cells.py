@@ -5,12 +5,11 @@ import os
 from dataclasses import replace
 
 import pytest
-from arm import recordings
+from arm import recordings, write_dataset
 from cells import note_threads, wait_for_the_end
 
 from gaponet.base.errors import UsageError
 from gaponet.base.executor import open_pool
-from gaponet.data.store import Dataset
 from gaponet.experiments.cells import SETUP_FILE, plan_cells, run_cells
 from gaponet.experiments.outcomes import train_cell
 from gaponet.experiments.variant import parse_variant
@@ -31,9 +30,7 @@ def local(tmp_path):
 
 @pytest.fixture
 def data(arm, tmp_path):
-    data = Dataset.create(tmp_path / "data", arm)
-    for sequence in recordings(arm, 8, rows=60, kp=0.5, delay=2):
-        data.append(sequence)
+    data = write_dataset(tmp_path / "data", arm, recordings(arm, 8, rows=60, kp=0.5, delay=2))
     return data
 
 
@@ -124,7 +121,12 @@ def test_cells_share_the_fit_of_delay_and_offset(data, arm, tmp_path, monkeypatc
     fits = []
     whole = DelayOffset.fit
     monkeypatch.setattr(DelayOffset, "fit", lambda *args: fits.append(1) or whole(*args))
-    first, second, part = cells(data, arm, tmp_path / "out", ("mlp", "mlp:history=2", "mlp:train_share=0.5"))
+    first, second, part = cells(
+        data,
+        arm,
+        tmp_path / "out",
+        ("mlp:mlp_hidden=8", "mlp:mlp_hidden=8:history=2", "mlp:mlp_hidden=8:train_share=0.5"),
+    )
     for cell in (first, second, part):
         train_cell(cell, lambda share, note: None)
     assert len(fits) == 2

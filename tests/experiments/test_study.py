@@ -4,7 +4,7 @@ from gaponet.experiments.study import quick_dataset
 
 
 def test_few_motions_and_every_kind_of_group(make_study, arm, tmp_path):
-    data = make_study(rates=(50, 100), payloads=(0.0, 0.1, 0.2, 0.3), units=("a", "b")).data
+    data = make_study(rates=(50, 100), payloads=(0.0, 0.1, 0.2, 0.3), units=("a",)).data
     part = quick_dataset(data, arm, tmp_path / "part")
     assert {e.meta.payload_mass for e in part.entries} == {0.0, 0.2, 0.3}  # lightest, middle, heaviest
     assert {round(1 / e.dt) for e in part.entries} == {50, 100}

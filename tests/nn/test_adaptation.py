@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import commands, record, write_arm
+from arm import commands, record, write_arm, write_dataset
 
 from gaponet import api
 from gaponet.base.errors import ModelError, NoGainError, UsageError
@@ -59,7 +59,7 @@ def test_a_motion_that_was_not_used_is_followed_better(found, model, robot, logs
     assert error(found.robot(robot)) < 0.2 * error(robot)
 
 
-def test_a_adaptation_is_read_as_it_was_written(found, tmp_path):
+def test_an_adaptation_is_read_as_it_was_written(found, tmp_path):
     odd = replace(found, unit_id="lab/arm 2")
     assert odd.save(tmp_path).name == "lab_arm_2.json"
     assert Adaptation.load(tmp_path, found.weights) == {"lab/arm 2": odd}
@@ -67,13 +67,13 @@ def test_a_adaptation_is_read_as_it_was_written(found, tmp_path):
         Adaptation.load(tmp_path, "0123456789ab")
 
 
-def test_a_adaptation_for_an_earlier_model_is_replaced(found, tmp_path):
+def test_an_adaptation_for_an_earlier_model_is_replaced(found, tmp_path):
     replace(found, weights="0123456789ab").save(tmp_path)
     found.save(tmp_path)
     assert Adaptation.load(tmp_path, found.weights) == {found.unit_id: found}
 
 
-def test_a_payload_that_nobody_weighed_is_found(model, robot):
+def test_an_unknown_payload_is_estimated(model, robot):
     logs = [record(robot, commands(450, seed), f"m{seed}", payload=0.2) for seed in range(2)]
     untold = [replace(s, meta=replace(s.meta, payload_mass=0.0)) for s in logs]
     found = Adaptation.fit(model, robot, untold, seconds=16.0, unknown_payload=True)
@@ -107,9 +107,7 @@ def test_a_damaged_adaptation_is_refused_with_file_and_field(found, tmp_path, ch
 
 
 def test_a_robot_folder_is_adapted_without_a_model_or_not_at_all(robot, logs, tmp_path):
-    data = Dataset.create(tmp_path / "data", robot)
-    for log in logs:
-        data.append(log)
+    data = write_dataset(tmp_path / "data", robot, logs)
     found = api.adapt_robot(robot, data, out=tmp_path / "today", seconds=16.0)
     assert found.after < 0.2 * found.before
     written = load_robot(tmp_path / "today")

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from arm import recordings, write_arm
+from arm import recordings, write_arm, write_dataset
 
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.cli.main import main
-from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaLoop
@@ -304,9 +303,7 @@ def few_gradient_steps(monkeypatch):
 def world(tmp_path_factory):
     place = tmp_path_factory.mktemp("world")
     robot = write_arm(place / "arm")
-    data = Dataset.create(place / "data", robot)
-    for sequence in recordings(robot, 8, rows=60, kp=0.5):
-        data.append(sequence)
+    data = write_dataset(place / "data", robot, recordings(robot, 8, rows=60, kp=0.5))
     return data, robot
 
 

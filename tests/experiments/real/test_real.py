@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from logs import arm_sequence, late, wave
+from logs import repeated_motions
 
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
@@ -23,16 +23,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "benchmark.md"
 
 @pytest.fixture
 def played(arm, tmp_path):
-    """Four motions by two units, each three times."""
-    data = Dataset.create(tmp_path / "data", arm)
-    for motion in range(4):
-        for unit in ("a", "b"):
-            for k in range(3):
-                ctrl = wave(120, 2, hertz=0.4 + 0.2 * motion)
-                qpos = late(ctrl, 2 + (unit == "b")) + 0.002 * k
-                one = arm_sequence(arm, ctrl, qpos, f"m{motion}", unit=unit, payload=0.5 * (unit == "b"))
-                data.append(replace(one, meta=replace(one.meta, repetition=k)))
-    return data
+    return repeated_motions(tmp_path / "data", arm)
 
 
 def test_every_card_has_an_existing_robot_and_a_row_on_the_page():

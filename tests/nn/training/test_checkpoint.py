@@ -7,22 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from arm import recordings, write_arm
+from arm import recordings, write_arm, write_dataset
+from runs import TINY_TRAINING, differences, read_checkpoint
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.data.store import Dataset
-from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.checkpoint import RENAMED
-from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import Budget
 from gaponet.nn.training.trainer import Trainer
 
-TINY = TrainConfig(
-    model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-    pretraining=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
-    ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
-    episode_s=0.5,
-    validate_every=2,
-)
 WARM, UPDATE = 8 * 30, 8 * 8
 STEPS = Budget(steps=2 * WARM + 6 * UPDATE)
 
@@ -31,27 +23,10 @@ STEPS = Budget(steps=2 * WARM + 6 * UPDATE)
 def world(tmp_path_factory):
     place = tmp_path_factory.mktemp("world")
     robot = write_arm(place / "arm")
-    data = Dataset.create(place / "data", robot)
-    for sequence in recordings(robot, 8, rows=60, kp=0.5):
-        data.append(sequence)
+    data = write_dataset(place / "data", robot, recordings(robot, 8, rows=60, kp=0.5))
     late = robot.with_servos({j: {"delay": 0.03} for j in robot.operated})
-    Trainer.prepare(data, late, place / "whole", TINY, STEPS).run()
-    return data, late, memory(place / "whole")
-
-
-def memory(run):
-    return torch.load(run / "checkpoint.pt", weights_only=True)
-
-
-def differences(a, b, where=""):
-    """Paths at which two nested states differ."""
-    if isinstance(a, dict):
-        assert a.keys() == b.keys()
-        return [d for k in a for d in differences(a[k], b[k], f"{where}/{k}")]
-    if isinstance(a, (list, tuple)):
-        return [d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{where}/{i}")]
-    same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b or (a != a and b != b)
-    return [] if same or where.endswith("/seconds") else [where]
+    Trainer.prepare(data, late, place / "whole", TINY_TRAINING, STEPS).run()
+    return data, late, read_checkpoint(place / "whole")
 
 
 def stop(stage, at):
@@ -67,51 +42,48 @@ def stop(stage, at):
     return show
 
 
-@pytest.mark.parametrize(("stage", "at"), [("pretraining", 5), ("pretraining", 15), ("ppo", 1), ("ppo", 6)])
+@pytest.mark.parametrize(("stage", "at"), [("pretraining", 5), ("pretraining", 15), ("ppo", 1)])
 def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage, at):
     data, robot, whole = world
     begun = not (stage == "pretraining" and at < 10)
     with nullcontext() if begun else pytest.raises(ModelError, match="before the first step of training"):
-        Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS, show=stop(stage, at)).run()
-    assert memory(tmp_path / "run")["steps"] < whole["steps"]
-    Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS, resume=True).run()
-    again = memory(tmp_path / "run")
+        Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, show=stop(stage, at)).run()
+    assert read_checkpoint(tmp_path / "run")["steps"] < whole["steps"]
+    Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True).run()
+    again = read_checkpoint(tmp_path / "run")
     assert differences(whole, again) == []
     assert [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").open()] == again["progress"]
 
 
-@pytest.fixture
-def earlier_names():
-    names = {today: earlier for earlier, today in RENAMED.items()}
-    return lambda state: {names.get(name, name): value for name, value in state.items()}
-
-
-def test_a_checkpoint_with_earlier_names_is_resumed(world, tmp_path, earlier_names):
+def test_a_checkpoint_with_earlier_names_is_resumed(world, tmp_path):
     data, robot, whole = world
-    Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS, show=stop("ppo", 6)).run()
-    state = earlier_names(memory(tmp_path / "run"))
+    model = Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, show=stop("ppo", 6)).run()
+    assert model.card["interrupted"]
+    with pytest.raises(UsageError, match="--resume"):
+        Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS)
+    earlier = {today: name for name, today in RENAMED.items()}
+    state = {earlier.get(name, name): value for name, value in read_checkpoint(tmp_path / "run").items()}
     state["net"]["bounded.unit"] = state["net"].pop("bounded.scale")
     torch.save(state, tmp_path / "run" / "checkpoint.pt")
-    Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS, resume=True).run()
-    assert differences(whole, memory(tmp_path / "run")) == []
+    model = Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True).run()
+    assert not model.card["interrupted"]
+    assert differences(whole, read_checkpoint(tmp_path / "run")) == []
 
 
 def test_a_run_killed_before_its_first_checkpoint_is_begun_again(world, tmp_path):
     data, robot, whole = world
-    Trainer.prepare(data, robot, tmp_path / "run", replace(TINY, seed=1), STEPS)
+    Trainer.prepare(data, robot, tmp_path / "run", replace(TINY_TRAINING, seed=1), STEPS)
     assert (tmp_path / "run" / "config.json").is_file()
-    Trainer.prepare(data, robot, tmp_path / "run", TINY, STEPS).run()
-    assert differences(whole, memory(tmp_path / "run")) == []
+    Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS).run()
+    assert differences(whole, read_checkpoint(tmp_path / "run")) == []
 
 
 def test_a_run_is_not_resumed_on_other_recordings(world, tmp_path):
     data, robot, _ = world
-    Trainer.prepare(data, robot, tmp_path / "run", TINY, Budget(steps=0)).run()
-    other = Dataset.create(tmp_path / "other", robot)
-    for sequence in recordings(robot, 8, rows=50, kp=0.5):
-        other.append(sequence)
+    Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, Budget(steps=0)).run()
+    other = write_dataset(tmp_path / "other", robot, recordings(robot, 8, rows=50, kp=0.5))
     with pytest.raises(UsageError, match=r"run: was trained on other recordings than this dataset holds; train anew"):
-        Trainer.prepare(other, robot, tmp_path / "run", TINY, STEPS, resume=True)
+        Trainer.prepare(other, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True)
 
 
 def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monkeypatch):
@@ -123,7 +95,7 @@ def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monk
 
     monkeypatch.setattr("gaponet.nn.training.trainer.choose_gain", halve)
     monkeypatch.setattr("gaponet.nn.training.validation.Validator.errors", better_each_time())
-    warm = replace(TINY, pretraining=replace(TINY.pretraining, rounds=4))
+    warm = replace(TINY_TRAINING, pretraining=replace(TINY_TRAINING.pretraining, rounds=4))
     card = Trainer.prepare(data, robot, tmp_path / "run", warm, Budget(steps=WARM)).run().card
     assert card["gain"] == 0.5
     gains = []
@@ -152,4 +124,4 @@ def test_a_checkpoint_that_is_none_is_refused_in_one_line(world, tmp_path, conte
     (tmp_path / "run" / "split.json").write_text("{}")
     (tmp_path / "run" / "checkpoint.pt").write_bytes(content)
     with pytest.raises(ModelError, match=r"checkpoint\.pt: does not fit this model or is damaged"):
-        Trainer.prepare(dataset, robot, tmp_path / "run", TINY, STEPS, resume=True)
+        Trainer.prepare(dataset, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True)

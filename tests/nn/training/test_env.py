@@ -118,10 +118,11 @@ def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(r
     np.testing.assert_array_equal(env.first, env.rows.first[drawn])
 
 
-def test_a_motions_end_is_a_time_out(robot):
+def test_the_end_of_a_motion_is_a_time_out_and_no_step_passes_it(robot):
     env = make(robot, recordings(robot, 2, rows=5))
     seen = 0
     for _ in range(6):
+        assert (env.row < env.last).all()
         seen += int(env.step(np.zeros((env.num_envs, 2), np.float32))[1].sum())
     assert seen >= env.num_envs
 
@@ -135,13 +136,6 @@ def test_the_actor_never_sees_the_recorded_state(robot):
     after = env.get_observations()
     assert torch.equal(before["actor"], after["actor"])
     assert not torch.equal(before["critic"], after["critic"])
-
-
-def test_a_step_never_runs_past_the_end_of_a_motion(robot):
-    env = DeltaEnv(recordings(robot, 2, rows=10), robot, ModelConfig(), 8, 1000, RewardConfig(), seed=0, nthread=1)
-    for _ in range(12):
-        assert (env.row < env.last).all()
-        env.step(np.zeros((8, 2), np.float32))
 
 
 def test_a_motion_of_one_row_is_refused(robot):

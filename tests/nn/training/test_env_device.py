@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from arm import recordings, write_arm
+from arm import recordings, write_arm, write_dataset
 from torch.overrides import TorchFunctionMode
 
 from gaponet.base.errors import UsageError
-from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
@@ -90,9 +89,7 @@ def test_nothing_goes_to_the_host_in_a_step(tmp_path, servo):
 
 def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
     robot, data = write_arm(tmp_path / "arm"), tmp_path / "data"
-    dataset = Dataset.create(data, robot)
-    for sequence in recordings(robot, 8, rows=80, kp=0.5, delay=2):
-        dataset.append(sequence)
+    dataset = write_dataset(data, robot, recordings(robot, 8, rows=80, kp=0.5, delay=2))
     small = TrainConfig(
         ModelConfig(history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
         pretraining=PretrainingConfig(

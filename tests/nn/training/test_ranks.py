@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from arm import recordings, write_arm
-from two_ranks import CONFIG, STEPS
+from arm import recordings, write_arm, write_dataset
+from runs import TINY_TRAINING, differences, read_checkpoint
+from two_ranks import STEPS
 
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
@@ -24,9 +25,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="Ctrl-C reaches no singl
 def place(tmp_path_factory):
     place = tmp_path_factory.mktemp("ranks")
     robot = write_arm(place / "arm")
-    data = Dataset.create(place / "data", robot)
-    for sequence in recordings(robot, 8, rows=60, kp=0.5):
-        data.append(sequence)
+    write_dataset(place / "data", robot, recordings(robot, 8, rows=60, kp=0.5))
     script = Path(__file__).parents[2] / "two_ranks.py"
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
     done = subprocess.run([*command, str(place)], capture_output=True, text=True, timeout=600)
@@ -67,45 +66,29 @@ def test_the_first_rank_alone_writes(saw):
     assert saw[1]["written"] == []
 
 
-def memory(run):
-    return torch.load(run / "checkpoint.pt", weights_only=True)
-
-
 def test_ranks_have_simulations_and_noise_of_their_own(place):
-    first = memory(place / "run-whole")
+    first = read_checkpoint(place / "run-whole")
     (second,) = first["others"]
     assert not torch.equal(first["env"]["arrays"]["row"], second["env"]["arrays"]["row"])
     assert not torch.equal(first["ppo"]["noise"], second["ppo"]["noise"])
-    assert len(first["ppo"]["noise"]) == CONFIG.ppo.num_envs // 2
+    assert len(first["ppo"]["noise"]) == TINY_TRAINING.ppo.num_envs // 2
     assert "critic" not in second["ppo"]
 
 
 def test_one_rank_that_is_interrupted_ends_both_and_they_go_on_to_the_bit(place, saw):
     assert [rank["interrupted"] for rank in saw] == [True, True]
     assert [rank["resumed"] for rank in saw] == [STEPS, STEPS]
-    whole, stopped = memory(place / "run-whole"), memory(place / "run-stopped")
-    for state in (whole, stopped):
-        del state["seconds"]
-        for line in state["progress"]:
-            del line["seconds"]
-    assert equal(whole, stopped)
-
-
-def equal(a, b):
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a)
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(map(equal, a, b))
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b or (a != a and b != b)
+    whole, stopped = (read_checkpoint(place / f"run-{name}") for name in ("whole", "stopped"))
+    assert differences(whole, stopped) == []
 
 
 def test_a_run_is_resumed_by_as_many_processes(place):
     data, robot = Dataset(place / "data"), write_arm(place / "arm")
     with pytest.raises(UsageError, match="was trained by 2 processes; resume with torchrun --nproc-per-node 2"):
-        Trainer.prepare(data, robot, place / "run-whole", CONFIG, Budget(steps=STEPS), resume=True)
+        Trainer.prepare(data, robot, place / "run-whole", TINY_TRAINING, Budget(steps=STEPS), resume=True)
 
 
 def test_what_ranks_cannot_share_evenly_is_refused(monkeypatch):
     monkeypatch.setattr(ranks, "world", lambda: 3)
     with pytest.raises(UsageError, match=r"--pretraining\.num-envs 8: 3 ranks cannot share them evenly"):
-        ranks.share(CONFIG)
+        ranks.share(TINY_TRAINING)

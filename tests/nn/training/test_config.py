@@ -9,7 +9,7 @@ from gaponet import api
 from gaponet.base.errors import UsageError
 from gaponet.cli.main import main
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.config import PAPER_PPO, PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import PAPER_PPO, Budget, PPOConfig, PretrainingConfig, TrainConfig
 
 CHANGED = TrainConfig(
     ModelConfig(kind="mlp", history=8, payload_input=False, mlp_hidden=(64, 32)),
@@ -53,3 +53,16 @@ def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
     words = shlex.split(shlex.join(["train", "data", "--out", "run", *config.options()]))
     assert main(words) == 2
     assert heard == [config]
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds", "steps"), [("90s", 90, None), ("10m", 600, None), ("2e6", None, 2_000_000)]
+)
+def test_budgets(text, seconds, steps):
+    assert Budget.parse(text) == Budget(seconds, steps)
+
+
+@pytest.mark.parametrize("text", ["", "-5m", "ten", "5 weeks", "0s", "10"])
+def test_a_budget_that_makes_no_sense_is_refused(text):
+    with pytest.raises(UsageError, match="--budget"):
+        Budget.parse(text)
