@@ -38,7 +38,7 @@ def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, eva
     cuts = [cuts[i * len(cuts) // min(COUNT, len(cuts))] for i in range(min(COUNT, len(cuts)))]
     rows, op = min(map(len, cuts)), robot.operated_index
     n, kd = len(op), robot.kd[robot.operated_index]
-    models = [build_model(robot, c.meta.payload_mass, c.meta.payload_side, c.dt, bare=True) for c in cuts]
+    models = [build_model(robot, c.meta.payload_mass, c.meta.payload_side, c.dt, physics_only=True) for c in cuts]
     own, h, count = models[0], models[0].opt.timestep, robot.steps_per(cuts[0].dt)
     damping = own.dof_damping[op] + kd
     armature = np.maximum(

@@ -259,7 +259,7 @@ def test_nothing_touches_without_a_table(tipped):
 
 
 def test_the_tip_presses_into_the_table_by_force_over_stiffness(tipped):
-    model = build_model(replace(tipped, table=Table(-0.05, 0.3, 3000.0)), bare=True)
+    model = build_model(replace(tipped, table=Table(-0.05, 0.3, 3000.0)), physics_only=True)
     model.dof_frictionloss[:] = 0.0
     data = mujoco.MjData(model)
     data.ctrl[:] = [0.3, 0.3]  # far below the table

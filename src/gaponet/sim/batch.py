@@ -146,7 +146,7 @@ class BatchSim:
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
         conditions = [Condition(*c) for c in conditions]
         robots = {c: robot.with_gains(c.kp, c.kd) for c in dict.fromkeys(conditions)}
-        self.models = {c: build_model(r, *c[:3], locked, bare=True) for c, r in robots.items()}
+        self.models = {c: build_model(r, *c[:3], locked, physics_only=True) for c, r in robots.items()}
         first = self.models[conditions[0]]
         kp_ratio = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
         self._kp_ratio = np.array([kp_ratio[c] for c in conditions])

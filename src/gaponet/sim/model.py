@@ -40,7 +40,7 @@ def build_model(
     payload_side: str = "both",
     dt: float | None = None,
     locked: tuple[str, ...] = (),
-    bare: bool = False,
+    physics_only: bool = False,
 ) -> mujoco.MjModel:
     """Return the nominal simulator of a robot with a payload.
 
@@ -53,13 +53,13 @@ def build_model(
         payload_side: "both" (every mount), or the side of one mount.
         dt: Control period, s; default robot.dt.
         locked: Joints clamped at home, without a degree of freedom (`idle_joints` finds those that change nothing).
-        bare: Leave out geoms that touch nothing and bodies that are locked to the world: faster, same motion.
+        physics_only: Leave out geoms that touch nothing and bodies that are locked to the world: faster, same motion.
 
     Raises:
         RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
         UsageError: Negative payload, unknown side, or a dt that is not positive.
     """
-    spec = build_spec(robot, payload_mass, payload_side, dt, locked, bare)
+    spec = build_spec(robot, payload_mass, payload_side, dt, locked, physics_only)
     model = compile_spec(spec, robot.mjcf)
     if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
         known = {j.name for j in spec.joints}
@@ -87,7 +87,7 @@ def build_spec(
     payload_side: str = "both",
     dt: float | None = None,
     locked: tuple[str, ...] = (),
-    bare: bool = False,
+    physics_only: bool = False,
 ) -> mujoco.MjSpec:
     """Return `build_model` before compilation, for a scene of several robots (report/view/scene.py)."""
     spec = read_mjcf(robot.mjcf)
@@ -110,9 +110,9 @@ def build_spec(
     for name in locked:
         freeze(spec, spec.joint(name), robot.qpos_home[robot.joint_names.index(name)])
     _add_actuators(spec, robot, locked)
-    if bare:
+    if physics_only:
         spec.compiler.discardvisual = True
-        _remove_standing(spec, spec.worldbody, {mount.body for mount in robot.payload_mounts})
+        _remove_fixed(spec, spec.worldbody, {mount.body for mount in robot.payload_mounts})
     _add_payload(spec, robot, payload_mass, payload_side)
     return spec
 
@@ -200,14 +200,14 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
 
 
-def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:
+def _remove_fixed(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:
     """Delete bodies that are fixed to a standing body and carry neither a joint nor a payload."""
     for child in list(body.bodies):
         limb = [child, *child.find_all("body")]
         if not any(len(part.joints) or part.name in keep for part in limb):
             spec.delete(child)
         elif not len(child.joints):
-            _remove_standing(spec, child, keep)
+            _remove_fixed(spec, child, keep)
 
 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
@@ -272,7 +272,7 @@ def _add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
         geom.contype, geom.conaffinity = 0, 0
     for pair in list(spec.pairs):
         spec.delete(pair)
-    # Marked as touching, though by nothing but the pairs below: what touches nothing is not compiled (bare).
+    # With a contact type, because physics_only leaves out geoms without one; only the pairs below touch.
     spec.worldbody.add_geom(
         name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(SIZE, SIZE, 0.1), pos=(0, 0, robot.table.height),
         contype=2, conaffinity=0, rgba=(0.55, 0.5, 0.45, 1),

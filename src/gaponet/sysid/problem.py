@@ -235,7 +235,7 @@ class KinematicChains:
     """
 
     def __init__(self, robot: RobotSpec) -> None:
-        model = build_model(replace(robot, table=None), bare=True)
+        model = build_model(replace(robot, table=None), physics_only=True)
         tree = model.dof_treeid[[model.joint(j).dofadr[0] for j in robot.operated]]
         chains = [np.flatnonzero(tree == t) for t in np.unique(tree)]
         most = max(map(len, chains))

@@ -88,7 +88,7 @@ def _record(job: Job, group: list[Take], motions: dict[str, Motion], locked: tup
         reading = robots.read()
         readings[:, t] = reading.qpos, reading.qvel, reading.tau, reading.temperature
         robots.step(targets[t], rows=np.arange(int((lengths > t).sum())))
-    models = {p: build_model(job.robot, *p, dt, bare=True) for p in dict.fromkeys(payloads)}
+    models = {p: build_model(job.robot, *p, dt, physics_only=True) for p in dict.fromkeys(payloads)}
     sequences = []
     for i, (take, c) in enumerate(zip(group, ctrl, strict=True)):
         qpos, qvel, tau, temperature = readings[:, : len(c), i]

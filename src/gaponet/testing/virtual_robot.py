@@ -359,7 +359,7 @@ def _models(
     for unit, (mass, side) in zip(units, payloads, strict=True):
         key = (id(unit), mass, side)
         if key not in models:
-            model = build_model(robot, mass, side, dt, locked, bare=True)
+            model = build_model(robot, mass, side, dt, locked, physics_only=True)
             model.opt.timestep = timestep
             _edit(model, robot, unit, locked)
             models[key] = model
