@@ -66,11 +66,9 @@ def _gravity(
 
 def tips_of(robot: RobotSpec) -> Callable[[Array], Array] | None:
     """Return the height of the lowest tip by postures (k, n), (k,) m; None if robot.toml names no tip."""
-    return (
-        partial(_lowest_tip, build_model(replace(robot, table=None), physics_only=True), robot.tips)
-        if robot.tips
-        else None
-    )
+    if not robot.tips:
+        return None
+    return partial(_lowest_tip, build_model(replace(robot, table=None), physics_only=True), robot.tips)
 
 
 def _lowest_tip(model: mujoco.MjModel, tips: tuple[Tip, ...], postures: Array) -> Array:

@@ -95,9 +95,8 @@ def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clampe
     """Return the joints that are clamped in a rollout, and where, rad: idle limbs at home, unrecorded joints where the
     recording says that they stood."""
     unknown = sequence.meta.unrecorded
-    at = {
-        j: float(sequence.qpos[0, i] if j in unknown else robot.qpos_home[i]) for i, j in enumerate(robot.joint_names)
-    }
+    angles = zip(robot.joint_names, sequence.qpos[0], robot.qpos_home, strict=True)
+    at = {j: float(seen if j in unknown else home) for j, seen, home in angles}
     return tuple((j, angle) for j, angle in at.items() if j in idle or j in unknown)
 
 

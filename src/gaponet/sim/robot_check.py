@@ -122,13 +122,13 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     if (model.body_gravcomp != 0).any():
         text = "gravcomp in robot.xml takes weight off bodies: right where the controller compensates gravity; else "
         yield Finding("note", "couplings", f"{text}delete it")
-    bare = names[model.dof_armature < MIN_ARMATURE]
-    if len(bare):
+    light = names[model.dof_armature < MIN_ARMATURE]
+    if len(light):
         text = (
-            f"no armature at {abbreviate(bare.tolist())}: geared motors have 0.001 to 0.5 kg·m² (rotor inertia times "
+            f"no armature at {abbreviate(light.tolist())}: geared motors have 0.001 to 0.5 kg·m² (rotor inertia times "
             "ratio squared); write armature in robot.xml, gaponet identify finds it"
         )
-        yield Finding("note", "inertia", text, tuple(bare))
+        yield Finding("note", "inertia", text, tuple(light))
     free = names[(model.dof_damping + robot.kd < 1e-9) & (model.dof_frictionloss < 1e-9)]
     if len(free):
         text = (
@@ -180,9 +180,8 @@ def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Arra
     """Find small motions that grow under gains, inertias and physics step; friction, which hides them, is left out."""
     thin = [robot.qpos_home, *postures[:: max(1, len(postures) // MAX_POSTURES)][:MAX_POSTURES]]
     cases = [(mass, model, q) for mass, model in models.items() for q in thin]
-    found = [_growth(model, q) for _, model, q in cases]
-    k = max(range(len(found)), key=lambda k: found[k][0])
-    (growth, joint, oscillates), mass = found[k], cases[k][0]
+    each = [(_growth(model, q), mass) for mass, model, q in cases]
+    (growth, joint, oscillates), mass = max(each, key=lambda one: one[0].factor)
     name = robot.joint_names[joint]
     if growth <= 1 + MAX_GROWTH:
         yield Finding("ok", "step", "gains, inertias and physics step go together", values={"growth": growth})

@@ -63,9 +63,7 @@ class JointRollouts:
         thins = self.thin * np.maximum(1, np.round(ROW_PERIOD_S / self.periods / self.thin)).astype(int)
         self._thins, rows = thins, max(map(len, parts))
         payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in parts]
-        models = {
-            payload: build_model(robot, *payload, self.dt, physics_only=True) for payload in dict.fromkeys(payloads)
-        }
+        models = {x: build_model(robot, *x, self.dt, physics_only=True) for x in dict.fromkeys(payloads)}
         loads = [_loads_along(p, models[x], self.op, k) for p, x, k in zip(parts, payloads, thins, strict=True)]
         low, high = robot.qpos_range[self.op].T
 
