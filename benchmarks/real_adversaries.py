@@ -3,7 +3,7 @@
     python benchmarks/real_adversaries.py labels --sets h1_2 --questions "3 kg left out"
 
 labels          permute payload and unit among the fitted recordings: effects of the labels must vanish
-asked_labels    permute the payload among the test recordings: the benefit of the payload label must vanish
+test_labels    permute the payload among the test recordings: the benefit of the payload label must vanish
 late            add 40 ms of delay to one in ten of the fitted recordings: no method may follow them
 all_late        add 40 ms of delay to all recordings: methods that fit a delay must not change
 joints          rotate the order of the joints in the fitted recordings: every fit must become worse
@@ -33,7 +33,7 @@ def labels(question: Question) -> Question:
     return _fitted(question, [replace(s, meta=m) for s, m in zip(question.fitted, permuted, strict=True)])
 
 
-def asked_labels(question: Question) -> Question:
+def test_labels(question: Question) -> Question:
     permuted = _permuted([s.meta for s in question.test], ("payload_mass",))
     return replace(question, test=[replace(s, meta=m) for s, m in zip(question.test, permuted, strict=True)])
 
@@ -56,7 +56,7 @@ def joints(question: Question) -> Question:
     ])  # fmt: skip
 
 
-ADVERSARIES: dict[str, Change] = {f.__name__: f for f in (labels, asked_labels, late, all_late, joints)}
+ADVERSARIES: dict[str, Change] = {f.__name__: f for f in (labels, test_labels, late, all_late, joints)}
 
 
 def _permuted(metas: list[SequenceMeta], fields: tuple[str, ...]) -> list[SequenceMeta]:

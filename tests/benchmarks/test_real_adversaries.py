@@ -20,8 +20,8 @@ def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, tmp_
     assert (later.qpos == was.qpos[:-rows]).all()
     assert sum(len(s) < len(was) for s in changed["late"].fitted) == -(-len(question.fitted) // 10)
     assert (changed["joints"].train[0].qpos == question.train[0].qpos[:, ::-1]).all()
-    asked = changed["asked_labels"]
+    asked = changed["test_labels"]
     assert asked.train is question.train
     assert [s.meta.payload_mass for s in asked.test] != [s.meta.payload_mass for s in question.test]
     assert sorted(s.meta.payload_mass for s in asked.test) == sorted(s.meta.payload_mass for s in question.test)
-    assert all(q.test is question.test for name, q in changed.items() if name not in ("all_late", "asked_labels"))
+    assert all(q.test is question.test for name, q in changed.items() if name not in ("all_late", "test_labels"))

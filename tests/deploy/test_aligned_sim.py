@@ -97,7 +97,7 @@ def test_a_mujoco_loop_of_ones_own_is_aligned_by_one_call_a_period(robot, model)
 
 
 def test_what_the_model_was_not_trained_for_is_refused(robot, model, tmp_path):
-    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, asked to run at 40\.0 Hz"):
+    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 40\.0 Hz"):
         AlignedSim(robot, model, dt=0.025)
     with pytest.raises(ModelError, match="which does not lie beside it"):
         AlignedSim(write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0")), model)

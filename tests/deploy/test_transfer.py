@@ -105,7 +105,7 @@ def test_a_loop_twice_as_quick_asks_the_operator_as_often(robot, model):
     there = follow(AlignedSim(robot, model))
     quick = AlignedSim(other(robot, kp=2.0), model, dt=robot.dt / 2)
     assert np.abs(follow(quick, repeat=2) - there).mean() < 0.001
-    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, asked to run at 40\.0 Hz"):
+    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 40\.0 Hz"):
         AlignedSim(robot, model, dt=0.025)
 
 

@@ -67,7 +67,7 @@ def test_a_corrected_replay_applies_the_artifacts_corrections(artifact, robot):
 def test_another_rate_is_refused(artifact, robot):
     model = GapModel.load(artifact[0])
     model.require(robot, 0.02006)  # the clock of a real 50 Hz loop
-    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, asked to run at 100\.0 Hz"):
+    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 100\.0 Hz"):
         model.require(robot, 0.01)
 
 

@@ -1,4 +1,4 @@
-"""The loop around a network: what it is given and what is made of its answer, the same in training and in free run."""
+"""The loop around a network: what it is given and what is made of its answer, the same in training and in rollouts."""
 
 import numpy as np
 import pytest

@@ -123,7 +123,7 @@ def test_a_run_uses_the_units_adaptation_and_refuses_a_payload_never_trained_on(
     played, err = run(place, capsys, *words, "--payload-mass", "0", "--unit-id", found["unit_id"])
     assert played["adapted"] == found["unit_id"]
     assert main([*words, "--robot", str(place / "arm"), "--payload-mass", "0.3"]) == 2
-    assert "asked for 0.3 kg, where it only guesses" in capsys.readouterr().err
+    assert "0.3 kg is outside" in capsys.readouterr().err
 
 
 def test_the_report_is_one_offline_page(place, capsys):

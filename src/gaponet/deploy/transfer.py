@@ -210,6 +210,6 @@ def control_periods_of(model: GapModel, dt: float) -> int:
             return count
     rates = ", ".join(f"{1 / trained:.1f}" for trained in model.card["dt"])
     raise ModelError(
-        f"{model.path}: trained at {rates} Hz, asked to run at {1 / dt:.1f} Hz; run the loop at a trained rate or a "
+        f"{model.path}: trained at {rates} Hz, the loop has {1 / dt:.1f} Hz; run it at a trained rate or a "
         "whole multiple of it, or train on logs of this rate"
     )

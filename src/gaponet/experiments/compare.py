@@ -65,12 +65,12 @@ class Compare:
         word = next(iter(outcomes.runs))
         baselines = outcomes.baselines(word)
         runs: Runs = {name: [baselines[name]] for name in BASELINES if name in baselines}
-        runs |= {word: list(outcomes.of_word(word)) for word in self.models if outcomes.of_word(word)}
+        runs |= {word: list(outcomes.of_model(word)) for word in self.models if outcomes.of_model(word)}
         entries, unseen = select_entries([outcomes.cells[word][0].folder], study.data)
         seeds = max(map(len, runs.values()))
         heading = (
-            f"Whole-motion free run on {len(entries)} {'held-out ' if unseen else ''}sequences, mean ± std over "
-            f"{seeds} seed{'s' if seeds > 1 else ''}."
+            f"Open-loop rollouts of {len(entries)} {'test ' if unseen else ''}recordings, whole motions; mean ± std "
+            f"over {seeds} seed{'s' if seeds > 1 else ''}."
         )
         columns = ("method", "seed", "units", "group", "key", *MEASURES)
         tables = [
@@ -168,7 +168,7 @@ def _figure(runs: Runs, label: str) -> Figure:
         title(m): (colours[m], [summarize(outcomes, *path, "mpjae") for path in places.values()])
         for m, outcomes in runs.items()
     }
-    return bars(list(places), methods, "MPJAE, mrad", f"Held-out motions, whole-motion free run, {label}")
+    return bars(list(places), methods, "MPJAE, mrad", f"Test motions, open-loop rollouts of whole motions, {label}")
 
 
 def _count(number: int | None) -> str:

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+BASELINES = ("nominal", "delay_offset", "identified")
+Show = Callable[[Running, int], None]  # called with the running cells and the number of finished ones
 Outcome = dict[str, Any]  # contents of a cell.json, or of a baseline's part of one
 LOCK_TIMEOUT_S = 60.0  # the cells of a comparison that was killed notice it at their next step
 CARD_FACTS = ("steps", "seconds", "val_mpjae", "gain", "sensor_r2", "parity_rad")
@@ -146,10 +148,6 @@ def _by_group(
     return {name: summary(part, robot) for name, part in groups.items() if part}
 
 
-BASELINES = ("nominal", "delay_offset", "identified")
-Show = Callable[[Running, int], None]  # called with the running cells and the number of finished ones
-
-
 @dataclass(frozen=True)
 class StudyOutcomes:
     """Outcomes of the finished cells by model word.
@@ -174,7 +172,7 @@ class StudyOutcomes:
         runs = {word: [read_record(c.folder / RESULT_FILE) for c in part] for word, part in done.items()}
         return cls(runs, cache(lambda word: _baselines(done[word][0], study)), done)
 
-    def of_word(self, word: str) -> ListOf[Outcome]:
+    def of_model(self, word: str) -> ListOf[Outcome]:
         """Return the outcome of each finished seed of a model."""
         return self.runs.get(word, [])
 

@@ -21,6 +21,13 @@ from gaponet.report.methods import IDENTIFIED
 from gaponet.report.provenance import robot_label
 from gaponet.robot.spec import RobotSpec
 
+# Small rounds, fitted until the labels are fitted (progress.jsonl: label_rmse). With 200 gradient steps a product
+# network has the advantage.
+TRAINING = TrainConfig(pretraining=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
+DEFAULT_MODELS = ("gaponet", "shared_mlp", "mlp:mlp_match=on")
+DEFAULT_BUDGET, DEFAULT_SEEDS = "76800", 3  # control steps of two rounds
+# Measured on one core with the virtual H1-2: s per training whatever its budget, and s per control step.
+SECONDS_PER_TRAINING, SECONDS_PER_STEP = 50.0, 6e-4
 QUICK_BUDGET, QUICK_SEEDS = "2560", 1  # control steps of a training
 QUICK_LABEL = "QUICK RUN, numbers mean nothing"
 QUICK_PRETRAINING = PretrainingConfig(
@@ -59,15 +66,6 @@ def _few(data: Dataset) -> list[Entry]:
         if e.meta.motion in motions and e.meta.payload_mass in payloads and e.meta.unit_id in units
         and e.meta.repetition == first
     ]  # fmt: skip
-
-
-# Small rounds, fitted until the labels are fitted (progress.jsonl: label_rmse). With 200 gradient steps a product
-# network has the advantage.
-TRAINING = TrainConfig(pretraining=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
-DEFAULT_MODELS = ("gaponet", "shared_mlp", "mlp:mlp_match=on")
-DEFAULT_BUDGET, DEFAULT_SEEDS = "76800", 3  # control steps of two rounds
-# Measured on one core with the virtual H1-2: s per training whatever its budget, and s per control step.
-SECONDS_PER_TRAINING, SECONDS_PER_STEP = 50.0, 6e-4
 
 
 @dataclass(frozen=True)

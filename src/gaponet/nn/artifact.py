@@ -236,8 +236,8 @@ class GapModel:
         beyond = mass[(mass > self.max_payload * (1 + 1e-6)) | (mass < least * (1 - 1e-6))]
         if beyond.size and not extrapolate:
             raise ModelError(
-                f"{self.path}: trained with {least:g} to {self.max_payload:g} kg, asked for {beyond.flat[0]:g} kg, "
-                "where it only guesses; train on such payloads, or extrapolate (--extrapolate, extrapolate=True)"
+                f"{self.path}: trained with {least:g} to {self.max_payload:g} kg; {beyond.flat[0]:g} kg is outside; "
+                "train on such payloads, or extrapolate (--extrapolate, extrapolate=True)"
             )
 
     def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:
@@ -259,7 +259,7 @@ class GapModel:
         if rates and min(abs(dt / r - 1) for r in rates) > RATE_TOLERANCE:
             seen = ", ".join(f"{1 / r:.1f}" for r in rates)
             raise ModelError(
-                f"{self.path}: trained at {seen} Hz, asked to run at {1 / dt:.1f} Hz; run the loop at a trained rate, "
+                f"{self.path}: trained at {seen} Hz, the loop has {1 / dt:.1f} Hz; run it at a trained rate, "
                 "or train on logs of this rate"
             )
 

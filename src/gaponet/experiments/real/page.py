@@ -33,9 +33,9 @@ COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal
 STEM = "real"
 HEADING = """# Real robots
 
-`gaponet experiment real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in free run from the
-recorded start. ± is the standard error over independent motions, of differences to the nominal simulator paired;
-"floor" is what two recordings of one command differ by."""
+`gaponet experiment real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in open-loop
+rollouts from the recorded start. ± is the standard error over independent motions, of differences to the nominal simulator
+paired; "floor" is what two recordings of one command differ by."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:

@@ -55,6 +55,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+AXES = ("X", "Y", "Z")
+AXIS_NAMES = ("forward", "left", "up")
 AVERAGED_S = 1.0  # end of a hold over which offsets are averaged
 SUCCESS_RADIUS_M = 0.01
 MIN_RISE_M = 0.05  # of a move that counts as lifting or lowering
@@ -192,10 +194,6 @@ def _effort(plan: Plan, played: Trajectories, row: int, robot: RobotSpec) -> tup
     torque = played.tau[holds, row][:, op].astype(float)
     heat = played.temperature[[0, len(plan.ctrl) - 1], row][:, op].astype(float)
     return float(np.sqrt((torque**2).mean())), float((heat[1] - heat[0]).mean())
-
-
-AXES = ("X", "Y", "Z")
-AXIS_NAMES = ("forward", "left", "up")
 
 
 @dataclass(frozen=True)

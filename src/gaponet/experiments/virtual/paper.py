@@ -280,7 +280,7 @@ def table_2(outcomes: StudyOutcomes, study: Study, *extra: Table2Row) -> ResultT
     columns = ("setting", "Obs Dim", *(f"{m:g} kg" for m in masses), "eight joints", "of nominal", "the paper")
     rows = []
     for row in (*table_2_rows(study), *extra):
-        if runs := outcomes.of_word(row.word):
+        if runs := outcomes.of_model(row.word):
             nominal = summarize([outcomes.baselines(row.word)["nominal"]], "known", "mpjae", scale=1).mean
             rows.append((
                 f"{row.comparison}: {row.setting}",
@@ -292,8 +292,8 @@ def table_2(outcomes: StudyOutcomes, study: Study, *extra: Table2Row) -> ResultT
             ))  # fmt: skip
     kind = "gaponet" if study.config.model.payload_input else PAPER_MODEL
     caption = (
-        f"{title(kind)}: MPJAE in mrad of held-out motions in whole-motion free run, ± std over seeds. Eight joints: "
-        "without wrists, all payloads. The paper: Obs Dim, then mrad at 0, 1, 2 and 3 kg. Its action duration is there "
-        "twice: correction held, sensors held."
+        f"{title(kind)}: MPJAE in mrad of test motions in open-loop rollouts of whole motions, ± std over seeds. Eight "
+        "joints: without wrists, all payloads. The paper: Obs Dim, then mrad at 0, 1, 2 and 3 kg. Its action "
+        "duration is there twice: correction held, sensors held."
     )
     return ResultTable(f"table2_{kind}", columns, tuple(rows), caption)

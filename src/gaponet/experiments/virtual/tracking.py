@@ -58,6 +58,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+JointSet = tuple[str, list[int]]  # label, columns
+
+BASELINE = {"alignment": "nominal", "compensation": "raw"}
+SOURCES = {"generated": "generated motions", "files": "motion files", "recorded": "recorded test motions"}
+MEANING = {
+    "alignment": "between simulator and robot under the same targets, open-loop rollout",
+    "compensation": "between targets and robot",
+}
+FIGURE_TITLES = {"alignment": "Alignment: simulator to robot", "compensation": "Compensation: robot to target"}
+MIN_TRAVEL = 0.1  # rad of a joint that an example shows
 REST_S = 2.0  # under the first target before a motion begins, for the compensator to blend in
 
 
@@ -184,18 +194,6 @@ def _median_row(pairs: ListOf[tuple[UnseenMotion, float]], robot: RobotSpec, tar
     op = robot.operated_index
     error = [np.abs(raw.qpos[:, i][:, op] - targets[:, i][:, op]).mean() for i in heaviest]
     return heaviest[int(np.argsort(error)[len(heaviest) // 2])]
-
-
-JointSet = tuple[str, list[int]]  # label, columns
-
-BASELINE = {"alignment": "nominal", "compensation": "raw"}
-SOURCES = {"generated": "generated motions", "files": "motion files", "recorded": "recorded test motions"}
-MEANING = {
-    "alignment": "between simulator and robot under the same targets, free run",
-    "compensation": "between targets and robot",
-}
-FIGURE_TITLES = {"alignment": "Alignment: simulator to robot", "compensation": "Compensation: robot to target"}
-MIN_TRAVEL = 0.1  # rad of a joint that an example shows
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from gaponet.robot.spec import RobotSpec
 
 
+MAX_BUDGET = 1e12  # control steps, or any unit of time
+MIN_STEPS = 100  # with fewer, the unit of time is probably missing
+SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}  # per unit
 RENAMED_FIELDS = {"warm_start": "pretraining"}  # of TrainConfig: earlier name → name of today
 
 
@@ -212,11 +215,6 @@ def _options(config: dict[str, Any], defaults: dict[str, Any], prefix: str) -> l
             option = "--model" if prefix + name == "--model.kind" else prefix + name
             words += [option, *map(str, value if isinstance(value, tuple) else [value])]
     return words
-
-
-MAX_BUDGET = 1e12  # control steps, or any unit of time
-MIN_STEPS = 100  # with fewer, the unit of time is probably missing
-SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}  # per unit
 
 
 @dataclass(frozen=True)
