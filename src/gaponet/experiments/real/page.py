@@ -34,8 +34,8 @@ STEM = "real"
 HEADING = """# Real robots
 
 `gaponet experiment real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in open-loop
-rollouts from the recorded start. ± is the standard error over independent motions, of differences to the nominal simulator
-paired; "floor" is what two recordings of one command differ by."""
+rollouts from the recorded start. ± is the standard error over independent motions, of differences to the nominal
+simulator paired; "floor" is what two recordings of one command differ by."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:
