@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.experiments.result import Result
-from gaponet.experiments.virtual.trained_models import TrainedModel
+from gaponet.experiments.virtual.play import TrainedModel
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.robot.spec import RobotSpec

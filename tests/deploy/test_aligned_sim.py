@@ -58,7 +58,7 @@ def test_one_simulation_takes_flat_arrays(robot, model):
     np.testing.assert_allclose(two.qpos, np.stack([one.qpos, one.qpos]), atol=1e-6)
 
 
-def test_one_of_several_begins_anew(robot, model):
+def test_one_of_several_simulations_can_be_reset(robot, model):
     sim, fresh = AlignedSim(robot, model, num_envs=2), AlignedSim(robot, model)
     for target in commands(15, 0):
         sim.step(target)
@@ -82,7 +82,7 @@ def test_late_servos_follow_the_target_in_force_at_the_start(robot, tmp_path):
     np.testing.assert_allclose(sim.qpos, simulated.qpos[-1], atol=1e-6)
 
 
-def test_a_mujoco_loop_of_ones_own_is_aligned_by_one_call_a_period(robot, model):
+def test_a_users_mujoco_loop_is_aligned_by_one_call_per_period(robot, model):
     mj_model = build_model(robot, 0.2)
     data, align, sim = mujoco.MjData(mj_model), MujocoAligner(model, mj_model, 0.02, 0.2), AlignedSim(robot, model, 0.2)
     for _ in range(2):
@@ -96,7 +96,7 @@ def test_a_mujoco_loop_of_ones_own_is_aligned_by_one_call_a_period(robot, model)
         np.testing.assert_allclose(data.qpos, sim.qpos, atol=1e-6)
 
 
-def test_what_the_model_was_not_trained_for_is_refused(robot, model, tmp_path):
+def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_path):
     with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 40\.0 Hz"):
         AlignedSim(robot, model, dt=0.025)
     with pytest.raises(ModelError, match="which does not lie beside it"):

@@ -91,7 +91,7 @@ def error(q, targets, skip=50):
     return float(np.abs(q - targets)[skip:].mean())
 
 
-def test_the_robot_does_what_the_nominal_simulator_does(robot, model):
+def test_with_aim_simulator_the_robot_moves_like_the_nominal_simulator(robot, model):
     targets = commands(200, 1)
     nominal = BatchSim(robot, [(0.2, "both", 0.02)], 1)
     nominal.reset(slice(None), targets[:1], np.zeros((1, 2)))
@@ -161,7 +161,7 @@ def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
         assert np.abs(q[end - 20 : end] - targets[end - 20 : end]).max() < 0.02
 
 
-def test_an_arm_that_swings_on_its_servos_is_not_stirred_up(tmp_path):
+def test_the_default_feedback_is_stable_on_a_weakly_damped_arm(tmp_path):
     swinging = write_arm(
         tmp_path, TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.0"), XML.replace('damping="0.5"', 'damping="0.05"')
     )
@@ -174,7 +174,7 @@ def test_an_arm_that_swings_on_its_servos_is_not_stirred_up(tmp_path):
     assert calm["default"] < 1e-3 < calm["fast"]
 
 
-def test_a_lead_makes_up_for_dead_time(robot, model):
+def test_a_lead_compensates_dead_time(robot, model):
     targets = commands(200, 1)
     late = {}
     for lead in (0, 3):
@@ -204,7 +204,7 @@ def test_a_stated_payload_is_compared_with_the_servo_torques(robot, model, held,
     assert compensator.payload_mass[0] == told
 
 
-def test_torques_that_are_no_payloads_are_not_believed_to_be_the_largest(robot, model):
+def test_torques_unlike_a_payload_give_mass_zero(robot, model):
     target = np.array([0.3, -0.2])
     compensator = Compensator(robot, model, NOW, payload_step=0.1)
     compensator.reset(target, None)
@@ -215,7 +215,7 @@ def test_torques_that_are_no_payloads_are_not_believed_to_be_the_largest(robot, 
     assert compensator.payload_mass[0] == 0.0
 
 
-def test_a_blocked_joint_winds_nothing_up(robot, model):
+def test_the_integral_of_a_blocked_joint_is_limited(robot, model):
     target = np.array([0.3, 0.3])
     compensator = Compensator(robot, model, replace(NOW, limit=0.05))
     compensator.reset(target, 0.0)
@@ -267,7 +267,7 @@ def test_other_arrays_and_robots_are_refused(robot, model):
         CompensatorConfig(gain=0.0)
 
 
-def test_feeding_the_dynamics_forward_brings_a_moving_arm_nearer(robot, model):
+def test_dynamic_feed_forward_reduces_the_error_of_a_moving_arm(robot, model):
     targets = commands(150, 1)
     missed = {}
     for dynamics in (False, True):
@@ -345,7 +345,7 @@ def test_payloads_beyond_the_training_data_are_refused_without_extrapolate(robot
 
 @pytest.mark.parametrize("payload", [0.2, None], ids=["told", "estimated"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_a_number_is_forgotten_at_once(robot, model, payload, bad):
+def test_values_that_are_not_finite_have_no_lasting_effect(robot, model, payload, bad):
     targets = commands(60, 0)
     one, two = (Compensator(robot, model, NOW, num_envs=2) for _ in range(2))
     for compensator in (one, two):

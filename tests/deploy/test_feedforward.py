@@ -19,7 +19,7 @@ def make(robot, num=1, acceleration_time=0.0):
     return sim, Feedforward(sim, np.arange(2), robot, 0.02, acceleration_time)
 
 
-def test_it_is_what_inverse_dynamics_asks_for(robot):
+def test_feed_forward_equals_inverse_dynamics(robot):
     sim, moving = make(robot)
     targets = commands(30, 0)
     moving.reset(targets[:1])

@@ -46,7 +46,7 @@ def test_gymnasium_makes_it_by_name():
     assert env.step(env.action_space.sample())[1] < 0
 
 
-def test_worlds_side_by_side_move_as_each_alone_and_begin_anew_by_themselves(robot, model):
+def test_vectorised_worlds_equal_single_ones_and_reset_themselves(robot, model):
     from gaponet.deploy.gym import TrackingEnv, TrackingVectorEnv
 
     references, rng = [commands(6, 0), commands(9, 1)], np.random.default_rng(0)
@@ -79,7 +79,7 @@ def test_gymnasium_makes_worlds_side_by_side_by_name():
     assert env.step(env.action_space.sample())[1].shape == (2,)
 
 
-def test_an_idle_policy_asks_the_simulator_for_the_reference(robot, model):
+def test_action_zero_follows_the_reference(robot, model):
     from gaponet.deploy.gym import TrackingEnv
 
     reference = commands(30, 0)

@@ -62,7 +62,7 @@ def test_twice_the_gain_follows_the_reference_to_a_microradian(tmp_path):
 @pytest.mark.parametrize(
     "factors", [{"kp": 0.5}, {"kp": 2.2, "frictionloss": 3.0}, {"damping": 2.0, "armature": 2.0}, {"frictionloss": 0.0}]
 )
-def test_it_moves_as_the_reference_with_its_operator(robot, model, factors, how):
+def test_the_target_moves_like_the_reference_with_its_model(robot, model, factors, how):
     there, target = follow(AlignedSim(robot, model)), other(robot, **factors)
     apart = np.abs(follow(AlignedSim(target, model, inverse=how)) - there).mean()
     assert (
@@ -71,7 +71,7 @@ def test_it_moves_as_the_reference_with_its_operator(robot, model, factors, how)
 
 
 @pytest.mark.parametrize("how", ["closed", "probes"])
-def test_it_follows_where_motors_give_all_they_can(tmp_path, how):
+def test_transfer_follows_saturated_motors(tmp_path, how):
     weak, strong = (
         write_arm(tmp_path / limit, TOML.replace("effort_limit = 5.0", f"effort_limit = {limit}"))
         for limit in ("1.0", "5.0")
@@ -83,7 +83,7 @@ def test_it_follows_where_motors_give_all_they_can(tmp_path, how):
 
 
 @pytest.mark.parametrize("how", ["closed", "probes"])
-def test_jumps_that_saturate_motors_do_not_wind_it_up(tmp_path, how):
+def test_jumps_that_saturate_motors_cause_no_windup(tmp_path, how):
     weak = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.7"), HEAVY)
     jumps = np.repeat([[-0.6, -0.6], [0.6, 0.6], [-0.6, -0.6]], [20, 60, 60], axis=0)
     there, target = follow(AlignedSim(weak, None), jumps), other(weak, kp=0.5)
@@ -101,7 +101,7 @@ def test_a_payload_that_the_simulator_does_not_know_of(robot, model, how):
     assert np.abs(follow(AlignedSim(robot, model, 0.0)) - there).mean() > 0.01
 
 
-def test_a_loop_twice_as_quick_asks_the_operator_as_often(robot, model):
+def test_at_twice_the_control_rate_the_model_keeps_its_own_rate(robot, model):
     there = follow(AlignedSim(robot, model))
     quick = AlignedSim(other(robot, kp=2.0), model, dt=robot.dt / 2)
     assert np.abs(follow(quick, repeat=2) - there).mean() < 0.001
@@ -131,7 +131,7 @@ def test_servos_that_are_late_like_the_reference_and_those_that_are_later(robot)
     assert apart[0] <= apart[1]
 
 
-def test_it_knows_nothing_of_targets_to_come(robot, model):
+def test_transfer_is_causal(robot, model):
     target = other(robot, kp=2.0)
     changed = TARGETS.copy()
     changed[80:] += 0.3
@@ -143,7 +143,7 @@ def test_it_knows_nothing_of_targets_to_come(robot, model):
 
 @pytest.mark.parametrize("how", ["closed", "probes"])
 @pytest.mark.parametrize("factors", [{"kp": 2.0}, {"kp": 0.5}, {"damping": 0.5}, {"frictionloss": 3.0}])
-def test_on_a_plane_and_pushed_it_is_nearer_to_the_reference_there(robot, factors, how):
+def test_transfer_reduces_the_difference_in_contact_and_under_a_push(robot, factors, how):
     tipped = replace(robot, tips=(Tip("fore", (0.2, 0.0, 0.0), 0.01),))
     reference, target = other(tipped, kp=0.8, damping=1.5), other(tipped, **factors)
     for plane, push in ((Table(-0.1, 0.3, 2e3), 0.0), (None, 1.0)):
@@ -155,12 +155,12 @@ def test_on_a_plane_and_pushed_it_is_nearer_to_the_reference_there(robot, factor
         assert given < 0.2 * alone
 
 
-def test_in_its_own_simulator_the_operator_alone_is_at_work(robot, model):
+def test_in_the_simulator_of_training_nothing_is_transferred(robot, model):
     assert AlignedSim(robot, model).transfer is None
     assert AlignedSim(other(robot, kp=1.5), model).transfer is not None
 
 
-def test_a_simulator_further_off_than_any_measured_is_refused(robot, model):
+def test_a_simulator_outside_the_measured_range_is_refused(robot, model):
     far = other(robot, kp=9.0)
     with pytest.raises(ModelError, match=r"joint 'shoulder': kp, as a ratio .* is 9; transfer was measured from 0\.15"):
         AlignedSim(far, model)
@@ -181,7 +181,7 @@ def scene(robot):
 
 
 @pytest.mark.parametrize("how", ["closed", "probes"])
-def test_a_scene_of_ones_own_moves_as_the_reference_with_its_operator(robot, model, how):
+def test_a_users_scene_moves_like_the_reference_with_its_model(robot, model, how):
     there, mj_model = follow(AlignedSim(robot, model, 0.2)), scene(robot)
     align, apart = MujocoAligner(model, mj_model, 0.02, payload_mass=0.2, inverse=how), []
     for correct in (align, lambda data, target: target):
@@ -196,7 +196,7 @@ def test_a_scene_of_ones_own_moves_as_the_reference_with_its_operator(robot, mod
     assert apart[0] < 0.1 * apart[1]
 
 
-def test_a_scene_that_is_the_simulator_of_training_gets_the_operator_alone(robot, model):
+def test_in_a_scene_equal_to_the_simulator_of_training_nothing_is_transferred(robot, model):
     assert MujocoAligner(model, build_model(robot), 0.02, 0.0).transfer is None
     assert MujocoAligner(model, build_model(robot), 0.02, payload_mass=0.2).transfer is not None
 

@@ -43,7 +43,7 @@ def found(model, robot, logs):
     return Adaptation.fit(model, robot, logs[:2], seconds=16.0)
 
 
-def test_gain_and_delay_of_the_unit_are_found(found, robot):
+def test_gain_and_delay_of_the_unit_are_estimated(found, robot):
     for i, joint in enumerate(robot.operated):
         assert found.servos[joint]["kp"] == pytest.approx(0.6 * robot.kp[i], rel=0.2)
         assert found.servos[joint]["delay"] == pytest.approx(0.04, abs=0.008)

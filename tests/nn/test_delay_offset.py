@@ -7,7 +7,7 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.sim.replay import replay
 
 
-def test_a_delay_of_three_periods_is_found(tmp_path):
+def test_a_delay_of_three_periods_is_estimated(tmp_path):
     robot = write_arm(tmp_path)
     found = DelayOffset.fit([record(robot, commands(400, s), f"m{s}", delay=3) for s in range(3)], robot)
     assert found.delay == {"shoulder": 0.06, "elbow": 0.06}

@@ -47,7 +47,7 @@ class FirstRow:
     ],
     ids=["stride", "held sensors", "fixed probes", "held probes"],
 )  # fmt: skip
-def test_training_and_free_run_give_the_network_the_same_numbers(tmp_path, how):
+def test_training_and_rollout_give_the_network_the_same_inputs(tmp_path, how):
     robot = write_arm(tmp_path)
     config = ModelConfig(history=2, num_probes=3, **how)
     sequence = recordings(robot, 2, rows=14, kp=0.6)[1:]
@@ -80,7 +80,7 @@ def looped(config, limits, num_envs, tensors):
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("when", [0, 5])
 @pytest.mark.parametrize("tensors", [False, True])
-def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(bad, when, tensors):
+def test_a_target_that_is_not_finite_affects_one_robot_for_one_period(bad, when, tensors):
     config, limits = ModelConfig(history=3), np.array([[-0.3, 0.3], [-10.0, 10.0]])
     rng = np.random.default_rng(1)
     kind = torch.from_numpy if tensors else np.asarray

@@ -31,11 +31,6 @@ def test_corrections_are_bounded_whatever_comes_in(config):
     assert delta.abs().max() <= config.delta_max
 
 
-def test_an_untrained_operator_hardly_corrects():
-    config = ModelConfig()
-    assert build_network(config, 5)(x(config, 5)).abs().max() < 0.05
-
-
 def test_features_do_not_change_when_all_positions_shift_but_the_pose_itself():
     config, n = ModelConfig(payload_input=False), 2
     features = build_network(config, n).features
@@ -58,7 +53,7 @@ def test_noise_on_the_inputs_changes_the_answer_and_none_does_not():
     assert not torch.equal(net(data), net(data))
 
 
-def test_a_joint_is_told_the_posture_of_the_others_but_not_their_past():
+def test_a_joint_observes_the_state_of_the_others_but_not_their_history():
     config, n = ModelConfig(history=2), 3
     net = build_network(config, n)
     torch.nn.init.normal_(net.trunk[-1].weight)
@@ -87,8 +82,8 @@ def test_a_joint_reads_its_own_sensors():
 BASELINES = ("mlp", "shared_mlp")
 
 
-@pytest.mark.parametrize("kind", [*BASELINES, "inverse"])
-def test_an_untrained_baseline_corrects_nothing(kind):
+@pytest.mark.parametrize("kind", ["gaponet", *BASELINES, "inverse"])
+def test_an_untrained_network_corrects_nothing(kind):
     config = ModelConfig(kind=kind)
     assert build_network(config, 5)(x(config, 5)).abs().max() == 0
 
@@ -130,6 +125,6 @@ def test_building_a_matched_mlp_leaves_the_seed_alone():
     assert torch.equal(torch.nn.Linear(first.shape[1], first.shape[0]).weight, first)
 
 
-def test_proportions_are_needed_to_match():
+def test_a_matched_mlp_needs_hidden_layers():
     with pytest.raises(UsageError, match="give the proportions"):
         ModelConfig(kind="mlp", mlp_match=True, mlp_hidden=())

@@ -43,7 +43,7 @@ def test_frames_are_the_last_ones_a_stride_apart(make, stride, seen):
 @pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])
 @pytest.mark.parametrize("stride", [1, 3])
 @pytest.mark.parametrize("seed", range(2))
-def test_history_is_what_a_list_of_past_frames_says_whatever_is_pushed_and_reset(make, stride, seed):
+def test_the_history_equals_a_list_of_past_frames_under_random_pushes_and_resets(make, stride, seed):
     rng, n, num = np.random.default_rng(seed), 2, 4
     config = ModelConfig(history=int(rng.integers(1, 5)), stride=stride)
     x = make((num, config.input_dim(n)))

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from arm import recordings, write_arm
+from arm import write_arm
 
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.export.torch_program import export_program
@@ -54,7 +54,7 @@ def artifact(robot, tmp_path_factory):
         {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False},
     ],
 )  # fmt: skip
-def test_what_ships_answers_as_the_network_does(how):
+def test_the_onnx_file_equals_the_network(how):
     net = trained(n=3, **how)
     x = sample_inputs(net, 20)
     with torch.inference_mode():
@@ -74,29 +74,6 @@ def test_without_onnxruntime_a_model_says_what_to_install(artifact, monkeypatch)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ModelError, match=r"pip install 'gaponet\[deploy\]'"):
         GapModel.load(artifact)
-
-
-def test_a_loop_of_ones_own_gets_what_replay_applies(artifact, robot):
-    model = GapModel.load(artifact)
-    sequences = recordings(robot, 3, rows=30)
-    corrector, loop = model.corrector(robot), model.loop(3)
-    corrector.reset(sequences)
-    for t in range(29):
-        q, v, a = (np.stack([getattr(s, name)[t] for s in sequences]) for name in ("qpos", "qvel", "ctrl"))
-        delta = loop.delta(q, v, a, np.array([s.meta.payload_mass for s in sequences]))
-        np.testing.assert_allclose(a + delta, corrector.correct(t, a, q, v), atol=1e-7)
-
-
-def test_one_robot_among_several_begins_anew(artifact):
-    loop = GapModel.load(artifact).loop(2)
-    q, v, a = np.random.default_rng(1).normal(0, 0.5, (3, 2, 2))
-    first = loop.delta(q, v, a, 0.0)
-    later = loop.delta(q, v, a, 0.0)
-    loop.reset(np.array([0]))
-    again = loop.delta(q, v, a, 0.0)
-    np.testing.assert_array_equal(again[0], first[0])
-    assert not np.array_equal(later, first)
-    assert not np.array_equal(again[1], first[1])
 
 
 def test_a_correction_never_leaves_the_joint_limits(artifact, robot):
@@ -130,7 +107,7 @@ def test_a_torch_export_of_other_weights_is_refused(artifact, tmp_path):
     assert not (tmp_path / "delta.pt2").exists()
 
 
-def test_a_card_with_switches_of_an_earlier_version_is_read_where_they_had_the_value_that_is_left(artifact):
+def test_removed_options_of_a_card_are_accepted_only_with_the_remaining_value(artifact):
     def written(**fields):
         card = json.loads((artifact / "card.json").read_text())
         card["model"] |= fields

@@ -124,7 +124,7 @@ def test_the_limit_changes_no_correction_within_it():
     [{}, {"payload_input": False}, {"payload_trunk": False}, {"delta_hold": 3}, {"sensor_hold": 5}, {"stride": 2},
      {"sensor_source": "learned"}, {"branch_observation": True, "relative_action": True, "real_state": True}],
 )  # fmt: skip
-def test_the_artifact_answers_as_the_network(tmp_path, how):
+def test_the_exported_paper_network_equals_the_network(tmp_path, how):
     config, robot = replace(PAPER, **how), write_arm(tmp_path / "arm")
     net = network(config)
     assert export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), sample_inputs(net)) <= 1e-5
@@ -141,7 +141,7 @@ def loop(infer, **how):
     return DeltaLoop(config, np.array([[-9.0, 9.0]] * 2), 2, infer)
 
 
-def test_a_correction_is_held_for_its_duration_and_begins_anew_after_a_reset():
+def test_a_correction_is_held_for_its_duration_and_restarts_after_a_reset():
     count = iter(range(100))
     held = loop(lambda x: np.full((2, 2), next(count), np.float32), delta_hold=3)
     zero = np.zeros((2, 2))
@@ -175,7 +175,7 @@ def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
     np.testing.assert_allclose(state - change, np.tile(np.concatenate([q, 0.02 * v], 1), (1, 4, 1)), atol=1e-6)
 
 
-def test_answers_of_the_simulator_are_what_the_branch_sees_and_no_control_loop_has_them(tmp_path):
+def test_with_fixed_probes_the_branch_observes_the_simulator_and_control_loops_are_refused(tmp_path):
     config, robot = replace(PAPER, sensor_source="fixed"), write_arm(tmp_path / "arm")
     net = network(config)
     assert config.input_dim(2) == PAPER.input_dim(2) + 4 * 2 * 2
@@ -224,7 +224,7 @@ def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp
     assert all(torch.equal(x, fitted[name]) for name, x in net.predictor.state_dict().items())
 
 
-def test_the_branch_sees_the_observation_and_the_trunk_the_lag_where_switches_say_so():
+def test_options_add_the_observation_to_the_branch_and_the_lag_to_the_trunk():
     net = network(replace(PAPER, branch_observation=True, relative_action=True))
     x = torch.randn(5, net.config.input_dim(2))
     relative = net.features(x)
@@ -233,7 +233,7 @@ def test_the_branch_sees_the_observation_and_the_trunk_the_lag_where_switches_sa
     assert net.branch[0].in_features == net.config.observation_dim(2) + 16
 
 
-def test_an_unknown_recorded_state_is_no_input_and_a_known_one_is():
+def test_a_hidden_recorded_state_has_no_effect_and_a_visible_one_has():
     net, plain = network(replace(PAPER, real_state=True)), network()
     state = net.state_dict()
     state["branch.0.weight"] = state["branch.0.weight"][:, 5:]
@@ -257,7 +257,7 @@ def test_half_of_the_episodes_show_the_recorded_state(tmp_path):
     assert not torch.equal(env.get_observations()["actor"][:, -1] == 1, shown)
 
 
-def test_a_loop_shows_what_it_is_given_beside_the_observation_and_else_zeros():
+def test_missing_extra_inputs_are_zero():
     seen = []
     given = loop(
         lambda x: seen.append(x[0, -21:].copy()) or np.zeros((2, 2), np.float32), sensor_source="fixed", real_state=True
@@ -309,9 +309,9 @@ def world(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "how",
-    [{"delta_hold": 3}, {"sensor_source": "fixed", "sensor_hold": 3}, {"sensor_source": "learned"},
-     {"branch_observation": True, "real_state": True}],
-    ids=["held correction", "fixed probes", "learned probes", "more inputs"],
+    [{"delta_hold": 3, "branch_observation": True, "real_state": True}, {"sensor_source": "fixed", "sensor_hold": 3},
+     {"sensor_source": "learned"}],
+    ids=["held correction and more inputs", "held fixed probes", "learned probes"],
 )  # fmt: skip
 def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(world, tmp_path, how):
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
@@ -342,7 +342,7 @@ def test_it_trains_by_labels_too_and_eval_says_how_many_corrections_are_at_the_l
     assert "of the corrections are at the limit (--model.delta-max)" in capsys.readouterr().out
 
 
-def test_a_refitted_predictor_keeps_the_units_that_the_branch_has_learned(world, tmp_path):
+def test_a_refitted_predictor_keeps_the_scale_of_the_sensor_values(world, tmp_path):
     fitted = []
     for every in (0, 2):
         config = replace(TRAINING, ppo=replace(TRAINING.ppo, refit_sensors=every))

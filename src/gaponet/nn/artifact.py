@@ -88,7 +88,6 @@ class _Card(TypedDict):
     units: NotRequired[tuple[str, ...]]
     recorded: NotRequired[dict[Literal["kp", "kd"], tuple[float, ...] | None]]
     virtual: NotRequired[bool]
-    simulator_only: NotRequired[bool]
     interrupted: NotRequired[bool]
     stages: NotRequired[_Stages]
     dataset_hash: NotRequired[str]

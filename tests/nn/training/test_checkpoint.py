@@ -86,7 +86,7 @@ def test_a_run_is_not_resumed_on_other_recordings(world, tmp_path):
         Trainer.prepare(other, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True)
 
 
-def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monkeypatch):
+def test_a_resumed_run_continues_with_gain_1(world, tmp_path, monkeypatch):
     data, robot, _ = world
 
     def halve(net, error, full_error):
@@ -118,7 +118,7 @@ def better_each_time():
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"\x80\x05cos\nsystem\n(S'true'\ntR."])
-def test_a_checkpoint_that_is_none_is_refused_in_one_line(world, tmp_path, content):
+def test_a_damaged_checkpoint_is_refused_in_one_line(world, tmp_path, content):
     dataset, robot = world[:2]
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "split.json").write_text("{}")

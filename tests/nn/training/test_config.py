@@ -25,7 +25,7 @@ def test_the_paper_s_recipe_has_no_supervised_start_and_keeps_what_was_changed()
     assert (config.model.kind, config.seed) == ("paper", 4)
 
 
-def test_a_gpu_has_simulations_of_its_own_number_unless_told():
+def test_the_default_number_of_simulations_depends_on_the_device():
     cuda = TrainConfig(ppo=PPOConfig(num_envs=256), device="cuda")
     assert (TrainConfig().sized().pretraining.num_envs, TrainConfig().sized().ppo.num_envs) == (256, 256)
     assert (cuda.sized().pretraining.num_envs, cuda.sized().ppo.num_envs) == (4096, 256)
@@ -63,6 +63,6 @@ def test_budgets(text, seconds, steps):
 
 
 @pytest.mark.parametrize("text", ["", "-5m", "ten", "5 weeks", "0s", "10"])
-def test_a_budget_that_makes_no_sense_is_refused(text):
+def test_an_invalid_budget_is_refused(text):
     with pytest.raises(UsageError, match="--budget"):
         Budget.parse(text)

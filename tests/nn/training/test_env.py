@@ -53,7 +53,7 @@ def test_the_reward_of_a_joint_compares_it_one_row_on(robot):
     np.testing.assert_allclose(reward[~done], -np.minimum(error / 0.02, 0.1), rtol=1e-4, atol=1e-6)
 
 
-def test_a_joint_of_which_nothing_was_recorded_stands_and_counts_nowhere(robot):
+def test_an_unrecorded_joint_stands_still_and_has_neither_reward_nor_label(robot):
     one, other = recordings(robot, 2, rows=60, kp=0.6)
     said = replace(one.meta, notes={"posture": {robot.joint_names[1]: 0.3}})
     still = np.tile(np.float32([np.nan, 0.3]), (len(one), 1))
@@ -78,7 +78,7 @@ def test_a_joint_of_which_nothing_was_recorded_stands_and_counts_nowhere(robot):
     assert np.isfinite(fit["label_rmse"])
 
 
-def test_a_robot_without_a_gap_earns_no_penalty(robot):
+def test_without_an_error_the_reward_is_zero(robot):
     env = make(robot, recordings(robot, 2, rows=60))
     for _ in range(10):
         reward, _ = env.step(np.zeros((env.num_envs, 2), np.float32))

@@ -106,6 +106,6 @@ def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_gpu_that_is_not_there_is_refused_before_any_time_is_spent():
+def test_a_missing_gpu_is_refused_before_training():
     with pytest.raises(UsageError, match="torch sees no GPU"):
         TrainConfig(device="cuda").network_device()

@@ -32,7 +32,7 @@ def test_advantages_by_hand():
     assert found.tolist() == [1.25, 1.0, 6.0]
 
 
-def test_the_actor_waits_for_a_critic_that_explains(env):
+def test_the_actor_is_trained_after_the_critic_explains_the_returns(env):
     torch.manual_seed(0)
     net = build_network(MODEL, 2)
     before = {name: p.clone() for name, p in net.named_parameters()}
@@ -47,7 +47,7 @@ def test_the_actor_waits_for_a_critic_that_explains(env):
     assert changed == {"branch", "trunk", "bias"}
 
 
-def test_joints_that_do_not_explore_teach_nothing(env):
+def test_joints_that_do_not_explore_are_masked_out(env):
     """Without noise on a joint its ratio is 1 whatever its advantage: it must be left out, not averaged in."""
     torch.manual_seed(0)
     learner = PPO(env, build_network(MODEL, 2), SETTINGS)
@@ -59,7 +59,7 @@ def test_joints_that_do_not_explore_teach_nothing(env):
     assert moved[~still].std().item() == pytest.approx(learner.innovation_std, rel=0.2)
 
 
-def test_exploration_stays_correlated_and_as_wide_as_it_is_asked_to_be(env):
+def test_exploration_has_the_set_correlation_and_width(env):
     torch.manual_seed(0)
     learner = PPO(env, build_network(MODEL, 2), PPOConfig(num_envs=16, num_steps=32, noise_share=1.0, std=0.01))
     seen = []
@@ -70,7 +70,7 @@ def test_exploration_stays_correlated_and_as_wide_as_it_is_asked_to_be(env):
     assert learner.noise_correlation == pytest.approx(np.exp(-env.robot.dt / 0.2))
 
 
-def test_it_learns_where_the_simulator_is_wrong(env):
+def test_ppo_increases_the_reward_in_a_wrong_simulator(env):
     torch.manual_seed(0)
     net = build_network(MODEL, 2)
     fit_inputs(net, env, env.get_observations()["actor"], 64, seed=0)

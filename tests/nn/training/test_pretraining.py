@@ -36,7 +36,7 @@ def fitted(tmp_path_factory):
     return warm
 
 
-def test_the_predictor_is_fitted_on_the_features_that_it_is_asked_with(fitted):
+def test_input_statistics_stay_fixed_after_the_predictor_is_fitted(fitted):
     net, before = fitted.net, fitted.net.features.standardise.mean.clone()
     assert before.abs().max() > 0
     fitted.round(lambda: 0.0)
@@ -44,7 +44,7 @@ def test_the_predictor_is_fitted_on_the_features_that_it_is_asked_with(fitted):
     assert fitted.pool_x[0].shape == (32 * 64, net.config.input_dim(2))
 
 
-def test_of_too_many_states_the_pool_keeps_a_part_of_every_environment(fitted, monkeypatch):
+def test_a_full_pool_takes_a_part_of_the_environments_of_each_period_in_turn(fitted, monkeypatch):
     env, rows = fitted.env, []
     fitted.config = replace(fitted.config, rounds=2, steps=6)
     for most in (10**6, 2 * 6 * 32 // 3):
@@ -66,7 +66,7 @@ def errors(sequences, labels, robot):
     return np.array([np.abs(t.qpos - s.qpos).mean() for s, t in zip(sequences, replay(told, robot), strict=True)])
 
 
-def test_labels_remove_most_of_the_gap(tmp_path):
+def test_labels_reduce_the_error_below_a_third(tmp_path):
     robot = write_arm(tmp_path)
     sequences = recordings(robot, 4, rows=200, kp=0.5, delay=3)
     labels = trajectory_labels(sequences, robot, 0.5)
@@ -74,13 +74,13 @@ def test_labels_remove_most_of_the_gap(tmp_path):
     assert (errors(sequences, labels, robot) < 0.3 * none).all()
 
 
-def test_without_a_gap_the_labels_are_zero(tmp_path):
+def test_without_an_error_the_labels_are_zero(tmp_path):
     robot = write_arm(tmp_path)
     labels = trajectory_labels(recordings(robot, 1, rows=200, kp=1.0, delay=0), robot, 0.5)
     assert np.abs(labels).max() < 1e-6
 
 
-def test_a_joint_that_nobody_recorded_has_no_label(tmp_path):
+def test_an_unrecorded_joint_has_no_label(tmp_path):
     robot = write_arm(tmp_path)
     (sequence,) = recordings(robot, 1, rows=60)
     meta = replace(sequence.meta, notes={"held_at_home": [robot.operated[1]]})
@@ -89,7 +89,7 @@ def test_a_joint_that_nobody_recorded_has_no_label(tmp_path):
     assert np.isfinite(labels[:, 0]).all()
 
 
-def test_where_a_tip_is_at_the_table_there_is_no_label(tmp_path):
+def test_rows_with_a_tip_at_the_table_have_no_label(tmp_path):
     robot = write_arm(tmp_path, toml=TOML + '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n')
     sequences = recordings(robot, 2, rows=100)
     q = np.concatenate([s.qpos for s in sequences])

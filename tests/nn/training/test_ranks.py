@@ -75,7 +75,7 @@ def test_ranks_have_simulations_and_noise_of_their_own(place):
     assert "critic" not in second["ppo"]
 
 
-def test_one_rank_that_is_interrupted_ends_both_and_they_go_on_to_the_bit(place, saw):
+def test_an_interrupt_of_one_rank_ends_both_and_the_resumed_run_is_equal_bit_for_bit(place, saw):
     assert [rank["interrupted"] for rank in saw] == [True, True]
     assert [rank["resumed"] for rank in saw] == [STEPS, STEPS]
     whole, stopped = (read_checkpoint(place / f"run-{name}") for name in ("whole", "stopped"))

@@ -99,7 +99,7 @@ def test_the_card_says_what_the_model_is(trained):
     assert card["val_mpjae"]["model"] < card["val_mpjae"]["nominal"]
 
 
-def test_the_kept_model_is_the_best_on_validation(trained):
+def test_the_exported_model_is_the_best_on_validation(trained):
     lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
     assert trained[2].card["val_mpjae"]["model"] == min(line["val_mpjae"] for line in lines)
     assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
@@ -112,7 +112,7 @@ def test_progress_says_how_far_labels_are_fitted(trained):
     assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
 
 
-def test_a_robot_without_a_gap_is_left_alone(robot, tmp_path):
+def test_without_an_error_to_correct_the_network_hardly_corrects(robot, tmp_path):
     data = dataset(tmp_path / "data", robot)
     Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS).run()
     assert evaluate([tmp_path / "run"], data, robot).result["delta"]["gaponet"]["max"] < 0.005
@@ -169,7 +169,7 @@ def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(tr
     assert result["methods"]["identified+gaponet"]["mpjae"] < 1.2 * result["methods"]["identified"]["mpjae"]
 
 
-def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot, trained, monkeypatch):
+def test_the_gain_is_halved_if_that_reduces_the_validation_error(tmp_path, robot, trained, monkeypatch):
     def error(validator, net, robot=None):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
         fitted = net is not None and bool(net.trunk[-1].weight.any())
         mean = 0.4 + 0.4 * abs(net.bounded.gain.item() - 0.5) if fitted else 0.5

@@ -8,13 +8,13 @@ from gaponet.nn.training.validation import choose_gain
 
 @pytest.mark.parametrize("kind", ["gaponet", "mlp"])
 @pytest.mark.parametrize(("ideal", "chosen"), [(1.3, 1.0), (0.55, 0.5), (0.0, 0.25)])
-def test_the_gain_with_the_least_error_is_kept(kind, ideal, chosen):
+def test_the_gain_with_the_least_error_is_chosen(kind, ideal, chosen):
     net = build_network(ModelConfig(kind=kind), 3)
     assert choose_gain(net, lambda: abs(net.bounded.gain.item() - ideal), abs(1 - ideal)) == chosen
     assert net.bounded.gain.item() == chosen
 
 
-def test_no_smaller_gain_is_asked_once_one_does_worse():
+def test_the_search_of_the_gain_stops_when_a_smaller_one_is_worse():
     net, asked = build_network(ModelConfig(), 3), []
 
     def error():

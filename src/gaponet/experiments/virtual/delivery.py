@@ -24,6 +24,7 @@ from gaponet.experiments.result import Result
 from gaponet.experiments.virtual.goals import GOALS_PER_TRAJECTORY, GoalPlanner, Plan
 from gaponet.experiments.virtual.play import (
     Progress,
+    TrainedModel,
     Trajectories,
     compensations,
     play,
@@ -44,7 +45,6 @@ from gaponet.experiments.virtual.statistics import (
     reduction,
     select,
 )
-from gaponet.experiments.virtual.trained_models import TrainedModel
 from gaponet.report.figures.charts import draw_bars
 from gaponet.report.figures.style import DASHED, figure, legend, styled
 from gaponet.report.methods import colour, title

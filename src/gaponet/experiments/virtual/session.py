@@ -17,8 +17,7 @@ from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.result import Result, facts
 from gaponet.experiments.study import DEFAULT_MODELS, QUICK_LABEL, Options, Study
-from gaponet.experiments.virtual.play import Progress
-from gaponet.experiments.virtual.trained_models import TrainedModel, load_trained
+from gaponet.experiments.virtual.play import Progress, TrainedModel, load_trained
 from gaponet.report.provenance import describe_provenance
 from gaponet.robot.spec import RobotSpec
 from gaponet.testing.collect import fleet_name

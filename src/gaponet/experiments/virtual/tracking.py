@@ -24,6 +24,7 @@ from gaponet.experiments.result import Result
 from gaponet.experiments.virtual.play import (
     PLANNED,
     Progress,
+    TrainedModel,
     Trajectories,
     compensations,
     play,
@@ -44,7 +45,6 @@ from gaponet.experiments.virtual.statistics import (
     reduction,
     select,
 )
-from gaponet.experiments.virtual.trained_models import TrainedModel
 from gaponet.experiments.virtual.unseen_motions import UnseenMotion, from_files, generated, require_unseen
 from gaponet.report.candidate import select_entries
 from gaponet.report.figures.charts import JointTrajectory, against, draw_bars

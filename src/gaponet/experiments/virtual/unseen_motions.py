@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.split import hash_order
 from gaponet.data.store import Dataset, Entry
-from gaponet.experiments.virtual.trained_models import TrainedModel
+from gaponet.experiments.virtual.play import TrainedModel
 from gaponet.report.candidate import split_of_run
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints

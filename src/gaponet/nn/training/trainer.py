@@ -31,10 +31,9 @@ from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import Checkpoint, StateDict
 from gaponet.nn.training.config import Budget, Status, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.loggers import Loggers
 from gaponet.nn.training.ppo import PPO, Update
 from gaponet.nn.training.pretraining import Pretraining, pretraining_config, trajectory_labels
-from gaponet.nn.training.run_folder import RunFolder, TrainingData
+from gaponet.nn.training.run_folder import Loggers, RunFolder, TrainingData
 from gaponet.nn.training.sensor_fit import fit_inputs, refit_sensors
 from gaponet.nn.training.validation import Validator, choose_gain
 from gaponet.robot.spec import RobotSpec
@@ -94,7 +93,7 @@ class Trainer:
             resume: Continue the run in out.
             holdout_units: Units that are only in the test split.
             show: Called with the state of the run.
-            log: Any of loggers.KINDS.
+            log: Any of run_folder.LOG_KINDS.
 
         Raises:
             DatasetError, UsageError: The recordings, the options or the folder do not fit.

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.experiments.virtual import trained_models as module
-from gaponet.experiments.virtual.trained_models import load_trained
+from gaponet.experiments.virtual import play as module
+from gaponet.experiments.virtual.play import load_trained
 
 
 class Model:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.nn.training.loggers import Loggers
+from gaponet.nn.training.run_folder import Loggers
 
 LINE = {"stage": "ppo", "steps": 640, "seconds": 2.5, "reward": float("nan"), "val_mpjae": 0.004, "nominal_mpjae": 0.01}
 
