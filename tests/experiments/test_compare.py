@@ -22,7 +22,7 @@ def summary(light, heavy, unit="a"):
 
 @pytest.fixture
 def result(make_study, make_outcomes, monkeypatch, tmp_path):
-    study = make_study()
+    study = make_study(payloads=(0.0, 0.1), units=("a",))
     new = {"new": summary(0.03, 0.03, "b")}
     runs = [{"seed": i, "known": summary(0.005, 0.01 * i), "parameters": 1234, "seconds": 90.0} | new for i in (1, 3)]
     cells = {"mlp": [SimpleNamespace(folder=tmp_path)]}
