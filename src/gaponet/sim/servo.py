@@ -171,7 +171,10 @@ def compiled(function: Any) -> Any:
     except ImportError:
         return None
     _extend(extending)
-    return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    try:
+        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    except RuntimeError:  # no folder for the cache is writable
+        return numba.njit(nogil=True, error_model="numpy")(function)
 
 
 @functools.cache
@@ -208,6 +211,9 @@ class ServoModel:
         self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
         self._set_joints = compiled(set_joints)
         self._take_terms()
+        bias, limit = self._bias.copy(), self._limit.copy()
+        self.before()  # compiles now, since the first step may belong to a control loop
+        self._bias[:], self._limit[:] = bias, limit
 
     def _take_terms(self) -> None:
         """Take the present values of the terms for the steps to come."""
