@@ -27,9 +27,7 @@ _Row = dict[str, float]  # metrics of a sequence, or their means
 
 
 def standard_error(values: Array) -> float:
-    """The standard error of the mean of values that belong to motions; nan for a single one.
-
-    For a difference of methods give their differences motion by motion (paired)."""
+    """Return the standard error of the mean of values by motion, or of paired differences; nan for a single one."""
     values = np.asarray(values)
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
@@ -79,7 +77,7 @@ class Run:
 
     @classmethod
     def of(cls, real: Sequence, simulated: Array, robot: RobotSpec) -> Run:
-        """A recording and simulated positions of all joints, (T, n_all) rad; keeps neither."""
+        """Pair a recording with simulated positions of all joints, (T, n_all) rad."""
         op = robot.operated_index
         unknown = real.meta.unrecorded
         held = tuple(i for i, j in enumerate(robot.operated) if j not in unknown) if unknown else None
@@ -87,11 +85,11 @@ class Run:
 
     @property
     def error(self) -> Array:
-        """e after each step, (T − 1, n), rad: row 0 is the common start and is no error."""
+        """e after each step, (T − 1, n) rad, without the common start."""
         return (self.qpos_sim - self.qpos_real)[1:]
 
     def holds(self, columns: list[int] | None) -> list[int] | None:
-        """Those of these columns (None: all) that the recording holds; None where it holds all."""
+        """Return the columns, out of these (None: all), that the recording holds; None for all."""
         if self.recorded is None:
             return columns
         return [i for i in self.recorded if columns is None or i in columns]
@@ -145,7 +143,7 @@ def _mean(rows: list[_Row]) -> _Row:
 
 
 def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
-    """One sequence's metrics over these columns; none where it holds none of them."""
+    """Return a sequence's metrics over these columns; nothing if it holds none of them."""
     if (held := run.holds(columns)) == []:
         return []
     c = slice(None) if held is None else held
@@ -172,17 +170,14 @@ def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
 
 
 def _mean_correlation(real: Array, sim: Array) -> float:
-    """Pearson's r, averaged over joints that moved; 1 where none did."""
+    """Return Pearson's r, averaged over joints that moved; 1 if none did."""
     moved = (np.ptp(real, axis=0) > 0.01) & (np.ptp(sim, axis=0) > 1e-6)
     values = [np.corrcoef(real[:, j], sim[:, j])[0, 1] for j in np.flatnonzero(moved)]
     return float(np.mean(values)) if values else 1.0
 
 
 def _horizons(run: Run) -> _Row:
-    """mpjae at times after the common start, as far as the motion lasts; and over the whole motion.
-
-    The error at a horizon is that of the steps in its last half, so that one frame does not decide.
-    """
+    """Return the mean |error| at horizons after the start, over the last half of each, and over the whole motion."""
     error = np.abs(run.error if run.recorded is None else run.error[:, list(run.recorded)])
     lasts = {f"{s:g}": last for s in HORIZONS_S if (last := max(round(s / run.dt), 1)) <= len(error)}
     return {h: error[last // 2 : last].mean() for h, last in lasts.items()} | {"whole": error.mean()}

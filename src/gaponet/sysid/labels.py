@@ -105,7 +105,6 @@ class Labels:
 
     recordings: list[LabelledRecording]
     groups: list[LabelGroup]
-    payloads: tuple[float, ...]
     agreement: dict[str, float] = field(default_factory=dict)
     gains: dict[str, tuple[Gains, Gains]] = field(default_factory=dict)
 
@@ -187,7 +186,7 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     gains = {
         j: (servo_gains(each), servo_gains(each, 1)) for j, each in torque_rows.items() if len(each) >= MIN_RECORDINGS
     }
-    return Labels(found, groups, tuple(payloads), agreement, gains)
+    return Labels(found, groups, agreement, gains)
 
 
 def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
