@@ -13,7 +13,7 @@ def format_uncertainty(value: float, standard_error: float) -> str:
     if standard_error > MAX_PRINTED_ERROR:
         return f"{value:.3g} ± ?"
     digits = 1 - math.floor(math.log10(standard_error)) if 0 < standard_error < math.inf else 3
-    return f"{round(value, digits):.{max(digits, 0)}f} ± {round(standard_error, digits):.{max(digits, 0)}f}"
+    return f"{round(value, digits) + 0.0:.{max(digits, 0)}f} ± {round(standard_error, digits):.{max(digits, 0)}f}"
 
 
 def escape(text: str) -> str:

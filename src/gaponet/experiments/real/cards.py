@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,6 +41,7 @@ class Card:
         known, inferred: Facts that the source states, and facts that were read off the data.
         questions: Names of questions (questions.py).
         elsewhere: Data set of the same robot that `elsewhere` methods identify on.
+        files: Pattern of the files to take; default all.
         labels: Given if payload and unit have to be estimated.
     """
 
@@ -61,6 +63,7 @@ class Card:
     joints: list[str] = field(default_factory=list)
     ignore: list[str] = field(default_factory=list)
     posture: dict[str, float] = field(default_factory=dict)
+    files: str = ""
     labels: MissingLabels | None = None
 
 
@@ -106,17 +109,21 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
     options: dict[str, Any] = {k: v for k in ("rate", "joints", "ignore", "posture") if (v := getattr(card, k))}
     options |= {"position_unit": card.position_unit} if card.position_unit else {}
     place.mkdir(parents=True, exist_ok=True)
+    source = data / card.folder
+    if card.files:
+        source = place / "recordings"
+        source.mkdir(exist_ok=True)
+        for file in sorted((data / card.folder).glob(card.files)):
+            shutil.copy2(file, source)
     if card.labels:
         gain = dict(zip(robot.joint_names, robot.kp.tolist(), strict=True))
-        labels = estimate(
-            read_logs(data / card.folder, robot, rate=card.rate), card.labels.payloads, card.labels.units, gain
-        )
+        labels = estimate(read_logs(source, robot, rate=card.rate), card.labels.payloads, card.labels.units, gain)
         write(labels, place)
         options["manifest"] = "labels.csv"
     logs = place / "logs.toml"
     write_text(logs, "".join(f"{k} = {_toml(v)}\n" for k, v in options.items()))
     report = import_logs(
-        data / card.folder, robot, card.unit, card.payload, place / "data", logs=logs if options else None, cut=card.cut
+        source, robot, card.unit, card.payload, place / "data", logs=logs if options else None, cut=card.cut
     )
     report.dataset.set_provenance(licence=card.licence, source=card.source)
     return report.dataset, robot, labels
