@@ -90,7 +90,7 @@ def scores(**errors):
 def test_the_verdict_states_the_gain_of_a_network_even_if_it_is_zero(tmp_path):
     useless = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(3.0, 3.2))
     said = verdict(useless)
-    assert said[1] == "After identification the error is 3.10 mrad, 84 % less."
+    assert said[1] == "After identification the error is 3.10 mrad, 84 % less, on 2 independent motions."
     assert "reduces the error of identification by 0.00 ± 0.00 mrad: leave the network out" in said[2]
     assert next_step(useless, "data", tmp_path) == f"gaponet export {tmp_path / 'robot'} --to mjcf"
     useful = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(2.0, 2.1))

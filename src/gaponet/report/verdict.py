@@ -64,7 +64,9 @@ def verdict(methods: Scores) -> list[str]:
         error = methods["identified"]["mpjae"]
         change = f"{100 * abs(1 - error / nominal):.0f} % {'less' if error <= nominal else 'MORE'}"
         end = "." if error < nominal else ": identify again, on logs like these."
-        sentences.append(f"After identification the error is {_mrad(error)} mrad, {change}{end}")
+        motions = len({name.partition("@")[0] for name in methods["identified"]["by_motion"]})  # pieces are one
+        count = f"{motions} independent motion{'s' * (motions != 1)}"
+        sentences.append(f"After identification the error is {_mrad(error)} mrad, {change}, on {count}{end}")
     return sentences + [_about_network(methods, own) for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
 
 
