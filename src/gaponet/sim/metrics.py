@@ -54,6 +54,14 @@ class Comparison:
         return float(gains.mean()), standard_error(gains)
 
     @property
+    def harmful(self) -> bool:
+        """True if the mean error rises by more than its paired standard error and by 1 %; of fewer than three motions,
+        by 10 %."""
+        gain, error = self.gain
+        least = MIN_RELATIVE_GAIN if len(self.before) > 2 else MIN_RELATIVE_GAIN_ONE_MOTION
+        return bool(gain < -max(np.nan_to_num(error), least * self.before.mean()))
+
+    @property
     def accepted(self) -> bool:
         """True if the mean error falls by more than 1 % and the paired relative gain exceeds one standard error
         (Student's t); of a single motion by more than 10 %."""

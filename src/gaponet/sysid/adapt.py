@@ -18,7 +18,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.metrics import Comparison
+from gaponet.sim.metrics import MIN_RELATIVE_GAIN, Comparison
 from gaponet.sim.replay import Corrector, rollout_errors
 from gaponet.sysid.axes import LARGE_KP_LOG_CHANGE, Bounds, Changes, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
@@ -47,7 +47,8 @@ class Adapted:
         before, after: RMS error of the windows, rad.
         payload_mass, payload_std: kg in each hand that carries; None unless the payload is unknown.
         judged: Mean |error| of motions before, and with the fit to the other motions, (motions,) rad.
-        accepted: Whether those motions improve significantly (`Comparison`); False for one short motion per joint.
+        accepted: True if the windows improve by 1 % and those motions do not become worse (`Comparison.harmful`); False
+            for one short motion per joint. The prior weighs the evidence.
     """
 
     robot: RobotSpec
@@ -94,7 +95,7 @@ def adapt(
     judged = _cross_validated(parts, robot, corrector, kd_known) if judge else (np.zeros(0), np.zeros(0))
     accepted = not judge or parts[0].duration > MAX_SHORT_WINDOW_S
     if len(judged[0]):
-        accepted = Comparison("adapted", *judged).accepted
+        accepted = not Comparison("adapted", *judged).harmful
         parts = [parts[i] for motions in _motions_that_judge(parts) for motion in motions for i in motion]
     rollouts = RobotRollouts(parts, robot, corrector=corrector)
     kd_slack = np.zeros(rollouts.n) if kd_known else robot.kd[rollouts.op]
@@ -111,6 +112,7 @@ def adapt(
         min_decrease=MIN_DECREASE, derive=problem.slopes,
     )  # fmt: skip
     before, after = (problem.rms(p) for p in (problem.own(float(np.mean(payloads))), x[0, 0]))
+    accepted = accepted and not (judge and after > (1 - MIN_RELATIVE_GAIN) * before)
     mass = {"payload_mass": float(x[0, 0, -1]), "payload_std": problem.payload_std(x)} if unknown_payload else {}
     return Adapted(problem.robot_with(x[0, 0]), before, after, **mass, judged=judged, accepted=accepted)
 
