@@ -90,26 +90,19 @@ def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tm
     assert set(ORDER) | {"target", "recorded"} <= set(METHODS)
 
 
-def test_the_card_says_what_the_model_is(trained):
+def test_card_and_progress_state_inputs_errors_and_label_fits(trained):
     card = trained[2].card
+    lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
+    assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
+    assert card["val_mpjae"]["model"] == min(line["val_mpjae"] for line in lines)  # the best is exported
+    fitted = [line for line in lines if line["stage"] == "pretraining"]
+    assert all(0 < line["label_rmse"] < 0.1 and line["label_rmse_before"] > 0 for line in fitted)
+    assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
     assert card["joint_names"] == ["shoulder", "elbow"]
     assert card["payload_seen"] == [0.0, 0.2]
     assert card["virtual"] is True
     assert card["parity_rad"] <= 1e-5
     assert card["val_mpjae"]["model"] < card["val_mpjae"]["nominal"]
-
-
-def test_the_exported_model_is_the_best_on_validation(trained):
-    lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
-    assert trained[2].card["val_mpjae"]["model"] == min(line["val_mpjae"] for line in lines)
-    assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
-
-
-def test_progress_says_how_far_labels_are_fitted(trained):
-    lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
-    fitted = [line for line in lines if line["stage"] == "pretraining"]
-    assert all(0 < line["label_rmse"] < 0.1 and line["label_rmse_before"] > 0 for line in fitted)
-    assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
 
 
 def test_without_an_error_to_correct_the_network_hardly_corrects(robot, tmp_path):
