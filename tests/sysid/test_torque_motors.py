@@ -13,7 +13,7 @@ from gaponet.sim.model import build_model
 
 TRUE = {"armature": (0.05, 0.03), "damping": (0.8, 0.3), "frictionloss": (0.12, 0.06)}
 DT, LATE = 0.005, 0.01  # s
-TOLD = """time_unit = "s"
+LOGS_TOML = """time_unit = "s"
 position_unit = "rad"
 ctrl = "q_{joint}"
 qpos = "q_{joint}"
@@ -40,12 +40,13 @@ def drive(robot, seed, unit=1.0, rows=1200):
     return np.concatenate([DT * np.arange(rows)[:, None], seen, np.array(told) / unit], axis=1)
 
 
-def imported(folder, robot, logs):
+def imported(folder, robot, logs, torque=True):
     (folder / "logs").mkdir(parents=True)
-    head = "time,q_shoulder,q_elbow,tau_shoulder,tau_elbow"
+    head = "time,q_shoulder,q_elbow" + ",tau_shoulder,tau_elbow" * torque
     for name, table in logs.items():
-        np.savetxt(folder / "logs" / f"{name}.csv", table, delimiter=",", header=head, comments="")
-    (folder / "logs" / "logs.toml").write_text(TOLD)
+        columns = table if torque else table[:, :3]
+        np.savetxt(folder / "logs" / f"{name}.csv", columns, delimiter=",", header=head, comments="")
+    (folder / "logs" / "logs.toml").write_text(LOGS_TOML if torque else LOGS_TOML.replace('tau = "tau_{joint}"\n', ""))
     words = ["--robot", str(robot.folder), "--unit-id", "a", "--payload-mass", "0", "--out", str(folder / "data")]
     assert main(["import", str(folder / "logs"), *words]) == 0
     return str(folder / "data")
@@ -93,18 +94,12 @@ def test_commands_that_need_positions_name_identify(robot, tmp_path, capsys):
         assert main(words) == 2, words
         assert "gaponet identify" in capsys.readouterr().err
     assert main(["doctor", data]) == 0
-    assert (
-        main(["identify", data, "--out", str(tmp_path / "found")]) == 0
-    )  # one recording: its parts fit and judge in turn
+    # Parts of a single recording fit and validate in turn.
+    assert main(["identify", data, "--out", str(tmp_path / "found")]) == 0
 
 
 def test_logs_without_torque_are_refused(robot, tmp_path, capsys):
-    table = drive(robot, 0, rows=300)
-    (tmp_path / "logs").mkdir()
-    np.savetxt(tmp_path / "logs/a.csv", table[:, :3], delimiter=",", header="time,q_shoulder,q_elbow", comments="")
-    (tmp_path / "logs/logs.toml").write_text(TOLD.replace('tau = "tau_{joint}"\n', ""))
-    words = ["--robot", str(robot.folder), "--unit-id", "a", "--payload-mass", "0", "--out", str(tmp_path / "data")]
-    assert main(["import", str(tmp_path / "logs"), *words]) == 0
-    assert main(["identify", str(tmp_path / "data"), "--out", str(tmp_path / "found")]) == 2
+    data = imported(tmp_path, robot, {"a": drive(robot, 0, rows=300)}, torque=False)
+    assert main(["identify", data, "--out", str(tmp_path / "found")]) == 2
     assert "has no torque of every operated joint" in capsys.readouterr().err
     assert not (tmp_path / "found").exists()
