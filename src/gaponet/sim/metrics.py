@@ -41,11 +41,16 @@ def confidence_factor(freedom: int) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A candidate against another one by the errors of the motions that judge, (motions,) rad."""
+    """A candidate against another one by the errors of the motions that judge, (motions,) rad.
+
+    Attributes:
+        adds_nothing: The candidate is no more complex than the other one, so a smaller mean error is enough.
+    """
 
     name: str
     before: Array
     after: Array
+    adds_nothing: bool = False
 
     @property
     def gain(self) -> tuple[float, float]:
@@ -65,6 +70,8 @@ class Comparison:
     def accepted(self) -> bool:
         """True if the mean error falls by more than 1 % and the paired relative gain exceeds one standard error
         (Student's t); of a single motion by more than 10 %."""
+        if self.adds_nothing:
+            return self.gain[0] > 0
         freedom, least = len(self.before) - 1, MIN_RELATIVE_GAIN
         if not freedom:
             least = MIN_RELATIVE_GAIN_ONE_MOTION
