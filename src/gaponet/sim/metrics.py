@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -50,7 +50,7 @@ class Comparison:
     name: str
     before: Array
     after: Array
-    adds_nothing: bool = False
+    adds_nothing: bool = field(default=False, kw_only=True)
 
     @property
     def gain(self) -> tuple[float, float]:

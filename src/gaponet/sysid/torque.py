@@ -79,8 +79,8 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
         if all(t.several_payloads for t in torques) or not options.place
     }
     options = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
-    errors = (held_out_errors(folds) for folds in (fitted.held_out, tried[options]))
-    comparison = Comparison("torque", *errors, adds_nothing=True)
+    pair = (held_out_errors(folds) for folds in (fitted.held_out, tried[options]))
+    comparison = Comparison("torque", *pair, adds_nothing=True)
     if not comparison.accepted:
         return replace(fitted, comparisons=(*fitted.comparisons, comparison))
     robot, folds, after = TorqueFit(every, given).fit(options), tuple(tried[options]), float(comparison.after.mean())
