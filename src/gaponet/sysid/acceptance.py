@@ -173,12 +173,12 @@ class Judge:
         """Compare a candidate with the one before it."""
         return Comparison(name, self.errors(before), self.errors(after))
 
-    def best(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
+    def best(self, candidates: dict[str, list[Values]], identified: bool = False) -> tuple[str, list[Values]]:
         """Return name and values of the best candidate.
 
         The second candidate is the default. Another one replaces it if it is accepted by `Comparison`, or better by
         10 %. The best values joint by joint ("mixed") replace it only if they are accepted. The first candidate, the
-        given robot, is returned if no fit is better by 1 %.
+        given robot, is returned if no fit is better by 1 %; one that is `identified` already, if none is accepted.
         """
         given, default, *others = candidates
         joints = np.array([self.errors_by_joint(v) for v in candidates.values()])
@@ -191,7 +191,10 @@ class Judge:
             limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[name].mean()
             much_better = other != "mixed" and errors[other].mean() < limit
             name = other if much_better or Comparison(other, errors[name], errors[other]).accepted else name
-        name = name if errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean() else given
+        better = errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean()
+        if identified:
+            better = Comparison(name, errors[given], errors[name]).accepted
+        name = name if better else given
         return name, candidates[name]
 
 

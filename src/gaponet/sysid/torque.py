@@ -80,7 +80,7 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
     }
     options = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
     pair = (held_out_errors(folds) for folds in (fitted.held_out, tried[options]))
-    comparison = Comparison("torque", *pair, adds_nothing=True)
+    comparison = Comparison("torque", *pair, adds_nothing=given.nominal is None)
     if not comparison.accepted:
         return replace(fitted, comparisons=(*fitted.comparisons, comparison))
     robot, folds, after = TorqueFit(every, given).fit(options), tuple(tried[options]), float(comparison.after.mean())
