@@ -155,3 +155,16 @@ def test_pieces_of_one_recording_are_one_motion(arm):
     for train, held_out in cross_validation(logs[:8], logs[8:], 3):
         assert not {s.meta.motion[:2] for s in train} & {s.meta.motion[:2] for s in held_out}
     assert len(motion_errors(logs, arm)) == 5
+
+
+def test_an_identified_start_changes_only_at_joints_whose_motions_accept_it(tmp_path):
+    robot = write_arm(tmp_path)
+    rng = np.random.default_rng(0)
+    logs = [
+        replace(s, qpos=s.qpos + 1e-3 * rng.standard_normal(s.qpos.shape).astype(np.float32))
+        for s in recordings(robot, 6, rows=100, kp=0.8)
+    ]
+    start = robot.with_servos({"shoulder": {"kp": 16.0}, "elbow": {"kp": 8.0}})  # the first is right
+    found = identify(logs[:3], start, logs[3:], windows=3, terms=(), table=False)
+    assert found.robot.kp[0] == 16.0
+    assert found.robot.kp[1] == pytest.approx(16.0, rel=0.1)

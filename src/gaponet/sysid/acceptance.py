@@ -133,6 +133,7 @@ class JudgedFold:
         keys = [(s.meta.motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
         each = [np.array([key == one for key in keys])[self.rollouts.window] for one in dict.fromkeys(keys)]
         self.motions = [rows for rows in each if rows.any()]
+        self.names = [key[0] for key, rows in zip(dict.fromkeys(keys), each, strict=True) if rows.any()]
         self._sums_of: dict[bytes, Array] = {}
 
     def sums(self, values: Values) -> tuple[Array, Array]:
@@ -173,12 +174,37 @@ class Judge:
         """Compare a candidate with the one before it."""
         return Comparison(name, self.errors(before), self.errors(after))
 
-    def best(self, candidates: dict[str, list[Values]], identified: bool = False) -> tuple[str, list[Values]]:
+    def best_by_joint(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
+        """Return name and values of the first candidate, with another one's values at joints whose motions accept them.
+
+        Units and payloads of a motion count as one, since a robot that is identified already needs evidence to change.
+        """
+        motions = np.array([name for fold in self.folds for name in fold.names])
+        errors = {name: self._joint_errors(v, motions) for name, v in candidates.items()}  # (motions, n), NaN: not held
+        given, *others = errors
+        winner = np.zeros(errors[given].shape[1], int)
+        for i in range(len(winner)):
+            held = ~np.isnan(errors[given][:, i])
+            name = min(others, key=lambda other: float(np.nansum(errors[other][:, i])))
+            if held.any() and Comparison(name, errors[given][held, i], errors[name][held, i]).accepted:
+                winner[i] = list(errors).index(name)
+        mixed = [_by_joint(each, winner) for each in zip(*candidates.values(), strict=True)]
+        return ("mixed", mixed) if winner.any() else (given, candidates[given])
+
+    def _joint_errors(self, candidate: ListOf[Values], motions: Array) -> Array:
+        """Return the mean |error| of each motion and joint, (motions, n) rad; NaN where a motion does not hold it."""
+        total, count = self._sums(candidate)
+        with np.errstate(invalid="ignore"):
+            return np.stack([
+                total[motions == one].sum(axis=0) / count[motions == one].sum(axis=0) for one in dict.fromkeys(motions)
+            ])  # fmt: skip
+
+    def best(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
         """Return name and values of the best candidate.
 
         The second candidate is the default. Another one replaces it if it is accepted by `Comparison`, or better by
         10 %. The best values joint by joint ("mixed") replace it only if they are accepted. The first candidate, the
-        given robot, is returned if no fit is better by 1 %; one that is `identified` already, if none is accepted.
+        given robot, is returned if no fit is better by 1 %.
         """
         given, default, *others = candidates
         joints = np.array([self.errors_by_joint(v) for v in candidates.values()])
@@ -191,10 +217,7 @@ class Judge:
             limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[name].mean()
             much_better = other != "mixed" and errors[other].mean() < limit
             name = other if much_better or Comparison(other, errors[name], errors[other]).accepted else name
-        better = errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean()
-        if identified:
-            better = Comparison(name, errors[given], errors[name]).accepted
-        name = name if better else given
+        name = name if errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean() else given
         return name, candidates[name]
 
 

@@ -164,7 +164,7 @@ def _fit_robot(
     searches = _SearchProgress(budget, len(terms), len(fits), progress)
     wholes, each = zip(*(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True)
     candidates = {name: [one[name] for one in each] for name in each[0]}
-    chosen, values = judge.best(candidates, identified=given.nominal is not None)
+    chosen, values = judge.best_by_joint(candidates) if given.nominal is not None else judge.best(candidates)
     base = values if chosen != "given" else candidates["limbs"]
     comparisons, values = _with_terms(fits, wholes, judge, terms, values, base, searches)
     chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
