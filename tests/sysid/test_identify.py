@@ -157,14 +157,19 @@ def test_pieces_of_one_recording_are_one_motion(arm):
     assert len(motion_errors(logs, arm)) == 5
 
 
-def test_an_identified_start_changes_only_at_joints_whose_motions_accept_it(tmp_path):
-    robot = write_arm(tmp_path)
-    rng = np.random.default_rng(0)
-    logs = [
-        replace(s, qpos=s.qpos + 1e-3 * rng.standard_normal(s.qpos.shape).astype(np.float32))
-        for s in recordings(robot, 6, rows=100, kp=0.8)
-    ]
-    start = robot.with_servos({"shoulder": {"kp": 16.0}, "elbow": {"kp": 8.0}})  # the first is right
-    found = identify(logs[:3], start, logs[3:], windows=3, terms=(), table=False)
-    assert found.robot.kp[0] == 16.0
-    assert found.robot.kp[1] == pytest.approx(16.0, rel=0.1)
+def test_a_joint_takes_a_fit_only_if_its_own_motions_accept_it():
+    """Payloads of one motion are one vote: the first joint's fit is better with both payloads of one motion of three."""
+    errors = {1.0: np.full((4, 2), 10.0), 2.0: np.array([[4.0, 8.0], [4.0, 8.1], [11.0, 7.9], [11.5, 8.2]])}
+
+    class Fold:
+        names = ["a", "a", "b", "c"]
+
+        def sums(self, values):
+            return errors[values["kp"][0]], np.ones((4, 2))
+
+    given, fit = ({"kp": np.full(2, kp)} for kp in errors)
+    name, (chosen,) = Judge([Fold()]).best_by_joint({"given": [given], "limbs": [fit]})
+    assert (name, chosen["kp"].tolist()) == ("mixed", [1.0, 2.0])
+    worse = {"kp": np.full(2, 3.0)}
+    errors[3.0] = errors[1.0] + 1.0
+    assert Judge([Fold()]).best_by_joint({"given": [given], "limbs": [worse]}) == ("given", [given])
