@@ -158,11 +158,11 @@ def test_pieces_of_one_recording_are_one_motion(arm):
 
 
 def test_a_joint_takes_a_fit_only_if_its_own_motions_accept_it():
-    """Payloads of one motion are one vote: the first joint's fit is better with both payloads of one motion of three."""
+    """Payloads of one motion are one vote: the first joint follows one motion of three better, with both payloads."""
     errors = {1.0: np.full((4, 2), 10.0), 2.0: np.array([[4.0, 8.0], [4.0, 8.1], [11.0, 7.9], [11.5, 8.2]])}
 
     class Fold:
-        names = ["a", "a", "b", "c"]
+        names = ("a", "a", "b", "c")
 
         def sums(self, values):
             return errors[values["kp"][0]], np.ones((4, 2))
