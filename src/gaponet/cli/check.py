@@ -74,8 +74,8 @@ def check(
     drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
     named = {m.joint for m in drift.moved}
     screen.table(
-        f"{made.recordings} recordings, {drift.seconds:.0f} s: what changed most, in standard deviations",
-        ["joint", "number", "by", "deviations", "moves it, mrad", "counts from, mrad", ""],
+        f"{made.recordings} recordings, {drift.seconds:.0f} s: largest change of each joint",
+        ["joint", "parameter", "change", "standard errors", "effect, mrad", "least that counts, mrad", ""],
         [
             _row(m, uncertainty, drift, m.joint in named)
             for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))

@@ -7,6 +7,7 @@ from pathlib import Path
 from gaponet import api
 from gaponet.api.opening import driven_by_torque
 from gaponet.api.results import IdentifyResult
+from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.base.text import format_uncertainty
 from gaponet.cli import options
@@ -59,6 +60,8 @@ def identify(
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
     if driven_by_torque(data):
+        if like is not None:
+            raise UsageError(f"--like {like}: {dataset} holds a robot that is driven by torque; leave --like out")
         with progress_bar("identifying"):
             driven = api.identify_torque(data, out=out, current=current, robot=spec)
         show_torque(screen, driven, current)
@@ -78,19 +81,17 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     """Print the verdict, the servos as a table, and what each term gave."""
     found, errors, values = made.fit, made.errors, made.values()
     nominal, left = (f"{mrad(e.mean())} ± {mrad(standard_error(e))}" for e in errors.values())
-    screen.say(
-        f"nominal {nominal} → identified {left} mrad on {len(errors['nominal'])} motion(s), not fitted "
-        f"({errors['identified'].mean() / errors['nominal'].mean():.2f})"
-    )
-    if len(found.held_out) > 1:
+    ratio, count, folds = errors["identified"].mean() / errors["nominal"].mean(), len(errors["nominal"]), found.held_out
+    screen.say(f"nominal {nominal} → identified {left} mrad ({ratio:.2f} of nominal); independent motions: {count}")
+    if len(folds) > 1:
         screen.say(
-            f"few motions validate: cross-validation in {len(found.held_out)} folds chose; the robot is fitted to all"
+            f"These are errors of {len(folds)}-fold cross-validation, since few motions validate. "
+            "The robot was then fitted to all motions."
         )
     if made.taken_from:
         taken = ", ".join(f"{joint} from {source}" for joint, source in made.taken_from.items())
-        screen.say(
-            f"start and prior: {taken}; {'fitted' if found.improved else 'no fit did better: taken as they are'}"
-        )
+        end = "" if found.improved else " No fit was better, so these servos are written as they are."
+        screen.say(f"Start and prior: {taken}.{end}")
     shown = [f for f in SERVO_FIELDS if any(v.get(f) for v in values.values())]
     for start in range(0, len(shown), MAX_COLUMNS):
         part = shown[start : start + MAX_COLUMNS]

@@ -101,16 +101,16 @@ def stored_robot_holder(artifact: Path) -> Path:
 
 def _with_gains(text: str, robot: RobotSpec) -> str:
     """Return the text of a robot.toml with kp and kd of this robot in its [[joint]] tables where they differ."""
-    file = tomllib.loads(text)
     scale = np.where(np.isin(robot.joint_names, robot.operated), robot.gain_scale, 1.0)
-    head, *tables = re.split(r"(?m)^(?=\[\[joint\]\])", text)
-    for i, table in enumerate(file["joint"]):
+    tables = re.split(r"(?m)^(?=\[)", text)
+    joints = [i for i, table in enumerate(tables) if table.startswith("[[joint]]")]
+    for n, (i, table) in enumerate(zip(joints, tomllib.loads(text)["joint"], strict=False)):
         for name, values in (("kp", robot.kp), ("kd", robot.kd)):
-            value = float(values[robot.joint_names.index(table["name"])] / scale[i])
+            value = float(values[n] / scale[n])
             if not np.isclose(value, table.get(name, 0.0), rtol=1e-6):
                 rest = re.sub(rf"(?m)^{name}\s*=.*\n", "", tables[i])
                 tables[i] = rest.replace("[[joint]]\n", f"[[joint]]\n{name} = {value:.6g}\n", 1)
-    return head + "".join(tables)
+    return "".join(tables)
 
 
 def _servo(robot: RobotSpec, joint: str) -> str:

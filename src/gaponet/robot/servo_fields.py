@@ -65,12 +65,12 @@ class ServoField:
 
     @property
     def signed(self) -> bool:
-        """Whether the value may be negative."""
+        """True if the value may be negative."""
         return self.limits[0] < 0
 
     @property
     def from_mjcf(self) -> bool:
-        """Whether NaN stands for the MJCF's value."""
+        """True if NaN stands for the MJCF's value."""
         return self.default is not None and math.isnan(self.default)
 
     @property

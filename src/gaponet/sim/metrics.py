@@ -44,13 +44,14 @@ class Comparison:
     """A candidate against another one by the errors of the motions that judge, (motions,) rad.
 
     Attributes:
-        adds_nothing: The candidate is no more complex than the other one, so a smaller mean error is enough.
+        equally_complex: True if the candidate has no more parameters than the other one, so that a smaller mean error
+            is enough.
     """
 
     name: str
     before: Array
     after: Array
-    adds_nothing: bool = field(default=False, kw_only=True)
+    equally_complex: bool = field(default=False, kw_only=True)
 
     @property
     def gain(self) -> tuple[float, float]:
@@ -70,7 +71,7 @@ class Comparison:
     def accepted(self) -> bool:
         """True if the mean error falls by more than 1 % and the paired relative gain exceeds one standard error
         (Student's t); of a single motion by more than 10 %."""
-        if self.adds_nothing:
+        if self.equally_complex:
             return self.gain[0] > 0
         freedom, least = len(self.before) - 1, MIN_RELATIVE_GAIN
         if not freedom:

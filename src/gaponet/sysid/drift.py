@@ -119,7 +119,7 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
         raise UsageError("no recording moves an operated joint away from what it may touch; record gaponet excite's")
     fields, joints = (*uncertainty.fields, PLAY), robot.operated
     repeatability = {
-        j: max(float(today), uncertainty.joints[j].repeatability)
+        j: uncertainty.joints[j].repeatability or float(today)  # today's may itself have become worse
         for j, today in zip(joints, repetition_difference(sequences, joints), strict=True)
     }
     times = {

@@ -164,8 +164,9 @@ def _fit_robot(
     searches = _SearchProgress(budget, len(terms), len(fits), progress)
     wholes, each = zip(*(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True)
     candidates = {name: [one[name] for one in each] for name in each[0]}
-    chosen, values = judge.best_by_joint(candidates) if given.nominal is not None else judge.best(candidates)
-    base = values if chosen != "given" else candidates["limbs"]
+    identified = given.nominal is not None
+    chosen, values = judge.best_by_joint(candidates) if identified else judge.best(candidates)
+    base = values if identified or chosen != "given" else candidates["limbs"]
     comparisons, values = _with_terms(fits, wholes, judge, terms, values, base, searches)
     chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
     joints, whole, first, common = fits[-1], wholes[-1], [one.bounds.first for one in fits], []
@@ -192,7 +193,8 @@ def _fit_robot(
     if len(splits) > 1:
         robots = [with_values(robot, v) if chosen != "given" else given for v in values]
         held_out = [
-            HeldOut(part, replace(one, table=fitted.table)) for (_, part), one in zip(splits, robots, strict=False)
+            HeldOut(part, replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high))
+            for (_, part), one in zip(splits, robots, strict=False)
         ]
     unknown = undetermined(whole, values[-1], errors)
     warnings = (
@@ -214,10 +216,12 @@ def _classic_candidates(
     joints: JointFit, searches: _SearchProgress, nthread: int
 ) -> tuple[RobotFit, dict[str, Values]]:
     """Fit the classic fields, joints by themselves and then together; return the whole robot's fit and candidates."""
-    bounds, names = joints.bounds, joints.robot.operated
+    bounds, names, residual = joints.bounds, joints.robot.operated, joints.prior.residual
+    given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
     searches.begin()
     report = searches.report("joints, each on its own", names, joints.rollouts.rows)
-    late = joints.search(("offset", "delay"), bounds.first, only=True, expired=searches.expired)
+    late = joints.search(("offset", "delay"), given, only=True, expired=searches.expired)
+    joints.prior.residual = residual  # of other fields' searches
     alone = joints.search(CLASSIC, bounds.start, joints.regressed(), report=report, expired=searches.expired)
     joints.prior.update_correlation_time(joints.rollouts, alone)
     whole = joints.robot_fit(nthread)
@@ -228,7 +232,7 @@ def _classic_candidates(
     )
     chains = whole.descend_chains(together, lambda names, rows: searches.report("limbs", names, rows), searches.expired)
     return whole, {
-        "given": bounds.first, "limbs": chains, "joints": alone, "whole": together, "delay and offset": late,
+        "given": given, "limbs": chains, "joints": alone, "whole": together, "delay and offset": late,
     }  # fmt: skip
 
 

@@ -80,7 +80,7 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
     }
     options = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
     pair = (held_out_errors(folds) for folds in (fitted.held_out, tried[options]))
-    comparison = Comparison("torque", *pair, adds_nothing=given.nominal is None)
+    comparison = Comparison("torque", *pair, equally_complex=given.nominal is None)
     if not comparison.accepted:
         return replace(fitted, comparisons=(*fitted.comparisons, comparison))
     robot, folds, after = TorqueFit(every, given).fit(options), tuple(tried[options]), float(comparison.after.mean())
@@ -234,11 +234,8 @@ class TorqueFit:
         require for a payload's place and hand x, (4,) m and kg."""
         robot, mounts, rows = self.robot, self.robot.payload_mounts, []
         model = build_model(replace(robot, payload_mounts=tuple(replace(m, mass=0.0) for m in mounts)))
-        data, bodies, full = (
-            mujoco.MjData(model),
-            [model.body(m.body).id for m in mounts],
-            np.empty((model.nv, model.nv)),
-        )
+        data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
+        bodies = [model.body(m.body).id for m in mounts]
         jac = np.empty((len(mounts), 2, 3, model.nv))  # of each mount's body: position and rotation
         every = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
         for s in self.sequences:
