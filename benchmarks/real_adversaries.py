@@ -3,7 +3,7 @@
     python benchmarks/real_adversaries.py labels --sets h1_2 --questions "3 kg left out"
 
 labels          permute payload and unit among the fitted recordings: effects of the labels must vanish
-test_labels    permute the payload among the test recordings: the benefit of the payload label must vanish
+test_labels     permute the payload among the test recordings: the benefit of the payload label must vanish
 late            add 40 ms of delay to one in ten of the fitted recordings: no method may follow them
 all_late        add 40 ms of delay to all recordings: methods that fit a delay must not change
 joints          rotate the order of the joints in the fitted recordings: every fit must become worse

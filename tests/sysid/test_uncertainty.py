@@ -8,7 +8,7 @@ import pytest
 from arm import TOML, XML, commands, record, write_arm
 
 from gaponet import api
-from gaponet.base.errors import RobotError
+from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import save_robot
@@ -242,3 +242,11 @@ def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(ar
     assert (precise.verdict, loose.verdict, none) == ("drifted", "same", 0.0)
     assert difference == pytest.approx(0.004 * 2**0.5, rel=0.5)
     assert loose.min_effect["shoulder"] == difference > loose.largest["shoulder"].moves
+
+
+def test_recordings_of_joints_that_were_never_identified_are_not_called_the_same(arm, folder):
+    robot = load_robot(folder)
+    half = replace(robot, **{f: np.where([True, False], getattr(robot, f), getattr(arm, f)) for f in TRUE})
+    logs = [replace(s, meta=replace(s.meta, notes={"held_at_home": ("shoulder",)})) for s in played(arm, 70, 2)]
+    with pytest.raises(UsageError, match="never identified: elbow"):
+        drift(half, ParameterUncertainty.load(robot), logs, 1)

@@ -52,6 +52,13 @@ def first_values(robot: RobotSpec) -> Values:
     return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS)}
 
 
+def identified_joints(robot: RobotSpec) -> set[str]:
+    """Return the operated joints whose classic fields differ from those of the robot before identification."""
+    now, then = first_values(robot), first_values(robot.before_identification)
+    moved = np.any([~np.isclose(now[f], then[f], rtol=1e-3, atol=1e-6) for f in CLASSIC], axis=0)
+    return {joint for joint, by in zip(robot.operated, moved, strict=True) if by}
+
+
 def with_values(robot: RobotSpec, values: Mapping[str, Array]) -> RobotSpec:
     """Return the robot with values (n,) of its operated joints, rounded to 6 digits."""
     return robot.with_servos({

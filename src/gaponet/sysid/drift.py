@@ -21,6 +21,7 @@ from gaponet.data.repeatability import repetition_difference
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
+from gaponet.sysid.axes import identified_joints
 from gaponet.sysid.evidence import Evidence, evidence, gradient_covariance, inverted, widened
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.uncertainty import PLAY, ParameterUncertainty
@@ -112,12 +113,18 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
         nthread: Threads, 0 for all cores.
 
     Raises:
-        UsageError: The recordings are too short, or move no joint.
+        UsageError: The recordings are too short, or move no joint that was identified.
     """
     own = evidence(robot, sequences, uncertainty.fields, nthread=nthread)
     if not own.rows.any():
         raise UsageError("no recording moves an operated joint away from what it may touch; record gaponet excite's")
     fields, joints = (*uncertainty.fields, PLAY), robot.operated
+    held = {j for j, rows in zip(joints, own.rows, strict=True) if rows}
+    if not held & identified_joints(robot):
+        raise UsageError(
+            f"{robot.folder}: these recordings hold only joints that were never identified: {', '.join(sorted(held))}. "
+            "Identify these joints first"
+        )
     repeatability = {
         j: uncertainty.joints[j].repeatability or float(today)  # today's may itself have become worse
         for j, today in zip(joints, repetition_difference(sequences, joints), strict=True)

@@ -15,7 +15,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.axes import CLASSIC, Values, first_values
+from gaponet.sysid.axes import Values, identified_joints
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import descend, soft_l1
 
@@ -48,10 +48,7 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
     Raises:
         UsageError: No joint corresponds.
     """
-    before = like.before_identification
-    now, then = first_values(like), first_values(before)
-    moved = np.any([~np.isclose(now[f], then[f], rtol=1e-3, atol=1e-6) for f in CLASSIC], axis=0)
-    changed = {joint for joint, by in zip(like.operated, moved, strict=True) if by}
+    before, changed = like.before_identification, identified_joints(like)
     sources: dict[str, str] = {}
     for i, joint in zip(robot.operated_index, robot.operated, strict=True):
         type_of = robot.servos[i]
