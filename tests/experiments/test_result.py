@@ -39,7 +39,9 @@ def test_several_values_have_a_sample_standard_deviation_and_one_value_has_none(
     assert format_cell(MeanStd.from_values([0.5])) == "0.50"
     assert format_cell(MeanStd.from_values([])) == ""
     assert format_cell(MeanStd.from_values([1.0, float("nan"), 3.0])) == "2.00 ± 1.41"
-    assert [format_cell(v) for v in (None, "a", 1234, float("nan"), True)] == ["", "a", "1,234", "", "yes"]
+    assert [format_cell(v) for v in (None, "a", 1234, float("nan"), True, -0.001)] == [
+        "", "a", "1,234", "", "yes", "0.00"
+    ]  # fmt: skip
 
 
 def test_a_row_of_the_wrong_length_is_refused():

@@ -6,7 +6,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from arm import TOML, XML, write_arm
+from arm import TOML, XML, commands, record, write_arm, write_dataset
 from files_arm import COMMON, write_files_arm
 from files_arm import XML as FILES_XML
 
@@ -16,7 +16,7 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import Table, load_robot
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.dynamics import inverse_dynamics, static_torque
-from gaponet.sim.model import build_model, model_hash, write_table
+from gaponet.sim.model import build_model, dataset_robot, model_hash, write_table
 
 
 def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
@@ -301,3 +301,17 @@ def test_a_table_that_nothing_may_touch_is_refused(tmp_path):
     stranger = write_arm(tmp_path / "b", toml=TOML + TIP.replace("fore", "jaw") + "[table]\nheight = -0.05\n")
     with pytest.raises(RobotError, match=r"a \[\[tip\]\] names body 'jaw', which is missing"):
         build_model(stranger)
+
+
+def test_a_datasets_robot_has_the_gains_that_all_recordings_state(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    soft = robot.with_gains((15.0, 15.0), None)
+    recorded = record(soft, commands(100, 1), "m")
+    recorded = replace(recorded, meta=replace(recorded.meta, kp=(15.0, 15.0), notes={"gains": "as recorded"}))
+    data = write_dataset(tmp_path / "data", robot, [recorded])
+    assert dataset_robot(data).kp.tolist() == [15.0, 15.0]
+    for name, nominal, kp in (("with", soft, 15.0), ("before", robot, 20.0)):  # fitted with these gains, or without
+        save_robot(nominal.with_servos({"elbow": {"delay": 0.01}}), tmp_path / name)
+        assert dataset_robot(data, tmp_path / name).kp.tolist() == [kp, kp]
+    data.append(replace(recorded.rows(slice(50)), meta=replace(recorded.meta, motion="n", kp=(9.0, 9.0))))
+    assert dataset_robot(data).kp.tolist() == [20.0, 20.0]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from gaponet.data.store import Entry
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.config import Kind
-    from gaponet.nn.training.config import TrainConfig
+    from gaponet.nn.training.config import Status, TrainConfig
     from gaponet.sysid.acceptance import Covariance, HeldOut
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
@@ -201,7 +201,7 @@ def train(
     out: Place,
     budget: str = "10m",
     config: TrainConfig | None = None,
-    model: Kind | None = None,
+    model: Kind | Literal["auto"] | None = None,
     robot: RobotSpec | Place | None = None,
     holdout_units: tuple[str, ...] = (),
     resume: bool = False,
@@ -218,8 +218,9 @@ def train(
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         config: Everything else; default `TrainConfig()`.
-        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, inverse;
-            default that of the config.
+        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, inverse. auto: gaponet,
+            shared_mlp and mlp get a fifth of the budget each, and the best on validation gets the rest. Default: that
+            of the config.
         robot: Another robot than the one that the dataset keeps, e.g. the folder that `identify` wrote.
         holdout_units: Units never trained on; their test motions stay in the test split.
         resume: Continue the run in `out`.
@@ -236,20 +237,28 @@ def train(
     from gaponet.base.files import lock_folder
     from gaponet.nn.training import ranks
     from gaponet.nn.training.config import Budget, TrainConfig
+    from gaponet.nn.training.selection import candidate_errors, train_best
     from gaponet.nn.training.trainer import Trainer
 
-    config = config or TrainConfig()
-    config = replace(config, model=replace(config.model, kind=model)) if model else config
-    with ranks.joined(config.device), ranks.on_first(lock_folder(Path(out), "run")):
+    config, whole, folder = config or TrainConfig(), Budget.parse(budget), Path(out)
+    with ranks.joined(config.device), ranks.on_first(lock_folder(folder, "run")):
         data, spec = as_dataset(dataset, robot)
         require_commands(data)
-        show = lambda status: progress(status.fraction, 1.0, status.note)  # noqa: E731
-        trainer = Trainer.prepare(
-            data, spec, Path(out), config, Budget.parse(budget),
-            resume=resume, holdout_units=holdout_units, show=show, log=log,
-        )  # fmt: skip
-        trained = trainer.run()
-    return TrainResult(model=trained, card=trained.card)
+
+        def one(kind: Kind, run: Path, share: float, spent: float, resume: bool) -> GapModel:
+            def show(status: Status) -> None:
+                progress(spent + share * status.fraction, 1.0, f"{kind}: {status.note}")
+
+            return Trainer.prepare(
+                data, spec, run, replace(config, model=replace(config.model, kind=kind)), whole.part(share),
+                resume=resume, holdout_units=holdout_units, show=show, log=log,
+            ).run()  # fmt: skip
+
+        if model == "auto":
+            trained = train_best(folder, resume, one)
+        else:
+            trained = one(model or config.model.kind, folder, 1.0, 0.0, resume)
+    return TrainResult(model=trained, card=trained.card, candidates=candidate_errors(folder))
 
 
 def adapt_model(

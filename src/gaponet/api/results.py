@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from gaponet.data.store import Dataset, Entry
     from gaponet.export.rollout import RolloutPrediction
     from gaponet.nn.artifact import GapModel
+    from gaponet.nn.config import Kind
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.finding import Finding
     from gaponet.robot.spec import RobotSpec
@@ -275,10 +276,12 @@ class TrainResult:
     Attributes:
         model: The exported model that was best on validation motions.
         card: What its card.json says: training, data, errors.
+        candidates: Kind of network → validation error after its part of the budget, rad; empty if one kind was given.
     """
 
     model: GapModel
     card: dict[str, Any] = field(repr=False)
+    candidates: Mapping[Kind, float] = field(default_factory=dict)
 
     @property
     def val_mpjae(self) -> dict[str, float]:
@@ -288,7 +291,8 @@ class TrainResult:
     def to_dict(self) -> dict[str, Any]:
         """The result as plain data."""
         keys = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
-        return {key: self.card[key] for key in keys}
+        kind = self.card["model"]["kind"]
+        return {key: self.card[key] for key in keys} | {"kind": kind, "candidates": dict(self.candidates)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -108,4 +108,4 @@ def format_cell(cell: Any, digits: int = 2) -> str:
         return "yes" if cell else "no"
     if isinstance(cell, (int, np.integer)):
         return f"{cell:,}"
-    return f"{cell:.{digits}f}" if math.isfinite(cell) else ""
+    return f"{cell:z.{digits}f}" if math.isfinite(cell) else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import nullcontext
 from pathlib import Path
 from shlex import quote
@@ -26,7 +27,7 @@ from gaponet.robot.folder import STORED_ROBOT
 def train(
     dataset: Source,
     out: Path,
-    model: Kind = "gaponet",
+    model: Kind | Literal["auto"] = "auto",
     recipe: Literal["labels", "paper"] = "labels",
     budget: str = "10m",
     resume: Flag = False,
@@ -61,17 +62,24 @@ def train(
         )  # fmt: skip
     if started():  # the first rank prints for all
         return
-    card = trained.card
+    card, kind = trained.card, title(trained.card["model"]["kind"])
     val = card["val_mpjae"]
+    if trained.candidates:
+        screen.say(
+            "validation error after a fifth of the budget, mrad: "
+            + ", ".join(f"{title(name)} {mrad(error)}" for name, error in trained.candidates.items())
+            + f"; without a network {mrad(val['start'])}. {kind} got the rest of the budget"
+        )
     screen.say(
         f"best on validation: {mrad(val['model'])} mrad, without the network {mrad(val['start'])}, nominal "
         f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "
         f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
-    gain = NetworkGain("identified", val["added"], val.get("error", 0.0), val["start"])
+    gain = NetworkGain("identified", val["added"], val.get("error", math.nan), val["start"])
+    scatter = "" if math.isnan(gain.standard_error) else f" ± {mrad(gain.standard_error)}"
     screen.say(
-        f"the network reduces the error by {mrad(gain.reduction)} ± {mrad(gain.standard_error)} mrad on validation "
-        "motions (paired)"
+        f"{kind} reduces the error by {mrad(gain.reduction)}{scatter} mrad on "
+        + ("validation motions (paired)" if scatter else "the one validation motion")
     )
     step = f"gaponet eval {out} {quote(dataset)}"
     if not gain.helps and val["start"] != val["nominal"]:

@@ -72,7 +72,7 @@ def view(
     from gaponet.report.view.side_by_side import select_entry, side_by_side
 
     out = Out(json)
-    data, spec = open_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot, model[0] if model else None)
     entry = select_entry(data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass)
     with progress_bar("replaying") as update:
         shown = side_by_side(data, entry, spec, model, update)

@@ -23,9 +23,9 @@ from gaponet.report.page import PageFigure, inline_image, page_figure, render
 from gaponet.report.run_files import REPAIR_HINT, read_config, read_gap, read_metrics, read_progress, read_trajectories
 from gaponet.report.tables import by_group, mrad, mrad_and_degrees, totals
 from gaponet.report.verdict import network_gain, verdict
-from gaponet.robot.folder import has_stored_robot, load_stored_robot
+from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sim.model import require_stored_robot
+from gaponet.sim.model import dataset_robot, require_stored_robot
 
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
 OPEN_TRAJECTORIES = 3  # motions shown without a click
@@ -146,7 +146,7 @@ def _evaluate(
         data = Dataset(place)
     except DatasetError as error:
         raise DatasetError(f"{error}. Say where the dataset is: gaponet report {run} --dataset DIR") from None
-    robot = robot or load_stored_robot(place if has_stored_robot(place) else run, data.robot_name)
+    robot = robot or dataset_robot(data, run)
     evaluate([run, *also], data, robot, progress=progress).save(run)
 
 

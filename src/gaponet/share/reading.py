@@ -6,8 +6,9 @@ import logging
 from pathlib import Path
 
 from gaponet.data.store import Dataset
-from gaponet.robot.folder import has_stored_robot, load_stored_robot
+from gaponet.robot.folder import has_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.model import dataset_robot
 
 
 def load_dataset(place: str | Path) -> Dataset:
@@ -26,13 +27,13 @@ def load_dataset(place: str | Path) -> Dataset:
 def open_dataset(
     dataset: Dataset | str | Path, robot: RobotSpec | str | Path | None = None, run: str | Path | None = None
 ) -> tuple[Dataset, RobotSpec]:
-    """Open a dataset for reading; return it and its robot.
+    """Open a dataset for reading; return it and its robot, with the gains that all recordings state.
 
     Args:
         dataset: Folder; or the address (s3://, gs://, file://, hf://) of a pushed dataset, which is read without a
             pull.
         robot: Robot to use instead of the one in the dataset folder.
-        run: Run folder whose robot is used if the dataset folder has none.
+        run: Run or robot folder that is used with the dataset (sim.model.dataset_robot).
 
     Raises:
         DatasetError: There is no dataset, it is damaged, or it cannot be reached.
@@ -43,10 +44,8 @@ def open_dataset(
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if robot is not None:
         return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
-    if not has_stored_robot(data.path) and run is not None and has_stored_robot(Path(run)):
-        return data, load_stored_robot(Path(run), data.robot_name)
-    spec = load_stored_robot(data.path, data.robot_name)
-    if not has_stored_robot(data.path):
+    spec = dataset_robot(data, None if run is None else Path(run))
+    if not has_stored_robot(data.path) and (run is None or not has_stored_robot(Path(run))):
         logging.getLogger("gaponet").warning(
             "%s holds no robot (written before November 2026): the package's %s is used", data.path, spec.name
         )

@@ -50,7 +50,7 @@ def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
         raise UsageError("heard")
 
     monkeypatch.setattr(api, "train", train)
-    words = shlex.split(shlex.join(["train", "data", "--out", "run", *config.options()]))
+    words = shlex.split(shlex.join(["train", "data", "--out", "run", "--model", "gaponet", *config.options()]))
     assert main(words) == 2
     assert heard == [config]
 

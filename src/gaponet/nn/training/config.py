@@ -200,6 +200,7 @@ def command(
     words = [*several, "gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
     words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
     words += ["--holdout-units", *holdout_units] if holdout_units else []
+    words += ["--model", "gaponet"] if config.model.kind == "gaponet" else []  # the command's default is auto
     return shlex.join(words + config.options())
 
 
@@ -242,6 +243,12 @@ class Budget:
         if not unit and number < MIN_STEPS:
             raise UsageError(f"--budget {text}: {number:g} control steps teach nothing; is it {text}s or {text}m?")
         return cls(seconds=number * SECONDS[unit]) if unit else cls(steps=int(number))
+
+    def part(self, share: float) -> Budget:
+        """Return a share of this budget."""
+        if self.seconds is not None:
+            return Budget(seconds=share * self.seconds)
+        return Budget(steps=max(round(share * (self.steps or 0)), 1))
 
     def spent(self, seconds: float, steps: int) -> float:
         """Return the used share of the budget; 1 or more at its end."""

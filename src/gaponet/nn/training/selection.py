@@ -1,0 +1,70 @@
+"""Choice of the network by validation: each kind is trained with a part of the budget, and the best gets the rest."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gaponet.base.errors import ModelError, UsageError
+from gaponet.base.files import write_json
+from gaponet.base.structure import read_json
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.config import Kind
+from gaponet.nn.training import ranks
+from gaponet.nn.training.checkpoint import CHECKPOINT
+
+CANDIDATES: tuple[Kind, ...] = ("gaponet", "shared_mlp", "mlp")
+SHARE = 0.2  # of the budget, for each candidate
+FOLDER, ERRORS = "candidates", "candidates.json"
+Train = Callable[[Kind, Path, float, float, bool], GapModel]  # kind, run, share of the budget, share spent, resume
+
+
+def train_best(out: Path, resume: bool, train: Train) -> GapModel:
+    """Train each candidate in OUT/candidates, copy the run with the least validation error to OUT, and go on with it.
+
+    OUT/candidates.json has the validation error of each candidate, rad.
+
+    Raises:
+        UsageError: OUT holds a run and resume is false, or no run and resume is true.
+    """
+    present = _kind(out)
+    if resume and present and not (out / FOLDER).is_dir():
+        return train(present, out, 1.0, 0.0, True)
+    if resume != (out / FOLDER).is_dir() or (not resume and present):
+        problem = "nothing to resume; train without --resume" if resume else "holds a run already; add --resume"
+        raise UsageError(f"{out}: {problem}, or choose another --out")
+    errors = candidate_errors(out)
+    for i, kind in enumerate(CANDIDATES):
+        if kind in errors:
+            continue
+        run = out / FOLDER / kind
+        model = train(kind, run, SHARE, i * SHARE, (run / CHECKPOINT).is_file())
+        if model.card["interrupted"]:
+            _copy(out, min(errors, key=errors.__getitem__, default=kind))
+            return GapModel.load(out)
+        errors[kind] = model.card["val_mpjae"]["model"]
+        ranks.once(lambda: write_json(out / ERRORS, errors))
+    best = min(errors, key=errors.__getitem__)
+    if _kind(out) != best:
+        _copy(out, best)
+    spent = SHARE * (len(CANDIDATES) - 1)
+    return train(best, out, 1 - spent, spent, True)
+
+
+def candidate_errors(run: Path) -> dict[Kind, float]:
+    """Return the validation error of each candidate of a run, rad; empty if one kind was given."""
+    return read_json(dict[Kind, float], run / ERRORS, ModelError) if (run / ERRORS).is_file() else {}
+
+
+def _kind(run: Path) -> Kind | None:
+    """Return the kind of network of a run; None if no run is there."""
+    config = run / "config.json"
+    found = (run / CHECKPOINT).is_file() and config.is_file()
+    return read_json(dict[str, Any], config, ModelError)["model"]["kind"] if found else None
+
+
+def _copy(out: Path, kind: Kind) -> None:
+    ignore = shutil.ignore_patterns(".*")
+    ranks.once(lambda: shutil.copytree(out / FOLDER / kind, out, dirs_exist_ok=True, ignore=ignore))

@@ -1,0 +1,67 @@
+"""Choice of the network by validation, with trainings that only write their files."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+
+from gaponet.base.errors import UsageError
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.training.selection import candidate_errors, train_best
+
+ERRORS = {"gaponet": 3.0, "shared_mlp": 1.0, "mlp": 2.0}
+
+
+class Trainings:
+    """Writes a run folder per call; ends early for one kind."""
+
+    def __init__(self, interrupted=""):
+        self.calls, self.interrupted = [], interrupted
+
+    def __call__(self, kind, run, share, spent, resume):
+        self.calls.append((kind, run.name, round(share, 6), round(spent, 6), resume))
+        run.mkdir(parents=True, exist_ok=True)
+        (run / "checkpoint.pt").write_text(kind)
+        (run / "config.json").write_text(json.dumps({"model": {"kind": kind}}))
+        card = {"interrupted": kind == self.interrupted, "val_mpjae": {"model": ERRORS[kind]}}
+        return SimpleNamespace(card=card)
+
+
+def test_the_best_kind_gets_the_rest_of_the_budget(tmp_path):
+    train = Trainings()
+    train_best(tmp_path / "run", False, train)
+    assert train.calls == [
+        ("gaponet", "gaponet", 0.2, 0.0, False),
+        ("shared_mlp", "shared_mlp", 0.2, 0.2, False),
+        ("mlp", "mlp", 0.2, 0.4, False),
+        ("shared_mlp", "run", 0.6, 0.4, True),
+    ]
+    assert candidate_errors(tmp_path / "run") == ERRORS
+    assert (tmp_path / "run/checkpoint.pt").read_text() == "shared_mlp"
+
+
+def test_an_interrupted_choice_leaves_the_best_so_far_and_goes_on_where_it_was(tmp_path, monkeypatch):
+    monkeypatch.setattr(GapModel, "load", classmethod(lambda cls, run: run))
+    run, train = tmp_path / "run", Trainings(interrupted="shared_mlp")
+    train_best(run, False, train)
+    assert [kind for kind, *_ in train.calls] == ["gaponet", "shared_mlp"]
+    assert (run / "checkpoint.pt").read_text() == "gaponet"
+    with pytest.raises(UsageError, match="holds a run already; add --resume"):
+        train_best(run, False, train)
+    again = Trainings()
+    train_best(run, True, again)
+    assert again.calls == [
+        ("shared_mlp", "shared_mlp", 0.2, 0.2, True),
+        ("mlp", "mlp", 0.2, 0.4, False),
+        ("shared_mlp", "run", 0.6, 0.4, True),
+    ]
+    assert (run / "checkpoint.pt").read_text() == "shared_mlp"
+
+
+def test_a_run_of_one_kind_is_resumed_with_its_kind(tmp_path):
+    with pytest.raises(UsageError, match="nothing to resume"):
+        train_best(tmp_path / "none", True, Trainings())
+    first, train = Trainings(), Trainings()
+    first("mlp", tmp_path / "run", 1.0, 0.0, False)
+    train_best(tmp_path / "run", True, train)
+    assert train.calls == [("mlp", "run", 1.0, 0.0, True)]
