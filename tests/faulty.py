@@ -195,6 +195,8 @@ FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, 
         lambda logs: one_of(logs, lambda g: g.change(EVERY, qpos=at(slice(400, 404), 0.0))), {}),
     "frozen channel": (lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(0, 400), lambda x: x[:1]))), {}),
     "command is the state": (lambda logs: all_of(logs, lambda g: replace(g, ctrl=g.qpos)), {}),
+    "command and state swapped in one": (
+        lambda logs: one_of(logs, lambda g: replace(g, ctrl=g.qpos, qpos=g.ctrl)), {}),
     "clock jumps on": (
         lambda logs: one_of(logs, lambda g: replace(g, time=g.time + 5 * (np.arange(len(g.time)) > 500))), {}),
     "clock jumps back": (

@@ -357,7 +357,7 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
     diagnosis = Diagnosis.of(real_dataset, so101, gravity_model=gravity_of(so101))
-    assert diagnosis.verdict == "Usable. Read the 4 warning(s) first."
+    assert diagnosis.verdict == "Usable. Read the 3 warning(s) first."
     lags = found(diagnosis, "lag", "note").values
     for joint in so101.operated:
         assert 0.08 <= lags[joint]["median"] <= 0.16

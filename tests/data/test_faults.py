@@ -1,4 +1,4 @@
-"""Each of thirty faults, put into good logs of a virtual arm, is found and named, or refused; the logs are good."""
+"""Each fault, put into good logs of a virtual arm, is found and named, or refused; the logs are good."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ NAMED = {
     "degrees of all": ("", "", "these look like degrees"),
     "offset of 20 mrad": ("offset", "note", "elbow_flex rests +2"),
     "offset of 150 mrad": ("offset", "warning", "more than assembly leaves"),
-    "lag of 100 ms more": ("lag", "warning", "of dead time: very long"),
+    "lag of 100 ms more": ("lag", "warning", "as dead time very long"),
     "lag of one joint": ("lag", "warning", "elbow_flex lags 1"),
     "scale of 1.2": ("scale", "warning", "elbow_flex goes 1.2"),
     "scale of 0.8": ("scale", "warning", "elbow_flex goes 0.8"),
@@ -29,6 +29,7 @@ NAMED = {
     "dropout as zeros": ("jumps", "warning", "all joints are exactly 0 for 4 rows of m2"),
     "frozen channel": ("stuck", "warning", "elbow_flex repeats one number"),
     "command is the state": ("copied", "error", "are the same numbers"),
+    "command and state swapped in one": ("copied", "error", "before their commands in m2, not in other recordings"),
     "clock jumps on": ("", "", "s after the row before it"),
     "clock jumps back": ("", "", "time does not increase"),
     "mixed rates": ("rate", "warning", "1 at 100.00 Hz"),

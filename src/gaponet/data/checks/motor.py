@@ -8,6 +8,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
+from gaponet.data.checks.recording import unsigned_torque
 from gaponet.data.checks.survey import Survey
 from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
 from gaponet.data.static_poses import StaticError, StaticPoses
@@ -44,31 +45,46 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
     # The timing check sees more of joints whose commands change sharply.
     smooth = [name for name in lags if name in robot.operated and not sharp[name]]
-    dead_time = {name: float(np.median(lags[name])) - expected[name] for name in smooth}
+    dead_time = {name: float(np.median(lags[name])) - expected[name][0] for name in smooth}
     usual = float(np.median(list(dead_time.values()))) if dead_time else 0.0
     if dead_time:
         verdict = next(words for limit, words in DEAD_TIMES if usual <= limit)
-        text += f". Beyond what kp and damping make of it that is {usual * 1e3:.0f} ms of dead time: {verdict}"
+        text += (
+            f". kp and damping explain all but {usual * 1e3:.0f} ms, which are dead time, friction or inertia (gaponet "
+            f"identify separates them); as dead time {verdict}"
+        )
     level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
     yield Finding(level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()})
     for name, late in dead_time.items():
-        if len(dead_time) > 2 and late - usual > MAX_EXTRA_LAG_S and late > 2 * expected[name]:
+        if (
+            len(dead_time) > 2
+            and late - usual > MAX_EXTRA_LAG_S
+            and late > max(2 * expected[name][0], expected[name][1])
+        ):
             text = (
                 f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: its channel is read late, "
-                "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
+                "filtered or from another bus, or it moves stiffly"
             )
             yield Finding("warning", "lag", text, (name,), {"extra_s": late - usual})
 
 
-def _expected_lag(robot: RobotSpec) -> dict[str, float]:
-    """Return the lag of a slow motion that kp, kd and the MJCF's damping explain, by joint, s."""
+def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
+    """Return the lag of a slow motion that kp, kd and the MJCF's damping explain, and the lag that the inertia at home
+    adds at the servo's own frequency √(kp / inertia), a quarter of a period; by joint, s."""
+    import mujoco
+
     from gaponet.robot.mjcf import compile_spec, read_mjcf
 
     model = compile_spec(read_mjcf(robot.mjcf), robot.mjcf)
-    damping = np.array([model.dof_damping[model.joint(name).dofadr[0]] for name in robot.joint_names])
-    damping = np.where(np.isfinite(robot.damping), robot.damping, damping) + robot.kd
-    lags = np.divide(damping, robot.kp, out=np.zeros_like(damping), where=robot.kp > 0)
-    return dict(zip(robot.joint_names, lags.tolist(), strict=True))
+    data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, full)
+    dofs = [model.joint(name).dofadr[0] for name in robot.joint_names]
+    damping = np.where(np.isfinite(robot.damping), robot.damping, model.dof_damping[dofs]) + robot.kd
+    inertia = np.diag(full)[dofs]
+    stiff = np.where(robot.kp > 0, robot.kp, np.inf)
+    lags = np.stack([damping / stiff, np.pi / 2 * np.sqrt(inertia / stiff)], axis=1)
+    return {name: (float(slow), float(near)) for name, (slow, near) in zip(robot.joint_names, lags, strict=True)}
 
 
 def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -105,12 +121,11 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     low, high = np.min([t.low for _, t in recorded], axis=0), np.max([t.high for _, t in recorded], axis=0)
     used = np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05
-    constant, alive = masked_names(robot, used & (low == high)), masked_names(robot, used & (low < high))
-    unsigned = masked_names(robot, used & (low < high) & (low >= 0))
+    constant, unsigned = masked_names(robot, used & (low == high)), unsigned_torque(recorded, robot)
     if constant:
         text = f"torque of {', '.join(constant)} never changes; ignore it"
         yield Finding("warning", "torque", text, constant)
-    if unsigned and unsigned == alive:
+    if unsigned:
         text = (
             "torque is unsigned (never negative, though joints move both ways): a magnitude of the current, not a "
             "torque; do not fit it"

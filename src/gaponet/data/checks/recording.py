@@ -121,9 +121,21 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             yield Finding("warning" if name in robot.operated else "note", "blocked", text, (name,), values)
 
 
+def unsigned_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> tuple[str, ...]:
+    """Return the joints with a changing torque if none of these torques is ever negative: magnitudes, no torques."""
+    if not recorded:
+        return ()
+    low, high = np.min([t.low for _, t in recorded], axis=0), np.max([t.high for _, t in recorded], axis=0)
+    alive = (np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05) & (low < high)
+    return () if (alive & (low < 0)).any() else masked_names(robot, alive)
+
+
 def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a motor reach its torque limit?"""
     recorded = [(s, s.torque) for s in surveys if s.torque is not None]
+    if unsigned_torque(recorded, robot):  # the torque check warns of it
+        yield Finding("ok", "saturation", "no signed torque recorded")
+        return
     over = [(s, t) for s, t in recorded if t.over_limit.any()]
     if not over:
         ok = Finding("ok", "saturation", "no torque at a limit" if recorded else "no torque recorded")

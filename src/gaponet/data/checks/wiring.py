@@ -107,6 +107,7 @@ def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are command and state two signals, and does the command come first?"""
     copies: dict[str, list[str]] = {}
+    usual: list[int] = []  # joints that follow their commands in most recordings
     for i, name in enumerate(robot.joint_names):
         moved = _moved(surveys, i)
         copied = [s.motion for s in moved if s.equals_command[i]]
@@ -120,6 +121,15 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "command and state swapped, or their clocks apart?"
             )
             yield Finding("error", "copied", text, (name,), {"lead_s": lead})
+        else:
+            usual.append(i)
+    early = [s for s in surveys if _moves_first(s, usual)]
+    if early:
+        text = (
+            f"joints move before their commands in {abbreviate([s.motion for s in early])}, not in other recordings: "
+            "command and state are swapped there; leave these out, or import them with the columns exchanged"
+        )
+        yield Finding("error", "copied", text, (), {"recordings": [s.entry.id for s in early]})
     if copies:
         motions = [motion for of_joint in copies.values() for motion in of_joint]
         text = (
@@ -128,6 +138,12 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "both; log the command that the servo was sent"
         )
         yield Finding("error", "copied", text, tuple(copies))
+
+
+def _moves_first(survey: Survey, joints: list[int]) -> bool:
+    """True if several of the joints move before their commands in a recording, and most of those that move."""
+    leads = [bool(np.isfinite(survey.lead[i])) for i in joints if survey.ctrl_range[i] > MIN_COMMAND_RAD]
+    return sum(leads) >= 2 and 2 * sum(leads) > len(leads)
 
 
 def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
