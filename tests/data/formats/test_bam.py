@@ -1,5 +1,6 @@
 """BAM's logs: one servo, its load and its gain said in the file."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -34,6 +35,17 @@ def test_a_recording_says_its_gain_and_its_load(tmp_path, bench):
     np.testing.assert_allclose(Condition.of(second, bench).kp, second.meta.kp)
     np.testing.assert_allclose(first.qpos[:, 0], late(wave(60, 1, 0.0053), 3)[:, 0], atol=1e-6)
     assert sorted(report.entries[0].channels) == ["ctrl", "qpos", "qvel", "temperature"]
+
+
+def test_a_supply_voltage_that_the_servo_contradicts_is_named(tmp_path, bench, caplog):
+    file = write_bam(tmp_path / "a.json", vin=15.0)
+    told = json.loads(file.read_text())
+    for volts, warned in ((14.8, False), (12.0, True)):
+        told["entries"] = [e | {"input_volts": volts} for e in told["entries"]]
+        file.write_text(json.dumps(told))
+        for _, load in read_logs(file, bench):
+            assert load.channels
+        assert ("vin says 15 V, the servo measured 12 V" in caplog.text) is warned
 
 
 def test_a_recording_ends_where_torque_is_switched_off(tmp_path, bench):

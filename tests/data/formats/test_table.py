@@ -40,6 +40,34 @@ def test_numbers_come_back_as_written(tmp_path, arm, kind):
     assert np.array_equal(log.channels["tau"].values[:, 0], np.arange(60.0))
 
 
+COMMANDED, MEASURED = ("ctrl.elbow", "ctrl.shoulder"), ("qpos.elbow", "qpos.shoulder")
+
+
+def by_joint(columns, path):
+    """The columns as a table with a row per joint and time."""
+    rows = ["t,joint,command,position,phase"]
+    for i, time in enumerate(columns["time"]):
+        rows += [
+            f"{time!r},{j},{columns[f'ctrl.{j}'][i]!r},{columns[f'qpos.{j}'][i]!r},run" for j in ("elbow", "shoulder")
+        ]
+    path.write_text("\n".join(map(str, rows)) + "\n")
+    return path
+
+
+def test_rows_per_joint_give_the_same_log_as_columns_per_joint(tmp_path, arm):
+    columns = {name: list(map(float, values)) for name, values in arm_columns().items()}
+    logs = tmp_path / "logs.toml"
+    logs.write_text('ctrl = "command"\nqpos = "position"\ntime_unit = "s"\nposition_unit = "rad"\n')
+    ((_, log),) = read_logs(by_joint(columns, tmp_path / "long.csv"), arm, logs=logs)
+    for k, joint in enumerate(log.joint_names):
+        assert np.array_equal(log.channels["qpos"].values[:, k], columns[f"qpos.{joint}"])
+        assert np.array_equal(log.channels["ctrl"].values[:, k], columns[f"ctrl.{joint}"])
+    text = (tmp_path / "long.csv").read_text().splitlines()
+    (tmp_path / "long.csv").write_text("\n".join(text[:-1]) + "\n")
+    with pytest.raises(LogError, match=r"joints have different times \(elbow 60, shoulder 59 rows\)"):
+        next(read_logs(tmp_path / "long.csv", arm, logs=logs))[1]()
+
+
 def test_a_folder_holds_one_motion_per_file(tmp_path, arm):
     folder = tmp_path / "logs"
     folder.mkdir()

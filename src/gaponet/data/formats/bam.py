@@ -9,6 +9,7 @@ ends where torque is switched off: from there on nothing is commanded.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -25,11 +26,12 @@ from gaponet.robot.spec import RobotSpec
 
 OPTIONS: tuple[str, ...] = ()
 EXTRA = ""
+MAX_VOLTS_RATIO = 0.1  # difference of stated and measured supply voltage, relative
 Size = Annotated[float, Gt(0), Interval(le=1e3)]
 
 
 class Sample(TypedDict):
-    """One sample; rad, rad/s, s, °C."""
+    """One sample; rad, rad/s, s, °C, V."""
 
     timestamp: float
     position: float
@@ -37,6 +39,7 @@ class Sample(TypedDict):
     torque_enable: bool
     speed: NotRequired[float]
     temp: NotRequired[float]
+    input_volts: NotRequired[float]
 
 
 class BamFile(TypedDict):
@@ -97,6 +100,12 @@ def _log(file: Path, told: BamFile, robot: RobotSpec, joint_map: dict[str, str] 
     on, cut = on[:off], on[off:]
     channels = {"ctrl": "goal_position", "qpos": "position", "qvel": "speed", "temperature": "temp"}
     time = np.array([e["timestamp"] for e in on])
+    volts = float(np.median([e.get("input_volts", told["vin"]) for e in on]))
+    if abs(volts - told["vin"]) > MAX_VOLTS_RATIO * told["vin"]:
+        logging.getLogger("gaponet").warning(
+            "%s: vin says %g V, the servo measured %g V: the gain is taken at vin; correct the file if that is wrong",
+            file, told["vin"], volts,
+        )  # fmt: skip
     gain = told["kp"] * servo.gain * (told["vin"] / servo.gain_volts if servo.gain_volts else 1.0)
     return Log(
         robot.name,

@@ -3,7 +3,7 @@
 Columns are called `time`, `ctrl.<joint>`, `qpos.<joint>` and, where the robot says more, `qvel.<joint>`, `tau.<joint>`,
 `temperature.<joint>`; others are left alone. A logs.toml (data.describe.logs_file) says other names, the units, and the
 names of the columns where the file has none. Torques are N·m and temperatures °C. Units have no default: a wrong guess
-looks like a sim-to-real gap.
+looks like a sim-to-real gap. A table with a column `joint` has a row per joint and time (formats.joint_rows).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal
-from gaponet.data.formats import DESCRIBED, files_under, parquet
+from gaponet.data.formats import DESCRIBED, files_under, joint_rows, parquet
 from gaponet.data.log import CHANNELS, skipped_rows
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
@@ -60,6 +60,9 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         for name in names:
             if names.count(name) > 1:
                 raise LogError(f"{file}:1: column '{name}' stands twice; rename one")
+        if joint_rows.joint_column(names):
+            yield joint_rows.recording(file, names, told, "," if _is_parquet(file) else _file_delimiter(file))
+            continue
         where, line = f"{file}:1", 1 if _is_parquet(file) else first + 1
         yield Recording(file.stem, str(file), dict.fromkeys(names, ()), load, where, (str(file),), line)
 
@@ -76,6 +79,11 @@ def _is_table(file: Path) -> bool:
 def _delimiter(line: str) -> str:
     """Return the separator of cells; a space for any white space."""
     return next((d for d in (",", ";", "\t") if d in line), " ")
+
+
+def _file_delimiter(file: Path) -> str:
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        return _delimiter(lines.readline(1 << 20))
 
 
 def _cells(line: str, delimiter: str) -> list[str]:

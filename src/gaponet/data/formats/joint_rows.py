@@ -1,0 +1,88 @@
+"""Tables with a row per joint and time: columns `time`, `joint` (names), and one column per signal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError
+from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
+from gaponet.data.describe.logs_file import LogsFile
+from gaponet.data.describe.recording import Recording, Signal
+from gaponet.data.formats import parquet
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+JOINT_COLUMNS = ("joint", "joint_name", "joint_names")
+TIME_COLUMNS = ("time", "t", "timestamp", "stamp")
+
+
+def joint_column(names: list[str]) -> str | None:
+    """Return the column with the joints' names; None if the table has no such column."""
+    return next((name for name in names if name.lower() in JOINT_COLUMNS), None)
+
+
+def recording(file: Path, names: list[str], told: LogsFile, delimiter: str) -> Recording:
+    """Return a table with a row per joint and time as a recording whose signals have a column per joint.
+
+    Raises:
+        LogError: The time column is not known, or a joint is missing at a time.
+    """
+    joint = joint_column(names)
+    time = (
+        told.get("time") if told.get("time") in names else next((n for n in names if n.lower() in TIME_COLUMNS), None)
+    )
+    if joint is None or time is None:
+        raise LogError(f"{file}:1: a row per joint, and no column of times; name it in logs.toml: time = …")
+    table = _table(file, names, delimiter)
+    of_row = np.array([str(name) for name in table.column(joint).to_pylist()], dtype=object)
+    joints = tuple(dict.fromkeys(of_row.tolist()))
+    order = [np.flatnonzero(of_row == name) for name in joints]
+    stamps = _numbers(file, table, time)
+    if len({len(rows) for rows in order}) > 1 or any((stamps[rows] != stamps[order[0]]).any() for rows in order):
+        counts = ", ".join(f"{name} {len(rows)}" for name, rows in zip(joints, order, strict=True))
+        raise LogError(f"{file}: joints have different times ({counts} rows); write every joint at every time")
+    signals = {n: joints for n in names if n not in (joint, time) and _is_number(table.column(n).type)}
+
+    def load(wanted: list[str]) -> dict[str, Signal]:
+        return {
+            n: Signal(
+                stamps[order[0]] if n == time else np.stack([_numbers(file, table, n)[rows] for rows in order], 1)
+            )
+            for n in wanted
+        }
+
+    default: LogsFile = {"time": time}
+    return Recording(file.stem, str(file), {time: ()} | signals, load, f"{file}:1", (str(file),), default=default)
+
+
+def _table(file: Path, names: list[str], delimiter: str) -> pa.Table:
+    if file.suffix.lower() == ".parquet":
+        return parquet.read(file, names)
+    import pyarrow as pa
+    import pyarrow.csv as pc
+
+    body = read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
+    try:
+        return pc.read_csv(
+            pa.py_buffer(body), pc.ReadOptions(use_threads=False), pc.ParseOptions(delimiter=delimiter)
+        ).rename_columns(names)
+    except pa.ArrowInvalid as error:
+        raise LogError(f"{file}: not a readable CSV file ({error}); export it again") from None
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    import pyarrow as pa
+
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+
+
+def _numbers(file: Path, table: pa.Table, name: str) -> Array:
+    column = table.column(name)
+    if not _is_number(column.type) or column.null_count:
+        raise LogError(f"{file}: column '{name}' holds cells that are no numbers; repair or cut these rows")
+    return np.asarray(column.to_numpy(), float)
