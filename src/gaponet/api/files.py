@@ -94,9 +94,19 @@ def export_network(
 
 
 def randomization(
-    robot: Place, *, out: Place, engine: Engine = "json", scope: Scope = "today", units: tuple[Place, ...] = ()
+    robot: Place,
+    *,
+    out: Place,
+    engine: Engine = "json",
+    scope: Scope = "today",
+    units: tuple[Place, ...] = (),
+    data: str | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[Path, Randomization]:
-    """Write the ranges of an identified robot's parameters, for domain randomisation.
+    """Write sampled units and ranges of an identified robot's parameters, for domain randomisation.
+
+    Units that follow the robot's recordings are kept. Their error is stated beside that of the robot with ± 20 % on
+    each number; units with a larger error are refused.
 
     Args:
         robot: Robot folder that `identify` or `adapt_robot` wrote, or run folder.
@@ -104,13 +114,22 @@ def randomization(
         engine: Engine whose terms are used, beside sampled units (randomization.json).
         scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot: over its type.
         units: For any-robot: robot folders of the type.
+        data: Dataset whose motions choose and judge the units; default: that of the identification.
+        progress: Called with done, total and a note.
 
     Returns:
         The file, and the ranges with sampled units.
-    """
-    from gaponet.export.randomization import sample_units, write_randomization
 
-    made = sample_units(simulator_folder(Path(robot)), scope, tuple(map(Path, units)))
+    Raises:
+        UsageError: The uncertainty, days or robots are missing.
+        NoGainError: The units follow the recordings worse than ± 20 % on each number.
+    """
+    from gaponet.export.plain_servos import read_recordings
+    from gaponet.export.randomization import judge_units, sample_units, write_randomization
+
+    spec = load_robot(simulator_folder(Path(robot)))
+    made = sample_units(spec, scope, tuple(map(Path, units)))
+    made = judge_units(made, spec, read_recordings(spec.folder, data, spec), progress)
     return write_randomization(made, engine, Path(out)), made
 
 

@@ -70,7 +70,7 @@ def export(
     """
     screen = Out(json)
     if to == "randomization":
-        _show_ranges(screen, robot, out or robot / "randomization", engine, scope, units)
+        _show_ranges(screen, robot, out or robot / "randomization", engine, scope, units, data)
         return
     if to == "lerobot":
         if into is None:
@@ -102,11 +102,24 @@ def export(
     screen.result(made.to_dict())
 
 
-def _show_ranges(screen: Out, robot: Path, out: Path, engine: Engine, scope: Scope, units: tuple[Path, ...]) -> None:
+def _show_ranges(
+    screen: Out, robot: Path, out: Path, engine: Engine, scope: Scope, units: tuple[Path, ...], data: str | None
+) -> None:
     from gaponet.export.randomization import table_rows
 
-    file, made = api.randomization(robot, out=out, engine=engine, scope=scope, units=units)
+    with progress_bar("drawing") as update:
+        file, made = api.randomization(
+            robot, out=out, engine=engine, scope=scope, units=units, data=data, progress=update
+        )  # fmt: skip
     screen.table(f"{made.robot}, {scope}: 9 of 10 units lie within", *table_rows(made))
+    forms = {"servo model": made.judged} | ({} if made.plain is made.judged else {"without it": made.plain})
+    rows = [
+        [form, *(mrad(judged.errors[name]) for name in ("exported", "units", "one by one", "by hand"))]
+        for form, judged in forms.items() if judged is not None
+    ]  # fmt: skip
+    if rows:
+        heading = ["form", "exported", "units", "numbers one by one", "± 20 % by hand"]
+        screen.table("Error on validation motions, mrad", heading, rows)
     for note in made.notes:
         screen.say(f"  {note}", "note", "cyan")
     if made.unknown:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from string import Template
 from typing import Any, Literal
@@ -20,6 +20,9 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
+from gaponet.base.progress import Progress, no_progress
+from gaponet.data.sequence import Sequence
+from gaponet.export.drawn_robots import DrawnRobots, draw_robots
 from gaponet.export.shipped import mujoco_randomization
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -43,6 +46,8 @@ class Randomization:
         units: Field → (samples, n), SI units; a row is one unit.
         ranges: Joint → field → low, value, high; 9 of 10 units lie between.
         unknown: "joint: field" of the numbers that no log determines.
+        judged: The units with the servo model that recordings chose; None without recordings.
+        plain: The same of the robot as fitted without its servo model.
     """
 
     robot: str
@@ -51,6 +56,12 @@ class Randomization:
     ranges: dict[str, dict[str, tuple[float, float, float]]]
     unknown: tuple[str, ...]
     notes: tuple[str, ...]
+    judged: DrawnRobots | None = None
+    plain: DrawnRobots | None = None
+
+    def for_engine(self, engine: Engine) -> DrawnRobots | None:
+        """Return the judged units in the form that an engine's file has."""
+        return self.judged if engine == "json" else self.plain
 
 
 def sample_units(
@@ -101,6 +112,25 @@ def sample_units(
     names = tuple(f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k])
     units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit}).items()}
     return Randomization(spec.name, scope, units, ranges, names, tuple(notes))
+
+
+def judge_units(
+    made: Randomization,
+    robot: RobotSpec,
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None,
+    progress: Progress = no_progress,
+) -> Randomization:
+    """Choose the units that follow the robot's recordings, and state their errors (export/drawn_robots.py).
+
+    Units of other days and robots are left as they are: this robot's recordings cannot judge them.
+    """
+    if recordings is None or made.scope != "today":
+        why = "there are no recordings" if recordings is None else f"units of scope {made.scope} differ on purpose"
+        return replace(made, notes=(*made.notes, f"{why}: the units were not compared with recordings"))
+    judged = plain = draw_robots(robot, made.units, recordings, progress=progress)
+    if robot.has_servo_model:
+        plain = draw_robots(robot, made.units, recordings, plain=True, progress=progress)
+    return replace(made, units=judged.units, judged=judged, plain=plain)
 
 
 def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
@@ -157,14 +187,27 @@ def _std_factor(count: int) -> float:
 
 
 def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Path:
-    """Write units and ranges as JSON, and the file of an engine beside it; return the engine's file."""
+    """Write units and ranges as JSON, and the file of an engine beside it; return the engine's file.
+
+    Raises:
+        NoGainError: Units of the engine's form follow the recordings worse than ± 20 % on each number.
+    """
+    if (judged := made.for_engine(engine)) is not None:
+        judged.require_better_than_by_hand()
+    content: dict[str, Any] = {
+        "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
+        "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}
+                   for j, by in made.ranges.items()},
+        "units": {f: np.round(v, 9) for f, v in made.units.items()}, "unknown": made.unknown, "notes": made.notes,
+    }  # fmt: skip
+    if made.judged is not None and made.plain is not None:
+        content |= {
+            "plain_units": {f: np.round(v, 9) for f, v in made.plain.units.items()},
+            "error_mrad": {form: {name: 1e3 * error for name, error in drawn.errors.items()}
+                           for form, drawn in (("servo model", made.judged), ("plain", made.plain))},
+        }  # fmt: skip
     with lock_folder(folder, FOLDER_KIND):
-        write_json(folder / FILE, {
-            "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
-            "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}
-                       for j, by in made.ranges.items()},
-            "units": {f: np.round(v, 9) for f, v in made.units.items()}, "unknown": made.unknown, "notes": made.notes,
-        })  # fmt: skip
+        write_json(folder / FILE, content)
         if engine == "json":
             return folder / FILE
         file = folder / f"{engine}_randomization.py"
@@ -172,8 +215,9 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
     return file
 
 
-HEAD = Template('''"""Ranges of $robot ($scope) for $engine, 9 of 10 units inside. Sampled one by one they are wider
-than the robot; whole units, in which numbers go together, are in randomization.json."""
+HEAD = Template('''"""Ranges of $robot ($scope) for $engine$narrowing.
+
+Whole units, in which numbers go together, are in randomization.json."""
 
 $imports
 
@@ -201,9 +245,13 @@ ISAACLAB_JOINT = Template("""\
 
 def _events(made: Randomization, engine: Engine) -> str:
     """Return event terms of mjlab 1.6, or of Isaac Lab 2 and 3, for each joint."""
-    mjlab = engine == "mjlab"
+    mjlab, narrowing, all_ranges = engine == "mjlab", ", 9 of 10 units inside", made.ranges
+    if (plain := made.plain) is not None:
+        narrowing = f": {plain.narrowing:.0%} of the width of 9 of 10 units, because numbers are drawn one by one"
+        kp = dict(zip(plain.robot.operated, plain.robot.kp[plain.robot.operated_index].tolist(), strict=True))
+        all_ranges = {j: {f: (low, kp[j], high) for f, (low, high) in by.items()} for j, by in plain.ranges.items()}
     terms, columns = "", {field: dict[str, tuple[float, float]]() for field in ("damping", "delay", "offset")}
-    for joint, by_field in made.ranges.items():
+    for joint, by_field in all_ranges.items():
         ranges = {f: _rounded(*by_field.get(f, (0.0, 0.0, 0.0))) for f in (*columns, "frictionloss", "armature", "kp")}
         for field, values in columns.items():
             values[joint] = ranges[field]
@@ -221,6 +269,7 @@ def _events(made: Randomization, engine: Engine) -> str:
         "place": "of ManagerBasedRlEnvCfg(events=…)" if mjlab else "attributes of your EventCfg",
         "imports": f"{functions}\n{managers} import EventTermCfg, SceneEntityCfg",
         "note": "" if mjlab else note,
+        "narrowing": narrowing,
     }
     return HEAD.substitute(columns, robot=made.robot, scope=made.scope, terms=terms, **text)
 

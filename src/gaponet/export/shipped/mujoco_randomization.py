@@ -17,37 +17,48 @@ HERE = Path(__file__).parent
 
 
 def units(file: Path = HERE / "randomization.json") -> dict[str, Any]:
-    """Read the file; "units" maps each field to samples × joints. A row is one unit."""
+    """Read the file; "units" maps each field to units × joints. A row is one unit."""
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
-def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> dict[str, dict[str, float]]:
-    """Set kp, damping, friction, armature and torque limit of every joint to those of a unit.
+def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
+    """Set the joints and position servos of a model, such as the robot.xml of gaponet export --to mjcf, to a unit.
 
-    kd of the servos does not change, and servos without a torque limit get none.
-
-    Returns:
-        Joint → values without a field in the model: offset (rad, added to every target), delay (s), servo model.
+    The unit is one without the servo model, where the file has these. kd of the servos does not change, servos without
+    a torque limit get none, and a delay is at most as long as the servo's buffer (nsample).
     """
-    rest: dict[str, dict[str, float]] = {}
+    values = drawn.get("plain_units", drawn["units"])
     for i, name in enumerate(drawn["joints"]):
-        unit = {field: float(values[row][i]) for field, values in drawn["units"].items()}
+        unit = {field: float(values[field][row][i]) for field in values}
         joint = model.joint(name)
-        dof = joint.dofadr[0]
-        model.dof_damping[dof] = unit.pop("damping")
-        model.dof_frictionloss[dof], model.dof_armature[dof] = unit.pop("frictionloss"), unit.pop("armature")
-        limit = unit.pop("effort_limit")
+        dof, kp, limit = joint.dofadr[0], unit["kp"], unit["effort_limit"]
+        model.dof_damping[dof], model.dof_frictionloss[dof] = unit["damping"], unit["frictionloss"]
+        model.dof_armature[dof] = unit["armature"]
         for servo in np.flatnonzero(model.actuator_trnid[:, 0] == joint.id):
             if model.actuator_trntype[servo] == mujoco.mjtTrn.mjTRN_JOINT:
-                model.actuator_gainprm[servo, 0], model.actuator_biasprm[servo, 1] = unit["kp"], -unit["kp"]
+                model.actuator_gainprm[servo, 0] = kp
+                model.actuator_biasprm[servo, :2] = kp * unit["offset"], -kp
+                model.actuator_biastype[servo] = mujoco.mjtBias.mjBIAS_AFFINE
                 if model.actuator_forcelimited[servo]:
                     model.actuator_forcerange[servo] = -limit, limit
-        del unit["kp"]
-        rest[name] = unit
-    return rest
+                if samples := int(model.actuator_history[servo, 0]):
+                    model.actuator_delay[servo] = min(unit["delay"], (samples - 2) * model.opt.timestep)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[str, Any]:
+    """Return the facts.json of gaponet export --to mjcf with the numbers of a unit, for mujoco_servos.Servos.
+
+    Servos(model, unit_facts(facts, drawn, row)) moves a model like the unit, with its servo model.
+    """
+    joints = {name: dict(servo) for name, servo in facts["joints"].items()}
+    for i, name in enumerate(drawn["joints"]):
+        joints[name] |= {field: float(values[row][i]) for field, values in drawn["units"].items()}
+    return facts | {"joints": joints}
 
 
 if __name__ == "__main__":
     model, drawn = mujoco.MjModel.from_xml_path(sys.argv[1]), units()
     for row in range(3):
-        print(row, apply(model, drawn, row))
+        apply(model, drawn, row)
+        print(row, {name: model.dof_frictionloss[model.joint(name).dofadr[0]] for name in drawn["joints"]})

@@ -1,0 +1,160 @@
+"""Units drawn from a robot's uncertainty, chosen and judged by rollouts of its recordings.
+
+The uncertainty is Gaussian on its axes, and holds for small deviations. Rollouts of recorded commands show which of
+many drawn units move like the robot: the best quarter of them is kept. Engines without the servo model need units of
+the robot as it was fitted without it: the deviation of a unit is then added to those values, on the same axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import NoGainError, UsageError
+from gaponet.base.progress import Progress, no_progress
+from gaponet.data.sequence import Sequence
+from gaponet.export.plain_servos import comparable, fit_plain_servos, rollout_error
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.spec import RobotSpec
+from gaponet.sysid.uncertainty import from_axes, to_axes
+
+Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
+
+DRAWN, KEPT_SHARE = 128, 0.25  # units, and the share of them that is kept
+NEAR = 0.5  # every second unit deviates by this share of what was drawn
+WINDOWS, WINDOW_S = 8, 8.0  # rollouts that choose
+JUDGED = 12  # units whose error on validation motions is stated
+BY_HAND, BY_HAND_FIELDS = 0.2, ("kp", "damping", "frictionloss", "armature")  # the usual randomisation: ± 20 %
+NARROWINGS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)  # of ranges from which numbers are drawn one by one
+
+
+@dataclass(frozen=True)
+class DrawnRobots:
+    """Units of one form of a robot: with its servo model, or fitted without it.
+
+    Attributes:
+        robot: The robot of this form.
+        units: The kept units.
+        errors: "exported", "units", "by hand" and "one by one" → mean |error| on validation motions, rad.
+        ranges: Joint → field → (low, high) for engines that draw numbers one by one.
+        narrowing: Share of the 90 % range that `ranges` has.
+    """
+
+    robot: RobotSpec
+    units: Units
+    errors: dict[str, float]
+    ranges: dict[str, dict[str, tuple[float, float]]]
+    narrowing: float
+
+    def require_better_than_by_hand(self) -> None:
+        """Refuse units that follow the recordings worse than the robot with ± 20 % on each number.
+
+        Raises:
+            NoGainError: They do.
+        """
+        if self.errors["units"] > self.errors["by hand"]:
+            raise NoGainError(
+                f"nothing is written: on motions that were not fitted, drawn units are "
+                f"{1e3 * self.errors['units']:.2f} mrad from the recordings, and the robot with ± 20 % on kp, damping, "
+                f"friction and armature {1e3 * self.errors['by hand']:.2f}. Randomise by ± 20 %, or record motions "
+                "that determine more (gaponet excite --for ROBOT)"
+            )
+
+
+def draw_robots(
+    robot: RobotSpec,
+    drawn: Units,
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]],
+    plain: bool = False,
+    progress: Progress = no_progress,
+) -> DrawnRobots:
+    """Choose units by training motions and judge them by validation motions.
+
+    Args:
+        robot: Identified.
+        drawn: Units of `randomization.sample_units`.
+        recordings: Training and validation motions.
+        plain: Units of the robot as fitted without its servo model.
+        progress: Called with done, total and a note.
+
+    Raises:
+        UsageError: No recording was made with the robot's own gains.
+    """
+    train, validation = (comparable(part, robot, part[0].meta.payload_mass) for part in recordings)
+    if not train or not validation:
+        raise UsageError(f"{robot.folder}: no recording was made with the robot's own gains; they cannot judge units")
+    base = fit_plain_servos(robot, train, progress=progress) if plain else robot
+    drawn = _moved(robot, base, {f: v[:DRAWN] for f, v in drawn.items()})
+    every, windows = robots_of(base, drawn), _windows(train)
+    costs = []
+    for i, one in enumerate(every):
+        costs.append(rollout_error(windows, one))
+        progress(i + 1, len(every), "units on training motions")
+    best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(every)), 1)])
+    units = {field: values[best] for field, values in drawn.items()}
+    rng = np.random.default_rng(0)
+
+    def error(robots: ListOf[RobotSpec]) -> float:
+        return float(np.mean([rollout_error(validation, one) for one in robots]))
+
+    progress(0, 1, "units on validation motions")
+    errors = {"exported": error([base]), "units": error(robots_of(base, units)[:JUDGED])}
+    errors["by hand"] = error(_by_hand(base, rng))
+    center = _values(base, tuple(units))
+    low, high = ({f: np.percentile(v, side, axis=0) for f, v in units.items()} for side in (5, 95))
+    limit = max(errors["by hand"], errors["units"])
+    for narrowing in NARROWINGS:
+        ends = [{f: center[f] + narrowing * (side[f] - center[f]) for f in units} for side in (low, high)]
+        alone = {f: rng.uniform(ends[0][f], ends[1][f], (JUDGED, len(center[f]))) for f in units}
+        errors["one by one"] = error(robots_of(base, alone))
+        if errors["one by one"] <= limit:
+            break
+    ranges = {
+        joint: {f: (float(ends[0][f][i]), float(ends[1][f][i])) for f in units} for i, joint in enumerate(base.operated)
+    }
+    return DrawnRobots(base, units, errors, ranges, narrowing)
+
+
+def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
+    """Return a robot for each row of units."""
+    count = len(next(iter(units.values())))
+    return [
+        base.with_servos({j: {f: float(v[k, i]) for f, v in units.items()} for i, j in enumerate(base.operated)})
+        for k in range(count)
+    ]
+
+
+def _values(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:
+    return {f: np.asarray(getattr(robot, f)[robot.operated_index], float) for f in fields}
+
+
+def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
+    """Return units that deviate from `base` as the drawn ones deviate from `robot`, every second one half as far."""
+    fields = [f for f in drawn if f != "effort_limit" and (base is robot or f not in SERVO_TERMS)]
+    own, center = (np.stack(list(to_axes(r, fields).values())) for r in (robot, base))
+    axes = np.stack([np.stack(list(to_axes(one, fields).values())) for one in robots_of(robot, drawn)])
+    share = np.where(np.arange(len(axes)) % 2, NEAR, 1.0)[:, None, None]
+    signed = [SERVO_FIELDS[f].axis == "log" or SERVO_FIELDS[f].signed for f in fields]
+    x = center + share * (axes - own)
+    units: Units = dict(from_axes(fields, np.where(signed, x, np.maximum(x, 0.0))))
+    op = robot.operated_index
+    units["effort_limit"] = base.effort_limit[op] * units["kp"] / base.kp[op]
+    return units
+
+
+def _by_hand(base: RobotSpec, rng: np.random.Generator) -> list[RobotSpec]:
+    values = _values(base, BY_HAND_FIELDS)
+    return robots_of(base, {f: v * rng.uniform(1 - BY_HAND, 1 + BY_HAND, (JUDGED, len(v))) for f, v in values.items()})
+
+
+def _windows(sequences: ListOf[Sequence]) -> list[Sequence]:
+    """Cut WINDOWS pieces of WINDOW_S, taken evenly from the recordings."""
+    pieces = []
+    for s in sequences:
+        rows = round(WINDOW_S / s.dt)
+        pieces += [s.rows(slice(start, start + rows)) for start in range(0, max(len(s) - rows // 2, 1), rows)]
+    return [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, WINDOWS).round().astype(int))]
