@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from environments import environment
 
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.export import export_folder as exporting
-from gaponet.export.plain_servos import own_motions
+from gaponet.export.plain_servos import own_motions, rollout_error
+from gaponet.export.shipped.mujoco_servos import Check
+from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import load_robot
 
 pytestmark = pytest.mark.peers
@@ -58,6 +63,31 @@ def test_late_servos_with_a_law_move_there_as_here_in_worlds_that_begin_anew_by_
     assert pairs
     for there, here in pairs:
         assert abs(float(there) - float(here)) <= 0.05 * float(here) + 0.05
+
+
+def test_a_drawn_unit_moves_in_mjlab_as_in_gaponet(exported: Path, tmp_path: Path) -> None:
+    check, rng = Check(exported / "mjlab"), np.random.default_rng(0)
+    joints, facts = check.facts["corrected"], check.facts["joints"]
+    fields = ("kp", "damping", "frictionloss", "armature", "offset", "effort_limit", *SERVO_TERMS)
+    now = {f: np.array([facts[j][f] for j in joints]) for f in fields}
+    units = {f: (x * rng.uniform(0.6, 1.6, (3, len(joints)))).tolist() for f, x in now.items()}
+    file = tmp_path / "randomization.json"
+    file.write_text(json.dumps({"joints": joints, "units": units}))
+    name = "mjlab-1.6"
+    _, script, version, packages = ENGINES[name]
+    python = environment(name, version, *((package,) for package in packages))
+    command = [python, script, str(file), "2"]
+    said = subprocess.run(command, cwd=exported / "mjlab", capture_output=True, text=True, check=True).stdout
+    unit = load_robot("so101").with_servos({
+        j: {f: units[f][2][i] for f in fields} | {"delay": facts[j]["delay"]} for i, j in enumerate(joints)
+    })  # fmt: skip
+    meta = SequenceMeta(unit.name, "itself", "m", 0.0, virtual=True)
+    motions = [Sequence(meta, unit.joint_names, float(m["dt"]), m["ctrl"], m["qpos"], m["qvel"]) for m in check.motions]
+    here = 1e3 * rollout_error(motions, unit)
+    (there,) = (float(x) for x in re.findall(r": ([\d.]+) mrad; in gaponet", said))
+    print(f"{said}the unit in gaponet: {here:.2f}")
+    assert here > 5
+    assert abs(there - here) <= 0.05 * here
 
 
 @pytest.mark.parametrize("name", ["mjlab-1.6", "isaaclab-3"])

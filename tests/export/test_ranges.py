@@ -3,13 +3,18 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 from arm import XML, write_arm
 
+from gaponet.base.errors import NoGainError
 from gaponet.cli.main import main
+from gaponet.export.drawn_robots import draw_robots, robots_of
+from gaponet.export.plain_servos import own_motions, rollout_error
+from gaponet.export.randomization import sample_units
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, to_axes
@@ -101,11 +106,12 @@ def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys):
     )
     code = (
         "import sys; sys.path.insert(0, sys.argv[1])\nimport mujoco, mujoco_randomization as r\n"
-        "m = mujoco.MjModel.from_xml_path(sys.argv[2]); u = r.units(); left = r.apply(m, u, 7)\n"
+        "m = mujoco.MjModel.from_xml_path(sys.argv[2]); u = r.units(); r.apply(m, u, 7)\n"
         "assert abs(m.actuator_gainprm[0, 0] - u['units']['kp'][7][1]) < 1e-6\n"
         "assert abs(m.actuator_forcerange[0, 1] - u['units']['effort_limit'][7][1]) < 1e-6\n"
         "assert abs(m.dof_frictionloss[1] - u['units']['frictionloss'][7][1]) < 1e-6\n"
-        "assert set(left['elbow']) == {'offset', 'delay'} and 'gaponet' not in sys.modules\n"
+        "assert abs(m.actuator_biasprm[0, 0] - u['units']['kp'][7][1] * u['units']['offset'][7][1]) < 1e-6\n"
+        "assert 'gaponet' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code, tmp_path / "out", tmp_path / "robot.xml"], check=True)
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml")).nu == 1
@@ -120,3 +126,17 @@ def test_events_in_an_engine_s_words_compile(arm, tmp_path, capsys, engine):
     compile(text, engine, "exec")
     low, _, high = said["ranges"]["elbow"]["frictionloss"]
     assert f"({low:.6g}, {high:.6g})" in text
+
+
+def test_units_that_follow_the_recordings_are_kept_and_worse_ones_than_by_hand_refused(arm, tmp_path):
+    folder = written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3]))
+    robot = load_robot(folder)
+    motions = own_motions(robot, count=4)
+    drawn = sample_units(robot)
+    made = draw_robots(robot, drawn.units, (motions[::2], motions[1::2]))
+    assert made.errors["exported"] < 1e-4  # the motions are the robot's own
+    first = np.mean([rollout_error(motions[1::2], r) for r in robots_of(robot, drawn.units)[:8]])
+    assert made.errors["units"] < 0.5 * first
+    assert len(made.units["kp"]) == 32
+    with pytest.raises(NoGainError, match=r"nothing is written: .* drawn units are \d"):
+        replace(made, errors=made.errors | {"by hand": made.errors["units"] / 2}).require_better_than_by_hand()

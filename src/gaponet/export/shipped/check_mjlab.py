@@ -1,9 +1,12 @@
 """Play the motions of check.npz in mjlab, in a few worlds, and print the error beside gaponet's: python check.py
 
+python check.py randomization.json ROW     # the same with a unit of gaponet export ROBOT --to randomization
+
 In an export of actuator networks mjlab's learned actuators play them.
 """
 
 import dataclasses
+import sys
 from pathlib import Path
 
 import gaponet_action as gaponet
@@ -30,11 +33,15 @@ else:
 options, decimation = gaponet.mjlab_options(HERE)
 step = check.facts["actuator_net"]["step"] if networks else check.step
 player = gaponet.CheckPlayer(check)
+events = {"start": EventTermCfg(func=player.reset_event(), mode="reset")}
+if sys.argv[1:]:
+    unit = gaponet.mjlab_units(sys.argv[1], rows=[int(sys.argv[2])] * check.worlds)
+    events = {"unit": EventTermCfg(func=unit, mode="reset")} | events
 cfg = ManagerBasedRlEnvCfg(
     decimation=decimation,
     scene=SceneCfg(num_envs=check.worlds, entities={"robot": entity}),
     actions={"joint_pos": action},
-    events={"start": EventTermCfg(func=player.reset_event(), mode="reset")},
+    events=events,
     sim=SimulationCfg(mujoco=dataclasses.replace(options, timestep=step)),
 )
 env = ManagerBasedRlEnv(cfg, device="cpu")

@@ -18,6 +18,7 @@ simulator move like the robot. Options are those of JointPositionActionCfg.
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -259,6 +260,36 @@ def mjlab_options(folder: str | Path) -> tuple[Any, int]:
     return MujocoCfg(**{k: v for k, v in facts["options"].items() if k in fields}), facts["decimation"]
 
 
+UNIT_FIELDS = (
+    "dof_armature", "dof_frictionloss", "dof_damping", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
+)  # fmt: skip
+
+
+def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> Any:
+    """Return the function of an event term that gives each world a unit of randomization.json, with the servo model.
+
+    EventTermCfg(func=mjlab_units("randomization.json"), mode="reset") draws a unit for each episode.
+
+    Args:
+        term: Action term of `mjlab_action`.
+        rows: Row for each world instead of a random one, (num_envs,).
+    """
+    from mjlab.managers.event_manager import requires_model_fields
+
+    drawn = json.loads(Path(file).read_text(encoding="utf-8"))
+    units = {field: torch.tensor(values) for field, values in drawn["units"].items()}
+
+    @requires_model_fields(*UNIT_FIELDS)
+    def use_units(env: Any, env_ids: Any) -> None:
+        servos = env.action_manager.get_term(term).terms
+        ids = torch.arange(env.num_envs) if env_ids is None else torch.as_tensor(env_ids)
+        row = torch.randint(len(units["kp"]), (len(ids),)) if rows is None else torch.as_tensor(rows)[ids.cpu()]
+        device = servos.kp.device
+        servos.set_units(ids.to(device), drawn["joints"], {f: x[row].to(device).float() for f, x in units.items()})
+
+    return use_units
+
+
 def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
     """Make joint friction as stiff as in training, which no MJCF can express.
 
@@ -307,13 +338,14 @@ class ServoModel:
         column = {f: torch.tensor([facts["joints"][j].get(f, 0.0) for j in joints], device=sim.device)
                   for f in ("kp", "offset", "frictionloss", *SERVO_TERMS)}  # fmt: skip
         self.sim, self.terms, model = sim, present({f: column[f] for f in SERVO_TERMS}), sim.mj_model
-        if not self.terms:
-            return
-        sim.expand_model_fields(("dof_frictionloss", "actuator_biasprm"))
+        self.joints = joints
         self.dof = torch.tensor([model.joint(f"{name}/{j}").dofadr[0] for j in joints], device=sim.device)
         self.at = torch.tensor([model.joint(f"{name}/{j}").qposadr[0] for j in joints], device=sim.device)
         self.servo = torch.tensor([model.actuator(f"{name}/{j}").id for j in joints], device=sim.device)
         self.kp, self.frictionloss, self.bias = column["kp"], column["frictionloss"], column["kp"] * column["offset"]
+        if not self.terms:
+            return
+        sim.expand_model_fields(("dof_frictionloss", "actuator_biasprm"))
         self.torque = torch.zeros(sim.num_envs, len(joints), device=sim.device)
         self.load, update = torch.zeros_like(self.torque), entity.update
 
@@ -322,6 +354,27 @@ class ServoModel:
             self.torque, self.load = sim.data.actuator_force[:, self.servo], sim.data.qfrc_bias[:, self.dof]
 
         entity.update = updated
+
+    def set_units(self, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]) -> None:
+        """Give worlds the numbers of units: field → (len(env_ids), joints). Delays stay as exported."""
+        columns = torch.tensor([self.joints.index(name) for name in joints], device=env_ids.device)
+        model, at, dof, servo = self.sim.model, env_ids[:, None], self.dof[columns], self.servo[columns]
+        kp, bias, limit = units["kp"], units["kp"] * units["offset"], units["effort_limit"]
+        model.dof_armature[at, dof], model.dof_frictionloss[at, dof] = units["armature"], units["frictionloss"]
+        damping = model.dof_damping  # MuJoCo's versions differ in whether it has powers of the speed
+        damping[(at, dof, 0) if damping.ndim == 3 else (at, dof)] = units["damping"]
+        model.actuator_gainprm[at, servo, 0] = kp
+        model.actuator_biasprm[at, servo, 0], model.actuator_biasprm[at, servo, 1] = bias, -kp
+        model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
+
+        def of_worlds(column: Tensor, values: Tensor) -> Tensor:
+            column = column.expand(self.sim.num_envs, -1).clone()
+            column[at, columns] = values.to(column.dtype)
+            return column
+
+        self.kp, self.bias = of_worlds(self.kp, kp), of_worlds(self.bias, bias)
+        self.frictionloss = of_worlds(self.frictionloss, units["frictionloss"])
+        self.terms = {name: of_worlds(column, units[name]) for name, column in self.terms.items()}
 
     def restart(self, fresh: Tensor, error: Tensor) -> None:
         """Restart fresh worlds with a distance from position to command, (num_envs, joints) rad."""
