@@ -4,12 +4,17 @@
 
 It fits kp, total damping, dry friction, armature, delay and offset of each joint, by finite differences over windows of
 the training motions, starting from the robot's file. The error is that of whole validation motions.
+
+    gaponet experiment real --method benchmarks/plain_fit.py:equal_windows
+
+is the same with the windows and bounds of gaponet identify, fitted to all recordings that a question gives to methods.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +25,8 @@ from scipy.optimize import least_squares
 
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
+from gaponet.experiments.real.methods import FittedSim
+from gaponet.experiments.real.questions import Question
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import open_dataset
@@ -30,16 +37,39 @@ WINDOW, COUNT, SETTLE = 5.0, 8, 0.1  # length of a window, s; number of windows;
 LOW, HIGH, STEP = (0.1, 0.0, 0.0, 0.0, 0.0, -10.0), (10.0, 10.0, 50.0, 50.0, 5.0, 10.0), 0.02
 
 
-def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, evaluations: int = 25) -> RobotSpec:
-    """Fit the robot to windows of recordings with one control period and the gains of robot.toml."""
-    length = round(WINDOW / sequences[0].dt)
+def equal_windows(question: Question) -> FittedSim:
+    """Fit with 40 windows of 8 s and friction up to kp / 5, as gaponet identify does."""
+    period = Counter(s.dt for s in question.fitted).most_common(1)[0][0]
+    sequences = [s for s in question.fitted if s.dt == period]
+    gains = {s.meta.recorded_gains for s in sequences}
+    robot = question.robot.with_gains(*gains.pop()) if len(gains) == 1 else question.robot
+    return FittedSim(plain_fit(sequences, robot, window=8.0, count=40, friction=200.0))
+
+
+def plain_fit(
+    sequences: list[Sequence],
+    robot: RobotSpec,
+    nthread: int = 0,
+    evaluations: int = 25,
+    window: float = WINDOW,
+    count: int = COUNT,
+    friction: float = 50.0,
+) -> RobotSpec:
+    """Fit the robot to windows of recordings with one control period and the gains of robot.toml.
+
+    Args:
+        window: Length of a window, s.
+        count: Number of windows.
+        friction: Largest dry friction, thousandths of kp.
+    """
+    length = round(window / sequences[0].dt)
     cuts = [s.rows(slice(a, a + length)) for s in sequences for a in range(0, len(s), length)]
-    cuts = [c for c in cuts if c.duration > 0.9 * WINDOW] or list(sequences)
-    cuts = [cuts[i * len(cuts) // min(COUNT, len(cuts))] for i in range(min(COUNT, len(cuts)))]
+    cuts = [c for c in cuts if c.duration > 0.9 * window] or list(sequences)
+    cuts = [cuts[i * len(cuts) // min(count, len(cuts))] for i in range(min(count, len(cuts)))]
     rows, op = min(map(len, cuts)), robot.operated_index
     n, kd = len(op), robot.kd[robot.operated_index]
     models = [build_model(robot, c.meta.payload_mass, c.meta.payload_side, c.dt, physics_only=True) for c in cuts]
-    own, h, count = models[0], models[0].opt.timestep, robot.steps_per(cuts[0].dt)
+    own, h, steps = models[0], models[0].opt.timestep, robot.steps_per(cuts[0].dt)
     damping = own.dof_damping[op] + kd
     armature = np.maximum(
         own.dof_armature[op], 2.5e-5 * robot.kp[op]
@@ -48,12 +78,12 @@ def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, eva
     scale = np.stack(
         [robot.kp[op], np.maximum(damping, 0.05 * robot.kp[op]), 1e-3 * robot.kp[op], armature, late, late / 2]
     )
-    low, high = (np.repeat(b, n) for b in (LOW, HIGH))
+    low, high = np.repeat(LOW, n), np.repeat((*HIGH[:2], friction, *HIGH[3:]), n)
     start = np.stack([robot.kp[op], damping, own.dof_frictionloss[op], armature, late, zero]) / scale
     start = np.clip(start.ravel(), low + 0.2, high - 0.2)  # the trust region is slow at bounds
     state = np.concatenate([[[0.0, *c.qpos[0], *c.qvel[0]]] for c in cuts]).astype(float)
     real = np.stack([c.qpos[1:rows, op] for c in cuts])
-    time_of = np.arange((rows - 1) * count) * h
+    time_of = np.arange((rows - 1) * steps) * h
     engines = [mujoco.MjData(models[0]) for _ in range(nthread or 2)]
     pool = Rollout(nthread=len(engines))
 
@@ -66,13 +96,13 @@ def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, eva
             one.actuator_biasprm[op, 1], one.actuator_biasprm[op, 2] = -kp, -np.minimum(kd, total)
             one.dof_damping[op], one.dof_frictionloss[op] = np.maximum(total - kd, 0), friction
             one.dof_armature[op] = armature
-            ctrl = c.ctrl[np.arange(len(time_of)) // count].astype(float)
+            ctrl = c.ctrl[np.arange(len(time_of)) // steps].astype(float)
             for i, j in enumerate(op):  # linear between commands, so that a delay has a gradient
                 ctrl[:, j] = np.interp(time_of - delay[i], time_of, ctrl[:, j])
             late.append(one)
             controls.append(ctrl)
         found, _ = pool.rollout(late, engines, state, np.stack(controls))
-        qpos = found[:, count - 1 :: count, 1 + op]
+        qpos = found[:, steps - 1 :: steps, 1 + op]
         return np.where(np.isfinite(qpos), np.clip(qpos - real, -1, 1), 1.0)[:, round(SETTLE / cuts[0].dt) :].ravel()
 
     def slopes(x: np.ndarray) -> np.ndarray:
