@@ -3,8 +3,7 @@
     gaponet experiment real --sets so101 so101_another_day --method benchmarks/published_so101.py:community \
         --method benchmarks/published_so101.py:hand_tuned
 
-Sets that are published for all joints: kp N·m/rad, damping N·m·s/rad, armature kg·m², dry friction N·m. Delay and offset
-are 0.
+Each is published for all joints: kp N·m/rad, damping N·m·s/rad, armature kg·m², dry friction N·m. Delay and offset: 0.
 """
 
 from gaponet.experiments.real.methods import FittedSim
