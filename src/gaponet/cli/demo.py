@@ -61,10 +61,8 @@ def demo(
         screen.say(f": which causes explain that?  (gaponet identify {dataset} --out {known})", "2 Identify")
         if not (known / "robot.toml").is_file():
             identify(str(dataset), known, budget=budget, robot=robot, holdout_units=holdout)
-        screen.say(
-            f": does a network find more?  (gaponet train {dataset} --robot {robot_argument(known)} --out {run})",
-            "3 Use",
-        )
+        words = f"gaponet train {dataset} --model gaponet --robot {robot_argument(known)} --out {run}"
+        screen.say(f": does a network find more?  ({words})", "3 Use")
         resume, config = (run / "checkpoint.pt").is_file(), TrainConfig(pretraining=QUICK)
         try:
             with progress_bar("training gaponet") as update:
