@@ -359,10 +359,8 @@ def adapt_robot(
         lock_folder(folder, "robot"),
         unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
     ):
-        gains_stated = all(s.meta.recorded_gains[1] is not None for s in sequences)
         fitted = adapt(
-            sequences, spec, seconds, unknown_payload, None, _window_rms(progress), gains_stated,
-            judge=not unknown_payload,
+            sequences, spec, seconds, unknown_payload, None, _window_rms(progress), judge=not unknown_payload
         )  # fmt: skip
         if not fitted.accepted:
             before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)

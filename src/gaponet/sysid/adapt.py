@@ -67,7 +67,6 @@ def adapt(
     unknown_payload: bool = False,
     corrector: Corrector | None = None,
     progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
-    kd_known: bool = True,
     judge: bool = False,
 ) -> Adapted:
     """Fit FIELDS of all operated joints at once.
@@ -79,7 +78,6 @@ def adapt(
         unknown_payload: Fit one payload mass for all recordings, instead of the recorded one.
         corrector: Corrects the targets, as in replay.
         progress: Called with iterations done, at most, and the present RMS error in rad.
-        kd_known: Whether the robot's kd is that of the servos; else damping may take from it.
         judge: Judge by motions that are not fitted; joints with one short motion keep their values then.
 
     Raises:
@@ -92,14 +90,13 @@ def adapt(
             "one and the same: give recordings of one mass"
         )
     parts = cut(sequences, max(1, round(seconds / WINDOW_S)))
-    judged = _cross_validated(parts, robot, corrector, kd_known) if judge else (np.zeros(0), np.zeros(0))
+    judged = _cross_validated(parts, robot, corrector) if judge else (np.zeros(0), np.zeros(0))
     accepted = not judge or parts[0].duration > MAX_SHORT_WINDOW_S
     if len(judged[0]):
         accepted = not Comparison("adapted", *judged).harmful
         parts = [parts[i] for motions in _motions_that_judge(parts) for motion in motions for i in motion]
     rollouts = RobotRollouts(parts, robot, corrector=corrector)
-    kd_slack = np.zeros(rollouts.n) if kd_known else robot.kd[rollouts.op]
-    problem = _Problem(rollouts, Bounds(robot, sequences).first, unknown_payload, kd_slack)
+    problem = _Problem(rollouts, Bounds(robot, sequences).first, unknown_payload, robot.kd[rollouts.op])
     done = 0
 
     def report(cost: Array) -> None:
@@ -131,15 +128,13 @@ def _motions_that_judge(parts: list[Sequence]) -> list[list[list[int]]]:
     return [motions for motions in every if len(motions) > 1]
 
 
-def _cross_validated(
-    parts: list[Sequence], robot: RobotSpec, corrector: Corrector | None, kd_known: bool
-) -> tuple[Array, Array]:
+def _cross_validated(parts: list[Sequence], robot: RobotSpec, corrector: Corrector | None) -> tuple[Array, Array]:
     """Return the mean |error| of motions, of the robot and of the fit to the other motions, (motions,) rad."""
     every, errors = _motions_that_judge(parts), list[tuple[float, ...]]()
     for k in range(min(MAX_FOLDS, max(map(len, every), default=0))):
         test = [motion for motions in every for motion in motions[k::MAX_FOLDS]]
         rest = [parts[i] for motions in every for motion in motions if motion not in test for i in motion]
-        both = robot, adapt(rest, robot, len(rest) * WINDOW_S, corrector=corrector, kd_known=kd_known).robot
+        both = robot, adapt(rest, robot, len(rest) * WINDOW_S, corrector=corrector).robot
         errors += [tuple(rollout_errors([parts[i] for i in motion], r).mean() for r in both) for motion in test]
     before, after = np.array(errors).reshape(-1, 2).T
     return before, after

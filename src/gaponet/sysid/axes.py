@@ -113,7 +113,7 @@ class Bounds:
         start: Start of a search: with a delay, and with as much armature as the physics step resolves.
         stated: Whether all recordings state their kp.
         kd: The servos' kd, (n,) N·m·s/rad.
-        kd_slack: kd that damping may take from the servos, (n,) N·m·s/rad; 0 if all recordings state it.
+        kd_slack: kd that damping may take from the servos, (n,) N·m·s/rad.
         unexcited: Joints that no command moves, (n,).
         limits: Field → lowest, highest, a large change, (n,) each, in the axes' units.
         guess: First value of a field of the servo model.
@@ -127,8 +127,7 @@ class Bounds:
         kp, limit = robot.kp[op], robot.effort_limit[op]
         self.first = first_values(robot)
         self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
-        kd_stated = all(s.meta.recorded_gains[1] is not None for s in sequences)
-        self.kd_slack = np.zeros(self.n) if kd_stated else self.kd.copy()
+        self.kd_slack = self.kd.copy()  # stated or not: firmware filters the velocity, and damps less than kd says
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
         self.unexcited = excitation < MIN_EXCITATION_RAD
         least_inertia = kp * (MIN_STEPS_PER_RADIAN * model.opt.timestep) ** 2
@@ -165,9 +164,7 @@ class Bounds:
                 below = x[i, k] - axes.low[i, k] < BOUND_TOLERANCE and (f == "damping" or axes.low[i, k] != 0)
                 if fixed or not (below or axes.high[i, k] - x[i, k] < BOUND_TOLERANCE):
                     continue
-                if f == "damping" and below and not self.kd_slack[i] and self.kd[i]:
-                    what = "0 beside the kd that the recordings state; less would fit better: check that kd"
-                elif f == "damping" and below:
+                if f == "damping" and below:
                     what = "none at all; check that commands are what the servo was given, and their clock"
                 else:
                     end = "least" if below else "most"
