@@ -58,7 +58,7 @@ class DrawnRobots:
         """
         if self.errors["units"] > self.errors["by hand"]:
             raise NoGainError(
-                f"nothing is written: on motions that were not fitted, drawn units are "
+                f"nothing is written: on validation motions, drawn units are "
                 f"{1e3 * self.errors['units']:.2f} mrad from the recordings, and the robot with ± 20 % on kp, damping, "
                 f"friction and armature {1e3 * self.errors['by hand']:.2f}. Randomise by ± 20 %, or record motions "
                 "that determine more (gaponet excite --for ROBOT)"
