@@ -105,8 +105,8 @@ def randomization(
 ) -> tuple[Path, Randomization]:
     """Write sampled units and ranges of an identified robot's parameters, for domain randomisation.
 
-    Units that follow the robot's recordings are kept. Their error is stated beside that of the robot with ± 20 % on
-    each number; units with a larger error are refused.
+    Of the sampled units, the quarter that follows the robot's recordings best is written. Its error is stated beside
+    that of the robot with ± 20 % on each number; units with a larger error are refused.
 
     Args:
         robot: Robot folder that `identify` or `adapt_robot` wrote, or run folder.
@@ -114,7 +114,7 @@ def randomization(
         engine: Engine whose terms are used, beside sampled units (randomization.json).
         scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot: over its type.
         units: For any-robot: robot folders of the type.
-        data: Dataset whose motions choose and judge the units; default: that of the identification.
+        data: Dataset whose motions choose and judge the units; default: the dataset of the identification.
         progress: Called with done, total and a note.
 
     Returns:

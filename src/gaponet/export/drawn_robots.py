@@ -1,8 +1,8 @@
 """Units drawn from a robot's uncertainty, chosen and judged by rollouts of its recordings.
 
-The uncertainty is Gaussian on its axes, and holds for small deviations. Rollouts of recorded commands show which of
-many drawn units move like the robot: the best quarter of them is kept. Engines without the servo model need units of
-the robot as it was fitted without it: the deviation of a unit is then added to those values, on the same axes.
+The uncertainty is Gaussian on its axes, and holds for small deviations. Rollouts of recorded commands show which drawn
+units move like the robot, and the best quarter is retained. Engines without the servo model need units of the robot as
+it was fitted without it: the deviation of a unit is then added to those values, on the same axes.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.errors import NoGainError, UsageError
+from gaponet.base.errors import NoGainError
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
-from gaponet.export.plain_servos import comparable, fit_plain_servos, rollout_error
+from gaponet.export.plain_servos import fit_plain_servos, rollout_error
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.uncertainty import from_axes, to_axes
 
 Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
 
-DRAWN, KEPT_SHARE = 128, 0.25  # units, and the share of them that is kept
+DRAWN, KEPT_SHARE = 128, 0.25  # number of units, and the share that is retained
 NEAR = 0.5  # every second unit deviates by this share of what was drawn
 WINDOWS, WINDOW_S = 8, 8.0  # rollouts that choose
 JUDGED = 12  # units whose error on validation motions is stated
@@ -38,7 +38,7 @@ class DrawnRobots:
 
     Attributes:
         robot: The robot of this form.
-        units: The kept units.
+        units: The retained units.
         errors: "exported", "units", "by hand" and "one by one" → mean |error| on validation motions, rad.
         ranges: Joint → field → (low, high) for engines that draw numbers one by one.
         narrowing: Share of the 90 % range that `ranges` has.
@@ -77,16 +77,11 @@ def draw_robots(
     Args:
         robot: Identified.
         drawn: Units of `randomization.sample_units`.
-        recordings: Training and validation motions.
+        recordings: Training and validation motions, with the robot's own gains.
         plain: Units of the robot as fitted without its servo model.
         progress: Called with done, total and a note.
-
-    Raises:
-        UsageError: No recording was made with the robot's own gains.
     """
-    train, validation = (comparable(part, robot, part[0].meta.payload_mass) for part in recordings)
-    if not train or not validation:
-        raise UsageError(f"{robot.folder}: no recording was made with the robot's own gains; they cannot judge units")
+    train, validation = recordings
     base = fit_plain_servos(robot, train, progress=progress) if plain else robot
     drawn = _moved(robot, base, {f: v[:DRAWN] for f, v in drawn.items()})
     every, windows = robots_of(base, drawn), _windows(train)

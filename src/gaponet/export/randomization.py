@@ -23,6 +23,7 @@ from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
 from gaponet.export.drawn_robots import DrawnRobots, draw_robots
+from gaponet.export.plain_servos import comparable
 from gaponet.export.shipped import mujoco_randomization
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -124,12 +125,14 @@ def judge_units(
 
     Units of other days and robots are left as they are: this robot's recordings cannot judge them.
     """
-    if recordings is None or made.scope != "today":
-        why = "there are no recordings" if recordings is None else f"units of scope {made.scope} differ on purpose"
+    mass = recordings[0][0].meta.payload_mass if recordings and recordings[0] else 0.0
+    train, validation = (comparable(part, robot, mass) for part in recordings or ((), ()))
+    if made.scope != "today" or not train or not validation:
+        why = "no recording with the robot's own gains" if made.scope == "today" else f"scope {made.scope}"
         return replace(made, notes=(*made.notes, f"{why}: the units were not compared with recordings"))
-    judged = plain = draw_robots(robot, made.units, recordings, progress=progress)
+    judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
     if robot.has_servo_model:
-        plain = draw_robots(robot, made.units, recordings, plain=True, progress=progress)
+        plain = draw_robots(robot, made.units, (train, validation), plain=True, progress=progress)
     return replace(made, units=judged.units, judged=judged, plain=plain)
 
 

@@ -112,8 +112,7 @@ class Bounds:
         first: The given robot's own values.
         start: Start of a search: with a delay, and with as much armature as the physics step resolves.
         stated: Whether all recordings state their kp.
-        kd: The servos' kd, (n,) N·m·s/rad.
-        kd_slack: kd that damping may take from the servos, (n,) N·m·s/rad.
+        kd: The servos' kd, (n,) N·m·s/rad. Damping may take from it, stated or not: firmware filters the velocity.
         unexcited: Joints that no command moves, (n,).
         limits: Field → lowest, highest, a large change, (n,) each, in the axes' units.
         guess: First value of a field of the servo model.
@@ -127,7 +126,6 @@ class Bounds:
         kp, limit = robot.kp[op], robot.effort_limit[op]
         self.first = first_values(robot)
         self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
-        self.kd_slack = self.kd.copy()  # stated or not: firmware filters the velocity, and damps less than kd says
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
         self.unexcited = excitation < MIN_EXCITATION_RAD
         least_inertia = kp * (MIN_STEPS_PER_RADIAN * model.opt.timestep) ** 2
@@ -184,7 +182,7 @@ class Axes:
     """
 
     def __init__(self, bounds: Bounds, fields: ListOf[str], rest: Values) -> None:
-        self.names, self.rest, self._kd_slack = list(dict.fromkeys(fields)), rest, bounds.kd_slack
+        self.names, self.rest, self._kd_slack = list(dict.fromkeys(fields)), rest, bounds.kd
         low, high, self.unit = (np.stack([bounds.limits[f][i] for f in self.names], axis=1) for i in range(3))
         self.low, self.high = low / self.unit, high / self.unit
         here = self._unclipped(rest)

@@ -126,7 +126,7 @@ class JointFit(FitProblem):
         ratio = np.divide(first, balanced["kp"], out=np.ones(self.bounds.n), where=valid)
         scaled = {f: x if f in ("offset", "delay") else x * ratio for f, x in balanced.items()}
         return [
-            {f: np.where(valid, x - self.bounds.kd_slack * (f == "damping"), own[f]) for f, x in values.items()}
+            {f: np.where(valid, x - self.bounds.kd * (f == "damping"), own[f]) for f, x in values.items()}
             for values in (balanced, scaled)
         ]
 

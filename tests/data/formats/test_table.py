@@ -68,6 +68,11 @@ def test_rows_per_joint_give_the_same_log_as_columns_per_joint(tmp_path, arm):
         next(read_logs(tmp_path / "long.csv", arm, logs=logs))[1]()
 
 
+def test_a_column_called_joint_beside_a_column_per_joint_is_no_table_with_a_row_per_joint(tmp_path, arm):
+    log = only(write(tmp_path / "wave.csv", arm_columns() | {"joint": np.zeros(60)}), arm)
+    assert log.joint_names == ("shoulder", "elbow")
+
+
 def test_a_folder_holds_one_motion_per_file(tmp_path, arm):
     folder = tmp_path / "logs"
     folder.mkdir()

@@ -21,22 +21,28 @@ JOINT_COLUMNS = ("joint", "joint_name", "joint_names")
 TIME_COLUMNS = ("time", "t", "timestamp", "stamp")
 
 
-def joint_column(names: list[str]) -> str | None:
-    """Return the column with the joints' names; None if the table has no such column."""
+def joint_column(names: list[str], logs: LogsFile) -> str | None:
+    """Return the column with the joints' names; None if the table has none, or has a column of commands per joint."""
+    before, pattern, after = str(logs.get("ctrl", "ctrl.{joint}")).partition("{joint}")
+    if pattern and any(n.startswith(before) and n.endswith(after) and len(n) > len(before + after) for n in names):
+        return None
     return next((name for name in names if name.lower() in JOINT_COLUMNS), None)
 
 
-def recording(file: Path, names: list[str], told: LogsFile, delimiter: str) -> Recording:
+def recording(file: Path, names: list[str], joint: str, logs: LogsFile, delimiter: str) -> Recording:
     """Return a table with a row per joint and time as a recording whose signals have a column per joint.
+
+    Args:
+        joint: The column with the joints' names.
+        logs: Content of logs.toml, or the defaults.
+        delimiter: Separator of a CSV file's cells.
 
     Raises:
         LogError: The time column is not known, or a joint is missing at a time.
     """
-    joint = joint_column(names)
-    time = (
-        told.get("time") if told.get("time") in names else next((n for n in names if n.lower() in TIME_COLUMNS), None)
-    )
-    if joint is None or time is None:
+    times = [n for n in names if n == logs.get("time") or n.lower() in TIME_COLUMNS]
+    time = logs.get("time") if logs.get("time") in times else next(iter(times), None)
+    if time is None:
         raise LogError(f"{file}:1: a row per joint, and no column of times; name it in logs.toml: time = …")
     table = _table(file, names, delimiter)
     of_row = np.array([str(name) for name in table.column(joint).to_pylist()], dtype=object)

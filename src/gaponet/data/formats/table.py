@@ -60,8 +60,8 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         for name in names:
             if names.count(name) > 1:
                 raise LogError(f"{file}:1: column '{name}' stands twice; rename one")
-        if joint_rows.joint_column(names):
-            yield joint_rows.recording(file, names, told, "," if _is_parquet(file) else _file_delimiter(file))
+        if joint := joint_rows.joint_column(names, told):
+            yield joint_rows.recording(file, names, joint, told, "," if _is_parquet(file) else _file_delimiter(file))
             continue
         where, line = f"{file}:1", 1 if _is_parquet(file) else first + 1
         yield Recording(file.stem, str(file), dict.fromkeys(names, ()), load, where, (str(file),), line)

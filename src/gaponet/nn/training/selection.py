@@ -29,25 +29,26 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     Raises:
         UsageError: OUT holds a run and resume is false, or no run and resume is true.
     """
-    present = _kind(out)
-    if resume and present and not (out / FOLDER).is_dir():
+    present, begun = ranks.once(lambda: (_kind(out), (out / FOLDER).is_dir()))
+    if resume and present and not begun:
         return train(present, out, 1.0, 0.0, True)
-    if resume != (out / FOLDER).is_dir() or (not resume and present):
+    if resume != begun or (not resume and present):
         problem = "nothing to resume; train without --resume" if resume else "holds a run already; add --resume"
         raise UsageError(f"{out}: {problem}, or choose another --out")
-    errors = candidate_errors(out)
+    errors = ranks.once(lambda: candidate_errors(out))
     for i, kind in enumerate(CANDIDATES):
         if kind in errors:
             continue
         run = out / FOLDER / kind
-        model = train(kind, run, SHARE, i * SHARE, (run / CHECKPOINT).is_file())
+        again = ranks.once((run / CHECKPOINT).is_file)
+        model = train(kind, run, SHARE, i * SHARE, again)
         if model.card["interrupted"]:
             _copy(out, min(errors, key=errors.__getitem__, default=kind))
             return GapModel.load(out)
         errors[kind] = model.card["val_mpjae"]["model"]
         ranks.once(lambda: write_json(out / ERRORS, errors))
     best = min(errors, key=errors.__getitem__)
-    if _kind(out) != best:
+    if ranks.once(lambda: _kind(out)) != best:
         _copy(out, best)
     spent = SHARE * (len(CANDIDATES) - 1)
     return train(best, out, 1 - spent, spent, True)
@@ -60,9 +61,9 @@ def candidate_errors(run: Path) -> dict[Kind, float]:
 
 def _kind(run: Path) -> Kind | None:
     """Return the kind of network of a run; None if no run is there."""
-    config = run / "config.json"
-    found = (run / CHECKPOINT).is_file() and config.is_file()
-    return read_json(dict[str, Any], config, ModelError)["model"]["kind"] if found else None
+    if not (run / CHECKPOINT).is_file():
+        return None
+    return read_json(dict[str, Any], run / "config.json", ModelError)["model"]["kind"]
 
 
 def _copy(out: Path, kind: Kind) -> None:
