@@ -14,7 +14,7 @@ from gaponet.base.errors import NoGainError
 from gaponet.cli.main import main
 from gaponet.export.drawn_robots import draw_robots, robots_of
 from gaponet.export.plain_servos import own_motions, rollout_error
-from gaponet.export.randomization import sample_units
+from gaponet.export.randomization import judge_units, sample_units
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, to_axes
@@ -138,5 +138,12 @@ def test_units_that_follow_the_recordings_are_kept_and_worse_ones_than_by_hand_r
     first = np.mean([rollout_error(motions[1::2], r) for r in robots_of(robot, drawn.units)[:8]])
     assert made.errors["units"] < 0.5 * first
     assert len(made.units["kp"]) == 32
+    written_units = judge_units(drawn, robot, (motions[::2], motions[1::2]))
+    low, value, high = written_units.ranges["elbow"]["kp"]
+    inside = (written_units.units["kp"][:, 1] >= low) & (written_units.units["kp"][:, 1] <= high)
+    assert 0.85 <= inside.mean() <= 0.95
+    assert value == drawn.ranges["elbow"]["kp"][1]
+    other_gains = [replace(s, meta=replace(s.meta, kp=(5.0, 5.0))) for s in motions]
+    assert "were not compared with recordings" in judge_units(drawn, robot, (other_gains, other_gains)).notes[-1]
     with pytest.raises(NoGainError, match=r"nothing is written: .* drawn units are \d"):
         replace(made, errors=made.errors | {"by hand": made.errors["units"] / 2}).require_better_than_by_hand()

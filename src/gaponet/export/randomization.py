@@ -133,7 +133,12 @@ def judge_units(
     judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
     if robot.has_servo_model:
         plain = draw_robots(robot, made.units, (train, validation), plain=True, progress=progress)
-    return replace(made, units=judged.units, judged=judged, plain=plain)
+    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in judged.units.items()}
+    ranges = {
+        joint: {f: (float(ends[f][0, i]), value, float(ends[f][1, i])) for f, (_, value, _) in by_field.items()}
+        for i, (joint, by_field) in enumerate(made.ranges.items())
+    }
+    return replace(made, units=judged.units, ranges=ranges, judged=judged, plain=plain)
 
 
 def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:

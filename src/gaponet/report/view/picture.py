@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -198,6 +199,8 @@ def renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
         UsageError: Nothing can be rendered here; the message says what to install.
     """
     try:
-        return mujoco.Renderer(model, height, width)
+        with warnings.catch_warnings():  # GLFW warns of a missing display before it fails
+            warnings.simplefilter("ignore")
+            return mujoco.Renderer(model, height, width)
     except Exception as error:  # GL libraries raise exceptions of any type
         raise UsageError(f"cannot render off screen ({type(error).__name__}: {error}). {INSTALL_HINT}") from None
