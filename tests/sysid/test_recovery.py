@@ -50,11 +50,11 @@ def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
 
 def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):
     robot, template = write_arm(tmp_path / "arm"), recordings(write_arm(tmp_path / "arm"), 1, rows=80)[0]
-    jumps = np.random.default_rng(0).uniform(-1, 1, (3, 4, 2)).repeat(20, axis=1)
+    jumps = np.random.default_rng(0).uniform(-1, 1, (5, 4, 2)).repeat(20, axis=1)
     asked = [replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}")) for i, c in enumerate(jumps)]
     weak = robot.with_servos({joint: {"effort_limit": 2.5} for joint in robot.joint_names})
     parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replay(asked, weak), strict=True)]
-    found = identify(parts[:2], robot, parts[2:], windows=2, terms=("limit",), table=False, folds=1)
+    found = identify(parts[:4], robot, parts[4:], windows=4, terms=("limit",), table=False, folds=1)
     assert [c.name for c in found.comparisons if c.accepted] == ["limit"]
     np.testing.assert_allclose(found.robot.effort_limit, 2.5, rtol=0.05)
     assert found.after < 0.1 * found.before
