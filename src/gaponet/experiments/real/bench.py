@@ -123,7 +123,9 @@ class Bench:
                 "by_joint_mrad": by_joint, "seconds": round(sum(e["seconds"] for e in evaluated), 1),
                 "notes": [e["note"] for e in evaluated if e["note"]],
             }))  # fmt: skip
-            self.say(f"{card.name}, {name}: {title}: {1e3 * errors.mean():.2f} mrad, nominal {1e3 * nominal.mean():.2f}")
+            self.say(
+                f"{card.name}, {name}: {title}: {1e3 * errors.mean():.2f} mrad, nominal {1e3 * nominal.mean():.2f}"
+            )
         return rows
 
     def _is_present(self, card: Card) -> bool:

@@ -90,7 +90,6 @@ OUR_SETTINGS: dict[str, dict[str, str | None]] = {
     "history H": {},
 }
 QUICK_MOTIONS, QUICK_GOALS = 4, 10
-FIGURE_2 = ("joint_ranges", "composition", "torque_temperature")
 
 
 @dataclass(frozen=True)
@@ -140,11 +139,11 @@ class Paper(UnitExperiment):
 
     def run(self, session: Session, progress: Progress) -> Result:
         """Return all figures and tables in the paper's order."""
-        from gaponet.report.figures.draw_dataset import draw_figures  # needs the extra "report"
+        from gaponet.report.figures.dataset_figures import draw_figures  # needs the extra "report"
 
         assert session.study is not None
         study, data, robot = session.study, session.data, session.robot
-        figures, _ = draw_figures(data, robot, FIGURE_2)
+        figures, _ = draw_figures(data, robot)
         scores = tracking.Tracking(count=self.count).measure(session, progress).scores
         virtual = any(e.meta.virtual for e in data.entries)
         errors, facts = list[HoldError](), dict[str, Any]()
