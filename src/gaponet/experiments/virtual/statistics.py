@@ -4,34 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Sequence as ListOf
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gaponet.base.result_table import MeanStd
-from gaponet.report.methods import colour, title
+from gaponet.report.methods import title
 
-NOT_IN_EXAMPLES = ("identified feedforward",)  # methods in bars and tables, but not in figures of single motions
 RIVALS = ("mlp", "shared_mlp")  # networks that GAPONet is compared with
 
 
-class Measured(Protocol):
+@dataclass(frozen=True)
+class Measured:
     """A measurement of a method with one payload.
 
     Attributes:
         method: Key of report.methods.METHODS.
-        seed: None for a method without training.
+        seed: Seed of the model; None for a method without training.
         payload: kg per hand.
     """
 
-    @property
-    def method(self) -> str: ...
-
-    @property
-    def seed(self) -> int | None: ...
-
-    @property
-    def payload(self) -> float: ...
+    method: str
+    seed: int | None
+    payload: float
 
 
 M = TypeVar("M", bound=Measured)
@@ -59,13 +55,6 @@ def over_seeds(measured: ListOf[M], value: Callable[[M], Any], scale: float = 1.
         by_seed.setdefault(m.seed, []).append(value(m))
     finite = [[v for v in values if v == v] for values in by_seed.values()]
     return MeanStd.from_values([float(average(values)) for values in finite if values], scale)
-
-
-def bar_series(
-    measured: ListOf[M], groups: ListOf[Any], value: Callable[[str, Any], MeanStd]
-) -> dict[str, tuple[str, list[MeanStd]]]:
-    """Return the bars of every method for charts.draw_bars: title → (colour, value of each group)."""
-    return {title(m): (colour(m), [value(m, group) for group in groups]) for m in methods(measured)}
 
 
 def reduction(value: float, base: float) -> float:
