@@ -27,7 +27,7 @@ def placed(method, offset, payload=3.0):
 def test_claims_are_reductions_at_all_payloads_and_at_the_heaviest():
     def score(part, method, payload, value):
         seed = None if method == "nominal" else 0
-        return Score(method, seed, payload, part, "generated", "m", np.full(2, value), 1.0)
+        return Score(method, seed, payload, part, "m", np.full(2, value))
 
     scores = [score(*s) for s in (("alignment", "nominal", 0.0, 0.2), ("alignment", "nominal", 3.0, 0.4),
                                   ("alignment", "gaponet", 0.0, 0.2), ("alignment", "gaponet", 3.0, 0.1))]  # fmt: skip

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from gaponet.experiments.virtual.statistics import (
     reduction,
     select,
 )
-from gaponet.experiments.virtual.unseen_motions import UnseenMotion, from_files, generated, require_unseen
+from gaponet.experiments.virtual.unseen_motions import UnseenMotion, generated, require_unseen
 from gaponet.report.candidate import select_entries
 from gaponet.report.figures.charts import draw_bars
 from gaponet.report.figures.style import figure, joint_label, legend, styled
@@ -49,7 +48,6 @@ if TYPE_CHECKING:
 JointSet = tuple[str, list[int]]  # label, columns
 
 BASELINE = {"alignment": "nominal", "compensation": "raw"}
-SOURCES = {"generated": "generated motions", "files": "motion files", "recorded": "recorded test motions"}
 MEANING = {
     "alignment": "between simulator and robot under the same targets, open-loop rollout",
     "compensation": "between targets and robot",
@@ -64,16 +62,12 @@ class Score(Measured):
 
     Attributes:
         part: alignment or compensation.
-        source: Source of the motion: generated, files or recorded.
         q_dis: Q_dis of each operated joint, (n,) rad·s.
-        seconds: Length of the motion.
     """
 
     part: str
-    source: str
     motion: str
     q_dis: Array
-    seconds: float
 
 
 def track(
@@ -96,17 +90,16 @@ def track(
                 meta = SequenceMeta(robot.name, unit_id, motion.name, payload, virtual=True)
                 states = (x[rest : len(ctrl[i]), i] for x in (played.qpos, played.qvel))
                 recorded.append(Sequence(meta, robot.joint_names, robot.dt, motion.ctrl, *states))
-            scores += align(recorded, [m.source for m, _ in pairs], robot, trained, progress)
+            scores += align(recorded, robot, trained, progress)
         for i, (motion, payload) in enumerate(pairs):
             error = (played.qpos[rest : len(ctrl[i]), i] - motion.ctrl)[:, op]
-            q_dis, seconds = np.abs(error.astype(float)).sum(axis=0) * robot.dt, len(error) * robot.dt
-            scores.append(Score(method, seed, payload, "compensation", motion.source, motion.name, q_dis, seconds))
+            q_dis = np.abs(error.astype(float)).sum(axis=0) * robot.dt
+            scores.append(Score(method, seed, payload, "compensation", motion.name, q_dis))
     return scores
 
 
 def align(
     recorded: ListOf[Sequence],
-    sources: ListOf[str],
     robot: RobotSpec,
     trained: ListOf[TrainedModel],
     progress: Progress = lambda step, share: None,
@@ -126,11 +119,10 @@ def align(
             progress(f"{method} simulator", done / total)
 
         replays = replay(list(recorded), simulator, corrector, nthread=1, progress=report, lock_idle=True)
-        for s, simulated, source in zip(recorded, replays, sources, strict=True):
+        for s, simulated in zip(recorded, replays, strict=True):
             error = (simulated.qpos - s.qpos)[1:, robot.operated_index]
-            q_dis, seconds = np.abs(error.astype(float)).sum(axis=0) * s.dt, len(error) * s.dt
-            meta = s.meta
-            scores.append(Score(method, seed, meta.payload_mass, "alignment", source, meta.motion, q_dis, seconds))
+            q_dis = np.abs(error.astype(float)).sum(axis=0) * s.dt
+            scores.append(Score(method, seed, s.meta.payload_mass, "alignment", s.meta.motion, q_dis))
     return scores
 
 
@@ -142,8 +134,6 @@ class Tracking(UnitExperiment):
     on the test motions. About ten minutes on one core with trained models.
     """
 
-    motions: Path | None = None
-    """Folder of motion files (SAGE txt, csv, npz) to play too, reported apart."""
     count: int = 10
     """How many motions are made for the experiment."""
 
@@ -160,12 +150,11 @@ class Tracking(UnitExperiment):
         robot, trained = session.robot, session.trained
         if not any(e.meta.virtual for e in session.data.entries):
             entries, unseen = select_entries([t.run for t in trained], session.data)
-            scores = align(session.data.sequences(entries), ["recorded"] * len(entries), robot, trained, progress)
+            scores = align(session.data.sequences(entries), robot, trained, progress)
             return scores, [], {"test_motions": len({e.meta.motion for e in entries}), "unseen": unseen}
         name, physics = session.unit
         progress("motions", 0.0)
         motions = generated(robot, self.count, max(session.payloads))
-        motions += from_files(robot, self.motions, max(session.payloads)) if self.motions else []
         motions = require_unseen(motions, session.data, robot, trained)
         facts = {"unit_trained_on": True} if name in session.trained_units else {}
         scores = track(robot, physics, name, motions, session.payloads, trained, progress)
@@ -183,14 +172,10 @@ def result(session: Session, scores: list[Score], motions: list[UnseenMotion], f
     tables = [by_payload(scores, part, sets) for part in parts]
     tables += [by_joint(scores, part, robot) for part in parts]
     tables += [_motion_table(motions, robot)] if motions else []
-    figures = {
-        source if i else "joints": draw_joints(of_source, robot, f"{SOURCES[source]}, {tag}")
-        for i, (source, of_source) in enumerate(by_source(scores).items())
-    }
     zero_shot = bool(motions) and not facts.get("unit_trained_on")
     heading = f"Zero-shot tracking of motions never trained on{', unit never trained on' * zero_shot} ({tag})"
     return session.result(
-        "tracking" if motions else "tracking-real", heading, tables, figures,
+        "tracking" if motions else "tracking-real", heading, tables, {"joints": draw_joints(scores, robot, tag)},
         [s for part in parts for s in sentences(scores, part, sets[0])], **facts,
     )  # fmt: skip
 
@@ -203,52 +188,42 @@ def joint_sets(robot: RobotSpec) -> list[JointSet]:
     return sets if len(plain) in (0, len(every)) else [(f"{len(plain)} joints", plain), *sets]
 
 
-def by_source(scores: ListOf[Score]) -> dict[str, list[Score]]:
-    """Group scores by the source of their motion."""
-    return {source: [s for s in scores if s.source == source] for source in dict.fromkeys(s.source for s in scores)}
-
-
 def by_payload(scores: ListOf[Score], part: str, sets: ListOf[JointSet]) -> ResultTable:
-    """Mean Q_dis over motions and joints; a row per source of motions, set of joints and payload."""
+    """Mean Q_dis over motions and joints; a row per set of joints and payload."""
     of_part = [s for s in scores if s.part == part]
     names, masses = methods(of_part), payloads(of_part)
     learned = [m for m in (*RIVALS, "gaponet") if m in names]
     rows: list[tuple[Any, ...]] = []
-    for source, of_source in by_source(of_part).items():
-        for label, columns in sets:
-            for payload in [*masses, None] if len(masses) > 1 else masses:
-                values = {m: q_dis(select(of_source, payload=payload), m, columns) for m in names}
-                cuts = (f"{reduction(values[m].mean, values[BASELINE[part]].mean):.0f} %" for m in learned)
-                where = f"{SOURCES[source]}, {label}, " + ("all payloads" if payload is None else f"{payload:g} kg")
-                rows.append((where, *values.values(), *cuts))
+    for label, columns in sets:
+        for payload in [*masses, None] if len(masses) > 1 else masses:
+            values = {m: q_dis(select(of_part, payload=payload), m, columns) for m in names}
+            cuts = (f"{reduction(values[m].mean, values[BASELINE[part]].mean):.0f} %" for m in learned)
+            where = f"{label}, all payloads" if payload is None else f"{label}, {payload:g} kg"
+            rows.append((where, *values.values(), *cuts))
     heads = (*(title(m) for m in names), *(f"{title(m)} cuts" for m in learned))
     caption = f"Mean Q_dis per joint, rad·s, {MEANING[part]}; ± is the standard deviation over training seeds."
     return ResultTable(part, ("Q_dis, rad·s", *heads), tuple(rows), caption, digits=4)
 
 
 def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> ResultTable:
-    """Mean Q_dis over motions; a row per source of motions, payload and joint."""
+    """Mean Q_dis over motions; a row per payload and joint."""
     of_part = [s for s in scores if s.part == part]
     names = methods(of_part)
     rows = [
-        (f"{SOURCES[source]}, {p:g} kg, {joint}", *(q_dis(select(of_source, payload=p), m, [i]) for m in names))
-        for source, of_source in by_source(of_part).items()
-        for p in payloads(of_part)
-        for i, joint in enumerate(robot.operated)
-    ]
+        (f"{p:g} kg, {joint}", *(q_dis(select(of_part, payload=p), m, [i]) for m in names))
+        for p in payloads(of_part) for i, joint in enumerate(robot.operated)
+    ]  # fmt: skip
     head = ("Q_dis, rad·s", *(title(m) for m in names))
     return ResultTable(f"{part}-joints", head, tuple(rows), f"Q_dis {MEANING[part]}, joint by joint.", digits=4)
 
 
 def _motion_table(motions: ListOf[UnseenMotion], robot: RobotSpec) -> ResultTable:
-    rows = [(m.name, SOURCES[m.source], len(m.ctrl) * robot.dt, m.nearest[0], m.nearest[1] * 1e3) for m in motions]
+    rows = tuple((m.name, len(m.ctrl) * robot.dt, m.nearest[0], m.nearest[1] * 1e3) for m in motions)
     caption = (
         "No motion is in the training or validation set. Nearest: the most similar motion there, and the RMS "
         "difference of the targets."
     )
-    return ResultTable(
-        "motions", ("motion", "from", "length, s", "nearest", "apart, mrad RMS"), tuple(rows), caption, 1
-    )
+    return ResultTable("motions", ("motion", "length, s", "nearest", "apart, mrad RMS"), rows, caption, 1)
 
 
 def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> MeanStd:
@@ -260,19 +235,14 @@ def sentences(scores: ListOf[Score], part: str, joints: JointSet) -> list[str]:
     """Return the conclusions about one part, for one set of joints."""
     label, columns = joints
     of_part = [s for s in scores if s.part == part]
-    names, masses, texts = methods(of_part), payloads(of_part), list[str]()
-    for source, of_source in by_source(of_part).items():
-        error = {p: {m: q_dis(select(of_source, payload=p), m, columns).mean for m in names} for p in (None, *masses)}
-        cuts = []
-        for m in names[1:]:
-            overall, heavy = (
-                percent_text(reduction(error[p][m], error[p][BASELINE[part]])) for p in (None, masses[-1])
-            )
-            cuts.append(f"{title(m)} {overall}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
-        texts.append(f"{part}, {SOURCES[source]}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}.")
-        duels = compare_with_rivals({p: error[p] for p in masses}, names)
-        texts += [f"{part}, {SOURCES[source]}: {sentence}." for sentence in duels]
-    return texts
+    names, masses, cuts = methods(of_part), payloads(of_part), list[str]()
+    error = {p: {m: q_dis(select(of_part, payload=p), m, columns).mean for m in names} for p in (None, *masses)}
+    for m in names[1:]:
+        overall, heavy = (percent_text(reduction(error[p][m], error[p][BASELINE[part]])) for p in (None, masses[-1]))
+        cuts.append(f"{title(m)} {overall}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
+    rivals = compare_with_rivals({p: error[p] for p in masses}, names)
+    first = f"{part}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}."
+    return [first, *(f"{part}: {sentence}." for sentence in rivals)]
 
 
 @styled
