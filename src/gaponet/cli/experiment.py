@@ -21,6 +21,7 @@ from gaponet.experiments.study import Options, Study
 from gaponet.experiments.variant import parse_variant
 from gaponet.experiments.virtual.delivery import Delivery
 from gaponet.experiments.virtual.paper import Paper
+from gaponet.experiments.virtual.play import load_trained
 from gaponet.experiments.virtual.session import Session, UnitExperiment
 from gaponet.experiments.virtual.tracking import Tracking
 from gaponet.nn.training.config import TrainConfig
@@ -78,8 +79,8 @@ def _on_unit(experiment: UnitExperiment, data: Dataset, robot: RobotSpec, out: P
         if failed:
             raise UsageError(f"{failed[0]}; run it again to retry")
         runs = experiment.evaluated(cells)
-    trained_on = data if study is None else study.data
-    session = Session.load(experiment, trained_on, robot.nominal or robot, runs, study, tuple(cells))
+    trained_on, nominal = data if study is None else study.data, robot.nominal or robot
+    session = Session(experiment, trained_on, nominal, load_trained(runs, nominal), study, tuple(cells))
     with progress_bar("playing") as update:
         result = experiment.run(session, lambda step, share: update(share, 1.0, step))
     show_result(result, out if study is None else study.out, screen)

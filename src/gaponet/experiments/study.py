@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,9 +14,9 @@ from gaponet.base.errors import UsageError
 from gaponet.base.executor import LOCAL
 from gaponet.data.split import hash_order
 from gaponet.data.store import Dataset, Entry
-from gaponet.experiments.cells import Cell, plan_cells
+from gaponet.experiments.cells import Cell
 from gaponet.experiments.variant import Variant, parse_variant
-from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.report.evaluate import evenly_spaced
 from gaponet.report.methods import IDENTIFIED
 from gaponet.report.provenance import robot_label
@@ -167,16 +168,27 @@ class Study:
         return parse_variant(word, self.config)
 
     def cells(self, words: ListOf[str]) -> list[Cell]:
-        """Return a cell for every model word and seed, in OUT/cells."""
-        numbers = range(self.config.seed, self.config.seed + self.seeds)
-        variants = [self.variant(w) for w in words]
-        return plan_cells(
-            self.data, variants, numbers, robots=self._simulator, out=self.out, budget=self.budget,
-            holdout_units=self.holdout_units, threads=self.threads,
-        )  # fmt: skip
+        """Return a cell in OUT/cells for every model word and seed.
 
-    def _simulator(self, variant: Variant) -> RobotSpec:
-        return self.identified if variant.identified and self.identified is not None else self.robot
+        They come seed by seed, so that an interrupted comparison has every model.
+
+        Raises:
+            UsageError: The same model twice, or an existing cell that was set up differently.
+        """
+        if len(set(words)) < len(words):
+            raise UsageError(
+                f"--models: '{max(words, key=words.count)}' is there twice; name each once, seeds repeat it"
+            )
+        Budget.parse(self.budget)
+        cells, data = list[Cell](), self.data.address or str(self.data.path.resolve())
+        for seed in range(self.config.seed, self.config.seed + self.seeds):
+            for variant in map(self.variant, words):
+                folder = self.out / "cells" / f"{re.sub(r'[^A-Za-z0-9_.=+-]+', '_', variant.name)}-{seed}"
+                robot = self.identified if variant.identified and self.identified else self.robot
+                cells.append(Cell(variant, seed, folder, data, robot, self.budget, self.holdout_units, self.threads))
+        for cell in cells:
+            cell.require_same_setup(self.data)
+        return cells
 
 
 def control_rates(data: Dataset) -> tuple[float, ...]:

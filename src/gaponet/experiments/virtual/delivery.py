@@ -23,7 +23,6 @@ from gaponet.experiments.virtual.play import Progress, TrainedModel, execute, wi
 from gaponet.experiments.virtual.session import Session, UnitExperiment
 from gaponet.experiments.virtual.statistics import (
     Measured,
-    compare_with_rivals,
     methods,
     over_seeds,
     payloads,
@@ -215,8 +214,7 @@ def sentences(errors: ListOf[HoldError]) -> list[str]:
             texts.append(f"At {light:g} kg, {title(m)} is WORSE than raw targets along {', '.join(worse)}.")
     if not any("WORSE" in s for s in texts):
         texts.append(f"At {light:g} kg nothing is worse than raw targets along any axis.")
-    lengths = {p: {m: float(np.linalg.norm(offset[m, p])) for m in names} for p in masses}
-    return texts + [f"{sentence} (length of the mean offsets)." for sentence in compare_with_rivals(lengths, names)]
+    return texts
 
 
 @styled

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gaponet.base.result_table import MeanStd
-from gaponet.report.methods import title
 
 RIVALS = ("mlp", "shared_mlp")  # networks that GAPONet is compared with
 
@@ -65,15 +64,3 @@ def reduction(value: float, base: float) -> float:
 def percent_text(change: float) -> str:
     """Describe a reduction in per cent in words; an increase in capitals."""
     return f"{change:.0f} % less" if change >= 0 else f"{-change:.0f} % MORE"
-
-
-def compare_with_rivals(error: Mapping[float, Mapping[str, float]], names: ListOf[str]) -> list[str]:
-    """Say for each rival network whether GAPONet has the smaller error, from {payload kg: {method: error}}."""
-    sentences = []
-    for rival in (r for r in RIVALS if r in names and "gaponet" in names):
-        lost = [f"{p:g} kg" for p, by_method in error.items() if by_method["gaponet"] >= by_method[rival]]
-        if lost:
-            sentences.append(f"GAPONet does NOT beat '{title(rival)}' at {', '.join(lost)}")
-        else:
-            sentences.append(f"GAPONet beats '{title(rival)}'" + (" at every payload" if len(error) > 1 else ""))
-    return sentences

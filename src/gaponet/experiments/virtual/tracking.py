@@ -24,7 +24,6 @@ from gaponet.experiments.virtual.session import Session, UnitExperiment
 from gaponet.experiments.virtual.statistics import (
     RIVALS,
     Measured,
-    compare_with_rivals,
     methods,
     over_seeds,
     payloads,
@@ -176,7 +175,7 @@ def result(session: Session, scores: list[Score], motions: list[UnseenMotion], f
     heading = f"Zero-shot tracking of motions never trained on{', unit never trained on' * zero_shot} ({tag})"
     return session.result(
         "tracking" if motions else "tracking-real", heading, tables, {"joints": draw_joints(scores, robot, tag)},
-        [s for part in parts for s in sentences(scores, part, sets[0])], **facts,
+        [conclusion(scores, part, sets[0]) for part in parts], **facts,
     )  # fmt: skip
 
 
@@ -231,8 +230,8 @@ def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> MeanStd:
     return over_seeds(select(scores, method), lambda s: s.q_dis[columns].mean())
 
 
-def sentences(scores: ListOf[Score], part: str, joints: JointSet) -> list[str]:
-    """Return the conclusions about one part, for one set of joints."""
+def conclusion(scores: ListOf[Score], part: str, joints: JointSet) -> str:
+    """Return a sentence about one part, for one set of joints: the reduction of the error by each method."""
     label, columns = joints
     of_part = [s for s in scores if s.part == part]
     names, masses, cuts = methods(of_part), payloads(of_part), list[str]()
@@ -240,9 +239,7 @@ def sentences(scores: ListOf[Score], part: str, joints: JointSet) -> list[str]:
     for m in names[1:]:
         overall, heavy = (percent_text(reduction(error[p][m], error[p][BASELINE[part]])) for p in (None, masses[-1]))
         cuts.append(f"{title(m)} {overall}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
-    rivals = compare_with_rivals({p: error[p] for p in masses}, names)
-    first = f"{part}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}."
-    return [first, *(f"{part}: {sentence}." for sentence in rivals)]
+    return f"{part}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}."
 
 
 @styled

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd
 from gaponet.report.figures.style import LETTER, figure, legend, styled
 
@@ -38,14 +37,9 @@ def draw_bars(ax: Axes, groups: ListOf[str], methods: Bars, size: float | None =
     width = 0.84 / len(methods)
     for i, (label, (colour, values)) in enumerate(methods.items()):
         x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
-        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=error_bars(values), color=colour, label=label,
+        std = np.array([v.std if v.std == v.std else 0.0 for v in values])
+        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=std if std.any() else None, color=colour, label=label,
                error_kw={"lw": 0.7, "capsize": 1.2, "capthick": 0.6})  # fmt: skip
     ax.set_xticks(np.arange(len(groups)), groups, fontsize=size)
     ax.tick_params(axis="x", length=0)
     ax.grid(axis="x", visible=False)
-
-
-def error_bars(values: ListOf[MeanStd]) -> Array | None:
-    """Return the lengths of error bars; None if no value has a standard deviation."""
-    std = np.array([v.std if v.std == v.std else 0.0 for v in values])
-    return std if std.any() else None
