@@ -23,7 +23,6 @@ from gaponet.experiments.virtual.statistics import methods, over_seeds, payloads
 from gaponet.experiments.virtual.tracking import Score
 from gaponet.report.methods import title
 
-
 # Claims of the paper, whose robots are real: reduction of the error, %.
 CLAIMS = {"Q_dis, all payloads": 40, "Q_dis, heaviest payload": 50, "X": 40, "Y": 40, "Z": 70}
 
