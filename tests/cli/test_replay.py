@@ -56,12 +56,11 @@ def test_a_simulator_that_is_not_the_robot_is_told_joint_by_joint(place, capsys)
     assert asked(place, "robot", capsys)["differ"] == []
 
 
-def test_what_the_robot_would_do_can_be_kept_and_drawn(place, capsys, tmp_path):
-    asked(place, "simulator", capsys, "--out", str(tmp_path / "a.npz"), "--figure", str(tmp_path / "a.png"))
+def test_what_the_robot_would_do_can_be_kept(place, capsys, tmp_path):
+    asked(place, "simulator", capsys, "--out", str(tmp_path / "a.npz"))
     held = np.load(tmp_path / "a.npz")
     assert held["robot_0"].shape == held["low_0"].shape == (250, 2)
     assert (held["low_0"] < held["robot_0"]).all()
-    assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_a_band_holds_nine_tenths_of_what_a_robot_does_that_was_identified_a_little_wrong(arm):

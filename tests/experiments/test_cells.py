@@ -10,9 +10,9 @@ from cells import note_threads, wait_for_the_end
 
 from gaponet.base.errors import UsageError
 from gaponet.base.executor import open_pool
-from gaponet.experiments.cells import SETUP_FILE, plan_cells, run_cells
+from gaponet.experiments.cells import SETUP_FILE, run_cells
 from gaponet.experiments.outcomes import train_cell
-from gaponet.experiments.variant import parse_variant
+from gaponet.experiments.study import Study
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 
@@ -35,8 +35,7 @@ def data(arm, tmp_path):
 
 
 def cells(data, arm, out, words=("mlp",), seeds=(0,), budget="640", base=SMALL):
-    variants = [parse_variant(w, base) for w in words]
-    return plan_cells(data, variants, seeds, robots=lambda v: arm, out=out, budget=budget, holdout_units=())
+    return Study(data, arm, out, replace(base, seed=seeds[0]), budget, len(seeds)).cells(words)
 
 
 def test_cells_come_seed_by_seed_in_folders_of_their_own(data, arm, tmp_path):
@@ -46,20 +45,20 @@ def test_cells_come_seed_by_seed_in_folders_of_their_own(data, arm, tmp_path):
 
 def test_a_cell_that_fails_leaves_the_others_alone(data, arm, tmp_path, local, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
-    made, shown = cells(data, arm, tmp_path / "out", seeds=(1, 2, 3, 0)), []
+    made, shown = cells(data, arm, tmp_path / "out", seeds=(0, 1, 2, 3)), []
     failed = run_cells(made, note_threads, local, lambda running, done: shown.append((len(running), done)))
     assert failed["mlp seed 1"] == "no such thing"
     assert failed["mlp seed 2"].startswith("ZeroDivisionError: a bug (see ")
     assert failed["mlp seed 3"].startswith("3 workers died of it, out of memory?")
     assert set(failed) == {f"mlp seed {i}" for i in (1, 2, 3)}
-    assert (made[3].folder / "threads").read_text() == "1"
+    assert (made[0].folder / "threads").read_text() == "1"
     assert max(running for running, _ in shown) <= 2
     assert shown[-1] == (0, 4)
     assert os.environ["OMP_NUM_THREADS"] == "5"
 
 
 def test_a_full_disk_and_a_missing_package_are_reported_without_a_file(data, arm, tmp_path, local):
-    made = cells(data, arm, tmp_path / "out", seeds=(4, 5, 0))
+    made = cells(data, arm, tmp_path / "out", seeds=(4, 5, 6))
     left = made[2].folder.with_name(made[2].folder.name + ".error.txt")
     left.parent.mkdir(parents=True)
     left.write_text("of an earlier attempt")

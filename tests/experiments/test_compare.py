@@ -62,7 +62,7 @@ def test_payloads_are_in_order_of_mass_and_new_units_are_named(result):
 def test_everything_is_written_and_no_line_is_lost(result, tmp_path):
     files = [f.name for f in write(result, tmp_path / "out")]
     assert files == [
-        "compare.csv", "compare-totals.csv", "compare-groups.csv", "compare-horizons.csv", "compare.svg", "compare.png",
+        "compare.csv", "compare-totals.csv", "compare-groups.csv", "compare.svg", "compare.png",
         "compare.md", "compare.json", "report.html",
     ]  # fmt: skip
     lines = list(csv.DictReader((tmp_path / "out" / "compare.csv").open()))

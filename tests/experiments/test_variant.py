@@ -43,9 +43,9 @@ def test_a_field_that_may_be_absent_reads_none():
         ("mlp:history", "'history' is not FIELD=VALUE"),
         ("mlp:kind=gaponet", "'kind=gaponet' is not"),
         ("mlp:seed=3", "'seed=3' is not"),
-        ("mlp:history=many", "history is 'many'; it must be a whole number"),
-        ("mlp:mlp_hidden=a,b", "mlp_hidden is 'a'; it must be a whole number"),
-        ("gaponet:sensors=magic", "sensors is 'magic'; it is one of off, predicted"),
+        ("mlp:history=many", "history is 'many': Input should be a valid integer"),
+        ("mlp:mlp_hidden=a,b", "mlp_hidden is 'a,b': Input should be a valid integer"),
+        ("gaponet:sensors=magic", "sensors is 'magic': Input should be 'off', 'predicted'"),
         ("gaponet:history=0", "it must be positive"),
     ],
 )

@@ -118,12 +118,6 @@ def test_trajectories_show_the_command_and_errors_of_a_motion_on_one_scale_movin
     assert np.ptp(axes[0].get_ylim()) >= 0.06
 
 
-def test_the_sensor_predictor_is_described_by_joint():
-    assert report._r2(None) == "–"
-    said = "0.900 on held-out states (elbow 0.80, wrist 1.00)"
-    assert report._r2({"mean": 0.9, "by_joint": {"elbow": 0.8, "wrist": 1.0}}) == said
-
-
 def test_an_identified_robot_has_a_page_without_training(evaluated, tmp_path):
     arm = load_robot(evaluated.parent / "arm")
     save_robot(arm.with_servos({"elbow": {"kp": 11.0}}), tmp_path / "fitted")

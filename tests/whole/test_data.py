@@ -60,8 +60,8 @@ def test_a_split_is_printed_and_written(place, capsys):
 def test_pictures_are_listed_and_what_is_left_out(place, capsys):
     words = ["data", "figures", "{}/set", "--out", "{}/pictures", "--robot", "{}/arm", "--json"]
     result = json.loads(run(place, capsys, *words).out)
-    assert len(result["figures"]) == 6
-    assert set(result["left_out"]) == {"torque_temperature", "gap_by_payload"}
+    assert len(result["figures"]) == 4
+    assert set(result["left_out"]) == {"torque_temperature"}
     assert (place / "pictures" / "joint_ranges.svg").is_file()
 
 

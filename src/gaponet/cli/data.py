@@ -85,19 +85,17 @@ def _figures(
     robot: Robot = None,
     json: Json = False,
 ) -> None:
-    """Draw the dataset: joint ranges, composition, torque and temperature, real against simulated, gap against payload.
-
-    Sequences that a figure needs are replayed first.
+    """Draw the dataset: joint ranges, composition, torque and temperature.
 
     Args:
         out: Folder for the pictures, each as SVG and PNG.
     """
-    from gaponet.report.figures.draw_dataset import draw_all
+    from gaponet.report.figures.dataset_figures import write_figures
 
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
     with progress_bar("drawing") as update:
-        written, left_out = draw_all(data, spec, out, update)
+        written, left_out = write_figures(data, spec, out, update)
     for path in written:
         screen.say(f"written: {path!s}")
     for name, reason in left_out.items():

@@ -12,7 +12,6 @@ from gaponet import api
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.gap import show_methods
-from gaponet.cli.identify import identify
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
@@ -46,6 +45,7 @@ def demo(
     from gaponet.report.view.portrait import portrait, prepare
 
     prepare()
+    from gaponet.cli.identify import identify  # imports mujoco
     from gaponet.report.report import write_report
 
     screen, began = Out(json), time.monotonic()

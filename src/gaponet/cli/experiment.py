@@ -17,10 +17,11 @@ from gaponet.cli.out import Out, writes
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.compare import Compare, with_identified
 from gaponet.experiments.outcomes import train_all
-from gaponet.experiments.study import Options, Study, expected_seconds
+from gaponet.experiments.study import Options, Study
 from gaponet.experiments.variant import parse_variant
 from gaponet.experiments.virtual.delivery import Delivery
 from gaponet.experiments.virtual.paper import Paper
+from gaponet.experiments.virtual.play import load_trained
 from gaponet.experiments.virtual.session import Session, UnitExperiment
 from gaponet.experiments.virtual.tracking import Tracking
 from gaponet.nn.training.config import TrainConfig
@@ -37,14 +38,14 @@ DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
 
 
 def _compare(experiment: Compare, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
-    """Estimate the time, train, and show the result."""
+    """Train, and show the result."""
     from gaponet.cli.show import show_result  # needs an extra; without it nothing is trained
 
     study = Study.from_options(data, robot, out, options, holdout_units=experiment.holdout_units, one_rate=False)
     if experiment.identify:
         study = _identified(experiment, study)
     screen, cells = Out(options.json), experiment.cells(study)
-    with _trainings(cells, study, screen) as show:
+    with _trainings(cells, screen) as show:
         result = experiment.run(study, show)
     show_result(result, study.out, screen)
     if failed := sum(not c.done for c in cells):
@@ -73,27 +74,23 @@ def _on_unit(experiment: UnitExperiment, data: Dataset, robot: RobotSpec, out: P
     if not runs:
         study = experiment.study(data, robot, out, options)
         cells = experiment.cells(study)
-        with _trainings(cells, study, screen) as show:
+        with _trainings(cells, screen) as show:
             failed = train_all(cells, study, show)
         if failed:
             raise UsageError(f"{failed[0]}; run it again to retry")
         runs = experiment.evaluated(cells)
-    trained_on = data if study is None else study.data
-    session = Session.load(experiment, trained_on, robot.nominal or robot, runs, study, tuple(cells))
+    trained_on, nominal = data if study is None else study.data, robot.nominal or robot
+    session = Session(experiment, trained_on, nominal, load_trained(runs, nominal), study, tuple(cells))
     with progress_bar("playing") as update:
         result = experiment.run(session, lambda step, share: update(share, 1.0, step))
     show_result(result, out if study is None else study.out, screen)
 
 
-def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
-    """Say how long the trainings will take, and open their progress bars."""
+def _trainings(cells: list[Cell], screen: Out) -> Any:
+    """Say how many trainings there are, and open their progress bars."""
     todo = sum(not c.done for c in cells)
-    minutes = expected_seconds(cells, study) / 60
-    rest = f"about {minutes:.0f} minutes" if minutes > 1.5 else "about a minute"
-    screen.say(
-        f"{len(cells)} trainings ({len({c.variant.name for c in cells})} settings), {len(cells) - todo} there already"
-        + (f"; the others take {rest}, {study.concurrency} at a time" if todo else "")
-    )
+    settings = len({c.variant.name for c in cells})
+    screen.say(f"{len(cells)} trainings ({settings} settings), {len(cells) - todo} there already")
     return progress_bars("trainings", todo)
 
 

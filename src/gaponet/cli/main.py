@@ -56,7 +56,7 @@ REMOVED = {
     "runs": "gaponet report --list",
     "attach": "gaponet export --to lerobot",
     "bench real": "gaponet experiment real",
-    **{f"bench {what}": f"python benchmarks/speed.py {what}" for what in ("sim", "train", "latency", "aligned")},
+    **{f"bench {what}": f"python benchmarks/speed.py {what}" for what in ("latency", "aligned")},
     "bench": "gaponet experiment real",
 }
 ABOUT = "Close the gap between simulated and real motors from joint logs."

@@ -21,7 +21,6 @@ def replay(
     described: Path | None = None,
     payload_mass: float = 0.0,
     out: Path | None = None,
-    figure: Path | None = None,
     json: Json = False,
 ) -> None:
     """Will a policy transfer? What the robot would do in its rollout.
@@ -32,7 +31,6 @@ def replay(
 
     Args:
         out: .npz to write: target, rollout, robot, low and high (T, joints), rad, and dt, s, of each rollout.
-        figure: .png and .svg to draw, of the first rollout.
     """
     screen = Out(json)
     with progress_bar("replaying") as update:
@@ -44,10 +42,6 @@ def replay(
     _tell(screen, robot, len(made.rollouts), made.joints, list(made.differ))
     if out is not None:
         made.save(out)
-    if figure:
-        from gaponet.report.figures.identified_robot import write_rollout
-
-        write_rollout(list(made.rollouts), made.robot.operated, figure)
     screen.result(made.to_dict())
 
 

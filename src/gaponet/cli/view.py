@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Data, Flag, Json, Robot
+from gaponet.cli.options import Data, Json, Robot
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
 from gaponet.share.reading import open_dataset
@@ -27,17 +27,14 @@ def view(
     payload_mass: float | None = None,
     show: tuple[str, ...] = ("target", "nominal", "aligned", "recorded"),
     render: Path | None = None,
-    web: Flag = False,
     port: int = 8080,
     start: float | None = None,
     duration: float = 8.0,
     speed: float = 1.0,
     magnify: float = 1.0,
-    ghost: bool = True,
     closeup: bool = False,
     fps: float = 20.0,
     width: int = 960,
-    course: bool = True,
     azimuth: float = 145.0,
     elevation: float = -14.0,
     robot: Robot = None,
@@ -52,17 +49,14 @@ def view(
         payload_mass: Which payload's recording, kg.
         show: Copies from left to right; aligned stands for the identified robot and every --model.
         render: Write a .gif, .mp4 or .png instead (.png: the moment of the largest nominal error).
-        web: The default without --render; accepted as before.
         port: Port of the browser's page, on this machine.
         start: s into the recording; default: where most happens.
         duration: s of the recording.
         speed: Below 1 is slow motion.
         magnify: Differences from the recording times this, to make milliradians visible; said on the picture.
-        ghost: Draw the recording, translucent, into each other copy.
         closeup: Limbs without an operated joint (a humanoid's legs) may be cut off.
         fps: Pictures a second of a film.
         width: Width of a picture, pixels; the height follows from the robots.
-        course: Draw the error against time below a picture.
         azimuth: Camera, degrees; 180 looks at the robot's front.
         elevation: Camera, degrees; negative looks down.
     """
@@ -81,9 +75,9 @@ def view(
     errors = {m.method: m.mpjae for m in shown.motions if m.method != "recorded"}
     _introduce(out, entry.meta, {m.name: m.mpjae for m in shown.motions if m.method in errors}, shown.seen)
     rows = slice(round(clip.start / shown.real.dt), round(clip.stop / shown.real.dt) + 1)
-    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, render is not None, closeup)
+    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), rows, render is not None, closeup)
     if render is not None:
-        _film(scene, clip, render, width, magnify, course, out)
+        _film(scene, clip, render, width, magnify, out)
     else:
         from gaponet.report.view.web import serve
 
@@ -116,11 +110,10 @@ def _introduce(out: Out, meta: SequenceMeta, errors: dict[str, float], seen: boo
         out.say("", "a model was trained or chosen on this recording: it is not held-out", "yellow")
 
 
-def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, course: bool, out: Out) -> None:
+def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, out: Out) -> None:
     from gaponet.report.view.film import write
     from gaponet.report.view.picture import Camera
 
-    span = (clip.start, clip.stop)
-    with Camera(scene, width, clip.speed, magnify, course, span) as camera, progress_bar("rendering") as update:
-        pictures = write(camera, clip, path, lambda done, total: update(done, total, "pictures"))
+    with Camera(scene, clip, width, magnify) as camera, progress_bar("rendering") as update:
+        pictures = write(camera, path, lambda done, total: update(done, total, "pictures"))
     out.say(f"{path}: {pictures} picture{'s' * (pictures > 1)}, {path.stat().st_size / 1e6:.2f} MB")

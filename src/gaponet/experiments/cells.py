@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import time
 import traceback
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from gaponet.base.progress import Running
 from gaponet.base.structure import read_json
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.experiments.variant import Variant
-from gaponet.nn.training.config import RENAMED_FIELDS, Budget, TrainConfig
+from gaponet.nn.training.config import RENAMED_FIELDS, TrainConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import model_hash
 
@@ -60,8 +59,8 @@ class Cell:
     dataset: str
     robot: RobotSpec
     budget: str
-    holdout_units: tuple[str, ...] = ()
-    threads: int = 1
+    holdout_units: tuple[str, ...]
+    threads: int
 
     @property
     def name(self) -> str:
@@ -81,49 +80,22 @@ class Cell:
             "dataset": dataset_hash(data.entries), "simulator": model_hash(self.robot),
         }))  # fmt: skip
 
+    def require_same_setup(self, data: Dataset) -> None:
+        """Refuse an existing folder that was set up differently, or that is no cell.
 
-def plan_cells(
-    dataset: Dataset,
-    variants: ListOf[Variant],
-    seeds: ListOf[int],
-    *,
-    robots: Callable[[Variant], RobotSpec],
-    out: Path,
-    budget: str,
-    holdout_units: tuple[str, ...],
-    threads: int = 1,
-) -> list[Cell]:
-    """Return all cells seed by seed, so that an interrupted comparison has every model.
-
-    Raises:
-        UsageError: The same model twice, or an existing cell in out that was set up differently.
-    """
-    names = [v.name for v in variants]
-    if len(set(names)) < len(names):
-        raise UsageError(f"--models: '{max(names, key=names.count)}' is there twice; name each once, seeds repeat it")
-    Budget.parse(budget)
-    data = dataset.address or str(dataset.path.resolve())
-    cells = []
-    for seed in seeds:
-        for v in variants:
-            folder = out / "cells" / f"{re.sub(r'[^A-Za-z0-9_.=+-]+', '_', v.name)}-{seed}"
-            cells.append(Cell(v, seed, folder, data, robots(v), budget, holdout_units, threads))
-    for cell in cells:
-        _require_same_setup(cell, dataset)
-    return cells
-
-
-def _require_same_setup(cell: Cell, dataset: Dataset) -> None:
-    if not cell.folder.exists():
-        return
-    file, wanted = cell.folder / SETUP_FILE, cell.setup(dataset)
-    if not file.is_file():
-        raise UsageError(f"{cell.folder}: is there but is no part of a comparison; choose another --out")
-    stored = read_record(file)
-    stored["config"] = _with_defaults(stored["config"], json.loads(json.dumps(asdict(TrainConfig().sized()))))
-    if stored != wanted:
-        changed = ", ".join(k for k in wanted if stored.get(k) != wanted[k])
-        raise UsageError(f"{cell.folder}: belongs to a comparison with another {changed}; choose another --out")
+        Raises:
+            UsageError: It names what differs.
+        """
+        if not self.folder.exists():
+            return
+        file, wanted = self.folder / SETUP_FILE, self.setup(data)
+        if not file.is_file():
+            raise UsageError(f"{self.folder}: is there but is no part of a comparison; choose another --out")
+        stored = read_record(file)
+        stored["config"] = _with_defaults(stored["config"], json.loads(json.dumps(asdict(TrainConfig().sized()))))
+        if stored != wanted:
+            changed = ", ".join(k for k in wanted if stored.get(k) != wanted[k])
+            raise UsageError(f"{self.folder}: belongs to a comparison with another {changed}; choose another --out")
 
 
 def _with_defaults(config: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:

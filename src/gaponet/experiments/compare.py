@@ -61,7 +61,7 @@ class Compare:
         return replace(result, sentences=(*result.sentences, *failed))
 
     def result(self, study: Study, outcomes: StudyOutcomes) -> Result:
-        """Return totals, groups, horizons, and one row per method, seed and group in the CSV file."""
+        """Return totals, groups, and one row per method, seed and group in the CSV file."""
         word = next(iter(outcomes.runs))
         baselines = outcomes.baselines(word)
         runs: Runs = {name: [baselines[name]] for name in BASELINES if name in baselines}
@@ -77,7 +77,6 @@ class Compare:
             ResultTable("all", columns, tuple(_long_rows(runs)), shown=False),
             _totals(runs),
             _groups(runs),
-            _horizons(runs),
         ]
         return outcomes.result(
             study, "compare", "Comparison", tables, {"compare": _figure(runs, study.label)}, sentences=[heading],
@@ -132,17 +131,6 @@ def _groups(runs: Runs) -> ResultTable:
         if len(keys) > 1 or (units == "new" and keys):
             rows += [(label.format(k), *(summarize(o, units, group, k, "mpjae") for o in runs.values())) for k in keys]
     return ResultTable("groups", ("MPJAE, mrad", *map(title, runs)), tuple(rows))
-
-
-def _horizons(runs: Runs) -> ResultTable:
-    """One row per time since the common start."""
-    times = list(runs["nominal"][0]["known"].get("by_horizon", {}))
-    rows = [
-        (f"{t} s" if t != "whole" else "whole motion", *(summarize(o, "known", "by_horizon", t, "mpjae")
-                                                         for o in runs.values())) for t in times
-    ]  # fmt: skip
-    note = "MPJAE in mrad by time since the common start, of the last half of that time."
-    return ResultTable("horizons", ("after", *map(title, runs)), tuple(rows), note)
 
 
 def _long_rows(runs: Runs) -> Iterator[tuple[Any, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,10 +11,10 @@ from typing import Annotated
 import tyro
 
 from gaponet.base.errors import UsageError
-from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool
+from gaponet.base.executor import LOCAL
 from gaponet.data.split import hash_order
 from gaponet.data.store import Dataset, Entry
-from gaponet.experiments.cells import RESULT_FILE, Cell, plan_cells, read_record
+from gaponet.experiments.cells import Cell
 from gaponet.experiments.variant import Variant, parse_variant
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.report.evaluate import evenly_spaced
@@ -26,8 +27,6 @@ from gaponet.robot.spec import RobotSpec
 TRAINING = TrainConfig(pretraining=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
 DEFAULT_MODELS = ("gaponet", "shared_mlp", "mlp:mlp_match=on")
 DEFAULT_BUDGET, DEFAULT_SEEDS = "76800", 3  # control steps of two rounds
-# Measured on one core with the virtual H1-2: s per training whatever its budget, and s per control step.
-SECONDS_PER_TRAINING, SECONDS_PER_STEP = 50.0, 6e-4
 QUICK_BUDGET, QUICK_SEEDS = "2560", 1  # control steps of a training
 QUICK_LABEL = "QUICK RUN, numbers mean nothing"
 QUICK_PRETRAINING = PretrainingConfig(
@@ -155,11 +154,6 @@ class Study:
         """Threads of one training."""
         return self.config.threads or 1
 
-    @property
-    def concurrency(self) -> int:
-        """Trainings at a time; a guess for a cluster, whose size is not known yet."""
-        return self.workers or (Pool.cores(self.threads) if self.executor == LOCAL else MAX_WORKERS)
-
     def variant(self, word: str) -> Variant:
         """Parse a model's word with this study's settings as defaults.
 
@@ -174,35 +168,29 @@ class Study:
         return parse_variant(word, self.config)
 
     def cells(self, words: ListOf[str]) -> list[Cell]:
-        """Return a cell for every model word and seed, in OUT/cells."""
-        numbers = range(self.config.seed, self.config.seed + self.seeds)
-        variants = [self.variant(w) for w in words]
-        return plan_cells(
-            self.data, variants, numbers, robots=self._simulator, out=self.out, budget=self.budget,
-            holdout_units=self.holdout_units, threads=self.threads,
-        )  # fmt: skip
+        """Return a cell in OUT/cells for every model word and seed.
 
-    def _simulator(self, variant: Variant) -> RobotSpec:
-        return self.identified if variant.identified and self.identified is not None else self.robot
+        They come seed by seed, so that an interrupted comparison has every model.
+
+        Raises:
+            UsageError: The same model twice, or an existing cell that was set up differently.
+        """
+        if len(set(words)) < len(words):
+            raise UsageError(
+                f"--models: '{max(words, key=words.count)}' is there twice; name each once, seeds repeat it"
+            )
+        Budget.parse(self.budget)
+        cells, data = list[Cell](), self.data.address or str(self.data.path.resolve())
+        for seed in range(self.config.seed, self.config.seed + self.seeds):
+            for variant in map(self.variant, words):
+                folder = self.out / "cells" / f"{re.sub(r'[^A-Za-z0-9_.=+-]+', '_', variant.name)}-{seed}"
+                robot = self.identified if variant.identified and self.identified else self.robot
+                cells.append(Cell(variant, seed, folder, data, robot, self.budget, self.holdout_units, self.threads))
+        for cell in cells:
+            cell.require_same_setup(self.data)
+        return cells
 
 
 def control_rates(data: Dataset) -> tuple[float, ...]:
     """Control rates of the recordings in ascending order, Hz."""
     return tuple(sorted({float(round(1 / e.dt)) for e in data.entries}))
-
-
-def expected_seconds(cells: ListOf[Cell], study: Study) -> float:
-    """Estimate the wall time of the unfinished cells, s, from the finished ones or from the virtual H1-2."""
-    done = [c for c in cells if c.done]
-    seconds = sum(read_record(c.folder / RESULT_FILE)["seconds"] for c in done)
-    factor = seconds / sum(_cost(c) for c in done) if done else 1.0
-    todo = [_cost(c) * factor for c in cells if not c.done]
-    return max(sum(todo) / study.concurrency, max(todo, default=0.0))
-
-
-def _cost(cell: Cell) -> float:
-    """Rough processor time of a cell, s."""
-    budget = Budget.parse(cell.budget)
-    if budget.seconds is not None:
-        return SECONDS_PER_TRAINING + budget.seconds
-    return SECONDS_PER_TRAINING + SECONDS_PER_STEP * (budget.steps or 0)

@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
 
 from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
@@ -17,7 +19,6 @@ from gaponet.report.methods import IDENTIFIED
 
 KINDS: tuple[str, ...] = get_args(get_type_hints(ModelConfig)["kind"])
 RESERVED = ("kind", "model", "seed", "threads")  # set by the word itself or by the comparison
-SWITCH = {"on": True, "true": True, "yes": True, "off": False, "false": False, "no": False}
 
 
 @dataclass(frozen=True)
@@ -81,30 +82,19 @@ def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
 
 def _places(config: TrainConfig) -> Iterator[tuple[str, tuple[str, str]]]:
     """Yield (name as written, (part of the config or "", field)) of every setting."""
-    for field in fields(config.model):
-        if field.name not in RESERVED:
-            yield field.name, ("model", field.name)
-    for field in fields(config):
-        if field.name in RESERVED:
-            continue
-        value = getattr(config, field.name)
-        if is_dataclass(value):
-            yield from ((f"{field.name}.{inner.name}", (field.name, inner.name)) for inner in fields(value))
+    yield from ((field.name, ("model", field.name)) for field in fields(config.model) if field.name not in RESERVED)
+    for field in (field for field in fields(config) if field.name not in RESERVED):
+        if is_dataclass(part := getattr(config, field.name)):
+            yield from ((f"{field.name}.{inner.name}", (field.name, inner.name)) for inner in fields(part))
         else:
             yield field.name, ("", field.name)
 
 
 def _read(text: str, hint: Any, where: str) -> Any:
-    if type(None) in get_args(hint):
-        return None if text == "none" else _read(text, get_args(hint)[0], where)
+    value: Any = None if text == "none" and type(None) in get_args(hint) else text
     if get_origin(hint) is tuple:
-        return tuple(_read(part, get_args(hint)[0], where) for part in text.split(",") if part)
-    options = get_args(hint) if get_origin(hint) is Literal else tuple(SWITCH) if hint is bool else ()
-    if options:
-        if text not in options:
-            raise UsageError(f"{where} is '{text}'; it is one of {', '.join(options)}")
-        return SWITCH[text] if hint is bool else text
+        value = [part for part in text.split(",") if part]
     try:
-        return hint(text)
-    except ValueError:
-        raise UsageError(f"{where} is '{text}'; it must be {'a whole number' if hint is int else 'a number'}") from None
+        return TypeAdapter(hint).validate_python(value)
+    except ValidationError as error:
+        raise UsageError(f"{where} is '{text}': {error.errors()[0]['msg']}") from None

@@ -19,7 +19,7 @@ from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
 from gaponet.report.candidate import is_robot, read_origin
 from gaponet.report.methods import method, title
-from gaponet.report.page import PageFigure, inline_image, page_figure, render
+from gaponet.report.page import inline_image, page_figure, render
 from gaponet.report.run_files import REPAIR_HINT, read_config, read_gap, read_metrics, read_progress, read_trajectories
 from gaponet.report.tables import by_group, mrad, mrad_and_degrees, totals
 from gaponet.report.verdict import network_gain, verdict
@@ -30,7 +30,6 @@ from gaponet.sim.model import require_stored_robot
 
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
 OPEN_TRAJECTORIES = 3  # motions shown without a click
-MAX_LISTED_MOTIONS = 6
 CARD_FACTS = ("dt", "payload_seen", "units", "hours", "steps", "seconds", "seed", "excess_delay", "parity_rad",
               "motions", "versions", "dataset_hash")  # fmt: skip
 
@@ -63,30 +62,22 @@ class _Evaluated:
         Raises:
             ModelError: A file is missing, damaged or incomplete.
         """
-        metrics = read_metrics(folder)
-        evaluated = cls(
-            robot, "identified" if model is None else method(model.config.kind, robot),
-            None if model is None else model.card, {} if model is None else read_config(folder), metrics,
-            read_trajectories(folder, metrics, len(robot.operated)), read_progress(folder), read_gap(folder),
-        )  # fmt: skip
-        if missing := evaluated._missing():
-            raise ModelError(f"{folder}: {', '.join(missing)} is missing; {REPAIR_HINT}")
-        return evaluated
-
-    def _missing(self) -> list[str]:
-        """Name what a report needs and the folder lacks."""
-        card, metrics, methods = self.card, self.metrics, self.metrics["methods"]
+        own = "identified" if model is None else method(model.config.kind, robot)
+        card, config = (None, {}) if model is None else (model.card, read_config(folder))
+        metrics, curve = read_metrics(folder), read_progress(folder)
         missing = [] if card is None else [name for name in CARD_FACTS if name not in card]
-        complete = (
-            {"date", "command", "moves", "shown"} <= metrics.keys()
-            and set(methods["nominal"]["by_joint"]) <= set(metrics["moves"])  # joints that a recording holds
-            and set(metrics["moves"]) == set(self.robot.operated)
-        )
-        missing += [] if self.own in methods and complete else [f"a whole evaluation of {title(self.own)}"]
-        if card is not None:
-            missing += [] if self.curve else ["progress.jsonl"]
-            missing += ["motions"] if not missing and {"train", "val"} - set(card["motions"]) else []
-        return missing
+        moves, joints = set(metrics.get("moves", ())), set(metrics["methods"]["nominal"]["by_joint"])
+        complete = {"date", "command", "shown"} <= metrics.keys() and joints <= moves == set(robot.operated)
+        if not complete or own not in metrics["methods"]:
+            missing.append(f"a whole evaluation of {title(own)}")
+        if card is not None and not curve:
+            missing.append("progress.jsonl")
+        if card is not None and {"train", "val"} - card.get("motions", {}).keys():
+            missing.append("motions")
+        if missing:
+            raise ModelError(f"{folder}: {', '.join(missing)} is missing; {REPAIR_HINT}")
+        arrays = read_trajectories(folder, metrics, len(robot.operated))
+        return cls(robot, own, card, config, metrics, arrays, curve, read_gap(folder))
 
 
 def write_report(
@@ -121,14 +112,9 @@ def write_report(
         _evaluate(run, dataset, also, given, progress)
     evaluated = _Evaluated.read(run, model, spec)
     progress(0, 1, "drawing")
-    commands = [
-        evaluated.config.get("command", ""),
-        evaluated.metrics["command"],
-        f"gaponet report {shlex.quote(str(run))}",
-    ]
-    values = _values(evaluated) | _photo(evaluated, picture) | {"commands": [c for c in commands if c]}
+    values = _values(evaluated) | _photo(evaluated, picture)
     path = run / "report.html"
-    write_text(path, render("report.html.j2", **values))
+    write_text(path, render("report.html.j2", report_command=f"gaponet report {shlex.quote(str(run))}", **values))
     progress(1, 1, "drawing")
     return path
 
@@ -164,14 +150,19 @@ def _values(e: _Evaluated) -> dict[str, Any]:
     if len(methods["nominal"]["by_payload"]) > 1:
         bars.append(page_figure(draw.by_payload(methods), "Payload in each hand."))
     joint_columns, joint_rows = _by_joint(e)
+    shown, trajectories = e.metrics["shown"], []
+    for row, fig in draw.trajectories(e.arrays, shown, e.robot.operated, list(methods)).items():
+        caption = f" (unit {shown[row]['unit_id']}, {shown[row]['payload_mass']:g} kg)"
+        trajectories.append(page_figure(fig, caption, shown[row]["motion"]))
     simulators = e.metrics.get("simulators", {}).items()
     values: dict[str, Any] = {
         "title": f"{e.robot.name} {name}", "heading": f"{e.robot.description}: {name}", "metrics": e.metrics,
-        "card": e.card, "verdict": " ".join(verdict(methods)), "warnings": warnings(e.card, e.own, e.metrics),
+        "card": e.card, "config": e.config, "verdict": " ".join(verdict(methods)),
+        "warnings": warnings(e.card, e.own, e.metrics),
         "totals": totals(methods, mrad_and_degrees), "best": int(np.argmin([m["mpjae"] for m in methods.values()])),
         "simulators": "; ".join(f"{title(name)} {simulator}" for name, simulator in simulators),
         "adapted_title": title("adapted"), "joint_columns": joint_columns, "joint_rows": joint_rows, "bars": bars,
-        "trajectories": _trajectories(e), "open_trajectories": OPEN_TRAJECTORIES,
+        "trajectories": trajectories, "open_trajectories": OPEN_TRAJECTORIES,
         "by_motion": by_group(methods, "motion", mrad_and_degrees), "waterfall": None,
     }  # fmt: skip
     if e.gap is not None:
@@ -179,8 +170,14 @@ def _values(e: _Evaluated) -> dict[str, Any]:
         values["waterfall"] = page_figure(waterfall(e.gap), caption)
     if e.card is not None:
         caption = "Free run over whole validation motions; the circled model was selected."
-        values["training_curve"] = page_figure(draw.training_curve(e.curve), caption)
-        values |= {"training_facts": _training_facts(e.card, e.config), "model_facts": _model_facts(e.card, e.metrics)}
+        delta, artifacts = e.metrics["delta"].items(), e.metrics["artifacts"].items()
+        values |= {
+            "training_curve": page_figure(draw.training_curve(e.curve), caption),
+            "how_trained": GapModel.how_trained(e.card),
+            "largest_corrections": ", ".join(f"{n} {d['max']:.3f}" for n, d in delta),
+            "artifacts": ", ".join(f"{n} {a['weights']} (seed {a['seed']})" for n, a in artifacts),
+            "versions": ", ".join(f"{k} {v}" for k, v in e.card["versions"].items()),
+        }
     return values
 
 
@@ -194,19 +191,6 @@ def _by_joint(e: _Evaluated) -> tuple[list[str], list[list[str]]]:
         moves = f"{moving} of {e.metrics['sequences']}" if moving else "none: stands still"
         rows.append([joint, *errors, *(mrad(joints[joint][k]) for k in ("static", "dynamic")), moves])
     return [*table.columns, f"{own} static", f"{own} dynamic", "moves in"], rows
-
-
-def _trajectories(e: _Evaluated) -> list[PageFigure]:
-    from gaponet.report.figures import evaluation as draw
-
-    figures = []
-    for row, fig in draw.trajectories(
-        e.arrays, e.metrics["shown"], e.robot.operated, list(e.metrics["methods"])
-    ).items():
-        shown = e.metrics["shown"][row]
-        caption = f" (unit {shown['unit_id']}, {shown['payload_mass']:g} kg)"
-        figures.append(page_figure(fig, caption, shown["motion"]))
-    return figures
 
 
 def _photo(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
@@ -271,42 +255,3 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
     if card.get("interrupted"):
         out.append("Training was interrupted before its budget was out.")
     return out
-
-
-def _training_facts(card: dict[str, Any], config: dict[str, Any]) -> list[list[str]]:
-    shape, ppo, motions = card["model"], config["ppo"], card["motions"]
-    more = " …" if len(motions["val"]) > MAX_LISTED_MOTIONS else ""
-    return [
-        ["trained on", f"{len(motions['train'])} motions, {card['hours']:.2f} h, units {', '.join(card['units'])}"],
-        ["trained", GapModel.how_trained(card)],
-        ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
-        ["validated on", ", ".join(motions["val"][:MAX_LISTED_MOTIONS]) + more],
-        ["observation", f"{shape['history']} past frames, payload {'in' if shape['payload_input'] else 'out'}"],
-        ["sensors", shape.get("sensors", "–") if shape["kind"] == "gaponet" else "–"],
-        ["sensor predictor R²", _r2(card.get("sensor_r2"))],
-        ["steps, time", f"{card['steps']:,} control steps in {card['seconds'] / 60:.1f} min"],
-        ["PPO", f"{ppo['num_envs']} environments, {ppo['epochs']} epochs, σ {ppo['std']:g} rad"],
-        ["seed", str(card["seed"])],
-        ["ONNX against torch", f"{card['parity_rad']:.1e} rad"],
-    ]
-
-
-def _r2(r2: dict[str, Any] | None) -> str:
-    """Format the R² of the sensor predictor on the test states."""
-    if r2 is None:
-        return "–"
-    joints = ", ".join(f"{j} {v:.2f}" for j, v in r2["by_joint"].items())
-    return f"{r2['mean']:.3f} on held-out states ({joints})"
-
-
-def _model_facts(card: dict[str, Any], metrics: dict[str, Any]) -> list[list[str]]:
-    largest = ", ".join(f"{n} {d['max']:.3f}" for n, d in metrics["delta"].items())
-    return [
-        ["robot, joints", f"{card['robot']}: {', '.join(card['joint_names'])}"],
-        ["simulator", f"{metrics['simulator_hash']}; kp {card['kp']}, kd {card['kd']}"],
-        ["dataset", f"{metrics['dataset']} (trained on {card['dataset_hash']})"],
-        ["rate", ", ".join(f"{1 / dt:.2f} Hz" for dt in card["dt"])],
-        ["largest |Δa|", f"limit {card['model']['delta_max']} rad; seen {largest}"],
-        ["artifacts", ", ".join(f"{n} {a['weights']} (seed {a['seed']})" for n, a in metrics["artifacts"].items())],
-        ["versions", ", ".join(f"{k} {v}" for k, v in card["versions"].items())],
-    ]

@@ -8,7 +8,6 @@ from pathlib import Path
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import has_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sim.dataset_robot import dataset_robot
 
 
 def load_dataset(place: str | Path) -> Dataset:
@@ -44,6 +43,8 @@ def open_dataset(
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if robot is not None:
         return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
+    from gaponet.sim.dataset_robot import dataset_robot  # imports mujoco, before which view and report choose OpenGL
+
     spec = dataset_robot(data, None if run is None else Path(run))
     if not has_stored_robot(data.path) and (run is None or not has_stored_robot(Path(run))):
         logging.getLogger("gaponet").warning(

@@ -51,16 +51,15 @@ def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(ar
     methods = {k: METHODS[k] for k in ("nominal", "delay_offset")}
     card = next(c for c in read_cards().set if c.name == "so101")
     bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=lambda text: None)
-    told = [row.as_dict() for row in bench.evaluate(card, "new motions", [question])]
-    assert [(r["motions"], r["recordings"]) for r in told] == [(1, 6), (1, 6)]
-    assert told[0]["standard_error"] is None
-    assert told[1]["of_nominal"] < 1.0
+    rows = bench.evaluate(card, "new motions", [question])
+    assert [(r["motions"], r["recordings"]) for r in rows] == [(1, 6), (1, 6)]
+    assert rows[0]["standard_error"] is None
+    assert rows[1]["of_nominal"] < 1.0
     stopped = Bench(
         read_cards(), tmp_path, tmp_path / "work", dict.fromkeys(methods, ("", None)), say=lambda text: None
     )
-    assert [row.as_dict()["mrad"] for row in stopped.evaluate(card, "new motions", [question])] == [
-        r["mrad"] for r in told
-    ]
+    again = stopped.evaluate(card, "new motions", [question])
+    assert [r["mrad"] for r in again] == [r["mrad"] for r in rows]
 
 
 def test_networks_are_trained_once_and_rejected_without_a_gain_over_identification(arm, played, tmp_path, monkeypatch):
@@ -111,7 +110,7 @@ def test_a_failing_method_loses_its_own_row_and_single_joints_are_tabulated_by_p
     said, methods = [], {"nominal": METHODS["nominal"], "mine": ("mine", lambda question: 1 / 0)}
     bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=said.append)
     card = next(c for c in read_cards().set if c.name == "so101")
-    (row,) = (row.as_dict() for row in bench.evaluate(card, question.name, [question]))
+    (row,) = bench.evaluate(card, question.name, [question])
     assert any("mine: ZeroDivisionError" in text for text in said)
     ((mrad, count),) = row["by_joint_mrad"][arm.operated[0]].values()
     assert (mrad, count) == (pytest.approx(row["mrad"]), 12)

@@ -5,7 +5,8 @@ import pytest
 from arm import TOML, write_arm
 
 from gaponet.base.errors import UsageError
-from gaponet.experiments.virtual.goals import GOALS_PER_TRAJECTORY, IK_TOLERANCE_M, GoalPlanner
+from gaponet.experiments.virtual import goals
+from gaponet.experiments.virtual.goals import GOALS_PER_TRAJECTORY, IK_TOLERANCE_M, MIN_FRONT_M, GoalPlanner
 
 
 @pytest.fixture(scope="module")
@@ -24,14 +25,13 @@ def test_targets_bring_the_hand_to_its_goals_and_keep_it_there(robot):
             moved = np.abs(np.diff(places[plan.start[k] : plan.arrive[k]], axis=0)).max()
             assert 1e-3 < moved < 0.05
         assert plan.leave[-1] == len(plan.ctrl)
-        assert plan.rise[0, 0] == pytest.approx(plan.goals[0, 0, 2] - places[0, 0, 2], abs=1e-9)
 
 
 def test_goals_lie_in_front_and_apart(robot):
-    planner = GoalPlanner(robot, 0.4, 0, front=0.15)
-    goals = np.array([plan.goals for plan in planner.plans(6)]).reshape(-1, 3)
-    assert goals[:, 0].min() >= 0.15
-    assert np.ptp(goals[:, 2]) > 0.1
+    planner = GoalPlanner(robot, 0.4, 0)
+    places = np.array([plan.goals for plan in planner.plans(6)]).reshape(-1, 3)
+    assert places[:, 0].min() >= MIN_FRONT_M
+    assert np.ptp(places[:, 2]) > 0.1
 
 
 def test_the_same_seed_gives_the_same_goals(robot):
@@ -40,8 +40,9 @@ def test_the_same_seed_gives_the_same_goals(robot):
     assert not np.array_equal(first, other)
 
 
-def test_a_robot_without_hands_and_a_place_out_of_reach_are_refused(robot, tmp_path):
+def test_a_robot_without_hands_and_a_place_out_of_reach_are_refused(robot, tmp_path, monkeypatch):
     with pytest.raises(UsageError, match="no hand that could deliver"):
         GoalPlanner(write_arm(tmp_path, TOML.split("[[payload_mount]]")[0]), 0.0, 0)
-    with pytest.raises(UsageError, match="lower --front"):
-        GoalPlanner(robot, 0.4, 0, front=0.5)
+    monkeypatch.setattr(goals, "MIN_FRONT_M", 0.5)
+    with pytest.raises(UsageError, match="no hand reaches"):
+        GoalPlanner(robot, 0.4, 0)

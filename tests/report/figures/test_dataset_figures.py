@@ -9,10 +9,9 @@ from gaponet.base.errors import DatasetError
 from gaponet.data.store import Dataset
 from gaponet.report.evaluate import evenly_spaced
 from gaponet.report.figures import dataset_figures as draw
-from gaponet.report.figures.draw_dataset import FIGURES, draw_all, largest_torque_change, swing
+from gaponet.report.figures.dataset_figures import largest_torque_change, swing, write_figures
 from gaponet.report.figures.style import save
 from gaponet.report.provenance import robot_label
-from gaponet.sim.model import model_hash
 
 
 @pytest.fixture
@@ -29,8 +28,8 @@ def dataset(arm, tmp_path):
 
 def test_every_picture_is_drawn_as_svg_and_png(dataset, arm, tmp_path):
     told = []
-    written, left_out = draw_all(dataset, arm, tmp_path / "out", lambda *what: told.append(what))
-    names = ["composition", "gap_by_payload", "joint_ranges", "real_and_simulated", "torque_temperature"]
+    written, left_out = write_figures(dataset, arm, tmp_path / "out", lambda *what: told.append(what))
+    names = ["composition", "joint_ranges", "torque_temperature"]
     assert sorted(p.name for p in written) == [f"{n}.{s}" for n in names for s in ("png", "svg")]
     assert left_out == {}
     assert told[-1][0] == told[-1][1] == len(names)
@@ -40,7 +39,7 @@ def test_every_picture_is_drawn_as_svg_and_png(dataset, arm, tmp_path):
 def test_the_same_data_give_the_same_svg(tmp_path):
     values = {"elbow": np.linspace(-1, 1, 500)}
     for name in ("one", "two"):
-        save(draw.joint_ranges(values, {"elbow": (-1.5, 1.5)}, "t"), tmp_path / name)
+        save(draw.draw_joint_ranges(values, {"elbow": (-1.5, 1.5)}, "t"), tmp_path / name)
     assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
 
 
@@ -48,20 +47,12 @@ def test_a_figure_without_data_is_skipped_with_a_reason(arm, tmp_path):
     data = Dataset.create(tmp_path / "data", arm)
     still = np.full((60, 2), 0.1)
     data.append(arm_sequence(arm, still, still + 0.01))
-    written, left_out = draw_all(data, arm, tmp_path / "out")
+    written, left_out = write_figures(data, arm, tmp_path / "out")
     assert left_out == {
         "joint_ranges": "no operated joint is commanded to move",
         "torque_temperature": "no torque was recorded",
-        "gap_by_payload": "no motion was recorded with several payloads",
     }
-    assert len(written) == 4
-
-
-def test_only_simulations_that_a_figure_needs_are_made(dataset, arm):
-    dataset.append(recordings(arm, 1, rows=60, unit="b")[0])  # with one payload only
-    for picture in FIGURES.values():
-        picture(dataset, arm, lambda *_: None)
-    assert [dataset.has_replay(e, model_hash(arm)) for e in dataset.entries] == [True] * 6 + [False]
+    assert len(written) == 2
 
 
 def test_the_motion_whose_torques_change_most_is_shown(dataset, arm):
@@ -87,29 +78,21 @@ def test_the_title_names_virtual_robots(dataset, arm):
     assert robot_label(real) == "arm"
     assert robot_label(virtual.entries) == "VIRTUAL arm"
     assert robot_label([*real, *virtual.entries]) == "partly VIRTUAL arm"
-    fig = draw.composition(virtual.entries, f"{robot_label(virtual.entries)}: 1 h")
+    fig = draw.composition(virtual, arm)
     assert fig.legends[0].get_title().get_text().startswith("VIRTUAL arm")
 
 
-def test_bars_are_as_high_as_the_hours(dataset):
-    fig = draw.composition(dataset.entries, "t")
+def test_bars_are_as_high_as_the_hours(dataset, arm):
+    fig = draw.composition(dataset, arm)
     payload, unit, rate = fig.axes
     assert [b.get_height() for b in payload.patches] == pytest.approx([180 * 0.02 / 3600] * 2)
     assert [b.get_height() for b in unit.patches] == pytest.approx([360 * 0.02 / 3600])
     assert [t.get_text() for t in rate.get_xticklabels()] == ["50"]
 
 
-def test_boxes_stand_at_the_quartiles():
-    errors = {0.0: np.linspace(0, 0.1, 101)[:, None], 2.0: np.linspace(0.1, 0.2, 101)[:, None]}
-    (ax,) = draw.gap_by_payload(errors, ["elbow"], "t").axes
-    boxes = sorted({(round(b.get_y(), 6), round(b.get_y() + b.get_height(), 6)) for b in ax.patches})
-    assert boxes == [(25.0, 75.0), (125.0, 175.0)]  # mrad
-    assert [t.get_text() for t in ax.get_xticklabels()] == ["all\njoints", "elbow"]
-
-
 def test_warming_is_counted_from_the_start(dataset):
     takes = {e.meta.payload_mass: dataset.read(e) for e in dataset.entries[:2]}
-    fig = draw.torque_temperature(takes, ["elbow"], "t")
+    fig = draw.draw_torque_temperature(takes, ["elbow"], "t")
     light, heavy = (line.get_ydata() for line in fig.axes[2].lines)
     assert light.max() == 0
     assert (heavy[0], heavy[-1]) == (0, pytest.approx(0.2 * 59, abs=1e-4))
@@ -117,21 +100,14 @@ def test_warming_is_counted_from_the_start(dataset):
 
 def test_a_sequence_without_temperature_has_no_such_row(arm):
     ctrl = wave(60, 2)
-    fig = draw.torque_temperature({0.0: arm_sequence(arm, ctrl, ctrl, tau=ctrl)}, ["elbow", "shoulder"], "t")
+    fig = draw.draw_torque_temperature({0.0: arm_sequence(arm, ctrl, ctrl, tau=ctrl)}, ["elbow", "shoulder"], "t")
     assert [ax.get_ylabel() for ax in fig.axes[::2]] == ["position, rad", "torque, N·m"]
-
-
-def test_the_gap_below_an_overlay_is_recorded_minus_simulated(arm):
-    ctrl = wave(60, 2)
-    fig = draw.overlay(arm_sequence(arm, ctrl, ctrl + 0.1), ctrl, ["elbow"], "t")
-    gap = next(line for line in fig.axes[1].lines if len(line.get_ydata()) == 60)
-    assert np.allclose(gap.get_ydata(), 100, atol=1e-3)
 
 
 def test_a_joint_without_limits_gets_no_grey_range():
     values = np.linspace(-1, 1, 500)
     limits = {"left_elbow": (-1.5, 1.5), "spin": (-np.inf, np.inf)}
-    fig = draw.joint_ranges(dict.fromkeys(limits, values), limits, "t")
+    fig = draw.draw_joint_ranges(dict.fromkeys(limits, values), limits, "t")
     ax = fig.axes[0]
     assert len(ax.patches) == 1
     assert ax.patches[0].get_width() == pytest.approx(3.0)
@@ -140,4 +116,4 @@ def test_a_joint_without_limits_gets_no_grey_range():
 
 def test_an_empty_dataset_has_no_pictures(arm, tmp_path):
     with pytest.raises(DatasetError, match="holds no sequences yet"):
-        draw_all(Dataset.create(tmp_path / "none", arm), arm, tmp_path / "out")
+        write_figures(Dataset.create(tmp_path / "none", arm), arm, tmp_path / "out")

@@ -1,4 +1,4 @@
-"""What a browser shows: gaponet view --web, and the report on a desk and on a phone. make browser."""
+"""What a browser shows: gaponet view, and the report on a desk and on a phone. make browser."""
 
 import threading
 import time
@@ -16,7 +16,7 @@ OFF = 60  # |difference| of one channel, of 255, by which a pixel is another
 
 @pytest.fixture
 def web(arm):
-    """Three copies of a moving arm, served and played as gaponet view --web does."""
+    """Two copies of a moving arm, served and played as gaponet view does."""
     from gaponet.report.view.film import Clip
     from gaponet.report.view.scene import Scene
     from gaponet.report.view.side_by_side import Copy, SideBySide
@@ -24,9 +24,9 @@ def web(arm):
 
     real = recordings(arm, 1, rows=200, kp=0.5)[0]
     swing = 0.8 * np.sin(np.arange(len(real)) / 20)[:, None] * np.ones(2)
-    off = {"nominal": 0.4, "gaponet": 0.1, "recorded": 0.0}
+    off = {"nominal": 0.4, "gaponet": 0.1}
     shown = SideBySide(real, arm, tuple(Copy(m, swing + o, np.full(len(real), o)) for m, o in off.items()), None)
-    served = WebScene(Scene(shown, ghost=False), Clip.from_start(shown, 0.0, 3.0), port=0)
+    served = WebScene(Scene(shown), Clip.from_start(shown, 0.0, 3.0), port=0)
     served.playing.value = False
     ended = threading.Event()
 

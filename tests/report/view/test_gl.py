@@ -1,6 +1,7 @@
 """Choosing OpenGL happens in the environment, once."""
 
 import os
+import subprocess
 import sys
 
 import pytest
@@ -46,3 +47,9 @@ def test_a_choice_that_mujoco_cannot_use_is_taken_back(headless):
     with pytest.raises(UsageError, match="MUJOCO_GL=egl: "):
         gl.choose_gl()
     assert "MUJOCO_GL" not in os.environ
+
+
+def test_commands_that_render_are_imported_without_mujoco():
+    """MuJoCo reads MUJOCO_GL once, when it is imported."""
+    code = "import sys\nfrom gaponet.cli import demo, report, robot, start, view\nprint('mujoco' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"

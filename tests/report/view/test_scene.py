@@ -38,21 +38,23 @@ def camera(tmp_path_factory):
     """One camera for all pictures, or a skip that says why."""
     scene = Scene(shown(write_arm(tmp_path_factory.mktemp("arm"))), flat=True)
     try:
-        opened = Camera(scene, width=320)
+        opened = Camera(scene, Clip.from_start(scene.shown, 0.1, 0.2, speed=0.5, fps=10), width=320)
     except UsageError as error:
         pytest.skip(f"no OpenGL here: {error}")
     with opened:
         yield opened
 
 
-def test_four_robots_have_the_angles_of_their_motions(four, arm):
-    scene = Scene(four, ghost=False)
-    assert scene.model.nq == 4 * 2
+def test_robots_have_the_angles_of_their_motions_and_ghosts_those_of_the_recording(four, arm):
+    scene = Scene(four)
+    assert scene.model.nq == 4 * 2 + 3 * 2
     scene.pose(0.2)
     for motion in four.motions:
         for j, joint in enumerate(arm.joint_names):
             angle = scene.data.qpos[scene.model.joint(f"{motion.method}/{joint}").qposadr[0]]
             assert angle == pytest.approx(motion.qpos[10, j])
+    ghost = scene.data.qpos[scene.model.joint("nominal-ghost/shoulder").qposadr[0]]
+    assert ghost == pytest.approx(four.real.qpos[10, 0])
 
 
 def test_between_two_rows_a_robot_is_between_them(four):
@@ -60,14 +62,6 @@ def test_between_two_rows_a_robot_is_between_them(four):
     scene.pose(0.21)
     angle = scene.data.qpos[scene.model.joint("recorded/elbow").qposadr[0]]
     assert angle == pytest.approx(four.real.qpos[10:12, 1].mean())
-
-
-def test_a_ghost_is_the_recording_in_each_other_copy(four):
-    scene = Scene(four)
-    assert scene.model.nq == 4 * 2 + 3 * 2
-    scene.pose(0.4)
-    ghost = scene.data.qpos[scene.model.joint("nominal-ghost/shoulder").qposadr[0]]
-    assert ghost == pytest.approx(four.real.qpos[20, 0])
 
 
 def test_hands_are_where_the_simulator_puts_them(four, arm):
@@ -166,9 +160,8 @@ def test_virtual_is_written_on_virtual_pictures_only(camera, monkeypatch):
 def test_films_have_the_length_asked_for(camera, tmp_path):
     from PIL import Image
 
-    clip = Clip.from_start(camera.scene.shown, 0.1, 0.2, speed=0.5, fps=10)
-    assert write(camera, clip, tmp_path / "a.gif") == 4  # 0.2 s at half speed, 10 pictures/s
-    assert write(camera, clip, tmp_path / "a.png") == 1
+    assert write(camera, tmp_path / "a.gif") == 4  # 0.2 s at half speed, 10 pictures/s
+    assert write(camera, tmp_path / "a.png") == 1
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 4
         assert film.info["duration"] == 100
@@ -177,7 +170,7 @@ def test_films_have_the_length_asked_for(camera, tmp_path):
 
 def test_an_mp4_is_an_mp4(camera, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
-    write(camera, Clip.from_start(camera.scene.shown, 0.0, 0.2, fps=10), tmp_path / "a.mp4")
+    write(camera, tmp_path / "a.mp4")
     assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
 
 

@@ -8,7 +8,7 @@ import json
 import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,59 +23,10 @@ from gaponet.experiments.real.questions import Question, questions, recorded_joi
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import standard_error
 
-Change = Callable[[Question], Question]
-Say = Callable[[str], None]
+Row = dict[str, Any]  # errors of one method on one question (Bench.evaluate)
 
 
-@dataclass(frozen=True)
-class Row:
-    """Errors of one method on one question.
-
-    Attributes:
-        error: Mean |error| of each independent motion, (motions,) rad.
-        nominal: The same of the nominal simulator, in the same order.
-        floor: Mean difference between repetitions, rad; NaN if unknown.
-        splits: Hashes of the recordings, one per fold.
-        seconds: Time of fitting and evaluation.
-        notes: Notes of the method, one per fold.
-        by_joint: Joint → payload, kg → (mean error over motions, mrad; number of recordings), of data sets in which
-            joints were recorded one at a time.
-    """
-
-    set: str
-    question: str
-    method: str
-    error: np.ndarray
-    nominal: np.ndarray
-    recordings: int
-    floor: float
-    splits: tuple[str, ...]
-    seconds: float
-    notes: tuple[str, ...] = ()
-    by_joint: dict[str, dict[str, tuple[float, int]]] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the row for JSON: mrad, standard errors over motions, of differences paired."""
-        less = 1e3 * (self.nominal - self.error)
-        return json_compatible({
-            "set": self.set, "question": self.question, "method": self.method, "mrad": 1e3 * self.error.mean(),
-            "standard_error": 1e3 * standard_error(self.error), "of_nominal": self.error.mean() / self.nominal.mean(),
-            "less_than_nominal": less.mean(), "less_standard_error": standard_error(less), "motions": len(self.error),
-            "recordings": self.recordings, "floor_mrad": 1e3 * self.floor, "splits": self.splits,
-            "by_joint_mrad": self.by_joint, "seconds": round(self.seconds, 1), "notes": self.notes,
-        })  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Evaluated:
-    """Evaluation of a method on one fold: mean |error| of each test recording, rad; s; a note."""
-
-    errors: list[float]
-    seconds: float
-    note: str
-
-
-@dataclass
+@dataclass(eq=False)
 class Bench:
     """A run of the benchmark. Datasets, trainings and evaluations below `work` are reused.
 
@@ -85,17 +36,13 @@ class Bench:
         work: Folder for datasets, trainings and evaluations.
         methods: Name → title and method.
         say: Called with a line about each step.
-        adversary: Name of the change to the recordings, or "".
-        change: Change of each question, as benchmarks/real_adversaries.py makes it.
     """
 
     cards: Cards
     data: Path
     work: Path
     methods: dict[str, tuple[str, Method]]
-    say: Say = print
-    adversary: str = ""
-    change: Change = lambda question: question
+    say: Callable[[str], None] = print
 
     def run(self, sets: tuple[str, ...] = (), names: tuple[str, ...] = ()) -> dict[str, Any]:
         """Import, split, fit and measure.
@@ -105,7 +52,7 @@ class Bench:
             names: Questions; default all.
 
         Returns:
-            rows (Row.as_dict), cards, labels (set → sentences), left_out (folder → reason), adversary, seconds (set →).
+            rows (evaluate), cards, labels (set → sentences), left_out (folder → reason), seconds (set →).
 
         Raises:
             UsageError: No such data set or question.
@@ -139,22 +86,24 @@ class Bench:
                 labels[card.name] = estimated.remarks
             for name in (q for q in card.questions if not names or q in names):
                 rows += self.evaluate(card, name, list(questions(name, dataset, robot, self._elsewhere(card))))
-            seconds[card.name] += sum(r.seconds for r in rows if r.set == card.name)
-        return {"rows": [r.as_dict() for r in rows], "cards": {c.name: c.title for c in present}, "labels": labels,
-                "left_out": left_out, "adversary": self.adversary,
+            seconds[card.name] += sum(r["seconds"] for r in rows if r["set"] == card.name)
+        return {"rows": rows, "cards": {c.name: c.title for c in present}, "labels": labels, "left_out": left_out,
                 "seconds": {k: round(v) for k, v in seconds.items()}}  # fmt: skip
 
     def evaluate(self, card: Card, name: str, folds: list[Question]) -> list[Row]:
-        """Evaluate every method on every fold of a question; methods without the data that they need are skipped."""
+        """Evaluate every method on every fold of a question; methods without the data that they need are skipped.
+
+        Returns:
+            A row per method for JSON: mrad, standard errors over motions, of differences paired; floor_mrad, the mean
+            difference of repetitions; splits, a hash per fold; and by_joint_mrad, joint → payload, kg → (mean error
+            over motions; number of recordings), of data sets in which joints were recorded one at a time.
+        """
         rows: list[Row] = []
         floors = [f for q in folds if (f := repeatability(q)) == f]
-        floor = float(np.mean(floors or [np.nan]))
-        splits = tuple(q.split_hash for q in folds)
-        changed = [(q, self.change(q)) for q in folds]
-        # Where the change keeps the training recordings, fits without the change are reused.
-        folds = [self._with_folder(card, new, self.adversary * (new.train is not old.train)) for old, new in changed]
+        nominal = np.empty(0)
+        folds = [self._with_folder(card, q) for q in folds]
         for method, (title, fit) in self.methods.items():
-            if _lacks_data(method, folds):
+            if _lacks_data(method, folds[0]):
                 continue
             try:
                 evaluated = [self._evaluate_fold(card, q, method, fit) for q in folds]
@@ -162,14 +111,20 @@ class Bench:
                 kind = "" if isinstance(error, GAPONetError) else f"{type(error).__name__}: "
                 self.say(f"{card.name}, {name}, {title}: {kind}{error}")
                 continue
-            by_motion, by_joint = _averages(folds, evaluated)
-            nominal = rows[0].error if rows else by_motion
-            rows.append(Row(
-                card.name, name, title, by_motion, nominal, sum(len(e.errors) for e in evaluated), floor, splits,
-                sum(e.seconds for e in evaluated), tuple(e.note for e in evaluated if e.note), by_joint,
-            ))  # fmt: skip
+            errors, by_joint = _averages(folds, [e["errors"] for e in evaluated])
+            nominal = nominal if rows else errors
+            less = 1e3 * (nominal - errors)
+            rows.append(json_compatible({
+                "set": card.name, "question": name, "method": title, "mrad": 1e3 * errors.mean(),
+                "standard_error": 1e3 * standard_error(errors), "of_nominal": errors.mean() / nominal.mean(),
+                "less_than_nominal": less.mean(), "less_standard_error": standard_error(less), "motions": len(errors),
+                "recordings": sum(len(e["errors"]) for e in evaluated),
+                "floor_mrad": 1e3 * float(np.mean(floors or [np.nan])), "splits": [q.split_hash for q in folds],
+                "by_joint_mrad": by_joint, "seconds": round(sum(e["seconds"] for e in evaluated), 1),
+                "notes": [e["note"] for e in evaluated if e["note"]],
+            }))  # fmt: skip
             self.say(
-                f"{card.name}, {name}: {title}: {1e3 * by_motion.mean():.2f} mrad, nominal {1e3 * nominal.mean():.2f}"
+                f"{card.name}, {name}: {title}: {1e3 * errors.mean():.2f} mrad, nominal {1e3 * nominal.mean():.2f}"
             )
         return rows
 
@@ -179,52 +134,39 @@ class Bench:
     def _elsewhere(self, card: Card) -> Callable[[], RobotSpec] | None:
         """Return a function that identifies the robot on the other data set of a card; None if that is not present."""
         other = next((c for c in self.cards.set if c.name == card.elsewhere and self._is_present(c)), None)
-        return functools.partial(self._identified_on, other.name) if other else None
+        return functools.partial(self._identified_on, other) if other else None
 
-    @functools.cache  # noqa: B019
-    def _identified_on(self, name: str) -> RobotSpec:
-        card = next(c for c in self.cards.set if c.name == name)
+    def _identified_on(self, card: Card) -> RobotSpec:
         dataset, robot, _ = prepare(card, self.data, self.work)
-        first = next(questions(card.questions[0], dataset, robot, None))
-        return identified(self._with_folder(card, first, "")).robot
+        return identified(self._with_folder(card, next(questions(card.questions[0], dataset, robot, None)))).robot
 
-    __hash__ = object.__hash__
-
-    def _with_folder(self, card: Card, question: Question, adversary: str) -> Question:
+    def _with_folder(self, card: Card, question: Question) -> Question:
         """Return the question with a folder of its own for identified robots and trainings."""
-        name = "-".join(filter(None, (card.name, question.split_hash, adversary)))
-        return replace(question, work=self.work / "made" / name)
+        return replace(question, work=self.work / "made" / f"{card.name}-{question.split_hash}")
 
-    def _evaluate_fold(self, card: Card, question: Question, method: str, fit: Method) -> Evaluated:
-        """Fit and evaluate, or read the stored evaluation."""
-        words = (card.name, question.name, question.split_hash, method, self.adversary)
-        file = self.work / "answers" / (re.sub(r"[^A-Za-z0-9]+", "-", " ".join(words).strip()) + ".json")
+    def _evaluate_fold(self, card: Card, question: Question, method: str, fit: Method) -> dict[str, Any]:
+        """Fit and evaluate, or read the stored evaluation: errors of the test recordings, rad; seconds; note."""
+        words = (card.name, question.name, question.split_hash, method)
+        file = self.work / "answers" / (re.sub(r"[^A-Za-z0-9]+", "-", " ".join(words)) + ".json")
         if file.is_file():
-            stored = json.loads(file.read_text(encoding="utf-8"))
-            return Evaluated(stored["errors"], stored["seconds"], stored.get("note", ""))
+            return {"note": "", **json.loads(file.read_text(encoding="utf-8"))}
         start = time.monotonic()
         fitted = fit(question)
-        evaluated = Evaluated(fitted.errors(question.test), time.monotonic() - start, fitted.note)
-        robot = fitted.robot
-        servos = {
-            j: {f: float(getattr(robot, f)[robot.joint_names.index(j)]) for f in ("kp", "delay", "offset")}
-            for j in robot.operated
-        }
-        record = {"errors": evaluated.errors, "seconds": evaluated.seconds, "note": evaluated.note, "servos": servos,
-                  "mounts": [m.pos for m in robot.payload_mounts]}  # fmt: skip
+        errors = fitted.errors(question.test)
+        record = {"errors": errors, "seconds": time.monotonic() - start, "note": fitted.note}
         file.parent.mkdir(parents=True, exist_ok=True)
         write_text(file, json.dumps(record))
-        return evaluated
+        return record
 
 
 def _averages(
-    folds: list[Question], evaluated: list[Evaluated]
+    folds: list[Question], errors: list[list[float]]
 ) -> tuple[np.ndarray, dict[str, dict[str, tuple[float, int]]]]:
-    """Return the mean error of each independent motion, rad, and Row.by_joint."""
+    """Return the mean error of each independent motion, rad, and by_joint_mrad (Bench.evaluate)."""
     by_motion: dict[str, list[float]] = {}
     by_cell: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for q, fold in zip(folds, evaluated, strict=True):
-        for s, motion, error in zip(q.test, q.test_motions, fold.errors, strict=True):
+    for q, fold in zip(folds, errors, strict=True):
+        for s, motion, error in zip(q.test, q.test_motions, fold, strict=True):
             by_motion.setdefault(motion, []).append(error)
             if len(columns := recorded_joints(s, q.robot)) == 1 < len(q.robot.operated):
                 cell = q.robot.joint_names[columns[0]], f"{s.meta.payload_mass:g}"
@@ -236,11 +178,10 @@ def _averages(
     return np.array([np.mean(v) for v in by_motion.values()]), by_joint
 
 
-def _lacks_data(method: str, folds: list[Question]) -> bool:
-    first = folds[0]
+def _lacks_data(method: str, question: Question) -> bool:
     if method == "constant":
-        return len({(s.meta.payload_mass, s.meta.unit_id) for s in first.train}) < 2
-    return (method == "elsewhere" and first.elsewhere is None) or (method == "adapted" and not first.few)
+        return len({(s.meta.payload_mass, s.meta.unit_id) for s in question.train}) < 2
+    return (method == "elsewhere" and question.elsewhere is None) or (method == "adapted" and not question.few)
 
 
 def load_method(where: str) -> tuple[str, Method]:

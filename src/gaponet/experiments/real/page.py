@@ -39,7 +39,7 @@ simulator paired; "floor" is what two recordings of one command differ by."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:
-    """One row per data set, question and method, from Row.as_dict."""
+    """One row per data set, question and method, from Bench.evaluate."""
     return ResultTable(STEM, COLUMNS, tuple(
         (r["set"], r["question"], r["method"] + _left_out(r.get("notes", ())),
          _plus_minus(r["mrad"], r["standard_error"]), f"{r['of_nominal']:.2f}",
@@ -83,18 +83,17 @@ def _plus_minus(value: float, error: float | None) -> str:
 def write_page(result: dict[str, Any], out: Path) -> list[Path]:
     """Write JSON, Markdown and figure of Bench.run into a folder. Return the files."""
     out.mkdir(parents=True, exist_ok=True)
-    rows, stem = result["rows"], f"{STEM}-{result['adversary']}".rstrip("-")
-    write_text(out / f"{stem}.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
-    parts = [HEADING, f"![Error of each method as a share of the nominal error]({stem}.png)"]
-    parts += [f"ADVERSARY: {result['adversary']}."] if result["adversary"] else []
+    rows = result["rows"]
+    write_text(out / f"{STEM}.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    parts = [HEADING, f"![Error of each method as a share of the nominal error]({STEM}.png)"]
     parts += [table.markdown() for table in (result_table(rows), *joint_tables(rows))]
     seconds = ", ".join(f"{name} {value:,} s" for name, value in result["seconds"].items())
     parts.append(f"From file to table, on this machine: {seconds}.")
     for name, remarks in result["labels"].items():
         parts += [f"Labels of {name} (`gaponet data labels`):", "\n".join(f"- {remark}" for remark in remarks)]
-    write_text(out / f"{stem}.md", "\n\n".join(parts) + "\n")
-    figures = save(draw(rows, result["cards"]), out / stem) if rows else []
-    return [out / f"{stem}.md", out / f"{stem}.json", *figures]
+    write_text(out / f"{STEM}.md", "\n\n".join(parts) + "\n")
+    figures = save(draw(rows, result["cards"]), out / STEM) if rows else []
+    return [out / f"{STEM}.md", out / f"{STEM}.json", *figures]
 
 
 @styled

@@ -20,6 +20,7 @@ MAX_JOINT_SPEED = 1.5  # rad/s, about that of the recipe's reaching motions
 MIN_MOVE_S = 1.0
 VOXEL_M = 0.05  # goals cover space evenly, not joint space
 MIN_DISTANCE_M = 0.1  # between a hand and its next goal
+MIN_FRONT_M = 0.1  # of the goals, in front of the base
 SAMPLED_POSTURES = 3000  # for the reachable space
 IK_TOLERANCE_M = 1e-3
 
@@ -32,7 +33,6 @@ class Plan:
         ctrl: Joint targets at the robot's control period, (T, n) rad.
         goals: Goals of each hand, (G, hands, 3) m in the frame of the robot's base.
         start, arrive, leave: Rows at which the move to a goal begins, the move ends, and its hold ends, (G,).
-        rise: Height gained on the move, (G, hands) m.
     """
 
     ctrl: Array
@@ -40,7 +40,6 @@ class Plan:
     start: Array
     arrive: Array
     leave: Array
-    rise: Array
 
 
 def find_hands(robot: RobotSpec, model: mujoco.MjModel) -> list[Arm]:
@@ -80,12 +79,11 @@ class HandPositions:
 class GoalPlanner:
     """Random trajectories for one robot, fixed by a seed."""
 
-    def __init__(self, robot: RobotSpec, max_payload: float, seed: int, hold: float = 3.0, front: float = 0.1) -> None:
+    def __init__(self, robot: RobotSpec, max_payload: float, seed: int, hold: float = 3.0) -> None:
         """
         Args:
             max_payload: Payload that can be held at every goal, kg per hand.
             hold: Time at each goal, s.
-            front: Least distance of the goals in front of the base, m.
         """
         self.robot, self.hold = robot, hold
         self.limits = Feasibility(robot, max_payload)
@@ -95,7 +93,7 @@ class GoalPlanner:
         self.hand_positions = HandPositions(self.model, self.arms)
         self.ik = [HandIK(self.limits, arm) for arm in self.arms]
         self.ready = Kit(self.limits).ready
-        self.reachable = [self._reachable(i, front) for i in range(len(self.arms))]
+        self.reachable = [self._reachable(i) for i in range(len(self.arms))]
 
     def plans(self, count: int) -> list[Plan]:
         """Return `count` trajectories.
@@ -115,7 +113,7 @@ class GoalPlanner:
             "give a lighter payload"
         )
 
-    def _reachable(self, hand: int, front: float) -> Array:
+    def _reachable(self, hand: int) -> Array:
         """Return positions of one hand, (k, 3) m, one for each voxel that a sampled posture reaches."""
         columns = self.arms[hand].columns
         q = np.repeat(self.ready[None], SAMPLED_POSTURES, axis=0)
@@ -124,9 +122,9 @@ class GoalPlanner:
         )
         positions = self.hand_positions(q)[:, hand]
         first = np.unique(np.floor(positions / VOXEL_M).astype(int), axis=0, return_index=True)[1]
-        chosen = first[positions[first, 0] >= front]
+        chosen = first[positions[first, 0] >= MIN_FRONT_M]
         if not len(chosen):
-            raise UsageError(f"{self.robot.name}: no hand reaches {front:g} m in front of the base; lower --front")
+            raise UsageError(f"{self.robot.name}: no hand reaches {MIN_FRONT_M:g} m in front of the base")
         return positions[chosen]
 
     def _plan(self) -> Plan | None:
@@ -153,6 +151,4 @@ class GoalPlanner:
         rows = [round(x / self.robot.dt) for x in (REST_S, *moves, self.hold)]
         start = rows[0] + np.cumsum([0, *(m + rows[-1] for m in rows[1:-2])])
         arrive = start + np.array(rows[1:-1])
-        before = [self.hand_positions(self.ready), *goals[:-1]]
-        rise = np.array([g[:, 2] - b[:, 2] for g, b in zip(goals, before, strict=True)])
-        return Plan(ctrl, np.array(goals), start, arrive, arrive + rows[-1], rise)
+        return Plan(ctrl, np.array(goals), start, arrive, arrive + rows[-1])

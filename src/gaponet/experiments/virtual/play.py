@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -99,106 +100,81 @@ M = TypeVar("M", bound=HasTargets)
 
 
 @dataclass(frozen=True)
-class Compensation:
-    """A compensator between targets and robot.
-
-    Attributes:
-        model: Network of the compensator; None for the feed-forward of the robot model alone.
-        robot: Robot model of the compensator.
-    """
-
-    model: GapModel | None
-    robot: RobotSpec
-    config: CompensatorConfig
-
-
-@dataclass(frozen=True)
 class Trajectories:
-    """States and commands of N motions, (T, N, n) of all joints; row t is the state at t·dt and the command after it.
+    """States of N motions, (T, N, n) of all joints; row t is the state at t·dt.
 
     Attributes:
         qpos, qvel: Encoder readings, rad, rad/s.
         true: True joint positions, rad.
-        sent: Commands, rad.
-        tau: Motor torque by the current sensors, N·m.
-        temperature: Winding temperature, °C.
     """
 
     qpos: Array
     qvel: Array
     true: Array
-    sent: Array
-    tau: Array
-    temperature: Array
-
-
-def compensations(
-    robot: RobotSpec, trained: ListOf[TrainedModel], config: CompensatorConfig = PLANNED
-) -> Iterable[tuple[str, int | None, Compensation | None]]:
-    """Yield (method, seed, compensation): raw, feed-forward of the nominal and the identified model, each network."""
-    yield "raw", None, None
-    yield "feedforward", None, Compensation(None, robot.before_identification, config)
-    for identified in [t.robot for t in trained if t.robot.nominal is not None][:1]:
-        yield "identified feedforward", None, Compensation(None, identified, config)
-    for t in trained:
-        yield t.method, t.seed, Compensation(t.model, t.robot, config)
-
-
-def step_name(method: str, seed: int | None) -> str:
-    """Name of a method and seed in the progress bar."""
-    return method if seed is None else f"{method} {seed}"
 
 
 def with_payloads(motions: ListOf[M], payloads: tuple[float, ...]) -> list[tuple[M, float]]:
-    """Return each motion with each payload, kg, the longest motions first as `play` needs them."""
+    """Return each motion with each payload, kg, the longest motions first as `execute` needs them."""
     return [(m, p) for m in sorted(motions, key=lambda m: -len(m.ctrl)) for p in payloads]
 
 
-def stack_targets(ctrl: ListOf[Array]) -> Array:
-    """Stack targets of unequal length to (T, N, n); shorter ones hold their last row."""
-    longest = max(len(c) for c in ctrl)
-    return np.stack([np.concatenate([c, np.repeat(c[-1:], longest - len(c), axis=0)]) for c in ctrl], axis=1)
-
-
-def play(
+def execute(
     robot: RobotSpec,
     unit: Physics,
-    targets: Array,
+    ctrl: ListOf[Array],
+    mass: ListOf[float],
+    trained: ListOf[TrainedModel],
+    config: CompensatorConfig,
+    progress: Progress = lambda step, share: None,
+) -> Iterator[tuple[str, int | None, Trajectories]]:
+    """Execute targets, (T, n) rad each, by every method: raw, feed-forward of robot models alone, each network.
+
+    Args:
+        ctrl: Targets of each motion, the longest first.
+        mass: Payload of each motion, kg per hand; compensators know it.
+
+    Yields:
+        Method, seed and trajectories.
+    """
+    methods: list[tuple[str, int | None, RobotSpec | None, GapModel | None]] = [("raw", None, None, None)]
+    methods.append(("feedforward", None, robot.before_identification, None))
+    methods += [("identified feedforward", None, t.robot, None) for t in trained if t.robot.nominal is not None][:1]
+    methods += [(t.method, t.seed, t.robot, t.model) for t in trained]
+    for name, seed, simulator, model in methods:
+        compensator = None if simulator is None else Compensator(
+            simulator, model, config, num_envs=len(ctrl), nthread=1, extrapolate=True
+        )  # fmt: skip
+        report = partial(progress, name if seed is None else f"{name} {seed}")
+        yield name, seed, _play(robot, unit, ctrl, np.array(mass), compensator, report)
+
+
+def _play(
+    robot: RobotSpec,
+    unit: Physics,
+    ctrl: ListOf[Array],
     mass: Array,
-    *,
-    lengths: Array,
-    compensation: Compensation | None = None,
-    progress: Callable[[float], None] = lambda share: None,
+    compensator: Compensator | None,
+    progress: Callable[[float], None],
 ) -> Trajectories:
-    """Start at rest under the first target, then follow the targets.
+    """Start at rest under the first target, then follow the targets; a motion that has ended stands still.
 
     Limbs without an operated joint stay at home: with a fixed base they share no dynamics with the others. The seed of
     a motion's noise and rest position is its number.
-
-    Args:
-        targets: (T, N, n) rad at the robot's control period.
-        mass: Payload in each hand, (N,) kg; the compensator knows it.
-        lengths: Rows of each motion, (N,), in descending order; a motion that has ended stands still.
-        compensation: None to send the targets as they are.
-        progress: Called after each period with the share of all control steps that is done.
     """
-    count = len(mass)
+    targets = np.stack([np.concatenate([c, np.repeat(c[-1:], len(ctrl[0]) - len(c), axis=0)]) for c in ctrl], axis=1)
     locked = idle_joints(robot, robot.operated)
-    robots = VirtualRobot(robot, [unit] * count, [(float(m), "both") for m in mass], robot.dt, locked=locked, nthread=1)
-    robots.reset(targets[0], list(range(count)), START_WARMING_K)
-    compensator = None
-    if compensation is not None:
-        compensator = Compensator(
-            compensation.robot, compensation.model, compensation.config, num_envs=count, nthread=1, extrapolate=True
-        )
+    loads = [(float(m), "both") for m in mass]
+    robots = VirtualRobot(robot, [unit] * len(mass), loads, robot.dt, locked=locked, nthread=1)
+    robots.reset(targets[0], list(range(len(mass))), START_WARMING_K)
+    if compensator is not None:
         compensator.reset(targets[0], mass)
-    out = np.empty((6, *targets.shape), np.float32)
-    running = (lengths > np.arange(len(targets))[:, None]).sum(1)
+    out = np.empty((3, *targets.shape), np.float32)
+    running = (np.array([len(c) for c in ctrl]) > np.arange(len(targets))[:, None]).sum(1)
     done = running.cumsum() / running.sum()
     for t, target in enumerate(targets):
         reading = robots.read()
         sent = target if compensator is None else compensator.step(target, reading.qpos, reading.qvel)
-        out[:, t] = reading.qpos, reading.qvel, robots.true_qpos(), sent, reading.tau, reading.temperature
+        out[:, t] = reading.qpos, reading.qvel, robots.true_qpos()
         robots.step(sent, np.arange(running[t]))
         progress(float(done[t]))
     return Trajectories(*out)

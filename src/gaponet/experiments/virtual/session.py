@@ -17,7 +17,7 @@ from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.result import Result, facts
 from gaponet.experiments.study import DEFAULT_MODELS, QUICK_LABEL, Options, Study
-from gaponet.experiments.virtual.play import Progress, TrainedModel, load_trained
+from gaponet.experiments.virtual.play import Progress, TrainedModel
 from gaponet.report.provenance import describe_provenance
 from gaponet.robot.spec import RobotSpec
 from gaponet.testing.collect import fleet_name
@@ -86,14 +86,6 @@ class Session:
     study: Study | None = None
     cells: tuple[Cell, ...] = ()
     start: float = field(default_factory=time.monotonic)
-
-    @classmethod
-    def load(
-        cls, experiment: UnitExperiment, data: Dataset, robot: RobotSpec, runs: tuple[Path, ...],
-        study: Study | None = None, cells: tuple[Cell, ...] = (),
-    ) -> Session:  # fmt: skip
-        """Load the models of these runs."""
-        return cls(experiment, data, robot, load_trained(runs, robot), study, cells)
 
     @property
     def fleet(self) -> str:

@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gaponet.base.result_table import MeanStd
-from gaponet.report.methods import colour, title
 
-NOT_IN_EXAMPLES = ("identified feedforward",)  # methods in bars and tables, but not in figures of single motions
 RIVALS = ("mlp", "shared_mlp")  # networks that GAPONet is compared with
 
 
-class Measured(Protocol):
+@dataclass(frozen=True)
+class Measured:
     """A measurement of a method with one payload.
 
     Attributes:
         method: Key of report.methods.METHODS.
-        seed: None for a method without training.
+        seed: Seed of the model; None for a method without training.
         payload: kg per hand.
     """
 
-    @property
-    def method(self) -> str: ...
-
-    @property
-    def seed(self) -> int | None: ...
-
-    @property
-    def payload(self) -> float: ...
+    method: str
+    seed: int | None
+    payload: float
 
 
 M = TypeVar("M", bound=Measured)
@@ -61,13 +56,6 @@ def over_seeds(measured: ListOf[M], value: Callable[[M], Any], scale: float = 1.
     return MeanStd.from_values([float(average(values)) for values in finite if values], scale)
 
 
-def bar_series(
-    measured: ListOf[M], groups: ListOf[Any], value: Callable[[str, Any], MeanStd]
-) -> dict[str, tuple[str, list[MeanStd]]]:
-    """Return the bars of every method for charts.draw_bars: title → (colour, value of each group)."""
-    return {title(m): (colour(m), [value(m, group) for group in groups]) for m in methods(measured)}
-
-
 def reduction(value: float, base: float) -> float:
     """Reduction of base to value, per cent; NaN for a base of zero."""
     return 100 * (1 - value / base) if base else float("nan")
@@ -76,15 +64,3 @@ def reduction(value: float, base: float) -> float:
 def percent_text(change: float) -> str:
     """Describe a reduction in per cent in words; an increase in capitals."""
     return f"{change:.0f} % less" if change >= 0 else f"{-change:.0f} % MORE"
-
-
-def compare_with_rivals(error: Mapping[float, Mapping[str, float]], names: ListOf[str]) -> list[str]:
-    """Say for each rival network whether GAPONet has the smaller error, from {payload kg: {method: error}}."""
-    sentences = []
-    for rival in (r for r in RIVALS if r in names and "gaponet" in names):
-        lost = [f"{p:g} kg" for p, by_method in error.items() if by_method["gaponet"] >= by_method[rival]]
-        if lost:
-            sentences.append(f"GAPONet does NOT beat '{title(rival)}' at {', '.join(lost)}")
-        else:
-            sentences.append(f"GAPONet beats '{title(rival)}'" + (" at every payload" if len(error) > 1 else ""))
-    return sentences

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,23 +19,11 @@ from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.experiments.result import Result
-from gaponet.experiments.virtual.play import (
-    PLANNED,
-    Progress,
-    TrainedModel,
-    Trajectories,
-    compensations,
-    play,
-    stack_targets,
-    step_name,
-    with_payloads,
-)
+from gaponet.experiments.virtual.play import PLANNED, Progress, TrainedModel, execute, with_payloads
 from gaponet.experiments.virtual.session import Session, UnitExperiment
 from gaponet.experiments.virtual.statistics import (
-    NOT_IN_EXAMPLES,
     RIVALS,
-    bar_series,
-    compare_with_rivals,
+    Measured,
     methods,
     over_seeds,
     payloads,
@@ -45,9 +31,9 @@ from gaponet.experiments.virtual.statistics import (
     reduction,
     select,
 )
-from gaponet.experiments.virtual.unseen_motions import UnseenMotion, from_files, generated, require_unseen
+from gaponet.experiments.virtual.unseen_motions import UnseenMotion, generated, require_unseen
 from gaponet.report.candidate import select_entries
-from gaponet.report.figures.charts import JointTrajectory, against, draw_bars
+from gaponet.report.figures.charts import draw_bars
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 from gaponet.report.methods import colour, title
 from gaponet.robot.spec import RobotSpec
@@ -61,48 +47,26 @@ if TYPE_CHECKING:
 JointSet = tuple[str, list[int]]  # label, columns
 
 BASELINE = {"alignment": "nominal", "compensation": "raw"}
-SOURCES = {"generated": "generated motions", "files": "motion files", "recorded": "recorded test motions"}
 MEANING = {
     "alignment": "between simulator and robot under the same targets, open-loop rollout",
     "compensation": "between targets and robot",
 }
 FIGURE_TITLES = {"alignment": "Alignment: simulator to robot", "compensation": "Compensation: robot to target"}
-MIN_TRAVEL = 0.1  # rad of a joint that an example shows
 REST_S = 2.0  # under the first target before a motion begins, for the compensator to blend in
 
 
 @dataclass(frozen=True)
-class Score:
-    """Q_dis of one motion with one payload.
+class Score(Measured):
+    """Q_dis of one motion.
 
     Attributes:
         part: alignment or compensation.
-        seed: Seed of the model; None for a method without training.
-        source: Source of the motion: generated, files or recorded.
-        payload: kg per hand.
         q_dis: Q_dis of each operated joint, (n,) rad·s.
-        seconds: Length of the motion.
     """
 
     part: str
-    method: str
-    seed: int | None
-    source: str
     motion: str
-    payload: float
     q_dis: Array
-    seconds: float
-
-
-@dataclass(frozen=True)
-class ExampleMotion:
-    """One motion of the compensation: targets, and joint positions by method, (T, n operated) rad."""
-
-    motion: str
-    payload: float
-    dt: float
-    target: Array
-    qpos: dict[str, Array]
 
 
 def track(
@@ -113,37 +77,28 @@ def track(
     payloads: tuple[float, ...],
     trained: ListOf[TrainedModel],
     progress: Progress = lambda step, share: None,
-) -> tuple[list[Score], ExampleMotion]:
+) -> list[Score]:
     """Execute every motion with every payload (kg per hand), raw and compensated, and in every simulator."""
     pairs, op, rest = with_payloads(motions, payloads), robot.operated_index, round(REST_S / robot.dt)
     ctrl = [np.concatenate([np.repeat(m.ctrl[:1], rest, axis=0), m.ctrl]) for m, _ in pairs]
-    lengths, targets = np.array([len(c) for c in ctrl]), stack_targets(ctrl)
-    mass = np.array([p for _, p in pairs])
     scores: list[Score] = []
-    example: dict[str, Array] = {}
-    shown, span = 0, slice(0)
-    for method, seed, compensation in compensations(robot, trained):
-        done = partial(progress, step_name(method, seed))
-        played = play(robot, unit, targets, mass, lengths=lengths, compensation=compensation, progress=done)
+    for method, seed, played in execute(robot, unit, ctrl, [p for _, p in pairs], trained, PLANNED, progress):
         if method == "raw":
-            recorded = _recordings(robot, unit_id, pairs, played, rest)
-            scores += align(recorded, [m.source for m, _ in pairs], robot, trained, progress)
-            shown = _median_row(pairs, robot, targets, played)
-            span = slice(rest, lengths[shown])
-        errors = [(played.qpos[rest:n, i] - targets[rest:n, i])[:, op] for i, n in enumerate(lengths)]
-        scores += [
-            _score("compensation", method, seed, motion.source, motion.name, payload, error, robot.dt)
-            for (motion, payload), error in zip(pairs, errors, strict=True)
-        ]
-        if seed in (None, trained[0].seed):
-            example[method] = played.qpos[span, shown][:, op]
-    target = targets[span, shown][:, op]
-    return scores, ExampleMotion(pairs[shown][0].name, float(mass[shown]), robot.dt, target, example)
+            recorded = []
+            for i, (motion, payload) in enumerate(pairs):
+                meta = SequenceMeta(robot.name, unit_id, motion.name, payload, virtual=True)
+                states = (x[rest : len(ctrl[i]), i] for x in (played.qpos, played.qvel))
+                recorded.append(Sequence(meta, robot.joint_names, robot.dt, motion.ctrl, *states))
+            scores += align(recorded, robot, trained, progress)
+        for i, (motion, payload) in enumerate(pairs):
+            error = (played.qpos[rest : len(ctrl[i]), i] - motion.ctrl)[:, op]
+            q_dis = np.abs(error.astype(float)).sum(axis=0) * robot.dt
+            scores.append(Score(method, seed, payload, "compensation", motion.name, q_dis))
+    return scores
 
 
 def align(
     recorded: ListOf[Sequence],
-    sources: ListOf[str],
     robot: RobotSpec,
     trained: ListOf[TrainedModel],
     progress: Progress = lambda step, share: None,
@@ -163,37 +118,11 @@ def align(
             progress(f"{method} simulator", done / total)
 
         replays = replay(list(recorded), simulator, corrector, nthread=1, progress=report, lock_idle=True)
-        for s, simulated, source in zip(recorded, replays, sources, strict=True):
+        for s, simulated in zip(recorded, replays, strict=True):
             error = (simulated.qpos - s.qpos)[1:, robot.operated_index]
-            scores.append(_score("alignment", method, seed, source, s.meta.motion, s.meta.payload_mass, error, s.dt))
+            q_dis = np.abs(error.astype(float)).sum(axis=0) * s.dt
+            scores.append(Score(method, seed, s.meta.payload_mass, "alignment", s.meta.motion, q_dis))
     return scores
-
-
-def _recordings(
-    robot: RobotSpec, unit: str, pairs: ListOf[tuple[UnseenMotion, float]], raw: Trajectories, rest: int
-) -> list[Sequence]:
-    """Return the measurements of the robot while it executed the raw targets."""
-    sequences = []
-    for i, (motion, payload) in enumerate(pairs):
-        meta = SequenceMeta(robot.name, unit, motion.name, payload, virtual=True, source="experiment tracking")
-        span = slice(rest, rest + len(motion.ctrl))
-        sequences.append(Sequence(meta, robot.joint_names, robot.dt, motion.ctrl, raw.qpos[span, i], raw.qvel[span, i]))
-    return sequences
-
-
-def _score(
-    part: str, method: str, seed: int | None, source: str, motion: str, payload: float, error: Array, dt: float
-) -> Score:
-    q_dis = np.abs(error.astype(float)).sum(axis=0) * dt
-    return Score(part, method, seed, source, motion, payload, q_dis, len(error) * dt)
-
-
-def _median_row(pairs: ListOf[tuple[UnseenMotion, float]], robot: RobotSpec, targets: Array, raw: Trajectories) -> int:
-    """Return the row of the motion with the median raw error among those with the heaviest payload."""
-    heaviest = [i for i, (_, p) in enumerate(pairs) if p == max(p for _, p in pairs)]
-    op = robot.operated_index
-    error = [np.abs(raw.qpos[:, i][:, op] - targets[:, i][:, op]).mean() for i in heaviest]
-    return heaviest[int(np.argsort(error)[len(heaviest) // 2])]
 
 
 @dataclass(frozen=True)
@@ -204,8 +133,6 @@ class Tracking(UnitExperiment):
     on the test motions. About ten minutes on one core with trained models.
     """
 
-    motions: Path | None = None
-    """Folder of motion files (SAGE txt, csv, npz) to play too, reported apart."""
     count: int = 10
     """How many motions are made for the experiment."""
 
@@ -213,63 +140,42 @@ class Tracking(UnitExperiment):
         """Return the experiment with few motions, for a quick run."""
         return replace(self, count=4)
 
-    def measure(self, session: Session, progress: Progress) -> TrackingScores:
-        """Execute the motions on the unit; recordings of a real robot allow alignment alone."""
+    def measure(self, session: Session, progress: Progress) -> tuple[list[Score], list[UnseenMotion], dict[str, Any]]:
+        """Execute the motions on the unit; recordings of a real robot allow alignment alone.
+
+        Returns:
+            Scores; the motions, of a virtual unit; further arguments of Session.result.
+        """
         robot, trained = session.robot, session.trained
         if not any(e.meta.virtual for e in session.data.entries):
             entries, unseen = select_entries([t.run for t in trained], session.data)
-            scores = align(session.data.sequences(entries), ["recorded"] * len(entries), robot, trained, progress)
-            motions = len({e.meta.motion for e in entries})
-            return TrackingScores(scores, None, [], {"test_motions": motions, "unseen": unseen})
+            scores = align(session.data.sequences(entries), robot, trained, progress)
+            return scores, [], {"test_motions": len({e.meta.motion for e in entries}), "unseen": unseen}
         name, physics = session.unit
         progress("motions", 0.0)
-        unseen_motions = generated(robot, self.count, max(session.payloads))
-        unseen_motions += from_files(robot, self.motions, max(session.payloads)) if self.motions else []
-        unseen_motions = require_unseen(unseen_motions, session.data, robot, trained)
-        scores, example = track(robot, physics, name, unseen_motions, session.payloads, trained, progress)
-        facts: dict[str, Any] = {"unit_trained_on": True} if name in session.trained_units else {}
-        return TrackingScores(scores, example, unseen_motions, facts | {"config": PLANNED})
+        motions = generated(robot, self.count, max(session.payloads))
+        motions = require_unseen(motions, session.data, robot, trained)
+        facts = {"unit_trained_on": True} if name in session.trained_units else {}
+        scores = track(robot, physics, name, motions, session.payloads, trained, progress)
+        return scores, motions, facts | {"motions": len(motions), "config": PLANNED}
 
     def run(self, session: Session, progress: Progress) -> Result:
         """Execute the motions and return tables, figures and sentences."""
-        return result(session, self.measure(session, progress))
+        return result(session, *self.measure(session, progress))
 
 
-@dataclass(frozen=True)
-class TrackingScores:
-    """Measurements of a tracking experiment.
-
-    Attributes:
-        example: None for recordings of a real robot.
-        motions: Empty for recordings of a real robot.
-        facts: Arguments of Session.result.
-    """
-
-    scores: list[Score]
-    example: ExampleMotion | None
-    motions: list[UnseenMotion]
-    facts: dict[str, Any]
-
-
-def result(session: Session, measured: TrackingScores) -> Result:
+def result(session: Session, scores: list[Score], motions: list[UnseenMotion], facts: dict[str, Any]) -> Result:
     """Return tables, figures and sentences."""
-    robot, scores, example = session.robot, measured.scores, measured.example
-    parts = list(dict.fromkeys(s.part for s in scores))
-    sets, tag = joint_sets(robot), "real robot" if example is None else "VIRTUAL robot"
+    robot, parts = session.robot, list(dict.fromkeys(s.part for s in scores))
+    sets, tag = joint_sets(robot), "VIRTUAL robot" if motions else "real robot"
     tables = [by_payload(scores, part, sets) for part in parts]
     tables += [by_joint(scores, part, robot) for part in parts]
-    tables += [_motion_table(measured.motions, robot)] if measured.motions else []
-    figures: dict[str, Figure] = {}
-    for source, of_source in by_source(scores).items():
-        figures["joints" if not figures else source] = draw_joints(of_source, robot, f"{SOURCES[source]}, {tag}")
-    if example is not None:
-        figures["example"] = draw_example(example, robot, tag)
-    zero_shot = example is not None and not measured.facts.get("unit_trained_on")
+    tables += [_motion_table(motions, robot)] if motions else []
+    zero_shot = bool(motions) and not facts.get("unit_trained_on")
     heading = f"Zero-shot tracking of motions never trained on{', unit never trained on' * zero_shot} ({tag})"
-    facts = measured.facts | ({"motions": len(measured.motions)} if measured.motions else {})
     return session.result(
-        "tracking" if example is not None else "tracking-real", heading, tables, figures,
-        [s for part in parts for s in sentences(scores, part, sets[0])], **facts,
+        "tracking" if motions else "tracking-real", heading, tables, {"joints": draw_joints(scores, robot, tag)},
+        [conclusion(scores, part, sets[0]) for part in parts], **facts,
     )  # fmt: skip
 
 
@@ -281,52 +187,42 @@ def joint_sets(robot: RobotSpec) -> list[JointSet]:
     return sets if len(plain) in (0, len(every)) else [(f"{len(plain)} joints", plain), *sets]
 
 
-def by_source(scores: ListOf[Score]) -> dict[str, list[Score]]:
-    """Group scores by the source of their motion."""
-    return {source: [s for s in scores if s.source == source] for source in dict.fromkeys(s.source for s in scores)}
-
-
 def by_payload(scores: ListOf[Score], part: str, sets: ListOf[JointSet]) -> ResultTable:
-    """Mean Q_dis over motions and joints; a row per source of motions, set of joints and payload."""
+    """Mean Q_dis over motions and joints; a row per set of joints and payload."""
     of_part = [s for s in scores if s.part == part]
     names, masses = methods(of_part), payloads(of_part)
     learned = [m for m in (*RIVALS, "gaponet") if m in names]
     rows: list[tuple[Any, ...]] = []
-    for source, of_source in by_source(of_part).items():
-        for label, columns in sets:
-            for payload in [*masses, None] if len(masses) > 1 else masses:
-                values = {m: q_dis(select(of_source, payload=payload), m, columns) for m in names}
-                cuts = (f"{reduction(values[m].mean, values[BASELINE[part]].mean):.0f} %" for m in learned)
-                where = f"{SOURCES[source]}, {label}, " + ("all payloads" if payload is None else f"{payload:g} kg")
-                rows.append((where, *values.values(), *cuts))
+    for label, columns in sets:
+        for payload in [*masses, None] if len(masses) > 1 else masses:
+            values = {m: q_dis(select(of_part, payload=payload), m, columns) for m in names}
+            cuts = (f"{reduction(values[m].mean, values[BASELINE[part]].mean):.0f} %" for m in learned)
+            where = f"{label}, all payloads" if payload is None else f"{label}, {payload:g} kg"
+            rows.append((where, *values.values(), *cuts))
     heads = (*(title(m) for m in names), *(f"{title(m)} cuts" for m in learned))
     caption = f"Mean Q_dis per joint, rad·s, {MEANING[part]}; ± is the standard deviation over training seeds."
     return ResultTable(part, ("Q_dis, rad·s", *heads), tuple(rows), caption, digits=4)
 
 
 def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> ResultTable:
-    """Mean Q_dis over motions; a row per source of motions, payload and joint."""
+    """Mean Q_dis over motions; a row per payload and joint."""
     of_part = [s for s in scores if s.part == part]
     names = methods(of_part)
     rows = [
-        (f"{SOURCES[source]}, {p:g} kg, {joint}", *(q_dis(select(of_source, payload=p), m, [i]) for m in names))
-        for source, of_source in by_source(of_part).items()
-        for p in payloads(of_part)
-        for i, joint in enumerate(robot.operated)
-    ]
+        (f"{p:g} kg, {joint}", *(q_dis(select(of_part, payload=p), m, [i]) for m in names))
+        for p in payloads(of_part) for i, joint in enumerate(robot.operated)
+    ]  # fmt: skip
     head = ("Q_dis, rad·s", *(title(m) for m in names))
     return ResultTable(f"{part}-joints", head, tuple(rows), f"Q_dis {MEANING[part]}, joint by joint.", digits=4)
 
 
 def _motion_table(motions: ListOf[UnseenMotion], robot: RobotSpec) -> ResultTable:
-    rows = [(m.name, SOURCES[m.source], len(m.ctrl) * robot.dt, m.nearest[0], m.nearest[1] * 1e3) for m in motions]
+    rows = tuple((m.name, len(m.ctrl) * robot.dt, m.nearest[0], m.nearest[1] * 1e3) for m in motions)
     caption = (
         "No motion is in the training or validation set. Nearest: the most similar motion there, and the RMS "
         "difference of the targets."
     )
-    return ResultTable(
-        "motions", ("motion", "from", "length, s", "nearest", "apart, mrad RMS"), tuple(rows), caption, 1
-    )
+    return ResultTable("motions", ("motion", "length, s", "nearest", "apart, mrad RMS"), rows, caption, 1)
 
 
 def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> MeanStd:
@@ -334,27 +230,16 @@ def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> MeanStd:
     return over_seeds(select(scores, method), lambda s: s.q_dis[columns].mean())
 
 
-def sentences(scores: ListOf[Score], part: str, joints: JointSet) -> list[str]:
-    """Return the conclusions about one part, for one set of joints."""
+def conclusion(scores: ListOf[Score], part: str, joints: JointSet) -> str:
+    """Return a sentence about one part, for one set of joints: the reduction of the error by each method."""
     label, columns = joints
     of_part = [s for s in scores if s.part == part]
-    names, masses, texts = methods(of_part), payloads(of_part), list[str]()
-    for source, of_source in by_source(of_part).items():
-        error = {p: {m: q_dis(select(of_source, payload=p), m, columns).mean for m in names} for p in (None, *masses)}
-        cuts = []
-        for m in names[1:]:
-            overall, heavy = (
-                percent_text(reduction(error[p][m], error[p][BASELINE[part]])) for p in (None, masses[-1])
-            )
-            cuts.append(f"{title(m)} {overall}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
-        texts.append(f"{part}, {SOURCES[source]}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}.")
-        duels = compare_with_rivals({p: error[p] for p in masses}, names)
-        texts += [f"{part}, {SOURCES[source]}: {sentence}." for sentence in duels]
-    return texts
-
-
-def _of_joint(values: dict[str, list[MeanStd]], method: str, joint: int) -> MeanStd:
-    return values[method][joint]
+    names, masses, cuts = methods(of_part), payloads(of_part), list[str]()
+    error = {p: {m: q_dis(select(of_part, payload=p), m, columns).mean for m in names} for p in (None, *masses)}
+    for m in names[1:]:
+        overall, heavy = (percent_text(reduction(error[p][m], error[p][BASELINE[part]])) for p in (None, masses[-1]))
+        cuts.append(f"{title(m)} {overall}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
+    return f"{part}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}."
 
 
 @styled
@@ -364,12 +249,12 @@ def draw_joints(scores: ListOf[Score], robot: RobotSpec, label: str) -> Figure:
     width = 0.52 * len(robot.operated) + 0.8
     fig = figure(max(6.0, width * len(parts)), 1.55 * len(masses) + 1.5)
     axes = fig.subplots(len(masses), len(parts), sharex=True, sharey="col", squeeze=False)
-    names, joints = [joint_label(n) for n in robot.operated], list(range(len(robot.operated)))
+    names = [joint_label(n) for n in robot.operated]
     for column, part in zip(axes.T, parts, strict=True):
         for ax, payload in zip(column, masses, strict=True):
             shown = select([s for s in scores if s.part == part], payload=payload)
-            values = {m: over_motions(select(shown, m)) for m in methods(shown)}
-            draw_bars(ax, names, bar_series(shown, joints, partial(_of_joint, values)), 7)
+            bars = {title(m): (colour(m), over_motions(select(shown, m))) for m in methods(shown)}
+            draw_bars(ax, names, bars, 7)
             ax.annotate(f"{payload:g} kg", (0.995, 0.97), xycoords="axes fraction", ha="right", va="top",
                         fontweight="bold")  # fmt: skip
         column[0].set_title(FIGURE_TITLES[part])
@@ -386,19 +271,3 @@ def over_motions(scores: ListOf[Score]) -> list[MeanStd]:
         by_motion.setdefault(s.motion, []).append(s.q_dis)
     values = np.array([np.mean(v, axis=0) for v in by_motion.values()])  # (motions, n)
     return [replace(s, std=s.standard_error) for s in map(MeanStd.from_values, values.T)]
-
-
-def draw_example(example: ExampleMotion, robot: RobotSpec, tag: str) -> Figure:
-    """Draw targets, positions by method and errors of the three moving joints with the largest raw error."""
-    moves = np.ptp(example.target, axis=0) > MIN_TRAVEL
-    raw = np.abs(example.qpos["raw"] - example.target).mean(axis=0) * (moves if moves.sum() > 2 else 1)
-    drawn = {m: qpos for m, qpos in example.qpos.items() if m not in NOT_IN_EXAMPLES}
-    joints = {
-        joint_label(robot.operated[j], wrapped=False): JointTrajectory(
-            {m: q[:, j] for m, q in drawn.items()}, example.target[:, j]
-        )
-        for j in sorted(np.argsort(-raw)[:3].tolist())
-    }
-    looks = {m: (title(m), colour(m)) for m in (*drawn, "target")}
-    heading = f"{example.motion}, {example.payload:g} kg in each hand, {tag}"
-    return against(np.arange(len(example.target)) * example.dt, joints, looks, "target", heading)

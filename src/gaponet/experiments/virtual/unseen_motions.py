@@ -1,10 +1,9 @@
-"""Motions that no model was trained on: generated or read from files, and checked against the training motions."""
+"""Motions that no model was trained on: generated, and checked against the training motions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from gaponet.report.candidate import split_of_run
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
 from gaponet.sysid.motion.coordinated import BUILDERS
-from gaponet.sysid.motion.files import SUFFIXES, read_motion
 from gaponet.sysid.motion.library import Library
 from gaponet.sysid.motion.motion import Motion
 
@@ -31,13 +29,11 @@ class UnseenMotion:
     """A motion at the robot's control period.
 
     Attributes:
-        source: generated, or files.
         ctrl: Targets, (T, n) rad; limbs without an operated joint stay at home.
         nearest: The most similar training motion, and the RMS difference of the operated joints' targets, rad.
     """
 
     name: str
-    source: str
     ctrl: Array
     nearest: tuple[str, float] = ("", float("inf"))
 
@@ -50,32 +46,13 @@ def generated(robot: RobotSpec, count: int, max_payload: float) -> list[UnseenMo
     names = names or hash_order(library.names())
     if count > len(names):
         raise UsageError(f"--count {count}: {robot.name} has {len(names)} motions for this experiment")
-    return [_unseen(name, "generated", library, robot) for name in names[:count]]
-
-
-def from_files(robot: RobotSpec, folder: Path, max_payload: float) -> list[UnseenMotion]:
-    """Read every motion file below a folder; motions are slowed or scaled until they fit the robot's limits.
-
-    Raises:
-        UsageError: No motion file there.
-    """
-    files = sorted(f for f in folder.rglob("*") if f.suffix in SUFFIXES)
-    if not files:
-        raise UsageError(f"--motions {folder}: no motion file there ({', '.join(SUFFIXES)})")
-    library = Library(robot, LIBRARY_SEED, max_payload)
-    motions = []
-    for file in files:
-        motion = read_motion(file, robot)
-        library.add(motion)
-        motions.append(_unseen(motion.name, "files", library, robot))
-    return motions
-
-
-def _unseen(name: str, source: str, library: Library, robot: RobotSpec) -> UnseenMotion:
-    ctrl = library.make(name).sample(robot.dt)
     idle = robot.index(idle_joints(robot, robot.operated))
-    ctrl[:, idle] = robot.qpos_home[idle]  # with a fixed base they share no dynamics with the others
-    return UnseenMotion(name, source, ctrl)
+    motions = []
+    for name in names[:count]:
+        ctrl = library.make(name).sample(robot.dt)
+        ctrl[:, idle] = robot.qpos_home[idle]  # with a fixed base they share no dynamics with the others
+        motions.append(UnseenMotion(name, ctrl))
+    return motions
 
 
 def require_unseen(

@@ -1,8 +1,10 @@
-"""The figures of a dataset, drawn from arrays."""
+"""Figures of a dataset: joint ranges, composition, torque and temperature. Recordings are selected by fixed rules."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -11,24 +13,88 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from gaponet.base.arrays import Array
+from gaponet.base.errors import DatasetError
+from gaponet.base.files import lock_folder
+from gaponet.base.progress import Progress, no_progress
+from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.sequence import LEVELS, Sequence
-from gaponet.data.store import Entry
-from gaponet.report.figures.style import figure, joint_label, legend, styled
-from gaponet.report.methods import colour
+from gaponet.data.store import Dataset, Entry
+from gaponet.report.evaluate import evenly_spaced
+from gaponet.report.figures.style import figure, joint_label, legend, save, styled
+from gaponet.report.provenance import robot_label
+from gaponet.robot.spec import RobotSpec
 
+MAX_RANGE_SEQUENCES, MAX_RANGE_ROWS = 400, 40_000  # of joint_ranges
+MAX_TORQUE_MOTIONS = 60  # compared to find the motion with the largest change of torque
+MAX_PAYLOADS = 4  # of torque_temperature
+MAX_JOINTS = 3  # beside each other
+SHOWN_S = 12.0  # of a long motion
 SIDES = {"left": "#3b7dd8", "right": "#d9662b", "": "#4d8f5b"}
 LEVEL_COLOURS = dict(zip(LEVELS, ("#9ecae1", "#4292c6", "#084594"), strict=True))
 SINGLE_POINTS = 250  # single rows drawn for each joint
 
 
-def payload_colours(payloads: list[float]) -> dict[float, Any]:
-    """Return colours of the payloads from light to heavy, dark enough for print."""
-    steps = np.linspace(0.85, 0.05, len(payloads)) if len(payloads) > 1 else [0.4]
-    return dict(zip(payloads, mpl.colormaps["plasma"](steps), strict=True))
+class _NoDataError(Exception):
+    """The dataset has no data for a figure; the message gives the reason."""
+
+
+def write_figures(
+    dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = no_progress
+) -> tuple[list[Path], dict[str, str]]:
+    """Write every figure for which the dataset has data.
+
+    Args:
+        dataset: At least one sequence.
+        robot: The dataset's robot.
+        out: Folder; figures of the same name are replaced.
+
+    Returns:
+        The files; and {figure: reason for its absence}.
+    """
+    dataset.require_robot(robot)
+    if not dataset.entries:
+        raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
+    with lock_folder(out, "figures"):
+        figures, left_out = draw_figures(dataset, robot, progress)
+        return [file for name, fig in figures.items() for file in save(fig, out / name)], left_out
+
+
+def draw_figures(
+    dataset: Dataset, robot: RobotSpec, progress: Progress = no_progress
+) -> tuple[dict[str, Figure], dict[str, str]]:
+    """Draw all figures. Return them, and {figure: reason for its absence}."""
+    figures, left_out = dict[str, Figure](), dict[str, str]()
+    for i, (name, draw) in enumerate(FIGURES.items()):
+        progress(i, len(FIGURES), name)
+        try:
+            figures[name] = draw(dataset, robot)
+        except _NoDataError as reason:
+            left_out[name] = str(reason)
+    progress(len(FIGURES), len(FIGURES), "")
+    return figures, left_out
+
+
+def joint_ranges(dataset: Dataset, robot: RobotSpec) -> Figure:
+    """Draw positions of each operated joint, of sequences that command it to move."""
+    rows: dict[str, list[Array]] = defaultdict(list)
+    entries = evenly_spaced(dataset.entries, MAX_RANGE_SEQUENCES)
+    stride = max(1, sum(e.rows for e in entries) // MAX_RANGE_ROWS)
+    for entry in entries:
+        arrays = dataset.channels(entry, ("ctrl", "qpos"))
+        for joint, j in zip(robot.operated, robot.operated_index, strict=True):
+            if np.ptp(arrays["ctrl"][:, j]) > MIN_MOTION_RAD:
+                rows[joint].append(arrays["qpos"][::stride, j])
+    if not rows:
+        raise _NoDataError("no operated joint is commanded to move")
+    positions = {joint: np.concatenate(rows[joint]) for joint in robot.operated if joint in rows}
+    limits = {j: tuple(robot.qpos_range[robot.joint_names.index(j)]) for j in positions}
+    part = f"{len(entries)} of " if len(entries) < len(dataset) else ""
+    title = f"{robot_label(entries)}: where joints were while commanded to move, {part}{len(dataset):,} sequences"
+    return draw_joint_ranges(positions, limits, title)
 
 
 @styled
-def joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, float]], title: str) -> Figure:
+def draw_joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, float]], title: str) -> Figure:
     """Draw a raincloud of each joint: density, quartiles with 1 % and 99 %, single rows; grey: the joint's range.
 
     Args:
@@ -80,8 +146,10 @@ def _density(values: Array) -> tuple[Array, Array]:
 
 
 @styled
-def composition(entries: list[Entry], title: str) -> Figure:
+def composition(dataset: Dataset, robot: RobotSpec) -> Figure:
     """Draw hours by payload, unit and rate, stacked by level, with the number of sequences over each bar."""
+    entries, motions = dataset.entries, len({e.meta.motion for e in dataset.entries})
+    title = f"{robot_label(entries)}: {dataset.hours():.2f} h, {motions} motions"
     keys = {
         "payload, kg per hand": lambda e: e.meta.payload_mass,
         "unit": lambda e: e.meta.unit_id,
@@ -117,29 +185,49 @@ def _hours(entries: Iterable[Entry]) -> float:
     return sum(e.rows * e.dt for e in entries) / 3600
 
 
+def torque_temperature(dataset: Dataset, robot: RobotSpec) -> Figure:
+    """Draw the motion with the largest change of torque at several payloads, and the joints that bear it."""
+    group = largest_torque_change(dataset, robot)
+    payloads = evenly_spaced(sorted({e.meta.payload_mass for e in group}), MAX_PAYLOADS)
+    takes = {}
+    for payload in payloads:
+        take = dataset.read(next(e for e in group if e.meta.payload_mass == payload))
+        takes[payload] = take.rows(slice(0, max(2, round(SHOWN_S / take.dt))))
+    heaviest = takes[max(takes)]
+    assert heaviest.tau is not None
+    size = swing(heaviest.tau[:, robot.operated_index])
+    joints = [robot.operated[i] for i in sorted(np.argsort(-size)[:MAX_JOINTS])]
+    meta = heaviest.meta
+    return draw_torque_temperature(takes, joints, f"{robot_label(group)}: {meta.motion}, {meta.unit_id}")
+
+
+FIGURES = {"joint_ranges": joint_ranges, "composition": composition, "torque_temperature": torque_temperature}
+
+
 @styled
-def torque_temperature(takes: dict[float, Sequence], joints: list[str], title: str) -> Figure:
+def draw_torque_temperature(takes: dict[float, Sequence], joints: list[str], title: str) -> Figure:
     """Draw position, torque and warming over time of one motion with several payloads.
 
     Args:
-        takes: {payload kg: recording}, with torque or temperature or both.
+        takes: {payload kg: recording} in ascending order, with torque or temperature or both.
     """
     first = next(iter(takes.values()))
     rows = [("qpos", "position, rad"), ("tau", "torque, N·m"), ("temperature", "warming, K")]
     rows = [(c, label) for c, label in rows if getattr(first, c) is not None]
     fig = figure(7.0, 0.9 + 1.45 * len(rows))
     axes = fig.subplots(len(rows), len(joints), sharex=True, squeeze=False)
-    _same_scale(axes[1:])
-    colours = payload_colours(sorted(takes))
-    for payload in sorted(takes):
-        take = takes[payload]
+    for ax in axes[1:, 1:].flat:  # one scale for a row, so that joints can be compared
+        ax.sharey(axes[ax.get_subplotspec().rowspan.start, 0])
+        ax.tick_params(labelleft=False)
+    colours = mpl.colormaps["plasma"](np.linspace(0.85, 0.05, len(takes)) if len(takes) > 1 else [0.4])
+    for colour, (payload, take) in zip(colours, takes.items(), strict=True):
         time = np.arange(len(take)) * take.dt
         for column, joint in enumerate(joints):
             j = take.joint_names.index(joint)
             for row, (channel, _) in enumerate(rows):
                 values = getattr(take, channel)[:, j]
                 values = values - values[0] if channel == "temperature" else values
-                axes[row, column].plot(time, values, color=colours[payload], lw=0.9, label=f"{payload:g} kg")
+                axes[row, column].plot(time, values, color=colour, lw=0.9, label=f"{payload:g} kg")
     for column, joint in enumerate(joints):
         axes[0, column].set_title(joint_label(joint, wrapped=False))
         axes[-1, column].set_xlabel("time, s")
@@ -151,70 +239,26 @@ def torque_temperature(takes: dict[float, Sequence], joints: list[str], title: s
     return fig
 
 
-@styled
-def overlay(real: Sequence, sim_qpos: Array, joints: list[str], title: str) -> Figure:
-    """Draw command, recording and nominal simulation of some joints, and their difference below.
+def largest_torque_change(dataset: Dataset, robot: RobotSpec) -> list[Entry]:
+    """Return the entries of the motion with the largest change of torque, among those with the most payloads."""
+    takes: dict[tuple[Any, ...], list[Entry]] = defaultdict(list)  # that differ only in payload and repetition
+    for e in dataset.entries:
+        takes[e.meta.motion, e.meta.unit_id, e.meta.payload_side, round(e.dt, 7)].append(e)
+    groups = [g for g in takes.values() if all("tau" in e.channels for e in g)]
+    if not groups:
+        raise _NoDataError("no torque was recorded")
+    count = lambda g: len({e.meta.payload_mass for e in g})  # noqa: E731
+    full = {g[0].meta.motion: g for g in reversed(groups) if count(g) == max(map(count, groups))}
 
-    Args:
-        sim_qpos: Positions of the nominal simulator, (T, n) rad.
-    """
-    fig = figure(7.0, 3.7)
-    axes = fig.subplots(2, len(joints), sharex=True, squeeze=False, height_ratios=[1.5, 1])
-    _same_scale(axes[1:])
-    time = np.arange(len(real)) * real.dt
-    for column, joint in enumerate(joints):
-        j = real.joint_names.index(joint)
-        top, low = axes[:, column]
-        top.plot(time, real.ctrl[:, j], color="#d99000", lw=0.8, ls=(0, (3, 1.5)), label="command")
-        top.plot(time, sim_qpos[:, j], color=colour("nominal"), lw=1.4, label="simulated")
-        top.plot(time, real.qpos[:, j], color=colour("recorded"), lw=1.0, label="recorded")
-        gap = (real.qpos[:, j] - sim_qpos[:, j]) * 1e3
-        low.axhline(0, color="#111111", lw=0.6)
-        low.fill_between(time, gap, 0, color=colour("gaponet"), alpha=0.25, lw=0)
-        low.plot(time, gap, color=colour("gaponet"), lw=0.9)
-        top.set_title(joint_label(joint, wrapped=False))
-        low.set_xlabel("time, s")
-        top.margins(x=0.01)
-    axes[0, 0].set_ylabel("position, rad")
-    axes[1, 0].set_ylabel("gap, mrad")
-    fig.align_ylabels(axes[:, 0])
-    legend(fig, title)
-    return fig
+    def torque(group: list[Entry]) -> float:
+        entry = max(group, key=lambda e: e.meta.payload_mass)
+        rows = dataset.channels(entry, ("tau",))["tau"][: round(SHOWN_S / entry.dt)]
+        return float(swing(rows[:, robot.operated_index]).mean())
+
+    return max(evenly_spaced(list(full.values()), MAX_TORQUE_MOTIONS), key=torque)
 
 
-@styled
-def gap_by_payload(errors: dict[float, Array], joints: list[str], title: str) -> Figure:
-    """Draw the mean |gap| of each joint and of all joints by payload: median, quartiles, 5–95 % over sequences.
-
-    Args:
-        errors: {payload kg: (sequences, n) rad, mean |gap| of a sequence}.
-        joints: (n).
-    """
-    fig = figure(7.0, 3.4)
-    ax = fig.subplots()
-    payloads, names = sorted(errors), ["all joints", *joints]
-    colours, width = payload_colours(payloads), 0.8 / len(payloads)
-    for i, payload in enumerate(payloads):
-        values = np.column_stack([errors[payload].mean(axis=1), errors[payload]]) * 1e3  # (sequences, 1 + n)
-        x = np.arange(len(names)) + (i - (len(payloads) - 1) / 2) * width
-        low, q1, middle, q3, high = np.percentile(values, [5, 25, 50, 75, 95], axis=0)
-        ax.vlines(x, low, high, color=colours[payload], lw=0.8)
-        ax.bar(x, q3 - q1, width * 0.8, q1, color=colours[payload], label=f"{payload:g} kg")
-        ax.hlines(middle, x - 0.4 * width, x + 0.4 * width, color="white", lw=1.2)
-    ax.axvline(0.5, color="#999999", lw=0.6)
-    ax.set_xticks(np.arange(len(names)), [joint_label(j) for j in names], fontsize=7.5)
-    ax.set_xlim(-0.55, len(names) - 0.45)
-    ax.set_ylim(bottom=0)
-    ax.grid(axis="x", visible=False)
-    ax.set_ylabel("mean |recorded − simulated|, mrad")
-    ax.set_xlabel("white: median over takes, box: quartiles, line: 5–95 %", fontsize=7.5)
-    legend(fig, title)
-    return fig
-
-
-def _same_scale(rows: Any) -> None:
-    """Give each row of axes one scale, so that joints can be compared."""
-    for row in rows:
-        for ax in row[1:]:
-            ax.sharey(row[0])
-            ax.tick_params(labelleft=False)
+def swing(values: Array) -> Array:
+    """Return the range of a signal from its 5th to its 95th percentile, (T, n) → (n,)."""
+    low, high = np.percentile(values, [5, 95], axis=0)
+    return high - low

@@ -12,11 +12,12 @@ from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd
 from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.signals import busiest_window
-from gaponet.report.figures.charts import JointTrajectory, against, bars
-from gaponet.report.figures.style import figure, joint_label, legend, styled
+from gaponet.report.figures.charts import bars
+from gaponet.report.figures.style import DASHED, DOTTED, figure, joint_label, legend, styled
 from gaponet.report.methods import colour, title
 
 SHOWN_S = 20.0  # of each motion, so that details are visible
+MIN_POSITION_SPAN = 0.06  # rad of a position axis, so that encoder steps of a joint at rest are not magnified
 MIN_CORRECTION = 1e-5  # rad; smaller corrections are noise
 
 
@@ -105,37 +106,57 @@ def trajectories(
     Returns:
         Figures by row, the motion with the longest travel first.
     """
-    looks = {n: (title(n), colour(n)) for n in (*methods, "recorded", "command")}
-    drawn: dict[int, tuple[Array, dict[str, JointTrajectory]]] = {}
-    for row, facts in enumerate(shown):
-        recorded, dt = arrays[f"{row}/recorded"], facts["dt"]
-        start = busiest_window(recorded, rows := round(SHOWN_S / dt))
-        window = slice(start, min(start + rows, len(recorded)))
-        drawn[row] = (
-            np.arange(len(recorded))[window] * dt,
-            _joint_trajectories(arrays, row, joints, methods, window, dt),
-        )
-    travel = {row: np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in drawn}
-    return {row: against(*drawn[row], looks, "recorded") for row in sorted(drawn, key=lambda row: -travel[row])}
+    travel = [np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in range(len(shown))]
+    order = sorted(range(len(shown)), key=lambda row: -travel[row])
+    return {row: _trajectory(arrays, row, joints, methods, shown[row]["dt"]) for row in order}
 
 
-def _joint_trajectories(
-    arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], window: slice, dt: float
-) -> dict[str, JointTrajectory]:
-    """Return the three joints with the largest nominal error; joints that are commanded to move come first."""
-    command, recorded = arrays[f"{row}/command"][window], arrays[f"{row}/recorded"]
+@styled
+def _trajectory(arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], dt: float) -> Figure:
+    """Draw the three joints with the largest nominal error, a column each; moving joints come first.
+
+    From top to bottom: positions, positions around the largest turn of the command, errors, and corrections.
+    """
+    recorded, count = arrays[f"{row}/recorded"], round(SHOWN_S / dt)
+    window = slice(start := busiest_window(recorded, count), min(start + count, len(recorded)))
+    time, command = np.arange(len(recorded))[window] * dt, arrays[f"{row}/command"][window]
     still = np.ptp(command, axis=0) <= MIN_MOTION_RAD
-    errors = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
+    columns = np.lexsort((-np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0), still))[:3]
     learned = [n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > MIN_CORRECTION]
-    joint_trajectories = {}
-    for j in sorted(np.lexsort((-errors, still))[:3].tolist()):
-        name = joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else "")
-        target = command[:, j]
-        joint_trajectories[name] = JointTrajectory(
-            {n: arrays[f"{row}/{n}"][window, j] for n in methods}, recorded[window, j], target,
-            {n: arrays[f"{row}/delta/{n}"][window, j] for n in learned}, _turn(target, dt),
-        )  # fmt: skip
-    return joint_trajectories
+    heights = {"position, rad": 1.8, "zoom, rad": 1.6, "error, mrad": 1.1} | ({"Δa, mrad": 0.9} if learned else {})
+    fig = figure(3.6 * len(columns), 1.0 + 1.1 * sum(heights.values()))
+    axes = fig.subplots(len(heights), len(columns), squeeze=False, height_ratios=list(heights.values()))
+    for column, j in zip(axes.T, sorted(columns.tolist()), strict=True):
+        zoom, real = _turn(command[:, j], dt), recorded[window, j]
+        for ax, part in zip(column, (slice(None), zoom), strict=False):
+            ax.step(time[part], command[part, j], where="post", color=colour("command"), ls=DOTTED, lw=1.1,
+                    label=title("command"))  # fmt: skip
+            for n in methods:
+                ax.plot(time[part], arrays[f"{row}/{n}"][window, j][part], color=colour(n), label=title(n))
+            ax.plot(time[part], real[part], color=colour("recorded"), ls=DASHED, lw=1.0, label=title("recorded"))
+            low, high = ax.get_ylim()
+            if high - low < MIN_POSITION_SPAN:
+                ax.set_ylim((low + high - MIN_POSITION_SPAN) / 2, (low + high + MIN_POSITION_SPAN) / 2)
+        column[0].axvspan(*time[zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
+        for n in methods:
+            column[2].plot(time, (arrays[f"{row}/{n}"][window, j] - real) * 1e3, color=colour(n), lw=1.0)
+        column[2].axhline(0, color="#111111", lw=0.6)
+        for n in learned:
+            delta = arrays[f"{row}/delta/{n}"][window, j]
+            column[3].plot(time[: len(delta)], delta * 1e3, color=colour(n), lw=0.9)
+        column[0].set_title(joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else ""))
+        column[-1].set_xlabel("time, s")
+        for ax in (column[0], *column[2:]):
+            ax.set_xlim(time[0], time[-1])
+    for line, label in zip(axes, heights, strict=True):
+        line[0].set_ylabel(label)
+    for line in axes[2:]:
+        end = 1.08 * max(abs(v) for ax in line for v in ax.dataLim.intervaly) or 1.0
+        for ax in line:
+            ax.set_ylim(-end, end)
+    fig.align_ylabels(axes[:, 0])
+    legend(fig)
+    return fig
 
 
 def _turn(command: Array, dt: float, seconds: float = 2.0) -> slice:

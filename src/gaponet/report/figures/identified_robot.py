@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gaponet.base.files import lock_folder, write_text
-from gaponet.report.figures.style import figure, joint_label, legend, save, styled
+from gaponet.report.figures.style import figure, joint_label, save, styled
 from gaponet.report.methods import colour, shade, title
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
@@ -114,27 +113,4 @@ def draw_uncertainty(uncertainty: ParameterUncertainty, heading: str) -> Figure:
         ax.set_title(name)
         ax.set_ylim(-0.6, len(joints) - 0.4)
     fig.suptitle(heading, x=0.01, ha="left", fontsize=9, fontweight="bold")
-    return fig
-
-
-def write_rollout(rollouts: ListOf[Any], joints: ListOf[str], path: Path) -> None:
-    """Draw the first of the rollouts of gaponet.export.rollout as SVG and PNG."""
-    save(_rollout(rollouts[0], joints), path.with_suffix(""))
-
-
-@styled
-def _rollout(rollout: Any, joints: ListOf[str]) -> Figure:
-    """Draw targets, the simulator's response and the robot's predicted response with its band, joint by joint."""
-    time = np.arange(len(rollout.target)) * rollout.dt
-    fig = figure(7.0, 1.0 + 1.1 * len(joints))
-    axes = np.atleast_1d(fig.subplots(len(joints), sharex=True))
-    for j, (ax, joint) in enumerate(zip(axes, joints, strict=True)):
-        low, high = (rollout.robot[:, j] + sign * rollout.half_width[:, j] for sign in (-1, 1))
-        ax.fill_between(time, low, high, color=colour("identified"), alpha=0.25, lw=0, label="its band")
-        ax.plot(time, rollout.robot[:, j], color=colour("identified"), label="robot would do")
-        ax.plot(time, rollout.rollout[:, j], color=colour("nominal"), label="simulator did")
-        ax.plot(time, rollout.target[:, j], color="#222222", lw=0.7, ls=":", label="target")
-        ax.set_ylabel(f"{joint_label(joint)}, rad")
-    axes[-1].set_xlabel(f"time in {rollout.name}, s")
-    legend(fig)
     return fig

@@ -12,11 +12,12 @@ import numpy as np
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
-from gaponet.report.view.picture import Camera
 from gaponet.report.view.side_by_side import SideBySide
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+
+    from gaponet.report.view.picture import Camera
 
 GIF_COLOURS = 200  # shared by all frames
 SUFFIXES = (".gif", ".mp4", ".png")
@@ -77,14 +78,14 @@ def require_writable(path: Path) -> None:
         _ffmpeg()
 
 
-def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int], None] = lambda i, n: None) -> int:
+def write(camera: Camera, path: Path, progress: Callable[[int, int], None] = lambda i, n: None) -> int:
     """Render to a file; a PNG shows the moment of the largest error of the first simulated copy.
 
     Returns:
         Number of pictures.
     """
     require_writable(path)
-    suffix = path.suffix.lower()
+    clip, suffix = camera.clip, path.suffix.lower()
     hundredths = max(round(100 / clip.fps), 2)  # a GIF counts in 1/100 s, and viewers slow down below 2
     times = clip.times(hundredths / 100 if suffix == ".gif" else 1 / clip.fps)
 

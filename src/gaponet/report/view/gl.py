@@ -14,18 +14,14 @@ INSTALL_HINT = (
 )
 
 
-def has_display() -> bool:
-    """Return True if the environment names a display, or the system always has one."""
-    return not sys.platform.startswith("linux") or any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
-
-
 def choose_gl() -> None:
     """Choose EGL, else OSMesa, if there is no display and MUJOCO_GL is not set; then import mujoco.
 
     Raises:
         UsageError: No backend works; the message says what to install.
     """
-    ours = not has_display() and not os.environ.get("MUJOCO_GL")
+    display = not sys.platform.startswith("linux") or any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
+    ours = not display and not os.environ.get("MUJOCO_GL")
     if ours:
         installed = [name for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")) if find_library(library)]
         if not installed:

@@ -12,6 +12,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
+from gaponet.report.view.film import Clip
 from gaponet.report.view.gl import INSTALL_HINT
 from gaponet.report.view.scene import Scene
 
@@ -41,7 +42,7 @@ class Layout:
         return self.head + self.robots + self.labels + self.course
 
     @classmethod
-    def for_scene(cls, scene: Scene, width: int, course: bool) -> Layout:
+    def for_scene(cls, scene: Scene, width: int) -> Layout:
         """Return the layout that fits the robots at this width.
 
         Raises:
@@ -50,31 +51,26 @@ class Layout:
         if not 160 <= width <= 3840:
             raise UsageError(f"--width is {width}; give 160 to 3840 pixels")
         tall = scene.box[3] - scene.box[2]
-        unit = max(width / 960, 0.5)
-        head, labels = round(34 * unit), round(54 * unit)
-        strip = round(96 * unit) if course else 0
-        scale = min(width / (scene.spacing * len(scene.base)), (MAX_HEIGHT * width - head - labels - strip) / tall)
+        head, labels, course = (round(height * max(width / 960, 0.5)) for height in (34, 54, 96))
+        scale = min(width / (scene.spacing * len(scene.base)), (MAX_HEIGHT * width - head - labels - course) / tall)
         robots = round(1.1 * tall * scale)
-        robots += (head + robots + labels + strip) % 2  # h264 wants even sizes
-        return cls(width, head, robots, labels, strip, scale)
+        robots += (head + robots + labels + course) % 2  # h264 wants even sizes
+        return cls(width, head, robots, labels, course, scale)
 
 
 class Camera:
     """Renders the frames of a scene. Close it, or use it in a with block."""
 
-    def __init__(self, scene: Scene, width: int = 960, speed: float = 1.0, magnify: float = 1.0, course: bool = True,
-                 span: tuple[float, float] = (0.0, np.inf)) -> None:  # fmt: skip
+    def __init__(self, scene: Scene, clip: Clip, width: int = 960, magnify: float = 1.0) -> None:
         """Open a GL context.
 
         Args:
+            clip: Its speed is printed on the picture; the error is drawn over its time.
             width: Width of the picture, pixels, even; the height follows from the robots.
-            speed, magnify: Printed on the picture.
-            course: Draw the error against time below.
-            span: Range of that time axis, s.
+            magnify: Printed on the picture.
         """
-        self.scene, self.speed, self.magnify = scene, speed, magnify
-        self.layout = Layout.for_scene(scene, width - width % 2, course)
-        self.span = (span[0], min(span[1], (len(scene.shown.real) - 1) * scene.shown.real.dt))
+        self.scene, self.clip, self.magnify = scene, clip, magnify
+        self.layout = Layout.for_scene(scene, width - width % 2)
         self.lens = self._lens()
         self.renderer = renderer(scene.model, self.layout.robots, self.layout.width)
         self.fonts = {size: font(size * max(width / 960, 0.5)) for size in (13, 15, 17)}
@@ -121,8 +117,7 @@ class Camera:
             if m.method != "recorded":
                 text = f"{m.error[row] * 1e3:.1f} mrad now, {m.mpjae * 1e3:.1f} mean"
                 draw.text((x, top + 1.5 * large.size), text, FAINT, small, anchor="ma")
-        if layout.course:
-            self._course(image, draw, row)
+        self._course(image, draw, row)
 
     def _head(self, draw: ImageDraw, time: float) -> None:
         """Write VIRTUAL where it applies, the recording on the left, and the time on the right."""
@@ -130,7 +125,7 @@ class Camera:
         meta = shown.real.meta
         facts = [meta.robot, meta.motion, f"unit {meta.unit_id}", _payload(meta.payload_mass, meta.payload_side)]
         facts += [] if shown.seen is None else ["seen in training" if shown.seen else "held out"]
-        clock = [f"speed {self.speed:g}x"] if self.speed != 1 else []
+        clock = [f"speed {self.clip.speed:g}x"] if self.clip.speed != 1 else []
         clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
         left, right = SEPARATOR.join(facts), SEPARATOR.join([*clock, f"{time:6.2f} s"])
         mark = "VIRTUAL ROBOT   " if meta.virtual else ""
@@ -145,7 +140,7 @@ class Camera:
         strip, x, (high, low) = self.strip
         top = self.layout.height - self.layout.course
         image.paste(strip, (0, top), strip)
-        now = x[np.clip(row - self.scene.row(self.span[0]), 0, len(x) - 1)]
+        now = x[np.clip(row - self.scene.row(self.clip.start), 0, len(x) - 1)]
         draw.line([(now, top + high), (now, top + low)], INK, 1)
 
     @cached_property
@@ -155,7 +150,7 @@ class Camera:
 
         layout, real, small = self.layout, self.scene.shown.real, self.fonts[13]
         pad = layout.head // 3
-        first, last = (self.scene.row(t) for t in self.span)
+        first, last = (self.scene.row(t) for t in (self.clip.start, self.clip.stop))
         rows = np.arange(first, max(last, first + 1) + 1).clip(max=len(real) - 1)
         errors = {m.colour: m.error[rows] * 1e3 for m in self.scene.shown.motions if m.method != "recorded"}
         peak = max([float(e.max()) for e in errors.values()] + [1e-3])

@@ -49,7 +49,7 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
     moment = largest_error_time(shown, clip)
     row = min(round(moment / dt), len(base) - 2)
     scene = Scene(shown, rows=slice(row, row + 2), flat=True, closeup=True)
-    with Camera(scene, 840, span=(clip.start, clip.stop)) as camera:
+    with Camera(scene, clip, 840) as camera:
         file = io.BytesIO()
         camera.picture(moment).save(file, "PNG", optimize=True)
     return file.getvalue()

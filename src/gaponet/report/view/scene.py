@@ -61,7 +61,6 @@ class Scene:
         self,
         shown: SideBySide,
         view: View = View(),
-        ghost: bool = True,
         rows: slice = slice(None),
         flat: bool = False,
         closeup: bool = False,
@@ -70,13 +69,12 @@ class Scene:
 
         Args:
             view: The camera's direction decides the direction of the row.
-            ghost: Draw the recording, translucent, into each other copy.
             rows: Frames that have to fit.
             flat: Put ghosts behind their copies, for an orthographic picture: only the differences are visible.
             closeup: Limbs without an operated joint need not fit.
         """
         self.shown, self.view = shown, view
-        self.ghosts = ghost and any(m.method == "recorded" for m in shown.motions) and len(shown.motions) > 1
+        self.ghosts = any(m.method == "recorded" for m in shown.motions) and len(shown.motions) > 1
         self.box, self.floor = self._fit(rows, closeup)
         self.spacing = 1.1 * (self.box[1] - self.box[0])
         k = len(shown.motions)

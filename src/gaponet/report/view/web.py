@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.errors import UsageError
 from gaponet.base.text import escape_markdown
 from gaponet.report.view.film import Clip
 from gaponet.report.view.scene import Scene
@@ -28,10 +27,8 @@ class WebScene:
         Args:
             port: Port on this machine.
         """
-        try:
-            import viser
-        except ImportError:
-            raise UsageError("--web needs viser; run: pip install 'gaponet[view]'") from None
+        import viser
+
         self.scene, self.clip = scene, clip
         self.server = viser.ViserServer(HOST, port, label="gaponet view", verbose=False)
         self.url = f"http://{HOST}:{self.server.get_port()}"
