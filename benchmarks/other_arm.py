@@ -16,7 +16,7 @@ from gaponet.robot.spec import load_robot
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
-from gaponet.sysid.shared_servo import servos_like
+from gaponet.sysid.servo_types import servos_like
 
 WINDOWS = (9, 36, 0)  # that are fitted; 0 for all
 VALIDATION_SHARE = 1 / 3

@@ -20,7 +20,7 @@ from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import slopes
-from gaponet.sysid.problem import MIN_CLUSTERS, cluster_of_rows
+from gaponet.sysid.problem import MIN_CLUSTERS, cluster_sums
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.table_contact import contact_height, tip_heights
 from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, Provenance, prior_std, to_axes
@@ -89,14 +89,6 @@ def widened(information: Array, overdispersion: Array) -> Array:
     return np.asarray(root[..., :, None] * information * root[..., None, :])
 
 
-def _clustered(x: Array, window: Array) -> tuple[Array, Array]:
-    """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster, (C,)."""
-    cluster, parts = cluster_of_rows(window)
-    each = np.zeros((len(x), int(cluster.max()) + 1, *x.shape[2:]))
-    np.add.at(each, (slice(None), cluster), x)  # type: ignore[arg-type]
-    return each, np.arange(each.shape[1]) // parts
-
-
 def gradient_covariance(gradients: Array) -> Array:
     """Return the covariance of the sum of gradients (n, C, Q) from their scatter over clusters, (n, Q, Q)."""
     each = gradients - gradients.mean(axis=1, keepdims=True)
@@ -131,10 +123,10 @@ def evidence(
     play = 0.5 / ERROR_SCALE_RAD * side * (rollouts.counted & rollouts.recorded[..., None])
     jac = np.concatenate([jac, play.reshape(bounds.n, -1, 1)], axis=-1)
     weight = 1 / np.sqrt(1 + here**2)
-    gradients, window = _clustered(jac * (weight * here)[..., None], rollouts.window)
+    gradients, window = cluster_sums(jac * (weight * here)[..., None], rollouts.window)
     each = ((j[None, :, :, None], (w[:, None] * j)[None, :, None, :]) for j, w in zip(jac, weight, strict=True))
     # A joint at a time, for memory.
-    information = np.concatenate([_clustered(a * b, rollouts.window)[0] for a, b in each])
+    information = np.concatenate([cluster_sums(a * b, rollouts.window)[0] for a, b in each])
     names = [f"{p.meta.motion}{f' ({p.meta.repetition})' * bool(p.meta.repetition)}" for p in parts]
     unique = list(dict.fromkeys(names))
     recording = np.array([unique.index(name) for name in names])

@@ -17,7 +17,7 @@ from gaponet.sim.model import build_model
 from gaponet.sysid.acceptance import Covariance, Std
 from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, Axes, Bounds, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
-from gaponet.sysid.least_squares import Errors, agreed_slopes, better_half, descend
+from gaponet.sysid.least_squares import Errors, Progress, agreed_slopes, better_half, descend
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
 ROBOT_WINDOWS = 8  # windows of the fit in the robot's simulator
@@ -106,10 +106,6 @@ class FitProblem:
         return lambda x: self.errors(axes.values(x), rollouts)
 
 
-Report = Callable[[Array], None]  # called in each iteration with every problem's least cost
-Expired = Callable[[], bool]  # whether the time of a search is over
-
-
 class JointFit(FitProblem):
     """Fit of every joint by itself, the others moving as recorded."""
 
@@ -137,8 +133,7 @@ class JointFit(FitProblem):
         others: ListOf[Values] = (),
         *,
         only: bool = False,
-        report: Report = lambda cost: None,
-        expired: Expired = lambda: False,
+        report: Progress = lambda cost: None,
     ) -> Values:
         """Fit the fields, the classic ones and those of the servo model that `start` has; return values (n,).
 
@@ -147,8 +142,7 @@ class JointFit(FitProblem):
             only: Fit no other fields.
             start: First start, (n,); STARTS in all are drawn around it.
             others: At most two starts in place of drawn ones.
-            report: Called in each iteration.
-            expired: Ends the search early.
+            report: Called in each iteration, as of `least_squares.descend`.
         """
         names = fields if only else fitted_fields(dict.fromkeys([*start, *fields]), encoder=True)
         axes = Axes(self.bounds, names, start)
@@ -161,7 +155,7 @@ class JointFit(FitProblem):
         windows = (self.rollouts.shortened(SHORT_WINDOW_S), self.rollouts, self.rollouts)
         for rollouts, iterations in zip(windows, SEARCH_ITERATIONS, strict=True):
             errors = self.of_axes(axes, rollouts)
-            x, cost = descend(x, axes.low, axes.high, errors, iterations, report, expired)
+            x, cost = descend(x, axes.low, axes.high, errors, iterations, report)
             self.prior.update_residual(cost.min(axis=0), rollouts.rows)
             if rollouts is self.rollouts:
                 x = better_half(x, cost)
@@ -185,8 +179,7 @@ class RobotFit(FitProblem):
         starts: ListOf[Values],
         iterations: ListOf[int],
         *,
-        report: Report = lambda cost: None,
-        expired: Expired = lambda: False,
+        report: Progress = lambda cost: None,
     ) -> Values:
         """Fit fields from starts (n,), the better of which go on after each number of iterations; return values (n,).
 
@@ -196,7 +189,7 @@ class RobotFit(FitProblem):
         x, cost = np.stack([axes.normalize(v) for v in starts]), np.zeros((len(starts), self.bounds.n))
         for i, count in enumerate(iterations):
             errors = self.of_axes(axes)
-            x, cost = descend(x, axes.low, axes.high, errors, count, report, expired, MIN_COST_DECREASE)
+            x, cost = descend(x, axes.low, axes.high, errors, count, report, MIN_COST_DECREASE)
             self.prior.update_residual(cost.min(axis=0), self.rollouts.rows)
             if i < len(iterations) - 1:
                 # The better start of every joint; and the start that is better in the sum over joints.
@@ -204,15 +197,10 @@ class RobotFit(FitProblem):
                 x = x[:1] if np.array_equal(x[0], x[1]) else x
         return {f: v[0].copy() for f, v in axes.values(x[[cost.sum(axis=1).argmin()]]).items()}
 
-    def descend_chains(
-        self, values: Values, report: Callable[[tuple[str, ...], Array], Report], expired: Expired = lambda: False
-    ) -> Values:
+    def descend_chains(self, values: Values, report: Callable[[tuple[str, ...], Array], Progress]) -> Values:
         """Fit values (n,) once more, with a joint's parameters judged by all joints of its kinematic chain.
 
-        Args:
-            values: Start.
-            report: Makes the function that is called in each iteration, from names and row counts of the chains.
-            expired: Ends the search early.
+        `report` makes the function that is called in each iteration, from names and row counts of the chains.
         """
         axes, chains = Axes(self.bounds, robot_fields(values), values), KinematicChains(self.robot)
 
@@ -223,7 +211,7 @@ class RobotFit(FitProblem):
         names = tuple(self.robot.operated[i] for i in chains.joints[:, 0])
         x, low, high = chains.pack(axes.normalize(values)[None]), chains.pack(axes.low), chains.pack(axes.high)
         iterations = max(1, min(CHAIN_ITERATIONS, CHAIN_CANDIDATES // (x.shape[-1] + 5)))
-        x, _ = descend(x, low, high, errors, iterations, report(names, rows), expired, MIN_CHAIN_COST_DECREASE)
+        x, _ = descend(x, low, high, errors, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE)
         return {f: v[0].copy() for f, v in axes.values(chains.unpack(x)).items()}
 
 
@@ -292,11 +280,9 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     here, jac = (y[0] for y in agreed_slopes(x[None], axes.low, axes.high, problem.of_axes(axes)))
     weight = 1 / np.sqrt(1 + here**2)
     gradient = jac * (weight * here)[..., None]  # (n, rows + PRIORS, P)
-    cluster, _ = cluster_of_rows(problem.rollouts.window)
-    clusters = int(cluster.max()) + 1
-    each = np.zeros((bounds.n, clusters, len(names)))
-    np.add.at(each, (slice(None), cluster), gradient[:, :-PRIORS])  # type: ignore[arg-type]
+    each, _ = cluster_sums(gradient[:, :-PRIORS], problem.rollouts.window)
     each -= each.mean(axis=1, keepdims=True)
+    clusters = each.shape[1]
     prior_jac = jac[:, -PRIORS:] * prior.error_std()[:, None, None]
     normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
     few = clusters / max(clusters - len(names), 1)  # squared, as a jackknife of so few clusters has it
@@ -322,15 +308,19 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     )
 
 
-def cluster_of_rows(window: Array) -> tuple[Array, int]:
-    """Return the cluster of each row, by its window (rows,), and how many clusters a window has.
+def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
+    """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster, (C,).
 
-    Clusters are windows, or parts of them where there are fewer than MIN_CLUSTERS.
+    Clusters are windows (rows,), or parts of them where there are fewer than MIN_CLUSTERS.
     """
-    parts = max(1, -(-MIN_CLUSTERS // (int(window.max()) + 1)))
+    count = int(window.max()) + 1
+    parts = max(1, -(-MIN_CLUSTERS // count))
     order, turn = np.argsort(window, kind="stable"), np.zeros(len(window), int)
     turn[order] = np.concatenate([np.arange(c) * parts // c for c in np.unique(window, return_counts=True)[1]])
-    return window * parts + turn, parts
+    cluster = window * parts + turn
+    sums = np.zeros((len(x), int(cluster.max()) + 1, *x.shape[2:]))
+    np.add.at(sums, (slice(None), cluster), x)  # type: ignore[arg-type]
+    return sums, np.arange(sums.shape[1]) // parts
 
 
 def _discretisation_std(problem: FitProblem, values: Values) -> Values:

@@ -195,7 +195,7 @@ class _TableRollouts(RobotRollouts):
         write_table(sim.batch, model, rows[:, 0], rows[:, 1], np.exp(rows[:, 2]))
         dof = np.array([model.joint(j).dofadr[0] for j in self.robot.operated])
         sim.batch.expand("qpos0")[:, dof] -= rows[:, 3:]
-        return self.simulated_errors(sim, self.parts * len(xs))
+        return self.simulated_errors(sim)
 
     def soft_errors(self, xs: Array) -> Array:
         """Return the errors of candidates in ERROR_SCALE_RAD, (k, n · rows)."""

@@ -97,11 +97,11 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
         for run in runs(sequences, [t.qpos for t in replay(sequences, judged, nthread=nthread, lock_idle=True)], judged)
     ]
     by_joint = {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(given.operated)}
-    return Identified(
-        robot, fitted.before, after, "torque", tuple(text for _, text in unknown.values()), errors.std,
-        (*fitted.comparisons, comparison), None, (),
-        {j: (before, by_joint[j]) for j, (before, _) in fitted.by_joint.items()}, errors.covariance,
-        {joint: fields for joint, (fields, _) in unknown.items()}, folds,
+    return replace(
+        fitted, robot=robot, after=after, chosen="torque", std=errors.std, covariance=errors.covariance,
+        warnings=tuple(text for _, text in unknown.values()), comparisons=(*fitted.comparisons, comparison),
+        table_fit=None, by_joint={j: (before, by_joint[j]) for j, (before, _) in fitted.by_joint.items()},
+        undetermined={joint: fields for joint, (fields, _) in unknown.items()}, held_out=folds,
     )  # fmt: skip
 
 
