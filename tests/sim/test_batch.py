@@ -121,7 +121,7 @@ def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, del
             seen = [sim.qpos.copy(), sim.qvel.copy(), sim.torque[[0, 0, 2]]]  # always of those that moved
             sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
             moved.append([*seen, bias.copy()])
-        np.testing.assert_array_equal(sim.data(1).qpos, sim.qpos[1])
+        np.testing.assert_array_equal(sim.batch.get_data(1).qpos, sim.qpos[1])
         assert isinstance(sim.batch, OneByOne) == one_by_one
         if one_by_one:  # a look at what follows from a state leaves each simulation the torque of its own step
             sim.step(targets[0])

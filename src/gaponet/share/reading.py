@@ -8,7 +8,7 @@ from pathlib import Path
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import has_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sim.dataset_robot import dataset_robot
+from gaponet.sim.model import dataset_robot
 
 
 def load_dataset(place: str | Path) -> Dataset:
@@ -33,7 +33,7 @@ def open_dataset(
         dataset: Folder; or the address (s3://, gs://, file://, hf://) of a pushed dataset, which is read without a
             pull.
         robot: Robot to use instead of the one in the dataset folder.
-        run: Run or robot folder that is used with the dataset (sim.dataset_robot).
+        run: Run or robot folder that is used with the dataset (sim.model.dataset_robot).
 
     Raises:
         DatasetError: There is no dataset, it is damaged, or it cannot be reached.

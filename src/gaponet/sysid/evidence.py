@@ -144,11 +144,9 @@ def estimate_uncertainty(
     held_out: ListOf[HeldOut] = (),
     nthread: int = 0,
 ) -> ParameterUncertainty:
-    """Estimate the parameter uncertainty of a robot that was fitted to recordings.
+    """Estimate the parameter uncertainty of a robot with the values that were fitted to recordings of one robot.
 
     Args:
-        robot: The robot with the fitted values.
-        sequences: Recordings of one robot that it was fitted to.
         judges: Recordings that were not fitted, for the residual; without any, the fitted ones.
         covariances: Joint → fields and their covariance on the axes; of other joints it follows from the recordings and
             from `before`.
@@ -156,7 +154,6 @@ def estimate_uncertainty(
             what both uncertainties explain.
         held_out: Recordings and the robots that were fitted without them, instead of `judges`, if `robot` was fitted to
             them as well.
-        nthread: Threads, 0 for all cores.
     """
     first = first_values(robot)
     fitted_fields = (*CLASSIC, *(f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()))

@@ -70,13 +70,9 @@ class _SearchProgress:
         self._total, self._done, self._end, self._search = self._last_of[-1], 0, np.inf, 0
         self.tell(0, "inertias along the recordings")
 
-    def tell(self, done: int, what: str) -> None:
-        """Report iterations done, and what comes next."""
+    def tell(self, done: float, what: str) -> None:
+        """Report iterations done, inf after the last search, and what comes next."""
         self._progress(min(done, self._total), self._total, what)
-
-    def finish(self, what: str) -> None:
-        """Report what is done after the last search; no time limit counts it."""
-        self.tell(self._total, what)
 
     def begin(self) -> None:
         """Begin the next search, which may take its share of the time that is left."""
@@ -130,8 +126,6 @@ def identify(
         windows: Number of rollouts of 8 s, taken evenly from the recordings.
         terms: Terms of the servo model, from TERMS, in the order in which they are fitted.
         table: Fit a table under the robot's tips.
-        nthread: Threads, 0 for all cores.
-        progress: Called in each iteration.
         budget: Time of the searches, s, without the table's; results are the same on every machine only without it.
         stops: Give joints that stayed behind several commands a stop there.
         folds: Folds of the cross-validation, at most; 1 for none.
@@ -174,7 +168,7 @@ def _fit_robot(
     fitted, table_fit = with_values(robot, values[-1]) if chosen != "given" else robot, None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, contact), min(h.min() for h in heights)
-        tell = lambda error: searches.finish(f"table {error * 1e3:.2f} mrad")  # noqa: E731
+        tell = lambda error: searches.tell(np.inf, f"table {error * 1e3:.2f} mrad")  # noqa: E731
         table_fit = fit_table(low, fitted, lowest, nthread, tell, validation)
         fitted = table_fit.robot
     if not stops:
@@ -194,11 +188,10 @@ def _fit_robot(
     )  # fmt: skip
     before, after = (float(judge.errors(v).mean()) for v in (first, values))
     by_joint = zip(*(judge.errors_by_joint(v).tolist() for v in (first, values)), strict=True)
-    searches.finish("the fitted robot, and recorded torque")
+    searches.tell(np.inf, "the fitted robot, and recorded torque")
     return Identified(
         fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit,
-        dict(zip(robot.operated, by_joint, strict=True)),
-        errors.covariance,
+        dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,
         {joint: fields for joint, (fields, _) in unknown.items()}, tuple(held_out),
     )  # fmt: skip
 

@@ -51,7 +51,6 @@ class JointRollouts:
             parts: Windows, each at its own control period.
             robot: Its stops, zeros, limits and inertias hold.
             contact_height: Height under which a tip may touch something, m.
-            nthread: Threads of the compiled rollouts, 0 for all cores.
         """
         self.parts, self.robot, self.op = parts, robot, robot.operated_index
         self.nthread = nthread or os.cpu_count() or 1

@@ -127,19 +127,13 @@ class JointFit(FitProblem):
         ]
 
     def search(
-        self,
-        fields: ListOf[str],
-        start: Values,
-        others: ListOf[Values] = (),
-        *,
-        only: bool = False,
+        self, fields: ListOf[str], start: Values, others: ListOf[Values] = (), *, only: bool = False,
         report: Progress = lambda cost: None,
-    ) -> Values:
+    ) -> Values:  # fmt: skip
         """Fit the fields, the classic ones and those of the servo model that `start` has; return values (n,).
 
         Args:
-            fields: Fields beside those of `start`.
-            only: Fit no other fields.
+            fields: Fields beside those of `start`; with `only` no others are fitted.
             start: First start, (n,); STARTS in all are drawn around it.
             others: At most two starts in place of drawn ones.
             report: Called in each iteration, as of `least_squares.descend`.
@@ -173,14 +167,9 @@ class RobotFit(FitProblem):
     """Fit of all joints in the simulator of the whole robot."""
 
     def descend(
-        self,
-        fields: ListOf[str],
-        rest: Values,
-        starts: ListOf[Values],
-        iterations: ListOf[int],
-        *,
+        self, fields: ListOf[str], rest: Values, starts: ListOf[Values], iterations: ListOf[int], *,
         report: Progress = lambda cost: None,
-    ) -> Values:
+    ) -> Values:  # fmt: skip
         """Fit fields from starts (n,), the better of which go on after each number of iterations; return values (n,).
 
         A joint's parameters are judged by the joint's own error. Fields of `rest` that are not fitted stay.

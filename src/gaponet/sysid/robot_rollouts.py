@@ -46,20 +46,12 @@ class RobotRollouts:
     """
 
     def __init__(
-        self,
-        parts: list[Sequence],
-        robot: RobotSpec,
-        nthread: int = 0,
-        corrector: Corrector | None = None,
+        self, parts: list[Sequence], robot: RobotSpec, nthread: int = 0, corrector: Corrector | None = None,
         touch: Array | None = None,
-    ) -> None:
-        """
-        Args:
-            parts: Windows of recordings.
-            robot: Its own values hold where candidates give none.
-            nthread: Threads, 0 for all cores.
-            corrector: Corrects the targets, as in replay.
-            touch: Rows in which a tip may touch something, (windows, rows): rollouts go on from the recording there.
+    ) -> None:  # fmt: skip
+        """Take windows of recordings, and a robot whose own values hold where candidates give none.
+
+        Rollouts go on from the recording in the rows of `touch`, (windows, rows), in which a tip may touch something.
         """
         self.parts, self.robot, self.nthread, self.corrector = parts, robot, nthread, corrector
         self.locked, self.op, self.n = idle_limbs(parts, robot), robot.operated_index, len(robot.operated)
@@ -83,11 +75,7 @@ class RobotRollouts:
         self.rows = self.recorded.sum(axis=1)
 
     def flat_errors(self, values: dict[str, Array]) -> Array:
-        """Return q_sim − q_real of k candidates in the rows that count, (k, n, rows) rad.
-
-        Args:
-            values: (k, n) each, as BatchSim.set_servos takes them.
-        """
+        """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n) as for BatchSim.set_servos."""
         k, m = len(values["kp"]), len(self.parts)
         delay = np.array(self.robot.delay)
         delay[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)

@@ -109,7 +109,6 @@ def fit_table(
         parts: Windows in which a tip is low; those with the largest errors without a table are fitted.
         robot: The robot with fitted servos; if it has a table, the height is taken as measured.
         lowest: Least height of a tip in the windows, m.
-        nthread: Threads, 0 for all cores.
         progress: Called in each iteration with the root mean square error, rad.
         validation: Whole recordings that choose among the starts' results; without them the windows do.
     """

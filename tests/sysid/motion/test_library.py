@@ -34,7 +34,7 @@ def test_per_joint_motions_cover_nine_tenths_of_every_operated_joint_at_three_ki
 def test_left_and_right_reach_the_same_places_mirrored(library):
     kit = library.kit
     for point in ([0.4, 0.2, 1.2], [0.3, 0.35, 1.0]):
-        left, right = kit.at(kit.ready, "left", point), kit.at(kit.ready, "right", point)
+        left, right = kit.at(kit.ready, ("left",), point), kit.at(kit.ready, ("right",), point)
         palm = kit.ik["left"].position(left)
         assert np.linalg.norm(palm - point) < 2e-3
         assert np.allclose(kit.ik["right"].position(right) * [1, -1, 1], palm, atol=4e-3)
