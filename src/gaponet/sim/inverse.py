@@ -87,9 +87,8 @@ class AnalyticInverse:
     ) -> None:
         """
         Args:
-            batch: Simulations to compute in, one per robot; nothing else may use them.
-            model: The model of all of them; payloads may differ.
-            joints: n names.
+            batch: Simulations to compute in, one per robot, with `model`; payloads may differ. Nothing else may use
+                them.
             nstep, timestep: Physics steps per control period, their length in s; (num,) each.
 
         Raises:
@@ -128,9 +127,7 @@ class AnalyticInverse:
     def __call__(self, periods: ListOf[Period], near: Array) -> Array:
         """Return the targets to send, (num, n) rad, not limited to any range.
 
-        Args:
-            periods: The coming one and `ahead` more.
-            near: Unused; ProbingInverse needs it.
+        `periods` are the coming one and `ahead` more; only ProbingInverse uses `near`.
         """
         held = np.stack([self._targets_in_force(period) for period in periods])
         if not self.ahead:

@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.executor import LOCAL, open_pool
 from gaponet.base.progress import no_progress
 from gaponet.data.pair import SimulatedReplay
@@ -21,7 +22,6 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import LOOSE_IMPEDANCE, STIFF_MOBILITY, idle_joints, model_hash
 
-Array = np.ndarray
 CHUNK = 256  # simulations side by side
 BATCH = 64  # sequences paired together; what an interruption can cost
 

@@ -10,14 +10,13 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.robot.collision import Collision
 from gaponet.robot.finding import LEVELS, Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
-
-Array = np.ndarray
 
 HOLD_S, HOLD_START_RAD = 60.0, 0.01  # of a hold at home, and distance from home at its start
 MAX_REST_SPEED = 0.05  # rad/s in the last ten seconds of the hold
@@ -41,7 +40,6 @@ def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures
     """Step the nominal simulator of a robot and return findings, worst first.
 
     Args:
-        robot: Loaded by load_robot.
         payloads: kg in every mount.
         postures: Postures from the logs, (k, n) rad; default random ones within the joint ranges.
 
