@@ -69,19 +69,6 @@ class Evidence:
         rows = self.rows * keep.mean()  # windows are as long as each other
         return Evidence(self.gradients[:, keep], self.information[:, keep], rows, order, rest, self.window_rms)
 
-    def overdispersion(self) -> Array:
-        """Return the variance of the clusters' summed gradients over that of independent rows, (n, Q)."""
-        own = np.einsum("nckk->nk", self.information)
-        scatter = np.einsum("nkk->nk", gradient_covariance(self.gradients))
-        return np.asarray(np.divide(scatter, own, out=np.zeros_like(own), where=own > 0))
-
-    def gauss_newton_step(self, overdispersion: Array) -> tuple[Array, Array]:
-        """Return the step that these recordings ask for by themselves, (n, Q), and its covariance."""
-        information = self.information.sum(axis=1)
-        inverse = inverted(information)
-        scatter = widened(information, overdispersion)
-        return -(inverse @ self.gradients.sum(axis=1)[..., None])[..., 0], inverse @ scatter @ inverse
-
 
 def widened(information: Array, overdispersion: Array) -> Array:
     """Return the covariance of summed gradients with this overdispersion, (…, Q, Q)."""
@@ -160,11 +147,16 @@ def estimate_uncertainty(
     fields = before.fields if before else fitted_fields
     own, values = evidence(robot, sequences, fields, nthread=nthread), to_axes(robot, fields)
     grouped = own.by_recording() if len(own.names) >= MIN_CLUSTERS // 4 else own
-    overdispersion, clusters = grouped.overdispersion(), grouped.gradients.shape[1]
+    clusters, independent = grouped.gradients.shape[1], np.einsum("nckk->nk", grouped.information)
+    scatter = np.einsum("nkk->nk", gradient_covariance(grouped.gradients))
+    overdispersion = np.divide(scatter, independent, out=np.zeros_like(independent), where=independent > 0)
     if before:
         old = np.stack([before.array(j, "overdispersion") for j in robot.operated])
         overdispersion = (before.clusters * old + clusters * overdispersion) / (before.clusters + clusters)
-    step, step_covariance = own.gauss_newton_step(np.maximum(overdispersion, 1.0))
+    information = own.information.sum(axis=1)
+    inverse = inverted(information)
+    step = -(inverse @ own.gradients.sum(axis=1)[..., None])[..., 0]
+    step_covariance = inverse @ widened(information, np.maximum(overdispersion, 1.0)) @ inverse
     repeatability = repetition_difference(sequences, robot.operated)
     errors, joints = _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread), {}
     for i, joint in enumerate(robot.operated):
@@ -179,8 +171,7 @@ def estimate_uncertainty(
             covariance = whole[np.ix_(at, at)]
         if not before:
             covariance = inverted(inverted(covariance) + np.diag(prior_std(fields, values[joint]) ** -2))
-        information = own.information[i].sum(axis=0)[:-1, :-1]
-        variance = max(np.trace(covariance @ information), 0.0) / max(own.rows[i], 1)
+        variance = max(np.trace(covariance @ information[i, :-1, :-1]), 0.0) / max(own.rows[i], 1)
         rms = float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2)))
         old_joint = before.joints[joint] if before and not (judges or held_out) else None
         joints[joint] = JointUncertainty(

@@ -37,7 +37,6 @@ from gaponet.sysid.problem import (
     fitted_fields,
     robot_fields,
     standard_errors,
-    undetermined,
 )  # fmt: skip
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.servo_types import far_from_published
@@ -181,10 +180,9 @@ def _fit_robot(
             HeldOut(part, replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high))
             for (_, part), one in zip(splits, robots, strict=False)
         ]
-    unknown = undetermined(whole, values[-1], errors)
     warnings = (
         *joints.bounds.warnings(values[-1], fitted_fields(values[-1])), *stop_questions(given, robot),
-        *far_from_published(fitted), *(text for _, text in unknown.values()),
+        *far_from_published(fitted), *errors.sentences,
     )  # fmt: skip
     before, after = (float(judge.errors(v).mean()) for v in (first, values))
     by_joint = zip(*(judge.errors_by_joint(v).tolist() for v in (first, values)), strict=True)
@@ -192,7 +190,7 @@ def _fit_robot(
     return Identified(
         fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit,
         dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,
-        {joint: fields for joint, (fields, _) in unknown.items()}, tuple(held_out),
+        errors.undetermined, tuple(held_out),
     )  # fmt: skip
 
 

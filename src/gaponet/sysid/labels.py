@@ -110,10 +110,12 @@ class Labels:
             f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
         ] if a else []  # fmt: skip
         loaded = [r for r in self.recordings if r.determined and not r.copy_of]
-        near = f"{sum(abs(r.torque_payload - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)} of {len(loaded)}"
+        near = sum(abs(r.torque_payload - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)
         if loaded:
-            limit = f"{MAX_PAYLOAD_ERROR_KG:g} kg"
-            lines += [f"torque alone, without the unit, gives {near} payloads within {limit} of their label"]
+            lines.append(
+                f"torque alone, without the unit, gives {near} of {len(loaded)} payloads within "
+                f"{MAX_PAYLOAD_ERROR_KG:g} kg of their label"
+            )
         return lines + [
             f"{joint}: torque is kp (command − position) − kd velocity, kp {format_uncertainty(g.kp, g.error)} "
             f"N·m/rad ({format_uncertainty(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: "
@@ -135,8 +137,9 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     Raises:
         LogError: More than one joint moves.
     """
-    found: list[LabelledRecording] = []
+    recordings: list[LabelledRecording] = []
     seen: dict[tuple[str, str], LabelledRecording] = {}
+    copies: list[tuple[LabelledRecording, LabelledRecording]] = []
     for name, log in logs:
         one = _read(name, log, gain)
         digest = hashlib.sha256(b"".join(log.channels[c].values.tobytes() for c in ("ctrl", "qpos"))).hexdigest()
@@ -144,33 +147,31 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
         if first is not one:
             one.copy_of = first.name
             first.named_payload = one.named_payload if first.named_payload is None else first.named_payload
-        found.append(one)
-    own = [r for r in found if not r.copy_of]
+            copies.append((one, first))
+        recordings.append(one)
+    own = list(seen.values())
     groups = [_fit(part, payloads, units) for part in _by_command(own)]
-    torque_rows: dict[str, list[Array]] = {}
-    for r in own:
-        torque_rows.setdefault(r.joint, []).extend([] if r.servo_rows is None else [r.servo_rows])
-    first_of = {r.name: r for r in own}
-    for r in found:
-        if r.copy_of:
-            first = first_of[r.copy_of]
-            r.payload, r.unit, r.determined = first.payload, first.unit, first.determined
-    said = [r for r in own if r.named_payload is not None and r.determined]
+    for one, first in copies:
+        one.payload, one.unit, one.determined = first.payload, first.unit, first.determined
+    named = [r for r in own if r.named_payload is not None and r.determined]
     agreement = {}
-    if said:
-        near = lambda r, m: abs(r.payload - m) < MAX_PAYLOAD_ERROR_KG  # noqa: E731
-        masses = {r.named_payload for r in said}
+    if named:
+        masses = {r.named_payload for r in named}
         others = [r for r in own if r.named_payload is None and r.determined]
         agreement = {
-            "said": len(said), "within_half_a_kg": float(np.mean([near(r, r.named_payload) for r in said])),
+            "said": len(named),
+            "within_half_a_kg": float(np.mean([abs(r.payload - (r.named_payload or 0.0)) < MAX_PAYLOAD_ERROR_KG
+                                               for r in named])),
             # What a file's name does not list is none of these either, where such files list all of a payload.
             "not_said": len(others),
             "taken_for_one_of_these": float(np.mean([r.payload in masses for r in others] or [False])),
         }  # fmt: skip
-    gains = {
-        j: (servo_gains(each), servo_gains(each, 1)) for j, each in torque_rows.items() if len(each) >= MIN_RECORDINGS
-    }
-    return Labels(found, groups, agreement, gains)
+    torque_rows: dict[str, list[Array]] = {}
+    for r in own:
+        torque_rows.setdefault(r.joint, []).extend([] if r.servo_rows is None else [r.servo_rows])
+    enough = {joint: rows for joint, rows in torque_rows.items() if len(rows) >= MIN_RECORDINGS}
+    gains = {joint: (servo_gains(rows), servo_gains(rows, 1)) for joint, rows in enough.items()}
+    return Labels(recordings, groups, agreement, gains)
 
 
 def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
@@ -182,19 +183,17 @@ def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
         )
     j = int(moved[0])
     joint = log.joint_names[j]
-    if "tau" in log.channels:
-        time, values = log.channels["tau"].time, log.channels["tau"].values[:, j]
+    servo_rows = None
+    if tau := log.channels.get("tau"):
+        time, values = tau.time, tau.values[:, j]
+        at = lambda c: np.interp(ctrl.time, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
+        speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), ctrl.time)
+        servo_rows = np.stack([ctrl.values[:, j], at("qpos"), speed, at("tau")])
     else:
         time = qpos.time
         values = gain[joint] * (ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j])
     later = time[: len(values)] >= time[0] + SETTLE_S
     commands = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
-    servo_rows = None
-    if "tau" in log.channels:
-        clock = ctrl.time
-        at = lambda c: np.interp(clock, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
-        speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), clock)
-        servo_rows = np.stack([ctrl.values[:, j], at("qpos"), speed, at("tau")])
     kilograms = PAYLOAD_IN_NAME.search(Path(log.source.partition("#")[0]).stem)
     payload = float(kilograms[1].replace("p", ".")) if kilograms else None
     return LabelledRecording(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -247,13 +247,15 @@ class StandardErrors:
 
     Attributes:
         std: Joint → field → standard error in SI units.
-        scaled: The same on the axes of the search, in large changes: torques there are divided by kp.
         covariance: Joint → fields and their covariance on the axes of uncertainty.py.
+        undetermined: Joint → fields that the recordings do not determine; all fields of unexcited joints.
+        sentences: A sentence for each of these joints.
     """
 
     std: Std
-    scaled: Std
-    covariance: Covariance = field(default_factory=dict)
+    covariance: Covariance
+    undetermined: dict[str, tuple[str, ...]]
+    sentences: tuple[str, ...]
 
 
 def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
@@ -290,11 +292,12 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     std |= {f: np.hypot(std[f], error) for f, error in _discretisation_std(problem, values).items()}
     unit = axes.unit[..., None]
     wide = unit * (cov + 1e3 * np.eye(len(names)) * lost[..., None, :]) * np.swapaxes(unit, -1, -2)
+    unknown = _undetermined(problem, values, axes, std, width)
     return StandardErrors(
         {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)},
-        {j: {f: float(width[i, k]) for k, f in enumerate(names)} for i, j in enumerate(joints)},
         {j: (names, wide[i]) for i, j in enumerate(joints)},
-    )
+        {j: fields for j, (fields, _) in unknown.items()}, tuple(text for _, text in unknown.values()),
+    )  # fmt: skip
 
 
 def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
@@ -326,12 +329,15 @@ def _inverse(normal: Array, size: Array) -> Array:
     return np.asarray(np.linalg.pinv(normal / each + fixed, rcond=1e-10, hermitian=True) / each)
 
 
-def undetermined(problem: FitProblem, values: Values, errors: StandardErrors) -> dict[str, tuple[tuple[str, ...], str]]:
-    """Return joint → fields that the recordings do not determine, and a sentence; all fields of unexcited joints."""
-    bounds, names, found = problem.bounds, fitted_fields(values), dict[str, tuple[tuple[str, ...], str]]()
-    axes = Axes(bounds, names, values)
-    x = axes.normalize(values)
-    ahead = axes.values(x + 1)
+def _undetermined(
+    problem: FitProblem, values: Values, axes: Axes, std: Values, width: Array
+) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Return joint → fields that the recordings do not determine, and a sentence; all fields of unexcited joints.
+
+    std: Standard errors in SI units, (n,); width: those on the axes, (n, P), where torques are divided by kp.
+    """
+    bounds, names, x = problem.bounds, axes.names, axes.normalize(values)
+    ahead, found = axes.values(x + 1), dict[str, tuple[tuple[str, ...], str]]()
     for i, joint in enumerate(problem.robot.operated):
         if bounds.unexcited[i]:
             why = (
@@ -345,11 +351,10 @@ def undetermined(problem: FitProblem, values: Values, errors: StandardErrors) ->
         for k, f in enumerate(names):
             if f == "stribeck_speed" and not values["stribeck"][i]:
                 continue
-            value, error = values[f][i], errors.std[joint].get(f, 0.0)
+            value, error = values[f][i], std[f][i]
             if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):
                 wide[f] = f"{f} {format_uncertainty(value, error)}"
-                scaled = errors.scaled.get(joint, {}).get(f, np.inf)
-                if SERVO_FIELDS[f].axis != "over kp" or scaled > MAX_RELATIVE_STD * max(abs(x[i, k]), 1.0):
+                if SERVO_FIELDS[f].axis != "over kp" or width[i, k] > MAX_RELATIVE_STD * max(abs(x[i, k]), 1.0):
                     also_over_kp.append(f)
         if wide:
             as_set = set(also_over_kp) == {"kp"} and len(wide) > 1

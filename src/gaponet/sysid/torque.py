@@ -29,7 +29,7 @@ from gaponet.sysid.adapt import PRIOR_RAD
 from gaponet.sysid.axes import CLASSIC, Bounds, Changes, first_values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED, JointRollouts
 from gaponet.sysid.least_squares import descend
-from gaponet.sysid.problem import JointFit, standard_errors, undetermined
+from gaponet.sysid.problem import JointFit, standard_errors
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
@@ -82,9 +82,7 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
         robot = folds[0].robot
     bounds = Bounds(robot, every)
     whole = JointFit(JointRollouts(cut(every, MAX_WINDOWS), robot, nthread=nthread), robot, bounds).robot_fit(nthread)
-    values = {f: bounds.first[f] for f in CLASSIC}
-    errors = standard_errors(whole, values)
-    unknown = undetermined(whole, values, errors)
+    errors = standard_errors(whole, {f: bounds.first[f] for f in CLASSIC})
     part = [
         run
         for sequences, judged in folds
@@ -93,9 +91,9 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
     by_joint = {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(given.operated)}
     return replace(
         fitted, robot=robot, after=after, chosen="torque", std=errors.std, covariance=errors.covariance,
-        warnings=tuple(text for _, text in unknown.values()), comparisons=(*fitted.comparisons, comparison),
+        warnings=errors.sentences, comparisons=(*fitted.comparisons, comparison),
         table_fit=None, by_joint={j: (before, by_joint[j]) for j, (before, _) in fitted.by_joint.items()},
-        undetermined={joint: fields for joint, (fields, _) in unknown.items()}, held_out=folds,
+        undetermined=errors.undetermined, held_out=folds,
     )  # fmt: skip
 
 
