@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import mujoco
@@ -76,8 +77,7 @@ def fit_torque_driven(
     """Fit the joints one by one, and judge all together.
 
     Args:
-        train: Recordings with torque.
-        judging: Other recordings; if it is `train` itself, parts of PART_S fit and judge in turn.
+        train, judging: Recordings with torque; if they are one list, parts of PART_S fit and judge in turn.
         robot: Its file gives inertias and gravity; payloads are taken as true.
         constant: Fit N·m per unit of the torque, as of a current.
 
@@ -210,10 +210,10 @@ def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> di
         for start in _starts(s):
             mujoco.mj_resetData(model, data)
             data.qpos[at], data.qvel[dof] = s.qpos[start], v[start]
-            for h in HORIZONS_S:
-                last = start + round(h / s.dt)
-                for t in range(start + round(([0.0, *HORIZONS_S][HORIZONS_S.index(h)]) / s.dt), last):
-                    data.qfrc_applied[dof] = tau[t]
+            for before, h in pairwise((0.0, *HORIZONS_S)):
+                first, last = (start + round(x / s.dt) for x in (before, h))
+                for torque in tau[first:last]:
+                    data.qfrc_applied[dof] = torque
                     mujoco.mj_step(model, data, steps)
                 errors.setdefault(h, []).append(np.abs(data.qpos[at] - s.qpos[last])[op])
     return {h: np.median(each, axis=0) for h, each in errors.items()}

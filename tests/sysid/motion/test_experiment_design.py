@@ -52,7 +52,7 @@ def pool(robot):
 @pytest.fixture(scope="module")
 def told(robot, pool):
     return ExperimentDesign.from_recordings(
-        robot, ParameterUncertainty.load(robot), simulated_recordings(robot, pool, 0.0, 1), 1
+        robot, ParameterUncertainty.load(robot), simulated_recordings(robot, pool, 0.0)
     )
 
 
@@ -70,7 +70,7 @@ def test_expected_information_is_that_of_a_recording(robot, pool, told):
     mine = ParameterUncertainty.load(robot)
     nominal = load_robot(robot.folder.parent / "arm")
     played = [record(nominal, m.sample(nominal.dt), f"n{k}", kp=0.84, delay=1) for k, m in enumerate(pool[:4])]
-    there = ExperimentDesign.from_recordings(robot, mine, played, 1)
+    there = ExperimentDesign.from_recordings(robot, mine, played)
     np.testing.assert_allclose(errors(told.after(range(4))), errors(there.after(range(4))), rtol=0.5)
 
 
@@ -106,7 +106,7 @@ def test_kp_of_unloaded_joints_is_reported_as_undetermined(tmp_path, robot, pool
     free = identified(tmp_path, XML.replace('axis="0 1 0"', 'axis="0 0 1"'))
     mine = ParameterUncertainty.load(free)
     motions = [m for m in candidate_motions(Library(free, 3, HELD)) if m.name.startswith("creep")]
-    slow = ExperimentDesign.from_recordings(free, mine, simulated_recordings(free, motions, 0.0, 1), 1)
+    slow = ExperimentDesign.from_recordings(free, mine, simulated_recordings(free, motions, 0.0))
     unsure = replace(slow, covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0])
     said = undetermined_gains(mine, unsure)
     assert set(said) == {"shoulder", "elbow"}

@@ -53,10 +53,10 @@ class ExperimentDesign:
 
     @classmethod
     def from_recordings(
-        cls, robot: RobotSpec, uncertainty: ParameterUncertainty, recordings: ListOf[Sequence], nthread: int = 0
+        cls, robot: RobotSpec, uncertainty: ParameterUncertainty, recordings: ListOf[Sequence]
     ) -> ExperimentDesign:
         """Make the design from simulated recordings of the identified robot; their names differ."""
-        own = evidence(robot, recordings, uncertainty.fields, 10**6, nthread).by_recording()
+        own = evidence(robot, recordings, uncertainty.fields, 10**6).by_recording()
         covariance = np.stack([uncertainty.array(j, "covariance") for j in robot.operated])
         overdispersion = np.stack([uncertainty.array(j, "overdispersion") for j in robot.operated])
         seconds = np.array([s.duration for s in recordings])
@@ -160,14 +160,14 @@ def _at_once(library: Library, variant: int) -> Motion:
     return library.limits.fit(made)
 
 
-def simulated_recordings(robot: RobotSpec, motions: ListOf[Motion], payload: float, nthread: int = 0) -> list[Sequence]:
+def simulated_recordings(robot: RobotSpec, motions: ListOf[Motion], payload: float) -> list[Sequence]:
     """Return recordings of motions that the robot would make as it is identified."""
     commanded = []
     for motion in motions:
         ctrl = motion.sample(robot.dt).astype(np.float32)
         meta = SequenceMeta(robot.name, "expected", f"{motion.name} {payload:g} kg", payload, virtual=True)
         commanded.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl)))
-    replays = replay(commanded, robot, nthread=nthread, lock_idle=True)
+    replays = replay(commanded, robot, lock_idle=True)
     return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(commanded, replays, strict=True)]
 
 
