@@ -47,8 +47,9 @@ def build_model(
 ) -> mujoco.MjModel:
     """Return the nominal simulator of a robot with a payload.
 
-    Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has, in the
-    order of `robot.joint_names`. The physics step is the robot's, stretched a little where it does not divide dt.
+    Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has. Degrees
+    of freedom and actuators are in the order of `robot.joint_names`, without locked joints. The physics step is the
+    robot's, stretched a little where it does not divide dt.
 
     Args:
         payload_mass: Mass in each hand named by `payload_side`, kg.
@@ -125,7 +126,7 @@ def idle_joints(robot: RobotSpec, moved: tuple[str, ...]) -> tuple[str, ...]:
     `moved` names the joints that a command moves, or holds away from home.
     """
     model = build_model(robot)
-    limb = {name: int(model.dof_treeid[model.joint(name).dofadr[0]]) for name in robot.joint_names}
+    limb = dict(zip(robot.joint_names, model.dof_treeid.tolist(), strict=True))
     busy = {limb[name] for name in moved}
     return tuple(name for name in robot.joint_names if limb[name] not in busy)
 

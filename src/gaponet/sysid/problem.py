@@ -213,7 +213,7 @@ class KinematicChains:
 
     def __init__(self, robot: RobotSpec) -> None:
         model = build_model(replace(robot, table=None), physics_only=True)
-        tree = model.dof_treeid[[model.joint(j).dofadr[0] for j in robot.operated]]
+        tree = model.dof_treeid[robot.operated_index]
         chains = [np.flatnonzero(tree == t) for t in np.unique(tree)]
         most = max(map(len, chains))
         self.joints = np.array([[*chain, *[-1] * (most - len(chain))] for chain in chains])
