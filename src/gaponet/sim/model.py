@@ -65,9 +65,9 @@ def build_model(
     spec = build_spec(robot, payload_mass, payload_side, dt, locked, physics_only)
     model = compile_spec(spec, robot.mjcf)
     if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
-        known = {j.name for j in spec.joints}
+        names = {j.name for j in spec.joints}
         raise RobotError(
-            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(known))}), but robot.toml names "
+            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(names))}), but robot.toml names "
             f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
         )
     address = [model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked]

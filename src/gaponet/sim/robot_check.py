@@ -52,16 +52,16 @@ def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures
         Collision(robot, model)  # raises where it is wrong
     low, high = np.clip(robot.qpos_range.T, -np.pi, np.pi)
     places = np.random.default_rng(0).uniform(low, high, (100, len(robot.kp))) if postures is None else postures
-    found = [
+    findings = [
         *_joints(robot), *_loads(robot, models), *_limits(robot, model), *_couplings(robot, model),
         *_contacts(robot, places, postures is not None), *_steps(robot, models, places),
     ]  # fmt: skip
-    if not any(f.level == "error" for f in found):
-        found += _hold(robot, payloads)
+    if not any(f.level == "error" for f in findings):
+        findings += _hold(robot, payloads)
     if not robot.payload_mounts:
         text = "no [[payload_mount]]: payloads other than 0 will be refused; add one to robot.toml if it carries any"
-        found.append(Finding("warning", "payload", text))
-    return sorted(found, key=lambda f: -LEVELS.index(f.level))
+        findings.append(Finding("warning", "payload", text))
+    return sorted(findings, key=lambda f: -LEVELS.index(f.level))
 
 
 def _joints(robot: RobotSpec) -> Iterator[Finding]:

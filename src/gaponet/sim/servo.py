@@ -185,8 +185,8 @@ class ServoModel:
     def reset(self, ids: Array, target: Array) -> None:
         """Begin again for simulations `ids`, which were put into a state, under position targets (k, nu) rad."""
         self.active = present(self.values)
-        asked = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
-        self.torque[ids] = asked.clip(*np.moveaxis(self.force_range[ids], -1, 0))
+        requested = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
+        self.torque[ids] = requested.clip(*np.moveaxis(self.force_range[ids], -1, 0))
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         self.load[ids] = self._passing[ids]
 

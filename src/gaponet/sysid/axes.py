@@ -152,7 +152,7 @@ class Bounds:
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
-        axes, found = Axes(self, names, values), []
+        axes, warnings = Axes(self, names, values), []
         x = axes.normalize(values)
         for i, joint in enumerate(self._joints):
             for k, f in enumerate(names):
@@ -165,8 +165,8 @@ class Bounds:
                 else:
                     end = "least" if below else "most"
                     what = f"{values[f][i]:.4g}, the {end} that is tried; {SERVO_FIELDS[f].advice}"
-                found.append(f"{joint}: {f} ended at its bound: {what}")
-        return tuple(found)
+                warnings.append(f"{joint}: {f} ended at its bound: {what}")
+        return tuple(warnings)
 
 
 class Axes:

@@ -150,8 +150,8 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     moved = [m for f in COMMON_FIELDS if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))]
     largest: dict[str, ParameterChange] = {m.joint: m for m in moved}
     for one in each:
-        found, first = one.explained(threshold)
-        moved += found
+        changes, first = one.explained(threshold)
+        moved += changes
         largest |= {one.name: first} if first else {}
     verdict: Verdict = "contradictory" if contradictory else "drifted" if moved or far else "same"
     seconds = float(sum(s.duration for s in sequences))
@@ -224,13 +224,13 @@ def _together(joints: ListOf[_Joint], number: int, threshold: float) -> Paramete
     total = max(information.sum(), 1e-300)
     by, error = float(pulls.sum() / total), float(total**-0.5)
     moves = float(np.sqrt(np.mean([(by * j.effect[number]) ** 2 for j in joints])))
-    found = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
+    change = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
     alone = max((abs(m.sigmas) for j in joints if (m := j.explained(np.inf)[1])), default=0.0)
-    if abs(found.sigmas) < max(threshold, alone) or moves < np.mean([j.min_effect for j in joints]):
+    if abs(change.sigmas) < max(threshold, alone) or moves < np.mean([j.min_effect for j in joints]):
         return None
     for j in joints:
         j.gradient = j.gradient - by * j.columns[:, number]
-    return found
+    return change
 
 
 def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:

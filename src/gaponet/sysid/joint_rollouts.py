@@ -102,10 +102,7 @@ class JointRollouts:
     def _counted(self) -> Array:
         """Return the rows that count, (windows, rows): after the start has settled, away from contacts."""
         rows, after = self.touch.shape[1], np.round(SETTLE_S / self.periods).astype(int)
-        near = np.zeros_like(self.touch)
-        for k in np.unique(after):
-            touch = self.touch[after == k]
-            near[after == k] = np.array([touch[:, max(0, t - k) : t + 1].any(axis=1) for t in range(rows)]).T
+        near = np.array([np.convolve(t, np.ones(k + 1))[:rows] > 0.5 for t, k in zip(self.touch, after, strict=True)])
         time, thin = np.arange(rows), self._thins[:, None]
         counted = (time > np.maximum(after, 1)[:, None]) & (time < self.lengths[:, None]) & ~near & (time % thin == 0)
         return np.asarray(counted[:, :: self.thin])

@@ -337,7 +337,7 @@ def _undetermined(
     std: Standard errors in SI units, (n,); width: those on the axes, (n, P), where torques are divided by kp.
     """
     bounds, names, x = problem.bounds, axes.names, axes.normalize(values)
-    ahead, found = axes.values(x + 1), dict[str, tuple[tuple[str, ...], str]]()
+    ahead, unknown = axes.values(x + 1), dict[str, tuple[tuple[str, ...], str]]()
     for i, joint in enumerate(problem.robot.operated):
         if bounds.unexcited[i]:
             why = (
@@ -345,7 +345,7 @@ def _undetermined(
                 "the file's values but for what others that move it show (kp, damping, friction, offset); record its "
                 "motion"
             )
-            found[joint] = tuple(names), why
+            unknown[joint] = tuple(names), why
             continue
         wide, also_over_kp = dict[str, str](), list[str]()
         for k, f in enumerate(names):
@@ -359,5 +359,5 @@ def _undetermined(
         if wide:
             as_set = set(also_over_kp) == {"kp"} and len(wide) > 1
             advice = "; known as multiples of kp: take the values as a set" if as_set else ""
-            found[joint] = tuple(wide), f"{joint}: not determined by these logs: {', '.join(wide.values())}{advice}"
-    return found
+            unknown[joint] = tuple(wide), f"{joint}: not determined by these logs: {', '.join(wide.values())}{advice}"
+    return unknown

@@ -48,14 +48,14 @@ class Arm:
 
 def arms(robot: RobotSpec) -> dict[str, Arm]:
     """The robot's arms by side; empty for a robot that is not built like that."""
-    found = {}
+    by_side = {}
     for mount in robot.payload_mounts:
         names = [[n for n in robot.joint_names if n.startswith(f"{mount.side}_{role}")] for role in ROLES]
         if all(len(n) == 1 for n in names):
             sign = -1.0 if mount.side == "right" else 1.0
             columns = robot.index([n[0] for n in names])
-            found[mount.side] = Arm(mount.side, sign, columns, f"payload_{mount.side}")
-    return found
+            by_side[mount.side] = Arm(mount.side, sign, columns, f"payload_{mount.side}")
+    return by_side
 
 
 class HandIK:

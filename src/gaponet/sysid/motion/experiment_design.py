@@ -131,16 +131,16 @@ def candidate_motions(library: Library, progress: Progress = no_progress) -> lis
         *(f"{s}-{short(j)}" for j in single for s in SIGNALS),
         *(f"{kind.__name__}-all-{v}" for kind in ANY for v in range(VARIANTS)),
     ]
-    found = []
+    motions = []
     for k in range(len(names) + MOTIONS_OF_ALL_JOINTS):
         progress(k, len(names) + MOTIONS_OF_ALL_JOINTS, "which motions fit the robot's limits")
         try:
-            found.append(library.make(names[k]) if k < len(names) else _at_once(library, k - len(names)))
+            motions.append(library.make(names[k]) if k < len(names) else _at_once(library, k - len(names)))
         except UsageError:  # does not fit this robot's limits: no candidate
             continue
-    if not found:
+    if not motions:
         raise UsageError(f"{robot.name}: no motion fits its limits; lighten --payloads, or look at collision.toml")
-    return found
+    return motions
 
 
 def _at_once(library: Library, variant: int) -> Motion:
