@@ -27,7 +27,7 @@ def test_feed_forward_equals_inverse_dynamics(robot):
         moving.update(target[None])
     sim.reset(slice(None), targets[-1:], np.zeros((1, 2)))
     sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-    data = sim.data(0)
+    data = sim.batch.get_data(0)
     model = next(iter(sim.models.values()))
     data.qacc[:] = moving.qacc[0]
     mujoco.mj_inverse(model, data)

@@ -73,16 +73,6 @@ def test_an_adaptation_for_an_earlier_model_is_replaced(found, tmp_path):
     assert Adaptation.load(tmp_path, found.weights) == {found.unit_id: found}
 
 
-def test_an_unknown_payload_is_estimated(model, robot):
-    logs = [record(robot, commands(450, seed), f"m{seed}", payload=0.2) for seed in range(2)]
-    untold = [replace(s, meta=replace(s.meta, payload_mass=0.0)) for s in logs]
-    found = Adaptation.fit(model, robot, untold, seconds=16.0, unknown_payload=True)
-    assert found.payload_mass == pytest.approx(0.2, abs=0.02)
-    assert found.payload_std < 0.02
-    with pytest.raises(UsageError, match="one and the same"):
-        Adaptation.fit(model, robot, [untold[0], logs[1]], unknown_payload=True)
-
-
 def test_recordings_of_two_units_are_refused(model, robot, logs):
     other = replace(logs[0], meta=replace(logs[0].meta, unit_id="other"))
     with pytest.raises(UsageError, match="give those of one unit"):

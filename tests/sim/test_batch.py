@@ -33,13 +33,6 @@ def test_a_batch_is_bit_identical_to_mj_step(tmp_path):
         np.testing.assert_array_equal(sim.qvel[i], data.qvel)
 
 
-def test_few_simulations_use_one_thread_by_default(tmp_path):
-    pytest.importorskip("mujoco.batch")
-    robot, one = write_arm(tmp_path), (0.0, "both", 0.02)
-    assert BatchSim(robot, [one] * 5).batch.nthread == 1
-    assert BatchSim(robot, [one] * 5, nthread=2).batch.nthread == 2
-
-
 def test_targets_beyond_the_joint_range_are_clipped(tmp_path):
     sim = BatchSim(write_arm(tmp_path), [(0.0, "both", 0.02)])
     sim.step(np.array([[9.0, -9.0]]))
@@ -121,7 +114,7 @@ def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, del
             seen = [sim.qpos.copy(), sim.qvel.copy(), sim.torque[[0, 0, 2]]]  # always of those that moved
             sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
             moved.append([*seen, bias.copy()])
-        np.testing.assert_array_equal(sim.data(1).qpos, sim.qpos[1])
+        np.testing.assert_array_equal(sim.batch.get_data(1).qpos, sim.qpos[1])
         assert isinstance(sim.batch, OneByOne) == one_by_one
         if one_by_one:  # a look at what follows from a state leaves each simulation the torque of its own step
             sim.step(targets[0])

@@ -15,9 +15,8 @@ from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import Table, load_robot
 from gaponet.sim.batch import BatchSim
-from gaponet.sim.dataset_robot import dataset_robot
-from gaponet.sim.dynamics import inverse_dynamics, static_torque
-from gaponet.sim.model import build_model, model_hash, write_table
+from gaponet.sim.dynamics import inverse_dynamics
+from gaponet.sim.model import build_model, dataset_robot, model_hash, write_table
 
 
 def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
@@ -209,13 +208,6 @@ def test_a_model_in_degrees_moves_as_the_same_one_in_radians(tmp_path):
     for ours, theirs in zip(models[:2], models[2:], strict=True):
         for field in ("jnt_range", "qpos0", "body_quat", "body_pos"):
             np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), atol=1e-9)
-
-
-def test_static_torque_of_a_level_arm_is_its_weight(arm):
-    # upper arm 0.3 kg at 0.1 m; fore arm 0.2 kg at 0.3 m; 0.5 kg in the hand at 0.4 m. y axis: positive turns down
-    tau = static_torque(build_model(arm, 0.5), np.zeros((1, 2)))[0]
-    assert tau[0] == pytest.approx(-9.81 * (0.3 * 0.1 + 0.2 * 0.3 + 0.5 * 0.4), rel=1e-6)
-    assert tau[1] == pytest.approx(-9.81 * (0.2 * 0.1 + 0.5 * 0.2), rel=1e-6)
 
 
 @pytest.mark.parametrize("payload", [0.0, 3.0])

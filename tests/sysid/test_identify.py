@@ -10,7 +10,7 @@ from gaponet.base.errors import UsageError
 from gaponet.robot.spec import load_robot
 from gaponet.sim.metrics import Comparison
 from gaponet.sim.replay import motion_errors
-from gaponet.sysid.acceptance import Judge, JudgedFold, cross_validation
+from gaponet.sysid.acceptance import Judge, cross_validation
 from gaponet.sysid.axes import Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.motion_limits import with_stops
@@ -142,7 +142,7 @@ def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
     robot, logs = write_arm(tmp_path), recordings(load_robot(tmp_path))[:3]
     again = [*logs, replace(logs[0], meta=replace(logs[0].meta, repetition=1, kp=(18.0, 18.0)))]
     values = Bounds(robot, logs).first
-    once, twice = (Judge([JudgedFold(x, robot, -np.inf, 1)]).errors([values]) for x in (logs, again))
+    once, twice = (Judge([x], robot, -np.inf, 1).errors([values]) for x in (logs, again))
     assert len(once) == len(twice) == 3
     np.testing.assert_allclose(twice[1:], once[1:])
 
@@ -161,15 +161,18 @@ def test_a_joint_takes_a_fit_only_if_its_own_motions_accept_it():
     """Payloads of one motion are one vote: the first joint follows one motion of three better, with both payloads."""
     errors = {1.0: np.full((4, 2), 10.0), 2.0: np.array([[4.0, 8.0], [4.0, 8.1], [11.0, 7.9], [11.5, 8.2]])}
 
-    class Fold:
-        names = ("a", "a", "b", "c")
+    class Payloads(Judge):
+        names = np.array(["a", "a", "b", "c"])
 
-        def sums(self, values):
-            return errors[values["kp"][0]], np.ones((4, 2))
+        def __init__(self):
+            pass
+
+        def _sums(self, candidate):
+            return errors[candidate[0]["kp"][0]], np.ones((4, 2))
 
     given, fit = ({"kp": np.full(2, kp)} for kp in errors)
-    name, (chosen,) = Judge([Fold()]).best_by_joint({"given": [given], "limbs": [fit]})
+    name, (chosen,) = Payloads().best_by_joint({"given": [given], "limbs": [fit]})
     assert (name, chosen["kp"].tolist()) == ("mixed", [1.0, 2.0])
     worse = {"kp": np.full(2, 3.0)}
     errors[3.0] = errors[1.0] + 1.0
-    assert Judge([Fold()]).best_by_joint({"given": [given], "limbs": [worse]}) == ("given", [given])
+    assert Payloads().best_by_joint({"given": [given], "limbs": [worse]}) == ("given", [given])

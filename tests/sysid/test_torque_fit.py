@@ -102,9 +102,8 @@ def test_the_fit_from_torque_is_used_if_validation_motions_accept_it(tmp_path):
     assert found.robot.kp == pytest.approx([12.0, 12.0], rel=0.03)
     assert found.robot.payload_mounts[0].mass == pytest.approx(0.3, abs=0.05)
     assert not (found.held_out[0].robot.kp == found.robot.kp).all()  # fitted once more, to the motions that judged it
-    silent = identify([replace(s, tau=None) for s in windows[:12]], robot, windows[12:], terms=(), folds=1)
-    assert silent.comparisons == ()
-    assert found.after < silent.after
+    assert found.after == pytest.approx(tried.after.mean())
+    assert tried.after.mean() < tried.before.mean()
 
 
 def test_a_refit_with_the_validation_motions_is_dropped_if_it_follows_them_worse(tmp_path, monkeypatch):

@@ -46,7 +46,6 @@ def identify(
     holdout_units: tuple[str, ...] = (),
     terms: tuple[Term, ...] = DEFAULT_TERMS,
     table: bool = True,
-    shared: bool = False,
     threads: int = 0,
     budget: str | None = None,
     stops: bool = False,
@@ -71,7 +70,6 @@ def identify(
         holdout_units: Units to leave out, as in training.
         terms: Terms of the servo model to try; each is accepted only if validation motions improve.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml).
-        shared: Give joints with one type of servo ([[servo]] in robot.toml) the same servo model.
         threads: 0 for all cores.
         budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.
         stops: Add an end stop to joints that stayed behind several commands; otherwise they are reported.
@@ -88,7 +86,7 @@ def identify(
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sysid.acceptance import HeldOut, held_out_errors
     from gaponet.sysid.identify import identify as fit
-    from gaponet.sysid.shared_servo import servos_like
+    from gaponet.sysid.servo_types import servos_like
 
     data, spec = as_dataset(dataset, robot)
     data.require_robot(spec)
@@ -107,7 +105,7 @@ def identify(
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
     with lock_folder(folder, "robot"):
         fitted = fit(
-            data.sequences(split["train"]), start, val, windows, terms, table, shared, threads, progress, seconds, stops
+            data.sequences(split["train"]), start, val, windows, terms, table, threads, progress, seconds, stops
         )
         after, given, nominal = (
             held_out_errors(HeldOut(s, one or own) for s, own in fitted.held_out)
@@ -268,7 +266,6 @@ def adapt_model(
     unit: str = "",
     motions: tuple[str, ...] = (),
     seconds: float = 30.0,
-    unknown_payload: bool = False,
     robot: RobotSpec | Place | None = None,
     mixed_gains: bool = False,
     progress: Progress = no_progress,
@@ -285,7 +282,6 @@ def adapt_model(
         motions: Only these; default: those that the run was trained on, so that its test motions stay unseen, or all
             where the unit played none of them.
         seconds: Duration of the recordings to use, in windows of 8 s.
-        unknown_payload: Ignore the recordings' payload and estimate it; all must carry the same.
         robot: Another robot than the one that the dataset keeps.
         mixed_gains: Accept recordings made with different kp or kd together.
         progress: Called with done, total and a note.
@@ -305,12 +301,11 @@ def adapt_model(
     entries = Adaptation.recordings(data, model, unit, motions)
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
-    fitted = Adaptation.fit(model, simulator, data.sequences(entries), seconds, unknown_payload, _window_rms(progress))
+    fitted = Adaptation.fit(model, simulator, data.sequences(entries), seconds, _window_rms(progress))
     fitted.save(folder)
     return AdaptResult(
         unit_id=fitted.unit_id, servos={j: {str(f): v for f, v in s.items()} for j, s in fitted.servos.items()},
-        before=fitted.before, after=fitted.after, payload_mass=fitted.payload_mass, payload_std=fitted.payload_std,
-        robot=None, folder=folder, recordings=len(entries),
+        before=fitted.before, after=fitted.after, robot=None, folder=folder, recordings=len(entries),
     )  # fmt: skip
 
 
@@ -322,7 +317,6 @@ def adapt_robot(
     unit: str = "",
     motions: tuple[str, ...] = (),
     seconds: float = 30.0,
-    unknown_payload: bool = False,
     payload_mass: float | None = None,
     progress: Progress = no_progress,
 ) -> AdaptResult:
@@ -337,7 +331,6 @@ def adapt_robot(
         unit: Unit to adapt to, where the dataset holds several.
         motions: Only these.
         seconds: Duration of the recordings to fit, in windows of 8 s; all of them are used for validation.
-        unknown_payload: Ignore the recordings' payload and estimate it; all must carry the same.
         payload_mass: kg in each hand, of logs whose format does not state it.
         progress: Called with done, total and a note.
 
@@ -359,9 +352,7 @@ def adapt_robot(
         lock_folder(folder, "robot"),
         unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
     ):
-        fitted = adapt(
-            sequences, spec, seconds, unknown_payload, None, _window_rms(progress), judge=not unknown_payload
-        )  # fmt: skip
+        fitted = adapt(sequences, spec, seconds, None, _window_rms(progress), judge=True)
         if not fitted.accepted:
             before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
             why = (
@@ -372,9 +363,6 @@ def adapt_robot(
             raise NoGainError(
                 f"nothing is written: {why}; keep {spec.name} as it is, or record motions that move each joint more"
             )
-        if fitted.payload_mass is not None:
-            mass = float(fitted.payload_mass)
-            sequences = [replace(s, meta=replace(s.meta, payload_mass=mass)) for s in sequences]
         before, after = (float(rollout_errors(sequences, r).mean()) for r in (spec, fitted.robot))
         if after > (1 - MIN_RELATIVE_GAIN) * before:
             raise NoGainError(
@@ -388,8 +376,7 @@ def adapt_robot(
     robot, joints = fitted.robot, zip(fitted.robot.operated, fitted.robot.operated_index, strict=True)
     return AdaptResult(
         unit_id=unit, servos={j: {f: float(getattr(robot, f)[i]) for f in FIELDS} for j, i in joints},
-        before=before, after=after, payload_mass=fitted.payload_mass, payload_std=fitted.payload_std, robot=robot,
-        folder=folder, recordings=len(sequences),
+        before=before, after=after, robot=robot, folder=folder, recordings=len(sequences),
     )  # fmt: skip
 
 

@@ -281,7 +281,7 @@ def _further_motions(
     chosen = tuple(pairs[i] for i in picks)
     return Plan(chosen), Prediction(
         before=before, after=after, useful_seconds=design.worth(),
-        undetermined=undetermined_gains(spec, uncertainty, design, motions, payloads),
+        undetermined=undetermined_gains(uncertainty, design),
         played=tuple((mass, motion.name) for mass, motion in chosen),
     )  # fmt: skip
 

@@ -226,9 +226,6 @@ class IdentifyResult:
             "terms": {
                 c.name: {"gain": c.gain[0], "standard_error": c.gain[1], "kept": c.accepted} for c in fit.comparisons
             },
-            "shared": {
-                t.name: {"own": t.before.mean(), "one": t.after.mean(), "standard_error": t.gain[1]} for t in fit.shared
-            },
             "table": vars(self.robot.table) if self.robot.table else None,
             "touching": list(fit.table_fit.motions) if fit.table_fit else [],
             "warnings": list(fit.warnings), "undetermined": fit.undetermined,
@@ -302,7 +299,6 @@ class AdaptResult:
     Attributes:
         servos: Operated joint → kp N·m/rad, damping N·m·s/rad, frictionloss N·m, offset rad, delay s.
         before, after: Mean error of whole recordings (robot), or RMS error of the fitted windows (model), rad.
-        payload_mass, payload_std: Estimated payload in each hand and its standard error, kg; None where it was given.
         robot: The adapted robot; None for a model.
         folder: Robot folder or run folder that holds the result.
         recordings: Number of recordings behind `before` and `after`.
@@ -312,8 +308,6 @@ class AdaptResult:
     servos: Mapping[str, Mapping[str, float]]
     before: float
     after: float
-    payload_mass: float | None
-    payload_std: float | None
     robot: RobotSpec | None
     folder: Path
     recordings: int
@@ -323,7 +317,6 @@ class AdaptResult:
         return {
             "unit_id": self.unit_id, "before": self.before, "after": self.after,
             "servos": {joint: dict(servo) for joint, servo in self.servos.items()}, "robot": str(self.folder),
-            "payload_mass": self.payload_mass, "payload_std": self.payload_std,
         }  # fmt: skip
 
 

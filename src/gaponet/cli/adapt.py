@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from pathlib import Path
 from typing import Annotated
 
@@ -34,7 +33,7 @@ def adapt(
     unit: Unit = "",
     motions: tuple[str, ...] = (),
     seconds: float = 30.0,
-    payload_mass: str = "recorded",
+    payload_mass: float | None = None,
     robot: Robot = None,
     mixed_gains: Flag = False,
     json: Json = False,
@@ -46,21 +45,18 @@ def adapt(
 
     Args:
         out: Robot folder to write, where a robot folder is adapted.
-        payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same. A
-            number: kg in each hand, of logs whose format does not state it.
+        payload_mass: kg in each hand, of logs whose format does not state it; of a robot folder.
     """
     screen = Out(json)
-    unknown = payload_mass == "unknown"
     if (run / "robot.toml").is_file():
         if out is None:
             raise UsageError(f"{run}: is a robot folder; give --out FOLDER for the adapted one")
         if robot is not None or mixed_gains:
             raise UsageError("--robot and --mixed-gains are for the adaptation of a run")
-        told = None if unknown or payload_mass == "recorded" else _mass(payload_mass)
         with progress_bar("adapting") as update:
             made = api.adapt_robot(
-                run, dataset, out=out, unit=unit, motions=motions, seconds=seconds, unknown_payload=unknown,
-                payload_mass=told, progress=update,
+                run, dataset, out=out, unit=unit, motions=motions, seconds=seconds, payload_mass=payload_mass,
+                progress=update,
             )  # fmt: skip
         screen.say(
             f"{mrad(made.before)} → {mrad(made.after)} mrad over {made.recordings} recording(s) of unit {made.unit_id} "
@@ -72,12 +68,12 @@ def adapt(
         return
     if out is not None:
         raise UsageError(f"{run}: is no robot folder (no robot.toml); --out is for those, a run keeps its adaptations")
-    if not unknown and payload_mass != "recorded":
-        raise UsageError(f"--payload-mass {payload_mass}: a run takes recorded or unknown")
+    if payload_mass is not None:
+        raise UsageError("--payload-mass is for the logs of a robot folder; the dataset of a run states its payload")
     with progress_bar("adapting") as update:
         made = api.adapt_model(
-            run, dataset, unit=unit, motions=motions, seconds=seconds, unknown_payload=unknown, robot=robot,
-            mixed_gains=mixed_gains, progress=update,
+            run, dataset, unit=unit, motions=motions, seconds=seconds, robot=robot, mixed_gains=mixed_gains,
+            progress=update,
         )  # fmt: skip
     _show(screen, made)
     screen.say(f"window RMS {mrad(made.before)} → {mrad(made.after)} mrad of the fitted windows; stored in {run}")
@@ -86,21 +82,10 @@ def adapt(
 
 
 def _show(screen: Out, made: AdaptResult) -> None:
-    """Print a unit's servos and its payload."""
+    """Print a unit's servos."""
     from gaponet.robot.servo_fields import SERVO_FIELDS
     from gaponet.sysid.adapt import FIELDS
 
     screen.table(f"Unit {made.unit_id}", ["joint", *(SERVO_FIELDS[f].heading for f in FIELDS)], [
         [j, *(f"{v[f] * SERVO_FIELDS[f].factor:.3g}" for f in FIELDS)] for j, v in made.servos.items()
     ])  # fmt: skip
-    if made.payload_mass is not None:
-        std = made.payload_std
-        deviation = f" ± {std:.2f}" if std is not None and isfinite(std) else ""  # it needs two windows
-        screen.say(f"payload {made.payload_mass:.2f}{deviation} kg in each hand that carries")
-
-
-def _mass(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise UsageError(f"--payload-mass {text}: give recorded, unknown, or a number of kg") from None

@@ -31,7 +31,6 @@ def identify(
     windows: int = 40,
     terms: tuple[Term, ...] = DEFAULT_TERMS,
     table: bool = True,
-    shared: Flag = False,
     threads: int = 0,
     budget: str | None = None,
     stops: Flag = False,
@@ -70,7 +69,7 @@ def identify(
     with progress_bar("identifying") as update:
         made = api.identify(
             data, out=out, windows=windows, robot=spec, like=like, units=units, holdout_units=holdout_units,
-            terms=terms, table=table, shared=shared, threads=threads, budget=budget, stops=stops, progress=update,
+            terms=terms, table=table, threads=threads, budget=budget, stops=stops, progress=update,
         )  # fmt: skip
     _show(screen, made, details)
     screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {robot_argument(out)}")
@@ -112,10 +111,6 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
             screen.say(
                 f"payload_mount {m.side}: at {m.pos} m of {m.body}, where {m.mass:g} kg hang that the model lacks"
             )
-    for law in found.shared:
-        own, one = (mrad(e.mean()) for e in (law.before, law.after))
-        costs = f"{mrad(-law.gain[0])} ± {mrad(law.gain[1])}"
-        screen.say(f"one law for every {law.name}: {own} → {one} mrad over {len(law.before)} recordings, costs {costs}")
     if found.table_fit is not None and found.table_fit.motions:
         touch, table = found.table_fit, found.robot.table
         what = "none that explains them"

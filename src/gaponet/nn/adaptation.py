@@ -1,8 +1,7 @@
 """Adaptation of a trained model to one unit (one physical robot): a file per unit in RUN/adaptation/.
 
 Units differ in gain, damping, friction, zero offsets and delay. These servo parameters of the simulator are fitted to
-half a minute of the unit's log, with the trained correction (sysid/adapt.py). The network does not change. An unknown
-payload mass is fitted with them.
+half a minute of the unit's log, with the trained correction (sysid/adapt.py). The network does not change.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class Adaptation:
         logs: Content hashes of the recordings.
         seconds: Duration of the fitted windows.
         before, after: RMS error of the fitted windows, rad.
-        payload_mass, payload_std: Fitted payload and its standard error, kg; None if the payload was known.
+        payload_mass, payload_std: Payload that an earlier version estimated, and its standard error, kg.
     """
 
     unit_id: str
@@ -70,30 +69,25 @@ class Adaptation:
         simulator: RobotSpec,
         sequences: ListOf[Sequence],
         seconds: float = 30.0,
-        unknown_payload: bool = False,
         progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
     ) -> Adaptation:
         """Fit the parameters of a unit, with the correction of a trained model.
 
         Args:
             sequences: Recordings of one unit. Windows of 8 s are taken from them evenly.
-            unknown_payload: Fit the payload mass too; all recordings have the same payload.
             progress: Same arguments as in sysid.adapt.
 
         Raises:
             UsageError: The recordings are of several units.
         """
         unit = _one_unit(sequences)
-        fitted = adapt(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)
+        fitted = adapt(sequences, simulator, seconds, model.corrector(simulator), progress)
         servos = {
             j: {f: float(getattr(fitted.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
             for j in simulator.operated
         }
         logs = tuple(s.content_hash() for s in sequences)
-        return Adaptation(
-            unit, model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after, fitted.payload_mass,
-            fitted.payload_std,
-        )  # fmt: skip
+        return Adaptation(unit, model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after)
 
     @classmethod
     def load(cls, run: Path, weights: str) -> dict[str, Adaptation]:

@@ -141,8 +141,8 @@ def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
 
 def reductions(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
     """Return the reduction of the error by each step and its standard error over motions, rad."""
-    held = {name: [(r, c) for r in part if (c := r.holds(columns)) is None or c] for name, part in done.items()}
-    errors = {name: np.array([np.abs(r.error if c is None else r.error[:, c]).mean() for r, c in part])
+    held = {name: [(r, c) for r in part if (c := r.holds(columns))] for name, part in done.items()}
+    errors = {name: np.array([np.abs(r.error[:, c]).mean() for r, c in part])
               for name, part in held.items()}  # fmt: skip
     less = {after: errors[before] - errors[after] for before, after in pairwise(errors)}
     return {name: [float(x.mean()), standard_error(x)] for name, x in less.items()}

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import array_like, array_module
+from gaponet.base.arrays import Array, array_like, array_module
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_TERMS, STOP_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo import ServoModel
-
-Array = np.ndarray
 
 
 class OneByOne:
@@ -131,13 +129,9 @@ class BatchSim:
     """
 
     def __init__(
-        self,
-        robot: RobotSpec,
-        conditions: list[Condition],
-        nthread: int = 0,
-        locked: tuple[str, ...] = (),
+        self, robot: RobotSpec, conditions: list[Condition], nthread: int = 0, locked: tuple[str, ...] = (),
         servo_model: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints that are not locked.
 
         With `servo_model` its terms may be written, also if the robot has none.
@@ -177,11 +171,8 @@ class BatchSim:
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None) -> None:
         """Put simulations `ids` into a state, (k, n) rad and rad/s.
 
-        Args:
-            ids: Simulations.
-            qpos, qvel: State, (k, n).
-            past: Targets of the control periods before, newest first, (k, depth, n) rad, for servos with a delay
-                (robot.delay). The oldest counts for all before it.
+        `past` are the targets of the control periods before, newest first, (k, depth, n) rad, for servos with a delay
+        (robot.delay). The oldest counts for all before it.
         """
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
@@ -289,18 +280,9 @@ class BatchSim:
             state |= {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
         return state if self.max_change is None else state | {"ctrl": self.ctrl}
 
-    def data(self, env: int) -> mujoco.MjData:
-        """Return one simulation as MjData, for rendering or forward kinematics."""
-        return self.batch.get_data(env)
-
 
 def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:
-    """Expand every model field that differs between simulations, and return those fields, live.
-
-    Args:
-        batch: nsim simulations.
-        models: Model of each simulation, (nsim); many are the same object.
-    """
+    """Expand every model field that differs between simulations, (nsim) models, and return those fields, live."""
     unique = list({id(m): m for m in models}.values())
     fields: dict[str, Array] = {}
     if len(unique) == 1:

@@ -9,10 +9,9 @@ from functools import partial
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec, Tip
 from gaponet.sim.model import build_model
-
-Array = np.ndarray
 
 CUTOFF_HZ = 6.0  # Hz: above the joints' bandwidth, below encoder steps at 50 Hz
 

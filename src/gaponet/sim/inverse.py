@@ -62,14 +62,14 @@ class Inertia:
         place[dof] = np.arange(len(dof))
         row = place[np.repeat(np.arange(model.nv), model.M_rownnz)]  # MuJoCo keeps the lower triangle, row by row
         column = place[model.M_colind]
-        self.kept = np.flatnonzero((row >= 0) & (column >= 0))
-        self.row, self.column, self.n = row[self.kept], column[self.kept], len(dof)
+        self._entries = np.flatnonzero((row >= 0) & (column >= 0))
+        self.row, self.column, self.n = row[self._entries], column[self._entries], len(dof)
         self.sparse: Array = batch.bind("M")
 
     def matrix(self, num: int) -> Array:
         """Mass matrices of the first num simulations, (num, n, n) kg·m²."""
         full = np.zeros((num, self.n, self.n))
-        values = self.sparse[:num, self.kept]
+        values = self.sparse[:num, self._entries]
         full[:, self.row, self.column] = values
         full[:, self.column, self.row] = values
         return full
@@ -87,9 +87,8 @@ class AnalyticInverse:
     ) -> None:
         """
         Args:
-            batch: Simulations to compute in, one per robot; nothing else may use them.
-            model: The model of all of them; payloads may differ.
-            joints: n names.
+            batch: Simulations to compute in, one per robot, with `model`; payloads may differ. Nothing else may use
+                them.
             nstep, timestep: Physics steps per control period, their length in s; (num,) each.
 
         Raises:
@@ -128,9 +127,7 @@ class AnalyticInverse:
     def __call__(self, periods: ListOf[Period], near: Array) -> Array:
         """Return the targets to send, (num, n) rad, not limited to any range.
 
-        Args:
-            periods: The coming one and `ahead` more.
-            near: Unused; ProbingInverse needs it.
+        `periods` are the coming one and `ahead` more; only ProbingInverse uses `near`.
         """
         held = np.stack([self._targets_in_force(period) for period in periods])
         if not self.ahead:
@@ -142,9 +139,9 @@ class AnalyticInverse:
 
     def _targets_in_force(self, period: Period) -> Array:
         way, gain = period.next_qpos - period.qpos, period.next_qvel - period.qvel
-        known = np.stack([self.h * period.qvel, self.h * period.next_qvel, way])
-        qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self.before, known)  # at which physics steps begin
-        before = np.einsum("ibkx,bkj->ikj", self.speeds, known) / self.h
+        ends = np.stack([self.h * period.qvel, self.h * period.next_qvel, way])
+        qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self.before, ends)  # at which physics steps begin
+        before = np.einsum("ibkx,bkj->ikj", self.speeds, ends) / self.h
         after, mean = before[1:], lambda x: np.einsum("ik,ikj->kj", self.share, x)
         torque = self._torque(mean(qpos), mean(before[:-1]), gain / self.dt, period.friction)
         torque += self.damping * (mean(after) - mean(before[:-1]))
@@ -199,9 +196,9 @@ class AnalyticInverse:
         """
         i = np.arange(count + 1.0)
         shape = np.linalg.pinv([[count, count**2], [i.sum(), (i**2).sum()]])  # α, β of v = v_0 + α i + β i²
-        known = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
+        weights = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
         speeds, before = np.zeros((rows + 1, 3)), np.zeros((rows, 3))
-        speeds[: count + 1] = np.stack([i, i**2], axis=1) @ known + [1.0, 0.0, 0.0]
+        speeds[: count + 1] = np.stack([i, i**2], axis=1) @ weights + [1.0, 0.0, 0.0]
         before[1:count] = speeds[1:count].cumsum(axis=0)
         return before, speeds
 
@@ -239,8 +236,8 @@ class ProbingInverse:
 
         error = target_errors(near[None])[0]
         wide = np.clip(PROBE_SCALE_RATIO * np.abs(error) / PROBES[-1], MIN_PROBE_SCALE, 1.0)
-        asked = PROBES[PROBES != 0, None, None] * wide
-        probed = np.insert(target_errors(near + asked), len(PROBES) // 2, error, axis=0)
+        probes = PROBES[PROBES != 0, None, None] * wide
+        probed = np.insert(target_errors(near + probes), len(PROBES) // 2, error, axis=0)
         more, slope = _crossing(_rising(probed / wide))
         away = near - periods[0].qpos
         saturated = (slope <= MIN_SLOPE) & (error * np.sign(away) > MIN_SLOPE * np.abs(away))  # far beyond a limit

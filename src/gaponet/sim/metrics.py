@@ -89,14 +89,13 @@ class Run:
     dt: float
     qpos_real: Array
     qpos_sim: Array
-    recorded: tuple[int, ...] | None = None  # columns that the recording holds; None for all
+    recorded: tuple[int, ...]  # columns that the recording holds
 
     @classmethod
     def of(cls, real: Sequence, simulated: Array, robot: RobotSpec) -> Run:
         """Pair a recording with simulated positions of all joints, (T, n_all) rad."""
         op = robot.operated_index
-        unknown = real.meta.unrecorded
-        held = tuple(i for i, j in enumerate(robot.operated) if j not in unknown) if unknown else None
+        held = tuple(i for i, j in enumerate(robot.operated) if j not in real.meta.unrecorded)
         return cls(real.meta, real.dt, real.qpos[:, op], np.asarray(simulated)[:, op], held)
 
     @property
@@ -104,10 +103,8 @@ class Run:
         """e after each step, (T − 1, n) rad, without the common start."""
         return (self.qpos_sim - self.qpos_real)[1:]
 
-    def holds(self, columns: list[int] | None) -> list[int] | None:
-        """Return the columns, out of these (None: all), that the recording holds; None for all."""
-        if self.recorded is None:
-            return columns
+    def holds(self, columns: list[int] | None) -> list[int]:
+        """Return the columns, out of these (None: all), that the recording holds."""
         return [i for i in self.recorded if columns is None or i in columns]
 
 
@@ -160,9 +157,8 @@ def _mean(rows: list[_Row]) -> _Row:
 
 def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
     """Return a sequence's metrics over these columns; nothing if it holds none of them."""
-    if (held := run.holds(columns)) == []:
+    if not (c := run.holds(columns)):
         return []
-    c = slice(None) if held is None else held
     error = run.error[:, c].astype(float)
     size = np.abs(error)
     real, sim = run.qpos_real[1:, c].astype(float), run.qpos_sim[1:, c].astype(float)
@@ -194,6 +190,6 @@ def _mean_correlation(real: Array, sim: Array) -> float:
 
 def _horizons(run: Run) -> _Row:
     """Return the mean |error| at horizons after the start, over the last half of each, and over the whole motion."""
-    error = np.abs(run.error if run.recorded is None else run.error[:, list(run.recorded)])
+    error = np.abs(run.error[:, list(run.recorded)])
     lasts = {f"{s:g}": last for s in HORIZONS_S if (last := max(round(s / run.dt), 1)) <= len(error)}
     return {h: error[last // 2 : last].mean() for h, last in lasts.items()} | {"whole": error.mean()}

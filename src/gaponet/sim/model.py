@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import GAPONetError, RobotError, UsageError
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot
 from gaponet.robot.freeze import freeze, units_per_si
 from gaponet.robot.mjcf import compile_spec, read_mjcf
 from gaponet.robot.servo_fields import SERVO_TERMS
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
     from mujoco.batch import Batch
+
+    from gaponet.data.store import Dataset
 
 
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
@@ -44,11 +47,11 @@ def build_model(
 ) -> mujoco.MjModel:
     """Return the nominal simulator of a robot with a payload.
 
-    Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has, in the
-    order of `robot.joint_names`. The physics step is the robot's, stretched a little where it does not divide dt.
+    Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has. Degrees
+    of freedom and actuators are in the order of `robot.joint_names`, without locked joints. The physics step is the
+    robot's, stretched a little where it does not divide dt.
 
     Args:
-        robot: The robot.
         payload_mass: Mass in each hand named by `payload_side`, kg.
         payload_side: "both" (every mount), or the side of one mount.
         dt: Control period, s; default robot.dt.
@@ -62,9 +65,9 @@ def build_model(
     spec = build_spec(robot, payload_mass, payload_side, dt, locked, physics_only)
     model = compile_spec(spec, robot.mjcf)
     if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
-        known = {j.name for j in spec.joints}
+        names = {j.name for j in spec.joints}
         raise RobotError(
-            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(known))}), but robot.toml names "
+            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(names))}), but robot.toml names "
             f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
         )
     address = [model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked]
@@ -120,17 +123,15 @@ def build_spec(
 def idle_joints(robot: RobotSpec, moved: tuple[str, ...]) -> tuple[str, ...]:
     """Return the joints of limbs without a moving joint: on a fixed base they share no dynamics with the rest.
 
-    Args:
-        robot: The robot.
-        moved: Names of the joints that a command moves, or holds away from home.
+    `moved` names the joints that a command moves, or holds away from home.
     """
     model = build_model(robot)
-    limb = {name: int(model.dof_treeid[model.joint(name).dofadr[0]]) for name in robot.joint_names}
+    limb = dict(zip(robot.joint_names, model.dof_treeid.tolist(), strict=True))
     busy = {limb[name] for name in moved}
     return tuple(name for name in robot.joint_names if limb[name] not in busy)
 
 
-def qpos_range(model: mujoco.MjModel) -> np.ndarray:
+def qpos_range(model: mujoco.MjModel) -> Array:
     """Joint limits, (n, 2), rad; ±inf where a joint is unlimited."""
     limited = model.jnt_limited.astype(bool)[:, None]
     return np.where(limited, model.jnt_range, [-np.inf, np.inf])
@@ -158,7 +159,6 @@ def require_stored_robot(holder: Path, robot: RobotSpec, error: type[GAPONetErro
 
     Args:
         holder: Run or dataset; `robot` itself is returned for one of a version that stored none.
-        robot: The robot that is to be used with it.
         error: Raised if the robots differ.
         hint: What to do about it.
     """
@@ -179,6 +179,24 @@ def require_same_robot(
             f"gains or inertias. Use {use}"
         )
     return own
+
+
+def dataset_robot(data: Dataset, run: Path | None = None) -> RobotSpec:
+    """Return a dataset's robot with the gains that all its recordings state.
+
+    Args:
+        run: Run or robot folder that is used with the dataset. Its robot is used if the dataset stores none, and the
+            gains of the dataset's robot.toml if it was fitted with them.
+    """
+    stored = None if run is None else run if (run / "robot.toml").is_file() else run / STORED_ROBOT
+    own = load_robot(stored) if stored is not None and (stored / "robot.toml").is_file() else None
+    if own is not None and stored != run and not has_stored_robot(data.path):
+        return own
+    robot, gains = load_stored_robot(data.path, data.robot_name), {e.meta.recorded_gains for e in data.entries}
+    recorded = robot.with_gains(*gains.pop()) if len(gains) == 1 else robot
+    if recorded is robot or own is None:
+        return recorded
+    return robot if model_hash(own.before_identification) == model_hash(robot.before_identification) else recorded
 
 
 def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
@@ -254,8 +272,6 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
             rgba=(0.8, 0.25, 0.2, 1),
         )  # fmt: skip
 
-
-Array = np.ndarray
 
 TABLE = "gaponet_table"
 IMPEDANCE = 0.5  # of the contact: with a constant one its stiffness in N/m does not depend on the posture

@@ -12,16 +12,16 @@ from typing import Protocol
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.executor import LOCAL, open_pool
 from gaponet.base.progress import no_progress
 from gaponet.data.pair import SimulatedReplay
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import Batch, BatchSim, Condition
+from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import LOOSE_IMPEDANCE, STIFF_MOBILITY, idle_joints, model_hash
 
-Array = np.ndarray
 CHUNK = 256  # simulations side by side
 BATCH = 64  # sequences paired together; what an interruption can cost
 
@@ -53,7 +53,7 @@ def replay(
     Args:
         sequences: Recordings; payload, period and gains of each are the simulation's.
         robot: The nominal simulator.
-        corrector: Corrects targets; None for the nominal simulator.
+        corrector: Corrects targets.
         nthread: Threads, 0 for all cores.
         progress: Called with control steps done and in all.
         lock_idle: Clamp limbs that no command moves at home: faster, and equal up to rounding for others.
@@ -61,13 +61,20 @@ def replay(
     """
     idle: list[tuple[str, ...]] = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
     locked = [_held(s, robot, limbs) for s, limbs in zip(sequences, idle, strict=True)]
-    total = sum(len(s) - 1 for s in sequences)
-    done = 0
+    digest, total, done = model_hash(robot), sum(len(s) - 1 for s in sequences), 0
     replays: dict[int, SimulatedReplay] = {}
     for chunk in _chunks(sequences, locked):
-        part, clamped = [sequences[i] for i in chunk], locked[chunk[0]]
+        part, clamped, home = [sequences[i] for i in chunk], locked[chunk[0]], np.array(robot.qpos_home)
+        joints = tuple(joint for joint, _ in clamped)
+        home[robot.index(joints)] = [angle for _, angle in clamped]
+        sim = BatchSim(replace(robot, qpos_home=home), [Condition.of(s, robot) for s in part], nthread, joints)
+        if creeps:  # MuJoCo's own mobility and impedance
+            sim.batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
+            sim.batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
         tell = lambda k, before=done: progress(before + k, total)  # noqa: E731
-        replays |= dict(zip(chunk, _roll_out(part, robot, corrector, nthread, tell, clamped, creeps), strict=True))
+        out = rollout(sim, part, corrector, tell)
+        for i, s in enumerate(part):
+            replays[chunk[i]] = SimulatedReplay(digest, *out[:, : len(s), i].astype(np.float32))
         done += sum(len(s) - 1 for s in part)
     return [replays[i] for i in range(len(sequences))]
 
@@ -117,32 +124,6 @@ def _chunks(sequences: ListOf[Sequence], locked: list[Clamped]) -> Iterator[list
             yield group[start : start + CHUNK]
 
 
-def _roll_out(
-    sequences: list[Sequence],
-    robot: RobotSpec,
-    corrector: Corrector | None,
-    nthread: int,
-    progress: Callable[[int], None],
-    clamped: Clamped,
-    creeps: bool,
-) -> list[SimulatedReplay]:
-    """Replay sequences that have the same joints clamped."""
-    digest, locked, home = model_hash(robot), tuple(j for j, _ in clamped), np.array(robot.qpos_home)
-    home[robot.index(locked)] = [at for _, at in clamped]
-    robot = replace(robot, qpos_home=home)
-    sim = BatchSim(robot, [Condition.of(s, robot) for s in sequences], nthread, locked)
-    if creeps:
-        _loosen_friction(sim.batch)
-    out = rollout(sim, sequences, corrector, progress)
-    return [SimulatedReplay(digest, *out[:, : len(s), i].astype(np.float32)) for i, s in enumerate(sequences)]
-
-
-def _loosen_friction(batch: Batch) -> None:
-    """Give friction MuJoCo's own mobility and impedance, with which it creeps."""
-    batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
-    batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
-
-
 def rollout(
     sim: BatchSim,
     sequences: ListOf[Sequence],
@@ -152,12 +133,8 @@ def rollout(
 ) -> Array:
     """Step a batch, one simulation per sequence, from the recorded start under the recorded commands.
 
-    Args:
-        sim: One simulation per sequence.
-        sequences: Recordings.
-        corrector: Corrects targets.
-        progress: Called with the control steps done.
-        touch: Rows after which a simulation goes on from the recording, (T, k).
+    A simulation goes on from the recording after the rows of `touch`, (T, k). `progress` is called with the control
+    steps done.
 
     Returns:
         qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad. Locked joints stand at
@@ -210,29 +187,19 @@ def pair_dataset(
     todo = sorted((e for e in entries or dataset.entries if not dataset.has_replay(e, digest)), key=lambda e: e.rows)
     if not todo:
         return 0
-    with dataset.writing_replays():
-        _pair(dataset, robot, todo, progress, lock_idle, executor)
-    return len(todo)
-
-
-def _pair(
-    dataset: Dataset, robot: RobotSpec, todo: list[Entry], progress: Progress, lock_idle: bool,
-    executor: str | Executor,
-) -> None:  # fmt: skip
     total, done = sum(e.rows - 1 for e in todo), 0
     parts = [todo[start : start + BATCH] for start in range(0, len(todo), BATCH)]
-    sequences = map(dataset.sequences, parts)
-    work = partial(replay, robot=robot, lock_idle=lock_idle)
-    with ExitStack() as stack:
+    sequences, work = map(dataset.sequences, parts), partial(replay, robot=robot, lock_idle=lock_idle)
+    with dataset.writing_replays(), ExitStack() as stack:
         if executor == LOCAL:
             replayed: Iterator[list[SimulatedReplay]] = (
                 work(part, progress=lambda k, of: progress(done + k, total)) for part in sequences
             )
         else:
-            pool = stack.enter_context(open_pool(executor, 0, 1))
-            replayed = pool.map(partial(work, nthread=1), sequences)
+            replayed = stack.enter_context(open_pool(executor, 0, 1)).map(partial(work, nthread=1), sequences)
         for part, replays in zip(parts, replayed, strict=True):
             for entry, simulated in zip(part, replays, strict=True):
                 dataset.write_replay(entry, simulated)
             done += sum(e.rows - 1 for e in part)
             progress(done, total)
+    return len(todo)

@@ -10,14 +10,13 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.robot.collision import Collision
 from gaponet.robot.finding import LEVELS, Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
-
-Array = np.ndarray
 
 HOLD_S, HOLD_START_RAD = 60.0, 0.01  # of a hold at home, and distance from home at its start
 MAX_REST_SPEED = 0.05  # rad/s in the last ten seconds of the hold
@@ -41,7 +40,6 @@ def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures
     """Step the nominal simulator of a robot and return findings, worst first.
 
     Args:
-        robot: Loaded by load_robot.
         payloads: kg in every mount.
         postures: Postures from the logs, (k, n) rad; default random ones within the joint ranges.
 
@@ -54,16 +52,16 @@ def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures
         Collision(robot, model)  # raises where it is wrong
     low, high = np.clip(robot.qpos_range.T, -np.pi, np.pi)
     places = np.random.default_rng(0).uniform(low, high, (100, len(robot.kp))) if postures is None else postures
-    found = [
+    findings = [
         *_joints(robot), *_loads(robot, models), *_limits(robot, model), *_couplings(robot, model),
         *_contacts(robot, places, postures is not None), *_steps(robot, models, places),
     ]  # fmt: skip
-    if not any(f.level == "error" for f in found):
-        found += _hold(robot, payloads)
+    if not any(f.level == "error" for f in findings):
+        findings += _hold(robot, payloads)
     if not robot.payload_mounts:
         text = "no [[payload_mount]]: payloads other than 0 will be refused; add one to robot.toml if it carries any"
-        found.append(Finding("warning", "payload", text))
-    return sorted(found, key=lambda f: -LEVELS.index(f.level))
+        findings.append(Finding("warning", "payload", text))
+    return sorted(findings, key=lambda f: -LEVELS.index(f.level))
 
 
 def _joints(robot: RobotSpec) -> Iterator[Finding]:

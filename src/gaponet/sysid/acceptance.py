@@ -59,14 +59,8 @@ def cross_validation(sequences: ListOf[Sequence], validation: ListOf[Sequence], 
     fold = {
         (joints, name): i % count for joints, names in motions.items() if len(names) > 1 for i, name in enumerate(names)
     }
-    place = [fold.get((s.meta.unrecorded, s.meta.independent_motion)) for s in every]
-    return [
-        (
-            [s for s, p in zip(every, place, strict=True) if p != k],
-            [s for s, p in zip(every, place, strict=True) if p == k],
-        )
-        for k in range(count)
-    ]
+    pairs = [(s, fold.get((s.meta.unrecorded, s.meta.independent_motion))) for s in every]
+    return [([s for s, k in pairs if k != i], [s for s, k in pairs if k == i]) for i in range(count)]
 
 
 @dataclass(frozen=True)
@@ -79,12 +73,11 @@ class Identified:
         chosen: Best candidate: given, joints (each by itself), whole (all together), limbs (kinematic chains), mixed,
             torque or ramp.
         warnings: Parameters at a bound, what to check, and what the recordings do not determine (last).
-        std: Joint → field → standard error; empty for joints with a shared servo model.
+        std: Joint → field → standard error.
         comparisons: Terms of the servo model in the order in which they were fitted; then torque and speed limits.
         table_fit: Result for the table; None if no tip may touch anything.
-        shared: Type of servo whose joints were given one servo model, with the errors before and after.
         by_joint: Joint → mean |error| before and after, rad.
-        covariance: Joint → fields and their covariance; without joints with a shared servo model.
+        covariance: Joint → fields and their covariance.
         undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
         held_out: Recordings that were not fitted and the robot that was fitted without them, one pair for each fold of
             a cross-validation; `robot` itself where nothing was fitted to them afterwards.
@@ -98,7 +91,6 @@ class Identified:
     std: Std
     comparisons: tuple[Comparison, ...]
     table_fit: TableFit | None
-    shared: tuple[Comparison, ...] = ()
     by_joint: dict[str, tuple[float, float]] = field(default_factory=dict)
     covariance: Covariance = field(default_factory=dict)
     undetermined: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -121,44 +113,40 @@ class Identified:
         )
 
 
-class JudgedFold:
-    """Errors of values on whole motions in the robot's simulator; repetitions of a motion count as one."""
-
-    def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float, nthread: int) -> None:
-        """Judge by sequences; rows with a tip below `contact_height`, m, do not count."""
-        self.rollouts = RobotRollouts(
-            list(sequences), robot, nthread, touch=_contact_rows(sequences, robot, contact_height)
-        )
-        # Repetitions and gains of what one unit plays with one payload are one judge.
-        keys = [(s.meta.motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
-        each = [np.array([key == one for key in keys])[self.rollouts.window] for one in dict.fromkeys(keys)]
-        self.motions = [rows for rows in each if rows.any()]
-        self.names = [key[0] for key, rows in zip(dict.fromkeys(keys), each, strict=True) if rows.any()]
-        self._sums_of: dict[bytes, Array] = {}
-
-    def sums(self, values: Values) -> tuple[Array, Array]:
-        """Return the sums of |error| over counted rows, rad, and their numbers, by motion and joint, (motions, n)."""
-        key = b"".join(f.encode() + values[f].tobytes() for f in sorted(values))
-        if key not in self._sums_of:
-            size = np.abs(self.rollouts.flat_errors({f: v[None] for f, v in values.items()}))[0]
-            self._sums_of[key] = np.stack([size[:, rows].sum(axis=1) for rows in self.motions])
-        return self._sums_of[key], np.stack([self.rollouts.recorded[:, rows].sum(axis=1) for rows in self.motions])
-
-
 class Judge:
-    """Errors of candidates on the motions that they were not fitted to.
+    """Errors of candidates on whole motions that they were not fitted to, in the simulator of the whole robot.
 
     A candidate is a list of values (n,): one for each fold, fitted without its motions; then perhaps one that was
-    fitted to all recordings, which no motion judges.
+    fitted to all recordings, which no motion judges. Repetitions of a motion count as one.
     """
 
-    def __init__(self, folds: ListOf[JudgedFold]) -> None:
-        self.folds = folds
+    def __init__(self, folds: ListOf[ListOf[Sequence]], robot: RobotSpec, contact_height: float, nthread: int) -> None:
+        """Take the recordings that judge, fold by fold; rows with a tip below `contact_height`, m, do not count."""
+        self._folds: list[tuple[RobotRollouts, list[Array]]] = []  # rollouts, and the rows of each motion
+        names = []
+        for sequences in folds:
+            touch = _contact_rows(sequences, robot, contact_height)
+            rollouts = RobotRollouts(list(sequences), robot, nthread, touch=touch)
+            # Repetitions and gains of what one unit plays with one payload are one judge.
+            keys = [(s.meta.motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
+            rows = {one: np.array([key == one for key in keys])[rollouts.window] for one in dict.fromkeys(keys)}
+            rows = {key: counted for key, counted in rows.items() if counted.any()}
+            self._folds.append((rollouts, list(rows.values())))
+            names += [motion for motion, *_ in rows]
+        self.names = np.array(names)  # of all motions, (motions,)
+        self._sums_of: dict[tuple[int, bytes], Array] = {}
 
     def _sums(self, candidate: ListOf[Values]) -> tuple[Array, Array]:
         """Return the sums of |error| over counted rows, rad, and their numbers, by motion and joint, (motions, n)."""
-        total, count = zip(*(fold.sums(v) for fold, v in zip(self.folds, candidate, strict=False)), strict=True)
-        return np.concatenate(total), np.concatenate(count)
+        totals, counts = [], []
+        for k, ((rollouts, motions), values) in enumerate(zip(self._folds, candidate, strict=False)):
+            key = k, b"".join(f.encode() + values[f].tobytes() for f in sorted(values))
+            if key not in self._sums_of:
+                size = np.abs(rollouts.flat_errors({f: v[None] for f, v in values.items()}))[0]
+                self._sums_of[key] = np.stack([size[:, rows].sum(axis=1) for rows in motions])
+            totals.append(self._sums_of[key])
+            counts += [rollouts.recorded[:, rows].sum(axis=1) for rows in motions]
+        return np.concatenate(totals), np.stack(counts)
 
     def errors(self, candidate: ListOf[Values]) -> Array:
         """Return the mean |error| of each motion, (motions,) rad."""
@@ -179,8 +167,7 @@ class Judge:
 
         Units and payloads of a motion count as one, since a robot that is identified already needs evidence to change.
         """
-        motions = np.array([name for fold in self.folds for name in fold.names])
-        errors = {name: self._joint_errors(v, motions) for name, v in candidates.items()}  # (motions, n), NaN: not held
+        errors = {name: self._joint_errors(v) for name, v in candidates.items()}  # (motions, n), NaN: not held
         given, *others = errors
         winner = np.zeros(errors[given].shape[1], int)
         for i in range(len(winner)):
@@ -191,13 +178,12 @@ class Judge:
         mixed = [_by_joint(each, winner) for each in zip(*candidates.values(), strict=True)]
         return ("mixed", mixed) if winner.any() else (given, candidates[given])
 
-    def _joint_errors(self, candidate: ListOf[Values], motions: Array) -> Array:
+    def _joint_errors(self, candidate: ListOf[Values]) -> Array:
         """Return the mean |error| of each motion and joint, (motions, n) rad; NaN where a motion does not hold it."""
         total, count = self._sums(candidate)
         with np.errstate(invalid="ignore"):
-            return np.stack([
-                total[motions == one].sum(axis=0) / count[motions == one].sum(axis=0) for one in dict.fromkeys(motions)
-            ])  # fmt: skip
+            same = [self.names == name for name in dict.fromkeys(self.names)]
+            return np.stack([total[rows].sum(axis=0) / count[rows].sum(axis=0) for rows in same])
 
     def best(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
         """Return name and values of the best candidate.

@@ -47,8 +47,7 @@ def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
 def first_values(robot: RobotSpec) -> Values:
     """Return the robot's own values, (n,) each. Damping is the MJCF's; below zero it is taken from the servo's kd."""
     model, op = build_model(replace(robot, table=None)), robot.operated_index
-    dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
-    passive = {f: np.array(getattr(model, f"dof_{f}")[dof]) for f in ("damping", "frictionloss", "armature")}
+    passive = {f: np.array(getattr(model, f"dof_{f}")[op]) for f in ("damping", "frictionloss", "armature")}
     return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS)}
 
 
@@ -122,14 +121,13 @@ class Bounds:
         op, self.n = robot.operated_index, len(robot.operated)
         self._joints, self.kd = robot.operated, robot.kd[op]
         model = build_model(replace(robot, table=None))
-        dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
         kp, limit = robot.kp[op], robot.effort_limit[op]
         self.first = first_values(robot)
         self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
         self.unexcited = excitation < MIN_EXCITATION_RAD
         least_inertia = kp * (MIN_STEPS_PER_RADIAN * model.opt.timestep) ** 2
-        resolved = least_inertia - (model.dof_M0[dof] - model.dof_armature[dof])
+        resolved = least_inertia - (model.dof_M0 - model.dof_armature)[op]
         self.start: Values = {f: self.first[f] for f in CLASSIC} | {
             "delay": np.maximum(self.first["delay"], START_DELAY_S),
             "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),
@@ -154,7 +152,7 @@ class Bounds:
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
-        axes, found = Axes(self, names, values), []
+        axes, warnings = Axes(self, names, values), []
         x = axes.normalize(values)
         for i, joint in enumerate(self._joints):
             for k, f in enumerate(names):
@@ -167,8 +165,8 @@ class Bounds:
                 else:
                     end = "least" if below else "most"
                     what = f"{values[f][i]:.4g}, the {end} that is tried; {SERVO_FIELDS[f].advice}"
-                found.append(f"{joint}: {f} ended at its bound: {what}")
-        return tuple(found)
+                warnings.append(f"{joint}: {f} ended at its bound: {what}")
+        return tuple(warnings)
 
 
 class Axes:

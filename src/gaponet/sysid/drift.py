@@ -104,13 +104,7 @@ class Drift:
 
 
 def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf[Sequence], nthread: int = 0) -> Drift:
-    """Compare recordings with the stored uncertainty of a robot.
-
-    Args:
-        robot: Identified robot.
-        uncertainty: Its uncertainty.
-        sequences: Recordings of a robot that should be the same.
-        nthread: Threads, 0 for all cores.
+    """Compare recordings of a robot that should be the same with the stored uncertainty of an identified robot.
 
     Raises:
         UsageError: The recordings are too short, or move no joint that was identified.
@@ -135,7 +129,10 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     }
     far = {j: by for j, by in times.items() if by > FAR_RATIO}
     overdispersion = np.stack([np.maximum(uncertainty.array(j, "overdispersion"), 1.0) for j in joints])
-    against = _contradictions(own.by_recording(), overdispersion, uncertainty, joints, fields)
+    against, rest = list[Contradiction](), own.by_recording()  # the farthest first; each is left out of the others
+    while len(rest.names) > 1 and (worst := _farthest(rest, overdispersion, uncertainty, joints, fields)):
+        against.append(worst)
+        rest = rest.without({worst.recording})
     aside = {a.recording for a in against}
     contradictory = len(aside) > MAX_SET_ASIDE * len(own.names)
     own = own if contradictory else own.without(aside)
@@ -153,26 +150,15 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     moved = [m for f in COMMON_FIELDS if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))]
     largest: dict[str, ParameterChange] = {m.joint: m for m in moved}
     for one in each:
-        found, first = one.explained(threshold)
-        moved += found
+        changes, first = one.explained(threshold)
+        moved += changes
         largest |= {one.name: first} if first else {}
     verdict: Verdict = "contradictory" if contradictory else "drifted" if moved or far else "same"
     seconds = float(sum(s.duration for s in sequences))
     return Drift(
-        verdict, tuple(moved), largest, {one.name: one.min_effect for one in each}, against,
+        verdict, tuple(moved), largest, {one.name: one.min_effect for one in each}, tuple(against),
         _advice(verdict, moved, against, joints, far), threshold, seconds, far,
     )  # fmt: skip
-
-
-def directions(uncertainty: ParameterUncertainty, joint: str) -> Array:
-    """Return the change of the axes and play by a change of one parameter in SI units, column by column, (Q, Q).
-
-    A softer motor has the friction that it had, so its friction over kp is larger.
-    """
-    found = np.eye(len(uncertainty.fields) + 1)
-    for i, (field, value) in enumerate(zip(uncertainty.fields, uncertainty.joints[joint].values, strict=True)):
-        found[i, uncertainty.fields.index("kp")] -= value * (SERVO_FIELDS[field].axis == "over kp")
-    return found
 
 
 class _Joint:
@@ -191,7 +177,12 @@ class _Joint:
         rows: int, repeatability: float,
     ) -> None:  # fmt: skip
         self.name, self.fields = name, (*uncertainty.fields, PLAY)
-        step_covariance, by_field = uncertainty.array(name, "gauss_newton_covariance"), directions(uncertainty, name)
+        # Change of the axes and play by a change of one parameter in SI units, column by column: a softer motor has the
+        # friction that it had, so its friction over kp is larger.
+        by_field = np.eye(len(self.fields))
+        over_kp = [SERVO_FIELDS[f].axis == "over kp" for f in uncertainty.fields]
+        by_field[:-1, self.fields.index("kp")] -= uncertainty.array(name, "values") * over_kp
+        step_covariance = uncertainty.array(name, "gauss_newton_covariance")
         variance = scatter + information @ step_covariance @ information
         size = np.sqrt(np.maximum(np.diag(variance), 1e-30))
         self.weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
@@ -233,13 +224,13 @@ def _together(joints: ListOf[_Joint], number: int, threshold: float) -> Paramete
     total = max(information.sum(), 1e-300)
     by, error = float(pulls.sum() / total), float(total**-0.5)
     moves = float(np.sqrt(np.mean([(by * j.effect[number]) ** 2 for j in joints])))
-    found = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
+    change = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
     alone = max((abs(m.sigmas) for j in joints if (m := j.explained(np.inf)[1])), default=0.0)
-    if abs(found.sigmas) < max(threshold, alone) or moves < np.mean([j.min_effect for j in joints]):
+    if abs(change.sigmas) < max(threshold, alone) or moves < np.mean([j.min_effect for j in joints]):
         return None
     for j in joints:
         j.gradient = j.gradient - by * j.columns[:, number]
-    return found
+    return change
 
 
 def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
@@ -248,23 +239,10 @@ def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
     return covariance @ columns.T @ weight @ pull, np.sqrt(np.maximum(np.diag(covariance), 1e-300))
 
 
-def _contradictions(
-    own: Evidence, overdispersion: Array, uncertainty: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
-) -> tuple[Contradiction, ...]:
-    """Return the recordings that differ from the others by more than recordings scatter, the farthest first.
-
-    Each is then left out of the others; its farthest parameter is named.
-    """
-    found: list[Contradiction] = []
-    while len(own.names) > 1 and (worst := _farthest(own, overdispersion, uncertainty, joints, fields)):
-        found.append(worst)
-        own = own.without({worst.recording})
-    return tuple(found)
-
-
 def _farthest(
     own: Evidence, overdispersion: Array, uncertainty: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
 ) -> Contradiction | None:
+    """Return the recording that differs most from the others, by more than recordings scatter, and its field."""
     count, worst = len(own.names), None
     rate = FALSE_CONTRADICTION_RATE / (count * len(joints) * len(fields))
     limit = float(student.isf(rate / 2, min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)))
@@ -289,12 +267,9 @@ def _farthest(
 
 
 def _advice(
-    verdict: Verdict,
-    moved: ListOf[ParameterChange],
-    against: ListOf[Contradiction],
-    joints: ListOf[str],
+    verdict: Verdict, moved: ListOf[ParameterChange], against: ListOf[Contradiction], joints: ListOf[str],
     far: Mapping[str, float],
-) -> str:
+) -> str:  # fmt: skip
     """Return what to do."""
     if verdict == "same":
         return "nothing to do"

@@ -20,7 +20,7 @@ from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import slopes
-from gaponet.sysid.problem import MIN_CLUSTERS, cluster_of_rows
+from gaponet.sysid.problem import MIN_CLUSTERS, cluster_sums
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.table_contact import contact_height, tip_heights
 from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, Provenance, prior_std, to_axes
@@ -69,32 +69,11 @@ class Evidence:
         rows = self.rows * keep.mean()  # windows are as long as each other
         return Evidence(self.gradients[:, keep], self.information[:, keep], rows, order, rest, self.window_rms)
 
-    def overdispersion(self) -> Array:
-        """Return the variance of the clusters' summed gradients over that of independent rows, (n, Q)."""
-        own = np.einsum("nckk->nk", self.information)
-        scatter = np.einsum("nkk->nk", gradient_covariance(self.gradients))
-        return np.asarray(np.divide(scatter, own, out=np.zeros_like(own), where=own > 0))
-
-    def gauss_newton_step(self, overdispersion: Array) -> tuple[Array, Array]:
-        """Return the step that these recordings ask for by themselves, (n, Q), and its covariance."""
-        information = self.information.sum(axis=1)
-        inverse = inverted(information)
-        scatter = widened(information, overdispersion)
-        return -(inverse @ self.gradients.sum(axis=1)[..., None])[..., 0], inverse @ scatter @ inverse
-
 
 def widened(information: Array, overdispersion: Array) -> Array:
     """Return the covariance of summed gradients with this overdispersion, (…, Q, Q)."""
     root = np.sqrt(overdispersion)
     return np.asarray(root[..., :, None] * information * root[..., None, :])
-
-
-def _clustered(x: Array, window: Array) -> tuple[Array, Array]:
-    """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster, (C,)."""
-    cluster, parts = cluster_of_rows(window)
-    each = np.zeros((len(x), int(cluster.max()) + 1, *x.shape[2:]))
-    np.add.at(each, (slice(None), cluster), x)  # type: ignore[arg-type]
-    return each, np.arange(each.shape[1]) // parts
 
 
 def gradient_covariance(gradients: Array) -> Array:
@@ -131,10 +110,10 @@ def evidence(
     play = 0.5 / ERROR_SCALE_RAD * side * (rollouts.counted & rollouts.recorded[..., None])
     jac = np.concatenate([jac, play.reshape(bounds.n, -1, 1)], axis=-1)
     weight = 1 / np.sqrt(1 + here**2)
-    gradients, window = _clustered(jac * (weight * here)[..., None], rollouts.window)
+    gradients, window = cluster_sums(jac * (weight * here)[..., None], rollouts.window)
     each = ((j[None, :, :, None], (w[:, None] * j)[None, :, None, :]) for j, w in zip(jac, weight, strict=True))
     # A joint at a time, for memory.
-    information = np.concatenate([_clustered(a * b, rollouts.window)[0] for a, b in each])
+    information = np.concatenate([cluster_sums(a * b, rollouts.window)[0] for a, b in each])
     names = [f"{p.meta.motion}{f' ({p.meta.repetition})' * bool(p.meta.repetition)}" for p in parts]
     unique = list(dict.fromkeys(names))
     recording = np.array([unique.index(name) for name in names])
@@ -152,11 +131,9 @@ def estimate_uncertainty(
     held_out: ListOf[HeldOut] = (),
     nthread: int = 0,
 ) -> ParameterUncertainty:
-    """Estimate the parameter uncertainty of a robot that was fitted to recordings.
+    """Estimate the parameter uncertainty of a robot with the values that were fitted to recordings of one robot.
 
     Args:
-        robot: The robot with the fitted values.
-        sequences: Recordings of one robot that it was fitted to.
         judges: Recordings that were not fitted, for the residual; without any, the fitted ones.
         covariances: Joint → fields and their covariance on the axes; of other joints it follows from the recordings and
             from `before`.
@@ -164,18 +141,22 @@ def estimate_uncertainty(
             what both uncertainties explain.
         held_out: Recordings and the robots that were fitted without them, instead of `judges`, if `robot` was fitted to
             them as well.
-        nthread: Threads, 0 for all cores.
     """
     first = first_values(robot)
     fitted_fields = (*CLASSIC, *(f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()))
     fields = before.fields if before else fitted_fields
     own, values = evidence(robot, sequences, fields, nthread=nthread), to_axes(robot, fields)
     grouped = own.by_recording() if len(own.names) >= MIN_CLUSTERS // 4 else own
-    overdispersion, clusters = grouped.overdispersion(), grouped.gradients.shape[1]
+    clusters, independent = grouped.gradients.shape[1], np.einsum("nckk->nk", grouped.information)
+    scatter = np.einsum("nkk->nk", gradient_covariance(grouped.gradients))
+    overdispersion = np.divide(scatter, independent, out=np.zeros_like(independent), where=independent > 0)
     if before:
         old = np.stack([before.array(j, "overdispersion") for j in robot.operated])
         overdispersion = (before.clusters * old + clusters * overdispersion) / (before.clusters + clusters)
-    step, step_covariance = own.gauss_newton_step(np.maximum(overdispersion, 1.0))
+    information = own.information.sum(axis=1)
+    inverse = inverted(information)
+    step = -(inverse @ own.gradients.sum(axis=1)[..., None])[..., 0]
+    step_covariance = inverse @ widened(information, np.maximum(overdispersion, 1.0)) @ inverse
     repeatability = repetition_difference(sequences, robot.operated)
     errors, joints = _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread), {}
     for i, joint in enumerate(robot.operated):
@@ -190,8 +171,7 @@ def estimate_uncertainty(
             covariance = whole[np.ix_(at, at)]
         if not before:
             covariance = inverted(inverted(covariance) + np.diag(prior_std(fields, values[joint]) ** -2))
-        information = own.information[i].sum(axis=0)[:-1, :-1]
-        variance = max(np.trace(covariance @ information), 0.0) / max(own.rows[i], 1)
+        variance = max(np.trace(covariance @ information[i, :-1, :-1]), 0.0) / max(own.rows[i], 1)
         rms = float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2)))
         old_joint = before.joints[joint] if before and not (judges or held_out) else None
         joints[joint] = JointUncertainty(

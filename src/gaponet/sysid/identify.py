@@ -25,7 +25,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import DEFAULT_TERMS, SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Comparison
-from gaponet.sysid.acceptance import HeldOut, Identified, Judge, JudgedFold, Split, cross_validation
+from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.motion_limits import stop_questions, with_speed_limits, with_stops
@@ -37,10 +37,9 @@ from gaponet.sysid.problem import (
     fitted_fields,
     robot_fields,
     standard_errors,
-    undetermined,
 )  # fmt: skip
 from gaponet.sysid.robot_rollouts import cut
-from gaponet.sysid.shared_servo import far_from_published, same_servos, share
+from gaponet.sysid.servo_types import far_from_published
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
 from gaponet.sysid.torque import with_torque
 
@@ -70,13 +69,9 @@ class _SearchProgress:
         self._total, self._done, self._end, self._search = self._last_of[-1], 0, np.inf, 0
         self.tell(0, "inertias along the recordings")
 
-    def tell(self, done: int, what: str) -> None:
-        """Report iterations done, and what comes next."""
+    def tell(self, done: float, what: str) -> None:
+        """Report iterations done, inf after the last search, and what comes next."""
         self._progress(min(done, self._total), self._total, what)
-
-    def finish(self, what: str) -> None:
-        """Report what is done after the last search; no time limit counts it."""
-        self.tell(self._total, what)
 
     def begin(self) -> None:
         """Begin the next search, which may take its share of the time that is left."""
@@ -90,13 +85,17 @@ class _SearchProgress:
         """Return whether the time of the present search is over."""
         return time.monotonic() - self._began > self._end
 
-    def report(self, what: str, joints: tuple[str, ...], rows: Array) -> Callable[[Array], None]:
-        """Return a function that is called in each iteration with the costs (n,) of problems of so many rows (n,)."""
+    def report(self, what: str, joints: tuple[str, ...], rows: Array) -> Callable[[Array], bool]:
+        """Return a function of the costs (n,) of problems of so many rows (n,), which says whether to end the search.
 
-        def tell(cost: Array) -> None:
+        It is called in each iteration.
+        """
+
+        def tell(cost: Array) -> bool:
             each = 1e3 * ERROR_SCALE_RAD * np.sqrt(2 * cost / np.maximum(rows, 1))
             self._done += 1
             self.tell(self._done, f"{what}: {each.mean():.2f} mrad, {joints[int(each.argmax())]} {each.max():.2f}")
+            return self.expired()
 
         return tell
 
@@ -108,7 +107,6 @@ def identify(
     windows: int = WINDOWS,
     terms: tuple[Term, ...] = DEFAULT_TERMS,
     table: bool = True,
-    shared: bool = False,
     nthread: int = 0,
     progress: Progress = lambda done, total, note: None,
     budget: float | None = None,
@@ -127,15 +125,12 @@ def identify(
         windows: Number of rollouts of 8 s, taken evenly from the recordings.
         terms: Terms of the servo model, from TERMS, in the order in which they are fitted.
         table: Fit a table under the robot's tips.
-        shared: Fit one servo model for the joints with one type of servo (robot.servos).
-        nthread: Threads, 0 for all cores.
-        progress: Called in each iteration.
         budget: Time of the searches, s, without the table's; results are the same on every machine only without it.
         stops: Give joints that stayed behind several commands a stop there.
         folds: Folds of the cross-validation, at most; 1 for none.
     """
     splits = cross_validation(sequences, validation, folds)
-    options = (splits, validation, windows, terms, table, shared, nthread, progress, stops)
+    options = (splits, validation, windows, terms, table, nthread, progress, stops)
 
     def fit(one: RobotSpec, seconds: float | None) -> Identified:
         fitted = _fit_robot(sequences, one, *options, seconds)
@@ -146,7 +141,7 @@ def identify(
 
 def _fit_robot(
     sequences: ListOf[Sequence], robot: RobotSpec, splits: ListOf[Split], validation: ListOf[Sequence], windows: int,
-    terms: tuple[Term, ...], table: bool, shared: bool, nthread: int, progress: Progress, stops: bool,
+    terms: tuple[Term, ...], table: bool, nthread: int, progress: Progress, stops: bool,
     budget: float | None,
 ) -> Identified:  # fmt: skip
     """Fit to positions, with the speed limits that the robot's servos have; arguments as of `identify`."""
@@ -158,9 +153,7 @@ def _fit_robot(
         JointFit(JointRollouts(cut(train, windows), robot, contact, nthread), robot, Bounds(robot, train))
         for train in fitted_sets
     ]
-    judge = Judge([
-        JudgedFold(held_out or fits[0].rollouts.parts, robot, contact, nthread) for _, held_out in splits
-    ])  # fmt: skip
+    judge = Judge([held_out or fits[0].rollouts.parts for _, held_out in splits], robot, contact, nthread)
     searches = _SearchProgress(budget, len(terms), len(fits), progress)
     wholes, each = zip(*(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True)
     candidates = {name: [one[name] for one in each] for name in each[0]}
@@ -169,21 +162,12 @@ def _fit_robot(
     base = values if identified or chosen != "given" else candidates["limbs"]
     comparisons, values = _with_terms(fits, wholes, judge, terms, values, base, searches)
     chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
-    joints, whole, first, common = fits[-1], wholes[-1], [one.bounds.first for one in fits], []
+    joints, whole, first = fits[-1], wholes[-1], [one.bounds.first for one in fits]
     errors = standard_errors(whole, values[-1])
-    for servo, places in (same_servos(robot) if shared else {}).items():
-        mine = [
-            share(one.rollouts, v, places, one.bounds.start["armature"][places].mean())
-            for one, v in zip(fits, values, strict=True)
-        ]
-        common.append(judge.compare(servo, values, mine))
-        values, chosen = mine, "whole"
-        errors.std |= {robot.operated[i]: {} for i in places}
-
     fitted, table_fit = with_values(robot, values[-1]) if chosen != "given" else robot, None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, contact), min(h.min() for h in heights)
-        tell = lambda error: searches.finish(f"table {error * 1e3:.2f} mrad")  # noqa: E731
+        tell = lambda error: searches.tell(np.inf, f"table {error * 1e3:.2f} mrad")  # noqa: E731
         table_fit = fit_table(low, fitted, lowest, nthread, tell, validation)
         fitted = table_fit.robot
     if not stops:
@@ -196,19 +180,17 @@ def _fit_robot(
             HeldOut(part, replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high))
             for (_, part), one in zip(splits, robots, strict=False)
         ]
-    unknown = undetermined(whole, values[-1], errors)
     warnings = (
         *joints.bounds.warnings(values[-1], fitted_fields(values[-1])), *stop_questions(given, robot),
-        *far_from_published(fitted), *(text for _, text in unknown.values()),
+        *far_from_published(fitted), *errors.sentences,
     )  # fmt: skip
     before, after = (float(judge.errors(v).mean()) for v in (first, values))
     by_joint = zip(*(judge.errors_by_joint(v).tolist() for v in (first, values)), strict=True)
-    searches.finish("the fitted robot, and recorded torque")
+    searches.tell(np.inf, "the fitted robot, and recorded torque")
     return Identified(
-        fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit, tuple(common),
-        dict(zip(robot.operated, by_joint, strict=True)),
-        {j: errors.covariance[j] for j in robot.operated if errors.std[j]},
-        {joint: fields for joint, (fields, _) in unknown.items()}, tuple(held_out),
+        fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit,
+        dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,
+        errors.undetermined, tuple(held_out),
     )  # fmt: skip
 
 
@@ -220,17 +202,15 @@ def _classic_candidates(
     given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
     searches.begin()
     report = searches.report("joints, each on its own", names, joints.rollouts.rows)
-    late = joints.search(("offset", "delay"), given, only=True, expired=searches.expired)
+    late = joints.search(("offset", "delay"), given, only=True, report=lambda cost: searches.expired())
     joints.prior.residual = residual  # of other fields' searches
-    alone = joints.search(CLASSIC, bounds.start, joints.regressed(), report=report, expired=searches.expired)
+    alone = joints.search(CLASSIC, bounds.start, joints.regressed(), report=report)
     joints.prior.update_correlation_time(joints.rollouts, alone)
     whole = joints.robot_fit(nthread)
     searches.begin()
     report = searches.report("whole robot", names, whole.rollouts.rows)
-    together = whole.descend(
-        CLASSIC, bounds.start, (alone, bounds.start), ROBOT_ITERATIONS, report=report, expired=searches.expired
-    )
-    chains = whole.descend_chains(together, lambda names, rows: searches.report("limbs", names, rows), searches.expired)
+    together = whole.descend(CLASSIC, bounds.start, (alone, bounds.start), ROBOT_ITERATIONS, report=report)
+    chains = whole.descend_chains(together, lambda names, rows: searches.report("limbs", names, rows))
     return whole, {
         "given": given, "limbs": chains, "joints": alone, "whole": together, "delay and offset": late,
     }  # fmt: skip
@@ -262,10 +242,8 @@ def _fit_term(
     searches.begin()
     report = searches.report(term, names, joints.rollouts.rows)
     start = values | {f: joints.bounds.guess[f] for f in TERMS[term]}
-    alone = joints.search(TERMS[term], start, report=report, expired=searches.expired)
+    alone = joints.search(TERMS[term], start, report=report)
     if any(SERVO_FIELDS[f].single_joint for f in TERMS[term]):
         return alone, None
     report = searches.report(f"{term}, whole robot", names, whole.rollouts.rows)
-    return alone, whole.descend(
-        robot_fields(alone), alone, (alone,), (POLISH_ITERATIONS,), report=report, expired=searches.expired
-    )
+    return alone, whole.descend(robot_fields(alone), alone, (alone,), (POLISH_ITERATIONS,), report=report)

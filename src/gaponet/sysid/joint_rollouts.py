@@ -51,7 +51,6 @@ class JointRollouts:
             parts: Windows, each at its own control period.
             robot: Its stops, zeros, limits and inertias hold.
             contact_height: Height under which a tip may touch something, m.
-            nthread: Threads of the compiled rollouts, 0 for all cores.
         """
         self.parts, self.robot, self.op = parts, robot, robot.operated_index
         self.nthread = nthread or os.cpu_count() or 1
@@ -103,10 +102,7 @@ class JointRollouts:
     def _counted(self) -> Array:
         """Return the rows that count, (windows, rows): after the start has settled, away from contacts."""
         rows, after = self.touch.shape[1], np.round(SETTLE_S / self.periods).astype(int)
-        near = np.zeros_like(self.touch)
-        for k in np.unique(after):
-            touch = self.touch[after == k]
-            near[after == k] = np.array([touch[:, max(0, t - k) : t + 1].any(axis=1) for t in range(rows)]).T
+        near = np.array([np.convolve(t, np.ones(k + 1))[:rows] > 0.5 for t, k in zip(self.touch, after, strict=True)])
         time, thin = np.arange(rows), self._thins[:, None]
         counted = (time > np.maximum(after, 1)[:, None]) & (time < self.lengths[:, None]) & ~near & (time % thin == 0)
         return np.asarray(counted[:, :: self.thin])

@@ -5,9 +5,6 @@ commands is a + b·m: m is one of the given payloads, b is common, a is the unit
 itself, by expectation maximisation over all pairs of unit and payload. Consecutive recordings with equal torque are
 repetitions of one unit. Units are distinguished by the order of their torques, which is assumed to be the same at every
 payload; the first unit of one joint need not be that of another.
-
-Torque also shows the time, since it is kp (command − position) − kd velocity of the command in force. A recording whose
-commands were written late or early shows to a quarter of a period, whatever its payload.
 """
 
 from __future__ import annotations
@@ -35,10 +32,8 @@ MAX_END_DIFFERENCE = 0.05  # of two commands that count as one, over the range o
 SETTLE_S = 0.1
 MAX_REPETITION_STD = 3.0  # standard deviations of a repetition within which neighbours are repetitions
 MIN_NM_PER_KG, MIN_BAND_DISTANCE = 0.3, 2.5  # distance in widths of a band, from which a joint determines its payload
-MIN_RECORDINGS, SEARCH_ROUNDS = 4, 4  # of a joint, for the search of lags
-MIN_EXPLAINED = 0.9  # of the torque's variance, by the servo's gains
+MIN_RECORDINGS = 4  # of a joint, for its gains from torque
 MAX_PAYLOAD_ERROR_KG = 0.5  # from a label
-MAX_LAG_S, LAG_STEP_S, LAG_RANGE_S = 0.015, 0.005, 0.08  # beside the others; steps and range of the search
 PAYLOAD_IN_NAME = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
 
 
@@ -55,8 +50,7 @@ class LabelledRecording:
         determined: Whether the joint's torque determines its payload.
         torque_payload: Payload estimated from torque without the unit, kg.
         copy_of: Name of an earlier recording with the same samples.
-        servo_rows: Time, command, position, velocity and torque of each row, (5, k), where torque was recorded.
-        lag: Lag of the torque behind the command, beside the other recordings of the joint, s.
+        servo_rows: Command, position, velocity and torque of each row, (4, k), where torque was recorded.
     """
 
     name: str
@@ -70,7 +64,6 @@ class LabelledRecording:
     torque_payload: float = 0.0
     copy_of: str = ""
     servo_rows: Array | None = field(default=None, repr=False)
-    lag: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -111,27 +104,24 @@ class Labels:
     @property
     def remarks(self) -> list[str]:
         """Return remarks in sentences."""
-        a, late = self.agreement, [r for r in self.recordings if abs(r.lag) > MAX_LAG_S]
+        a = self.agreement
         lines = [
             f"of {a['said']} recordings with a payload in the file's name, {a['within_half_a_kg']:.0%} are within "
             f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
         ] if a else []  # fmt: skip
-        loaded = [r for r in self.recordings if r.determined and not r.copy_of and abs(r.lag) <= MAX_LAG_S]
-        near = f"{sum(abs(r.torque_payload - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)} of {len(loaded)}"
+        loaded = [r for r in self.recordings if r.determined and not r.copy_of]
+        near = sum(abs(r.torque_payload - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)
         if loaded:
-            limit = f"{MAX_PAYLOAD_ERROR_KG:g} kg"
-            lines += [f"torque alone, without the unit, gives {near} payloads within {limit} of their label"]
-        lines += [
+            lines.append(
+                f"torque alone, without the unit, gives {near} of {len(loaded)} payloads within "
+                f"{MAX_PAYLOAD_ERROR_KG:g} kg of their label"
+            )
+        return lines + [
             f"{joint}: torque is kp (command − position) − kd velocity, kp {format_uncertainty(g.kp, g.error)} "
             f"N·m/rad ({format_uncertainty(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: "
             f"{g.explained:.1%} of its variance"
             for joint, (g, end) in self.gains.items()
             if g.trusted
-        ]
-        return lines + [
-            f"{r.name}: its torque follows the command {abs(r.lag) * 1e3:.0f} ms {'later' if r.lag > 0 else 'sooner'}"
-            f" than in the other recordings of {r.joint}: clocks of command and state are apart; it is left out"
-            for r in late
         ]
 
 
@@ -147,8 +137,9 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     Raises:
         LogError: More than one joint moves.
     """
-    found: list[LabelledRecording] = []
+    recordings: list[LabelledRecording] = []
     seen: dict[tuple[str, str], LabelledRecording] = {}
+    copies: list[tuple[LabelledRecording, LabelledRecording]] = []
     for name, log in logs:
         one = _read(name, log, gain)
         digest = hashlib.sha256(b"".join(log.channels[c].values.tobytes() for c in ("ctrl", "qpos"))).hexdigest()
@@ -156,37 +147,31 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
         if first is not one:
             one.copy_of = first.name
             first.named_payload = one.named_payload if first.named_payload is None else first.named_payload
-        found.append(one)
-    own = [r for r in found if not r.copy_of]
-    for joint in dict.fromkeys(r.joint for r in own):
-        _estimate_lags([r for r in own if r.joint == joint and r.servo_rows is not None])
-    timely = [r for r in own if abs(r.lag) <= MAX_LAG_S]
-    groups = [_fit(part, payloads, units) for part in _by_command(timely)]
-    torque_rows: dict[str, list[Array]] = {}
-    for r in timely:
-        torque_rows.setdefault(r.joint, []).extend([] if r.servo_rows is None else [r.servo_rows[1:]])
-    first_of = {r.name: r for r in own}
-    for r in found:
-        if r.copy_of:
-            r.payload, r.unit, r.determined = (
-                getattr(first_of[r.copy_of], f) for f in ("payload", "unit", "determined")
-            )
-    said = [r for r in own if r.named_payload is not None and r.determined]
+            copies.append((one, first))
+        recordings.append(one)
+    own = list(seen.values())
+    groups = [_fit(part, payloads, units) for part in _by_command(own)]
+    for one, first in copies:
+        one.payload, one.unit, one.determined = first.payload, first.unit, first.determined
+    named = [r for r in own if r.named_payload is not None and r.determined]
     agreement = {}
-    if said:
-        near = lambda r, m: abs(r.payload - m) < MAX_PAYLOAD_ERROR_KG  # noqa: E731
-        masses = {r.named_payload for r in said}
+    if named:
+        masses = {r.named_payload for r in named}
         others = [r for r in own if r.named_payload is None and r.determined]
         agreement = {
-            "said": len(said), "within_half_a_kg": float(np.mean([near(r, r.named_payload) for r in said])),
+            "said": len(named),
+            "within_half_a_kg": float(np.mean([abs(r.payload - (r.named_payload or 0.0)) < MAX_PAYLOAD_ERROR_KG
+                                               for r in named])),
             # What a file's name does not list is none of these either, where such files list all of a payload.
             "not_said": len(others),
             "taken_for_one_of_these": float(np.mean([r.payload in masses for r in others] or [False])),
         }  # fmt: skip
-    gains = {
-        j: (servo_gains(each), servo_gains(each, 1)) for j, each in torque_rows.items() if len(each) >= MIN_RECORDINGS
-    }
-    return Labels(found, groups, agreement, gains)
+    torque_rows: dict[str, list[Array]] = {}
+    for r in own:
+        torque_rows.setdefault(r.joint, []).extend([] if r.servo_rows is None else [r.servo_rows])
+    enough = {joint: rows for joint, rows in torque_rows.items() if len(rows) >= MIN_RECORDINGS}
+    gains = {joint: (servo_gains(rows), servo_gains(rows, 1)) for joint, rows in enough.items()}
+    return Labels(recordings, groups, agreement, gains)
 
 
 def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
@@ -198,57 +183,22 @@ def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
         )
     j = int(moved[0])
     joint = log.joint_names[j]
-    if "tau" in log.channels:
-        time, values = log.channels["tau"].time, log.channels["tau"].values[:, j]
+    servo_rows = None
+    if tau := log.channels.get("tau"):
+        time, values = tau.time, tau.values[:, j]
+        at = lambda c: np.interp(ctrl.time, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
+        speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), ctrl.time)
+        servo_rows = np.stack([ctrl.values[:, j], at("qpos"), speed, at("tau")])
     else:
         time = qpos.time
         values = gain[joint] * (ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j])
     later = time[: len(values)] >= time[0] + SETTLE_S
     commands = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
-    servo_rows = None
-    if "tau" in log.channels:
-        clock = ctrl.time
-        at = lambda c: np.interp(clock, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
-        speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), clock)
-        servo_rows = np.stack([clock, ctrl.values[:, j], at("qpos"), speed, at("tau")])
     kilograms = PAYLOAD_IN_NAME.search(Path(log.source.partition("#")[0]).stem)
     payload = float(kilograms[1].replace("p", ".")) if kilograms else None
     return LabelledRecording(
         name, joint, float(ctrl.values[-1, j]), (values[later], commands), payload, servo_rows=servo_rows
     )
-
-
-def _estimate_lags(part: list[LabelledRecording]) -> None:
-    """Set the lag of each recording of a joint."""
-    shifts = np.arange(-LAG_RANGE_S, LAG_RANGE_S + LAG_STEP_S / 2, LAG_STEP_S)
-
-    def rows(r: LabelledRecording, shift: float) -> Array:  # command − position, −velocity, 1, torque
-        time, ctrl, qpos, qvel, tau = r.servo_rows  # type: ignore[misc]
-        inside = (time - LAG_RANGE_S >= time[0]) & (time + LAG_RANGE_S <= time[-1])
-        return np.stack([np.interp(time - shift, time, ctrl) - qpos, -qvel, np.ones_like(tau), tau])[:, inside]
-
-    def residuals(x: Array) -> Array:  # N·m, of each recording and shift
-        return np.array([np.abs(np.tensordot(m[:, :3], x, (1, 0)) - m[:, 3]).mean(axis=1) for m in every])
-
-    def fit(k: int) -> tuple[float, Array]:  # kp, kd and a constant, fitted to the best half
-        chosen = np.arange(len(part))
-        for _ in range(SEARCH_ROUNDS):
-            rows = np.concatenate([every[i][k] for i in chosen], axis=1)
-            x = np.linalg.lstsq(rows[:3].T, rows[3])[0]
-            costs = residuals(x)[:, k]
-            chosen = np.argsort(costs)[: max(MIN_RECORDINGS, len(part) // 2)]
-        return float(np.median(costs)), x
-
-    if len(part) < MIN_RECORDINGS:
-        return
-    every = [np.stack([rows(r, s) for s in shifts]) for r in part]  # (shifts, 4, k) each
-    _, x = min((fit(k) for k in range(len(shifts))), key=lambda one: one[0])
-    best = residuals(x).argmin(axis=1).tolist()
-    rest = np.concatenate([x @ m[k, :3] - m[k, 3] for m, k in zip(every, best, strict=True)])
-    torque = np.concatenate([m[0, 3] for m in every])
-    if rest.var() < (1 - MIN_EXPLAINED) * torque.var() and x[0] > 0:
-        for r, k in zip(part, best, strict=True):
-            r.lag = round(float(shifts[k] - np.median(shifts[best])), 4)
 
 
 def _by_command(recordings: list[LabelledRecording]) -> list[list[LabelledRecording]]:
@@ -372,13 +322,10 @@ def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
     sheet.writerow(["file", "motion", "unit", "payload", "estimated", "leave_out"])
     for r in labels.recordings:
         payload = r.payload if r.named_payload is None else r.named_payload
-        what = (
-            "unit"
-            if r.named_payload is not None
-            else f"unit, payload{'' if r.determined else ' (not determined by this joint)'}"
-        )
-        sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", what,
-                        "yes" if r.copy_of or abs(r.lag) > MAX_LAG_S else "no"])  # fmt: skip
+        unsure = "" if r.determined else " (not determined by this joint)"
+        estimated = "unit" if r.named_payload is not None else f"unit, payload{unsure}"
+        sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", estimated,
+                        "yes" if r.copy_of else "no"])  # fmt: skip
     write_text(folder / "labels.csv", text.getvalue())
     lines = ["# gaponet data labels: units and payloads are estimated from held torque", 'manifest = "labels.csv"']
     lines += [f"rate = {rate:g}"] if rate else []

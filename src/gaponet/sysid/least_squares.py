@@ -17,6 +17,7 @@ DIFFERENCE_STEP = 0.1  # large changes, of finite differences
 DAMPING_FACTORS = np.array([1e-3, 0.1, 1.0, 30.0])  # of the last best damping, evaluated together
 MIN_RELATIVE_DECREASE = 1e-4  # of the cost, for another iteration
 
+Progress = Callable[[Array], object]  # a true answer ends the search
 Errors = Callable[[Array], Array]  # candidates (k, n, P) → errors (k, n, m), 1 where they begin to count linearly
 
 
@@ -26,8 +27,7 @@ def descend(
     high: Array,
     errors: Errors,
     iterations: int,
-    progress: Callable[[Array], None] = lambda cost: None,
-    expired: Callable[[], bool] = lambda: False,
+    progress: Progress = lambda cost: None,
     min_decrease: float = MIN_RELATIVE_DECREASE,
     derive: Callable[[Array, Array, Errors], tuple[Array, Array]] | None = None,
 ) -> tuple[Array, Array]:
@@ -41,17 +41,14 @@ def descend(
         low, high: Bounds, (n, P).
         errors: Function of candidates.
         iterations: At most; each evaluates S·(P + 1 + len(DAMPING_FACTORS)) candidates.
-        progress: Called after each iteration with the least cost of every problem, (n,).
-        expired: Ends the search before any iteration but the first.
+        progress: Called after each iteration with the least cost of every problem, (n,); True ends the search.
         min_decrease: Ends the search when the relative decrease of every cost is smaller.
         derive: Replaces `slopes`, where it takes fewer candidates than P + 1.
     """
     damping = np.full(x.shape[:2], 1e-2)
     best = np.full(x.shape[:2], np.inf)
     best_x, best_total = x, np.full(x.shape[:2], np.inf)
-    for i in range(iterations):
-        if i and expired():
-            break
+    for _ in range(iterations):
         here, jac = (derive or slopes)(x, high, errors)
         weight = 1 / np.sqrt(1 + here**2)
         normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
@@ -68,8 +65,7 @@ def descend(
         damping = np.clip(damping * np.where(lower, DAMPING_FACTORS[choice], DAMPING_FACTORS[-1]), 1e-6, 1e3)
         decrease = np.where(lower, 1 - least / np.maximum(best, 1e-300), 0.0)
         best = np.minimum(least, best)
-        progress(best.min(axis=0))
-        if (decrease < min_decrease).all():
+        if progress(best.min(axis=0)) or (decrease < min_decrease).all():
             break
     best = soft_l1(_evaluated(errors, x[None]))[0]
     better = best.sum(axis=1) < best_total.sum(axis=1)

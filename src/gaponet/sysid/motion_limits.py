@@ -147,10 +147,10 @@ def with_speed_limits(
 ) -> Identified:
     """Fit the robot, and again with speed limits where recordings show some; return the fit that validation accepts.
 
+    Speed limits that the robot has are taken as true.
+
     Args:
         fit: Function of the robot to start from and of the time that it may take, s.
-        sequences: Recordings that are fitted.
-        robot: Start of the fit; speed limits that it has are taken as true.
         budget: Time of all fits together, s; None for no limit.
     """
     speeds = {} if robot.target_speed.any() else dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))

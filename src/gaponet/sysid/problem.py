@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from gaponet.sim.model import build_model
 from gaponet.sysid.acceptance import Covariance, Std
 from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, Axes, Bounds, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
-from gaponet.sysid.least_squares import Errors, agreed_slopes, better_half, descend
+from gaponet.sysid.least_squares import Errors, Progress, agreed_slopes, better_half, descend
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
 ROBOT_WINDOWS = 8  # windows of the fit in the robot's simulator
@@ -106,10 +106,6 @@ class FitProblem:
         return lambda x: self.errors(axes.values(x), rollouts)
 
 
-Report = Callable[[Array], None]  # called in each iteration with every problem's least cost
-Expired = Callable[[], bool]  # whether the time of a search is over
-
-
 class JointFit(FitProblem):
     """Fit of every joint by itself, the others moving as recorded."""
 
@@ -131,24 +127,16 @@ class JointFit(FitProblem):
         ]
 
     def search(
-        self,
-        fields: ListOf[str],
-        start: Values,
-        others: ListOf[Values] = (),
-        *,
-        only: bool = False,
-        report: Report = lambda cost: None,
-        expired: Expired = lambda: False,
-    ) -> Values:
+        self, fields: ListOf[str], start: Values, others: ListOf[Values] = (), *, only: bool = False,
+        report: Progress = lambda cost: None,
+    ) -> Values:  # fmt: skip
         """Fit the fields, the classic ones and those of the servo model that `start` has; return values (n,).
 
         Args:
-            fields: Fields beside those of `start`.
-            only: Fit no other fields.
+            fields: Fields beside those of `start`; with `only` no others are fitted.
             start: First start, (n,); STARTS in all are drawn around it.
             others: At most two starts in place of drawn ones.
-            report: Called in each iteration.
-            expired: Ends the search early.
+            report: Called in each iteration, as of `least_squares.descend`.
         """
         names = fields if only else fitted_fields(dict.fromkeys([*start, *fields]), encoder=True)
         axes = Axes(self.bounds, names, start)
@@ -161,7 +149,7 @@ class JointFit(FitProblem):
         windows = (self.rollouts.shortened(SHORT_WINDOW_S), self.rollouts, self.rollouts)
         for rollouts, iterations in zip(windows, SEARCH_ITERATIONS, strict=True):
             errors = self.of_axes(axes, rollouts)
-            x, cost = descend(x, axes.low, axes.high, errors, iterations, report, expired)
+            x, cost = descend(x, axes.low, axes.high, errors, iterations, report)
             self.prior.update_residual(cost.min(axis=0), rollouts.rows)
             if rollouts is self.rollouts:
                 x = better_half(x, cost)
@@ -179,15 +167,9 @@ class RobotFit(FitProblem):
     """Fit of all joints in the simulator of the whole robot."""
 
     def descend(
-        self,
-        fields: ListOf[str],
-        rest: Values,
-        starts: ListOf[Values],
-        iterations: ListOf[int],
-        *,
-        report: Report = lambda cost: None,
-        expired: Expired = lambda: False,
-    ) -> Values:
+        self, fields: ListOf[str], rest: Values, starts: ListOf[Values], iterations: ListOf[int], *,
+        report: Progress = lambda cost: None,
+    ) -> Values:  # fmt: skip
         """Fit fields from starts (n,), the better of which go on after each number of iterations; return values (n,).
 
         A joint's parameters are judged by the joint's own error. Fields of `rest` that are not fitted stay.
@@ -196,7 +178,7 @@ class RobotFit(FitProblem):
         x, cost = np.stack([axes.normalize(v) for v in starts]), np.zeros((len(starts), self.bounds.n))
         for i, count in enumerate(iterations):
             errors = self.of_axes(axes)
-            x, cost = descend(x, axes.low, axes.high, errors, count, report, expired, MIN_COST_DECREASE)
+            x, cost = descend(x, axes.low, axes.high, errors, count, report, MIN_COST_DECREASE)
             self.prior.update_residual(cost.min(axis=0), self.rollouts.rows)
             if i < len(iterations) - 1:
                 # The better start of every joint; and the start that is better in the sum over joints.
@@ -204,15 +186,10 @@ class RobotFit(FitProblem):
                 x = x[:1] if np.array_equal(x[0], x[1]) else x
         return {f: v[0].copy() for f, v in axes.values(x[[cost.sum(axis=1).argmin()]]).items()}
 
-    def descend_chains(
-        self, values: Values, report: Callable[[tuple[str, ...], Array], Report], expired: Expired = lambda: False
-    ) -> Values:
+    def descend_chains(self, values: Values, report: Callable[[tuple[str, ...], Array], Progress]) -> Values:
         """Fit values (n,) once more, with a joint's parameters judged by all joints of its kinematic chain.
 
-        Args:
-            values: Start.
-            report: Makes the function that is called in each iteration, from names and row counts of the chains.
-            expired: Ends the search early.
+        `report` makes the function that is called in each iteration, from names and row counts of the chains.
         """
         axes, chains = Axes(self.bounds, robot_fields(values), values), KinematicChains(self.robot)
 
@@ -223,7 +200,7 @@ class RobotFit(FitProblem):
         names = tuple(self.robot.operated[i] for i in chains.joints[:, 0])
         x, low, high = chains.pack(axes.normalize(values)[None]), chains.pack(axes.low), chains.pack(axes.high)
         iterations = max(1, min(CHAIN_ITERATIONS, CHAIN_CANDIDATES // (x.shape[-1] + 5)))
-        x, _ = descend(x, low, high, errors, iterations, report(names, rows), expired, MIN_CHAIN_COST_DECREASE)
+        x, _ = descend(x, low, high, errors, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE)
         return {f: v[0].copy() for f, v in axes.values(chains.unpack(x)).items()}
 
 
@@ -236,7 +213,7 @@ class KinematicChains:
 
     def __init__(self, robot: RobotSpec) -> None:
         model = build_model(replace(robot, table=None), physics_only=True)
-        tree = model.dof_treeid[[model.joint(j).dofadr[0] for j in robot.operated]]
+        tree = model.dof_treeid[robot.operated_index]
         chains = [np.flatnonzero(tree == t) for t in np.unique(tree)]
         most = max(map(len, chains))
         self.joints = np.array([[*chain, *[-1] * (most - len(chain))] for chain in chains])
@@ -270,13 +247,15 @@ class StandardErrors:
 
     Attributes:
         std: Joint → field → standard error in SI units.
-        scaled: The same on the axes of the search, in large changes: torques there are divided by kp.
         covariance: Joint → fields and their covariance on the axes of uncertainty.py.
+        undetermined: Joint → fields that the recordings do not determine; all fields of unexcited joints.
+        sentences: A sentence for each of these joints.
     """
 
     std: Std
-    scaled: Std
-    covariance: Covariance = field(default_factory=dict)
+    covariance: Covariance
+    undetermined: dict[str, tuple[str, ...]]
+    sentences: tuple[str, ...]
 
 
 def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
@@ -292,11 +271,9 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     here, jac = (y[0] for y in agreed_slopes(x[None], axes.low, axes.high, problem.of_axes(axes)))
     weight = 1 / np.sqrt(1 + here**2)
     gradient = jac * (weight * here)[..., None]  # (n, rows + PRIORS, P)
-    cluster, _ = cluster_of_rows(problem.rollouts.window)
-    clusters = int(cluster.max()) + 1
-    each = np.zeros((bounds.n, clusters, len(names)))
-    np.add.at(each, (slice(None), cluster), gradient[:, :-PRIORS])  # type: ignore[arg-type]
+    each, _ = cluster_sums(gradient[:, :-PRIORS], problem.rollouts.window)
     each -= each.mean(axis=1, keepdims=True)
+    clusters = each.shape[1]
     prior_jac = jac[:, -PRIORS:] * prior.error_std()[:, None, None]
     normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
     few = clusters / max(clusters - len(names), 1)  # squared, as a jackknife of so few clusters has it
@@ -315,22 +292,27 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     std |= {f: np.hypot(std[f], error) for f, error in _discretisation_std(problem, values).items()}
     unit = axes.unit[..., None]
     wide = unit * (cov + 1e3 * np.eye(len(names)) * lost[..., None, :]) * np.swapaxes(unit, -1, -2)
+    unknown = _undetermined(problem, values, axes, std, width)
     return StandardErrors(
         {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)},
-        {j: {f: float(width[i, k]) for k, f in enumerate(names)} for i, j in enumerate(joints)},
         {j: (names, wide[i]) for i, j in enumerate(joints)},
-    )
+        {j: fields for j, (fields, _) in unknown.items()}, tuple(text for _, text in unknown.values()),
+    )  # fmt: skip
 
 
-def cluster_of_rows(window: Array) -> tuple[Array, int]:
-    """Return the cluster of each row, by its window (rows,), and how many clusters a window has.
+def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
+    """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster, (C,).
 
-    Clusters are windows, or parts of them where there are fewer than MIN_CLUSTERS.
+    Clusters are windows (rows,), or parts of them where there are fewer than MIN_CLUSTERS.
     """
-    parts = max(1, -(-MIN_CLUSTERS // (int(window.max()) + 1)))
+    count = int(window.max()) + 1
+    parts = max(1, -(-MIN_CLUSTERS // count))
     order, turn = np.argsort(window, kind="stable"), np.zeros(len(window), int)
     turn[order] = np.concatenate([np.arange(c) * parts // c for c in np.unique(window, return_counts=True)[1]])
-    return window * parts + turn, parts
+    cluster = window * parts + turn
+    sums = np.zeros((len(x), int(cluster.max()) + 1, *x.shape[2:]))
+    np.add.at(sums, (slice(None), cluster), x)  # type: ignore[arg-type]
+    return sums, np.arange(sums.shape[1]) // parts
 
 
 def _discretisation_std(problem: FitProblem, values: Values) -> Values:
@@ -347,12 +329,15 @@ def _inverse(normal: Array, size: Array) -> Array:
     return np.asarray(np.linalg.pinv(normal / each + fixed, rcond=1e-10, hermitian=True) / each)
 
 
-def undetermined(problem: FitProblem, values: Values, errors: StandardErrors) -> dict[str, tuple[tuple[str, ...], str]]:
-    """Return joint → fields that the recordings do not determine, and a sentence; all fields of unexcited joints."""
-    bounds, names, found = problem.bounds, fitted_fields(values), dict[str, tuple[tuple[str, ...], str]]()
-    axes = Axes(bounds, names, values)
-    x = axes.normalize(values)
-    ahead = axes.values(x + 1)
+def _undetermined(
+    problem: FitProblem, values: Values, axes: Axes, std: Values, width: Array
+) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Return joint → fields that the recordings do not determine, and a sentence; all fields of unexcited joints.
+
+    std: Standard errors in SI units, (n,); width: those on the axes, (n, P), where torques are divided by kp.
+    """
+    bounds, names, x = problem.bounds, axes.names, axes.normalize(values)
+    ahead, unknown = axes.values(x + 1), dict[str, tuple[tuple[str, ...], str]]()
     for i, joint in enumerate(problem.robot.operated):
         if bounds.unexcited[i]:
             why = (
@@ -360,20 +345,19 @@ def undetermined(problem: FitProblem, values: Values, errors: StandardErrors) ->
                 "the file's values but for what others that move it show (kp, damping, friction, offset); record its "
                 "motion"
             )
-            found[joint] = tuple(names), why
+            unknown[joint] = tuple(names), why
             continue
         wide, also_over_kp = dict[str, str](), list[str]()
         for k, f in enumerate(names):
             if f == "stribeck_speed" and not values["stribeck"][i]:
                 continue
-            value, error = values[f][i], errors.std[joint].get(f, 0.0)
+            value, error = values[f][i], std[f][i]
             if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):
                 wide[f] = f"{f} {format_uncertainty(value, error)}"
-                scaled = errors.scaled.get(joint, {}).get(f, np.inf)
-                if SERVO_FIELDS[f].axis != "over kp" or scaled > MAX_RELATIVE_STD * max(abs(x[i, k]), 1.0):
+                if SERVO_FIELDS[f].axis != "over kp" or width[i, k] > MAX_RELATIVE_STD * max(abs(x[i, k]), 1.0):
                     also_over_kp.append(f)
         if wide:
             as_set = set(also_over_kp) == {"kp"} and len(wide) > 1
             advice = "; known as multiples of kp: take the values as a set" if as_set else ""
-            found[joint] = tuple(wide), f"{joint}: not determined by these logs: {', '.join(wide.values())}{advice}"
-    return found
+            unknown[joint] = tuple(wide), f"{joint}: not determined by these logs: {', '.join(wide.values())}{advice}"
+    return unknown

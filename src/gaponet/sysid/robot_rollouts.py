@@ -46,20 +46,12 @@ class RobotRollouts:
     """
 
     def __init__(
-        self,
-        parts: list[Sequence],
-        robot: RobotSpec,
-        nthread: int = 0,
-        corrector: Corrector | None = None,
+        self, parts: list[Sequence], robot: RobotSpec, nthread: int = 0, corrector: Corrector | None = None,
         touch: Array | None = None,
-    ) -> None:
-        """
-        Args:
-            parts: Windows of recordings.
-            robot: Its own values hold where candidates give none.
-            nthread: Threads, 0 for all cores.
-            corrector: Corrects the targets, as in replay.
-            touch: Rows in which a tip may touch something, (windows, rows): rollouts go on from the recording there.
+    ) -> None:  # fmt: skip
+        """Take windows of recordings, and a robot whose own values hold where candidates give none.
+
+        Rollouts go on from the recording in the rows of `touch`, (windows, rows), in which a tip may touch something.
         """
         self.parts, self.robot, self.nthread, self.corrector = parts, robot, nthread, corrector
         self.locked, self.op, self.n = idle_limbs(parts, robot), robot.operated_index, len(robot.operated)
@@ -82,31 +74,25 @@ class RobotRollouts:
         self.standing = [(w, i) for w, p in enumerate(parts) for i, j in enumerate(free) if j in p.meta.unrecorded]
         self.rows = self.recorded.sum(axis=1)
 
-    def flat_errors(self, values: dict[str, Array], parts: list[Sequence] | None = None) -> Array:
-        """Return q_sim − q_real of k candidates in the rows that count, (k, n, rows) rad.
-
-        Args:
-            values: (k, n) each, as BatchSim.set_servos takes them.
-            parts: The windows of each candidate in turn, k times as many, where candidates have windows of their own.
-        """
+    def flat_errors(self, values: dict[str, Array]) -> Array:
+        """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n) as for BatchSim.set_servos."""
         k, m = len(values["kp"]), len(self.parts)
         delay = np.array(self.robot.delay)
         delay[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
-        parts = self.parts * k if parts is None else parts
         terms = any(values[f].any() for f in SERVO_TERMS if f in values)
         plain: dict[str, Any] = {} if terms else dict.fromkeys(SERVO_TERMS, np.array(0.0))
         acting = replace(self.robot, delay=delay, **plain)
-        conditions = [Condition.of(s, self.robot) for s in parts]
-        sim = BatchSim(acting, conditions, self.nthread, self.locked, servo_model=terms)
+        conditions = [Condition.of(s, self.robot) for s in self.parts]
+        sim = BatchSim(acting, conditions * k, self.nthread, self.locked, servo_model=terms)
         sim.set_servos(self.robot.operated, {f: np.repeat(x, m, axis=0) for f, x in values.items()})
         for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
             sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
-        return self.simulated_errors(sim, parts)
+        return self.simulated_errors(sim)
 
-    def simulated_errors(self, sim: BatchSim, parts: list[Sequence]) -> Array:
+    def simulated_errors(self, sim: BatchSim) -> Array:
         """Return q_sim − q_real in the rows that count, (k, n, rows) rad, of simulations of k times the windows."""
         k, m = sim.num_envs // len(self.parts), len(self.parts)
-        qpos = rollout(sim, parts, self.corrector, touch=np.tile(self.touch, k))[0, 1:][..., self.op]
+        qpos = rollout(sim, self.parts * k, self.corrector, touch=np.tile(self.touch, k))[0, 1:][..., self.op]
         error = (qpos.reshape(len(qpos), k, m, self.n) - self.real[1:, None]).astype(np.float32)
         errors = error.transpose(1, 3, 0, 2)[:, :, self.counted]
         return np.clip(np.nan_to_num(errors, nan=MAX_ERROR_RAD), -MAX_ERROR_RAD, MAX_ERROR_RAD) * self.recorded

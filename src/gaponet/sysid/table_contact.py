@@ -77,12 +77,12 @@ def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
 
 def low_windows(sequences: ListOf[Sequence], heights: ListOf[Array], below: float) -> list[Sequence]:
     """Return the windows in which a tip comes below a height, m, the longest first."""
-    found = []
+    windows = []
     for s, height in zip(sequences, heights, strict=True):
         rows = min(round(WINDOW_S / s.dt), len(s))
         starts = range(0, len(s) - rows + 1, rows)
-        found += [s.rows(slice(a, a + rows)) for a in starts if (height[a : a + rows] < below).any()]
-    return sorted(found, key=lambda s: -len(s))
+        windows += [s.rows(slice(a, a + rows)) for a in starts if (height[a : a + rows] < below).any()]
+    return sorted(windows, key=lambda s: -len(s))
 
 
 def _most_wrong(scene: _TableRollouts, away: Array) -> list[Sequence]:
@@ -96,20 +96,15 @@ def _most_wrong(scene: _TableRollouts, away: Array) -> list[Sequence]:
 
 
 def fit_table(
-    parts: list[Sequence],
-    robot: RobotSpec,
-    lowest: float,
-    nthread: int,
-    progress: Callable[[float], None],
+    parts: list[Sequence], robot: RobotSpec, lowest: float, nthread: int, progress: Callable[[float], None],
     validation: ListOf[Sequence] = (),
-) -> TableFit:
+) -> TableFit:  # fmt: skip
     """Fit height, friction and stiffness of the table and the zeros, from several starts.
 
     Args:
         parts: Windows in which a tip is low; those with the largest errors without a table are fitted.
         robot: The robot with fitted servos; if it has a table, the height is taken as measured.
         lowest: Least height of a tip in the windows, m.
-        nthread: Threads, 0 for all cores.
         progress: Called in each iteration with the root mean square error, rad.
         validation: Whole recordings that choose among the starts' results; without them the windows do.
     """
@@ -124,19 +119,18 @@ def fit_table(
     heights = lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
     if measured is not None:
         heights = np.array([measured.height])
-    guesses = np.repeat(away, len(START_LOG_STIFFNESS) * len(heights), axis=0)
-    guesses[:, 0] = np.tile(heights, len(START_LOG_STIFFNESS))
-    guesses[:, 2] = np.repeat(START_LOG_STIFFNESS, len(heights))
-    costs = soft_l1(scene.soft_errors(guesses)).reshape(len(START_LOG_STIFFNESS), -1)
-    starts = guesses.reshape(*costs.shape, -1)[np.arange(len(START_LOG_STIFFNESS)), costs.argmin(axis=1)]
+    guesses = np.tile(away, (len(START_LOG_STIFFNESS), len(heights), 1))
+    guesses[..., 0], guesses[..., 2] = heights, np.array(START_LOG_STIFFNESS)[:, None]
+    costs = soft_l1(scene.soft_errors(guesses.reshape(-1, 3 + n))).reshape(guesses.shape[:2])
+    starts = guesses[np.arange(len(guesses)), costs.argmin(axis=1)]
     pace, best_first = [np.inf], starts[costs.min(axis=1).argsort()]
-    found = [_searched(scene, start, measured is not None, progress, pace) for start in best_first]
-    tables = [_with_table(robot, x) for x, _ in found]
-    errors = [cost for _, cost in found]
+    results = [_searched(scene, start, measured is not None, progress, pace) for start in best_first]
+    tables = [_with_table(robot, x) for x, _ in results]
+    errors = [cost for _, cost in results]
     if validation:
         errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
     best = int(np.argmin(errors))
-    without, within = scene.mean(away[0]), scene.mean(found[best][0])
+    without, within = scene.mean(away[0]), scene.mean(results[best][0])
     accepted = Comparison("table", without, within).accepted
     return TableFit(tables[best] if accepted else robot, accepted, without, within, motions)
 
@@ -168,11 +162,11 @@ def _searched(
     rng = np.random.default_rng(0)
     population = start + START_STD * unit * rng.standard_normal((CANDIDATES, len(unit)))
     population[0] = start
-    found = differential_evolution(
+    best = differential_evolution(
         cost, Bounds(low, high), init=np.clip(population, low, high), maxiter=GENERATIONS, tol=0, polish=False,
         vectorized=True, updating="deferred", callback=report, rng=rng,
     )  # fmt: skip
-    return found.x, float(found.fun)
+    return best.x, float(best.fun)
 
 
 def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
@@ -195,7 +189,7 @@ class _TableRollouts(RobotRollouts):
         write_table(sim.batch, model, rows[:, 0], rows[:, 1], np.exp(rows[:, 2]))
         dof = np.array([model.joint(j).dofadr[0] for j in self.robot.operated])
         sim.batch.expand("qpos0")[:, dof] -= rows[:, 3:]
-        return self.simulated_errors(sim, self.parts * len(xs))
+        return self.simulated_errors(sim)
 
     def soft_errors(self, xs: Array) -> Array:
         """Return the errors of candidates in ERROR_SCALE_RAD, (k, n · rows)."""

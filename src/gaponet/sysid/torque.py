@@ -29,7 +29,7 @@ from gaponet.sysid.adapt import PRIOR_RAD
 from gaponet.sysid.axes import CLASSIC, Bounds, Changes, first_values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED, JointRollouts
 from gaponet.sysid.least_squares import descend
-from gaponet.sysid.problem import JointFit, standard_errors, undetermined
+from gaponet.sysid.problem import JointFit, standard_errors
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
@@ -61,13 +61,7 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
     """Return the fit from torque if motions that were not fitted accept it, else `fitted`.
 
     An accepted fit is repeated with all recordings. Without cross-validation it is kept only if the validation motions
-    are followed no worse.
-
-    Args:
-        fitted: Fit to positions.
-        splits: Recordings to fit and those that judge, fold by fold.
-        given: Robot that the fit starts from.
-        nthread: Threads, 0 for all cores.
+    are followed no worse. `given` is the robot that both fits start from.
     """
     every = [*splits[0][0], *splits[0][1]]
     torques = [TorqueFit(train, given) for train, _ in splits]
@@ -88,20 +82,18 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
         robot = folds[0].robot
     bounds = Bounds(robot, every)
     whole = JointFit(JointRollouts(cut(every, MAX_WINDOWS), robot, nthread=nthread), robot, bounds).robot_fit(nthread)
-    values = {f: bounds.first[f] for f in CLASSIC}
-    errors = standard_errors(whole, values)
-    unknown = undetermined(whole, values, errors)
+    errors = standard_errors(whole, {f: bounds.first[f] for f in CLASSIC})
     part = [
         run
         for sequences, judged in folds
         for run in runs(sequences, [t.qpos for t in replay(sequences, judged, nthread=nthread, lock_idle=True)], judged)
     ]
     by_joint = {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(given.operated)}
-    return Identified(
-        robot, fitted.before, after, "torque", tuple(text for _, text in unknown.values()), errors.std,
-        (*fitted.comparisons, comparison), None, (),
-        {j: (before, by_joint[j]) for j, (before, _) in fitted.by_joint.items()}, errors.covariance,
-        {joint: fields for joint, (fields, _) in unknown.items()}, folds,
+    return replace(
+        fitted, robot=robot, after=after, chosen="torque", std=errors.std, covariance=errors.covariance,
+        warnings=errors.sentences, comparisons=(*fitted.comparisons, comparison),
+        table_fit=None, by_joint={j: (before, by_joint[j]) for j, (before, _) in fitted.by_joint.items()},
+        undetermined=errors.undetermined, held_out=folds,
     )  # fmt: skip
 
 
@@ -173,12 +165,8 @@ class TorqueFit:
     """
 
     def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec) -> None:
-        """
-        Args:
-            sequences: Recordings; those whose gains are stated are left out.
-            robot: Start of the fit; its payload masses are taken as true.
-        """
-        self.robot, self.nominal = robot, robot
+        """Recordings whose gains are stated are left out; the robot's payload masses are taken as true."""
+        self.robot = robot
         self.sequences = [s for s in sequences if s.tau is not None and s.meta.recorded_gains[0] is None]
         trusted = {joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.gains().items() if g.trusted}
         self.trusted = len(self.sequences) == len(sequences) and bool(trusted)
@@ -189,21 +177,20 @@ class TorqueFit:
 
     def gains(self) -> dict[str, Gains]:
         """Return joint → gains; without joints whose command never moves."""
-        parts: dict[int, list[Array]] = {}
+        parts: dict[str, list[Array]] = {}
         for s in self.sequences:
             assert s.tau is not None
-            for j in _moved(s, self.nominal):
-                parts.setdefault(j, []).append(np.stack([x[:, j] for x in (s.ctrl, s.qpos, s.qvel, s.tau)]))
-        return {self.nominal.joint_names[j]: servo_gains(each) for j, each in parts.items()}
+            for j in _moved(s, self.robot):
+                rows = np.stack([x[:, j] for x in (s.ctrl, s.qpos, s.qvel, s.tau)])
+                parts.setdefault(self.robot.joint_names[j], []).append(rows)
+        return {joint: servo_gains(each) for joint, each in parts.items()}
 
     def payload_placed(self, friction: bool = False) -> RobotSpec:
         """Return the robot with the payload's place and the mass of the hand, by least squares on recorded torque.
 
         A joint's torque is that of the model, that of (payload + hand) at the mount, and that of the joint's own
-        friction, armature and damping. Every mount is moved alike, mirrored to the other side.
-
-        Args:
-            friction: Use the friction, armature and damping as well.
+        friction, armature and damping, which the robot takes over with `friction`. Every mount is moved alike, mirrored
+        to the other side.
         """
         robot, mount = self.robot, self.robot.payload_mounts[0]
         joints, column, tau, qacc, qvel, required = self._balance()

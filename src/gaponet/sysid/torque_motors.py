@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import mujoco
@@ -76,8 +77,7 @@ def fit_torque_driven(
     """Fit the joints one by one, and judge all together.
 
     Args:
-        train: Recordings with torque.
-        judging: Other recordings; if it is `train` itself, parts of PART_S fit and judge in turn.
+        train, judging: Recordings with torque; if they are one list, parts of PART_S fit and judge in turn.
         robot: Its file gives inertias and gravity; payloads are taken as true.
         constant: Fit N·m per unit of the torque, as of a current.
 
@@ -108,10 +108,9 @@ def fit_torque_driven(
         bias[j], factor[j] = x[3], x[4]
     fitted = robot.with_servos(servos)
     angles = [_ahead(judging, r, k) for r, k in ((robot, np.ones_like(factor)), (fitted, factor))]
-    given = build_model(robot)
-    dof = [given.joint(name).dofadr[0] for name in names]
-    old = {f: np.ravel(getattr(given, f"dof_{f}"))[dof] for f in PASSIVE_FIELDS}
-    new = {f: getattr(fitted, f)[robot.operated_index] for f in PASSIVE_FIELDS}
+    given, op = build_model(robot), robot.operated_index
+    old = {f: np.ravel(getattr(given, f"dof_{f}"))[op] for f in PASSIVE_FIELDS}
+    new = {f: getattr(fitted, f)[op] for f in PASSIVE_FIELDS}
     lags = np.array([round(servos[n]["delay"] / (DELAYS_S[1] - DELAYS_S[0])) for n in names])
     residuals = (_residual(test, old, np.ones_like(factor), 0 * lags), _residual(test, new, factor, lags))
     angle = {h: (angles[0][h], angles[1][h]) for h in HORIZONS_S}
@@ -121,10 +120,7 @@ def fit_torque_driven(
 def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
     op, dt = robot.operated_index, s.dt
     model = build_model(robot, s.meta.payload_mass, s.meta.payload_side)
-    for name in robot.operated:
-        dof = model.joint(name).dofadr[0]
-        model.dof_armature[dof] = 0.0
-        model.dof_damping[dof, ...] = 0.0
+    model.dof_armature[op] = model.dof_damping[op] = 0.0
     smooth = lowpass(s.qpos.astype(float), dt, DIFFERENTIATION_CUTOFF_HZ)
     v = differentiate(smooth, dt)
     a = differentiate(v, dt)
@@ -200,8 +196,6 @@ def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> di
         model = build_model(robot, s.meta.payload_mass, s.meta.payload_side, dt=s.dt)
         model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
         data, steps = mujoco.MjData(model), round(s.dt / model.opt.timestep)
-        joints = [model.joint(name) for name in robot.joint_names]
-        at, dof = (np.array([getattr(x, f)[0] for x in joints]) for f in ("qposadr", "dofadr"))
         assert s.tau is not None
         time, tau = np.arange(len(s)) * s.dt, s.tau.astype(float)
         for j, i in enumerate(op):
@@ -209,11 +203,11 @@ def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> di
         v = differentiate(lowpass(s.qpos.astype(float), s.dt, DIFFERENTIATION_CUTOFF_HZ), s.dt)
         for start in _starts(s):
             mujoco.mj_resetData(model, data)
-            data.qpos[at], data.qvel[dof] = s.qpos[start], v[start]
-            for h in HORIZONS_S:
-                last = start + round(h / s.dt)
-                for t in range(start + round(([0.0, *HORIZONS_S][HORIZONS_S.index(h)]) / s.dt), last):
-                    data.qfrc_applied[dof] = tau[t]
+            data.qpos[:], data.qvel[:] = s.qpos[start], v[start]
+            for before, h in pairwise((0.0, *HORIZONS_S)):
+                first, last = (start + round(x / s.dt) for x in (before, h))
+                for torque in tau[first:last]:
+                    data.qfrc_applied[:] = torque
                     mujoco.mj_step(model, data, steps)
-                errors.setdefault(h, []).append(np.abs(data.qpos[at] - s.qpos[last])[op])
+                errors.setdefault(h, []).append(np.abs(data.qpos - s.qpos[last])[op])
     return {h: np.median(each, axis=0) for h, each in errors.items()}

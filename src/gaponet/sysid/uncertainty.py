@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
-from gaponet.base.errors import GAPONetError, RobotError, UsageError
+from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import write_json
 from gaponet.base.structure import read_json, validated
 from gaponet.base.text import format_uncertainty
@@ -28,7 +28,6 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
 PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
-MEND = "identify or adapt it again"
 UNOBSERVED_RELATIVE_ERROR = 1.0  # from which a value of zero means that no effect was seen
 MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = 0.9, 0.03  # from which parameters are known only as a set
 OLD_KEYS = {  # of known.json → of uncertainty.json
@@ -106,28 +105,23 @@ class ParameterUncertainty:
             RobotError: The file is damaged, or its values are not those of robot.toml.
         """
         hint = "identify or adapt again, or remove the file: the robot then has values without uncertainty"
-        file, old = (robot.folder / name for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE))
-        if file.is_file():
-            found = read_json(cls, file, RobotError, hint)
-        elif old.is_file():
-            file = old
-            table = _with_new_keys(read_json(dict[str, Any], old, RobotError, hint))
-            found = validated(cls, table, old, RobotError, hint)
-        else:
+        files = (robot.folder / name for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE))
+        if (file := next((f for f in files if f.is_file()), None)) is None:
             return None
-        for joint, values in to_axes(robot, found.fields).items():
-            stored = found.joints.get(joint)
+        table = _with_new_keys(read_json(dict[str, Any], file, RobotError, hint))
+        uncertainty = validated(cls, table, file, RobotError, hint)
+        for joint, values in to_axes(robot, uncertainty.fields).items():
+            stored = uncertainty.joints.get(joint)
             if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
                 raise RobotError(f"{file}: its values are other values than robot.toml's, at {joint}; {hint}")
-        return found
+        return uncertainty
 
     @classmethod
-    def require(cls, robot: RobotSpec, error: type[GAPONetError] = UsageError) -> ParameterUncertainty:
-        """Return `load`, or raise `error` if the robot's folder has no uncertainty."""
-        found = cls.load(robot)
-        if found is None:
-            raise error(f"{robot.folder}: keeps only values (no {UNCERTAINTY_FILE}); {MEND}")
-        return found
+    def require(cls, robot: RobotSpec) -> ParameterUncertainty:
+        """Return `load`; refuse a robot whose folder has no uncertainty."""
+        if (uncertainty := cls.load(robot)) is None:
+            raise UsageError(f"{robot.folder}: keeps only values (no {UNCERTAINTY_FILE}); identify or adapt it again")
+        return uncertainty
 
     def save(self, folder: Path) -> None:
         """Write uncertainty.json into a robot folder."""
@@ -140,9 +134,7 @@ class ParameterUncertainty:
     def si(self, joint: str, covariance: Array | None = None) -> tuple[dict[str, float], Array]:
         """Return a joint's values by field and their covariance (P, P), in SI units.
 
-        Args:
-            joint: Its name.
-            covariance: (P, P) on the axes, instead of the joint's own.
+        `covariance` (P, P) on the axes replaces the joint's own.
         """
         x, step = self.array(joint, "values"), 1e-6
         here = from_axes(self.fields, x)
@@ -153,13 +145,12 @@ class ParameterUncertainty:
 
 
 def _with_new_keys(table: dict[str, Any]) -> dict[str, Any]:
-    """Rename the keys of a known.json."""
-    return {
-        OLD_KEYS.get(key, key): {j: _with_new_keys(v) if isinstance(v, dict) else v for j, v in value.items()}
-        if key == "joints" and isinstance(value, dict)
-        else value
-        for key, value in table.items()
-    }
+    """Rename the keys of a known.json; those of an uncertainty.json stay."""
+    renamed = {OLD_KEYS.get(key, key): value for key, value in table.items()}
+    joints = renamed.get("joints")
+    if isinstance(joints, dict):
+        renamed["joints"] = {j: _with_new_keys(v) if isinstance(v, dict) else v for j, v in joints.items()}
+    return renamed
 
 
 def to_axes(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:

@@ -52,7 +52,7 @@ def pool(robot):
 @pytest.fixture(scope="module")
 def told(robot, pool):
     return ExperimentDesign.from_recordings(
-        robot, ParameterUncertainty.load(robot), simulated_recordings(robot, pool, 0.0, 1), 1
+        robot, ParameterUncertainty.load(robot), simulated_recordings(robot, pool, 0.0)
     )
 
 
@@ -70,7 +70,7 @@ def test_expected_information_is_that_of_a_recording(robot, pool, told):
     mine = ParameterUncertainty.load(robot)
     nominal = load_robot(robot.folder.parent / "arm")
     played = [record(nominal, m.sample(nominal.dt), f"n{k}", kp=0.84, delay=1) for k, m in enumerate(pool[:4])]
-    there = ExperimentDesign.from_recordings(robot, mine, played, 1)
+    there = ExperimentDesign.from_recordings(robot, mine, played)
     np.testing.assert_allclose(errors(told.after(range(4))), errors(there.after(range(4))), rtol=0.5)
 
 
@@ -102,13 +102,13 @@ def test_a_well_identified_robot_needs_no_more_motions(told):
 
 def test_kp_of_unloaded_joints_is_reported_as_undetermined(tmp_path, robot, pool, told):
     """Its joints turn about upright axes, and no log has shown what moves: friction over kp is seen, kp is not."""
-    assert undetermined_gains(robot, ParameterUncertainty.load(robot), told, pool, (0.0,)) == {}
+    assert undetermined_gains(ParameterUncertainty.load(robot), told) == {}
     free = identified(tmp_path, XML.replace('axis="0 1 0"', 'axis="0 0 1"'))
     mine = ParameterUncertainty.load(free)
     motions = [m for m in candidate_motions(Library(free, 3, HELD)) if m.name.startswith("creep")]
-    slow = ExperimentDesign.from_recordings(free, mine, simulated_recordings(free, motions, 0.0, 1), 1)
+    slow = ExperimentDesign.from_recordings(free, mine, simulated_recordings(free, motions, 0.0))
     unsure = replace(slow, covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0])
-    said = undetermined_gains(free, mine, unsure, motions, (0.0,))
+    said = undetermined_gains(mine, unsure)
     assert set(said) == {"shoulder", "elbow"}
     assert all("so no motion separates kp from friction and damping" in why for why in said.values())
 

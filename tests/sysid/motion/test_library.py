@@ -34,7 +34,7 @@ def test_per_joint_motions_cover_nine_tenths_of_every_operated_joint_at_three_ki
 def test_left_and_right_reach_the_same_places_mirrored(library):
     kit = library.kit
     for point in ([0.4, 0.2, 1.2], [0.3, 0.35, 1.0]):
-        left, right = kit.at(kit.ready, "left", point), kit.at(kit.ready, "right", point)
+        left, right = kit.at(kit.ready, ("left",), point), kit.at(kit.ready, ("right",), point)
         palm = kit.ik["left"].position(left)
         assert np.linalg.norm(palm - point) < 2e-3
         assert np.allclose(kit.ik["right"].position(right) * [1, -1, 1], palm, atol=4e-3)
@@ -94,18 +94,3 @@ def test_every_signal_stays_inside_and_starts_and_ends_at_rest(name, span):
 def test_a_creep_is_slow():
     y = SIGNALS["creep"](-1.0, 2.0, np.random.default_rng(0), DT)
     assert np.abs(np.diff(y) / DT).max() < 0.101
-
-
-def test_a_chirp_gets_faster():
-    y = SIGNALS["chirp"](-1.0, 1.0, np.random.default_rng(0), DT)
-    moving = y[50:-50] - y[0]
-    crossings = np.flatnonzero(np.diff(np.sign(moving)))
-    gaps = np.diff(crossings) * DT
-    assert gaps[0] > 3 * gaps[-1]
-
-
-def test_trapezoids_cruise_at_constant_speeds():
-    y = SIGNALS["trapezoids"](-2.0, 2.0, np.random.default_rng(3), DT)
-    speed = np.abs(np.diff(y)) / DT
-    cruising = sorted({round(float(v), 1) for v in speed if (np.abs(speed - v) < 0.01).sum() > 30 and v > 0.1})
-    assert cruising == [0.4, 0.7, 1.0, 1.4]

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.sysid.motion.feasible import MAX_SPEED, TORQUE_SHARE, Feasibility, stretch
-from gaponet.sysid.motion.motion import GRID, PEAK_SPEED, Motion, blend, fade, move_time, through
+from gaponet.sysid.motion.feasible import MAX_SPEED, TORQUE_SHARE, Feasibility
+from gaponet.sysid.motion.motion import GRID, PEAK_SPEED, Motion, blend, through
 
 
 def test_a_move_starts_and_ends_at_rest_and_passes_the_middle_in_the_middle():
@@ -26,18 +26,6 @@ def test_via_points_are_reached_and_held():
     assert (path[:2] == [0.0, 1.0]).all()
     assert np.allclose(path[11:15], [2.0, -1.0])
     assert np.allclose(path[-1], [0.5, 0.5])
-
-
-def test_move_time_keeps_peak_speed():
-    # 1 rad at 1.5 rad/s peak: 1.875 · 1 / 1.5 = 1.25 s
-    assert move_time(np.array([1.0, 0.01]), 1.5).tolist() == [1.25, 0.5]
-
-
-def test_a_faded_wave_starts_and_ends_at_zero():
-    window = fade(500, 0.01, 1.0)
-    assert window[0] == 0
-    assert window[-1] == 0
-    assert window[250] == 1
 
 
 def still(robot, shoulder, elbow=0.0, rows=50):
@@ -85,10 +73,3 @@ def test_a_motion_that_cannot_be_fitted_is_refused_with_the_reason(arm):
     limits = Feasibility(arm, 5.0)
     with pytest.raises(UsageError, match=r"'hold' does not fit arm .* shoulder needs .* at 5 kg, .* lighter payload"):
         limits.fit(Motion("hold", "joint", GRID, still(arm, 0.0)))
-
-
-def test_stretch_keeps_ends():
-    ctrl = np.linspace([0.0, 1.0], [1.0, 3.0], 101)
-    slow = stretch(ctrl, 2.0)
-    assert len(slow) == 201
-    assert np.allclose(slow[[0, 100, -1]], [[0, 1], [0.5, 2], [1, 3]])

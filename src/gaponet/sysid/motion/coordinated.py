@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import accumulate
 
 import mujoco
 import numpy as np
@@ -21,6 +22,10 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.feasible import Feasibility
 from gaponet.sysid.motion.motion import GRID, fade, through
 
+Sides = tuple[str, ...]
+MAX_IK_ITERATIONS = 80
+DURATION_S = 8.0  # of most whole-body motions
+KNOT_ROWS = 10  # between postures on a path of the hands that are computed; a spline goes through them
 ROLES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll")
 
 
@@ -43,14 +48,14 @@ class Arm:
 
 def arms(robot: RobotSpec) -> dict[str, Arm]:
     """The robot's arms by side; empty for a robot that is not built like that."""
-    found = {}
+    by_side = {}
     for mount in robot.payload_mounts:
         names = [[n for n in robot.joint_names if n.startswith(f"{mount.side}_{role}")] for role in ROLES]
         if all(len(n) == 1 for n in names):
             sign = -1.0 if mount.side == "right" else 1.0
             columns = robot.index([n[0] for n in names])
-            found[mount.side] = Arm(mount.side, sign, columns, f"payload_{mount.side}")
-    return found
+            by_side[mount.side] = Arm(mount.side, sign, columns, f"payload_{mount.side}")
+    return by_side
 
 
 class HandIK:
@@ -69,12 +74,12 @@ class HandIK:
         mujoco.mj_kinematics(self.model, self.data)
         return self.data.xpos[self.body].copy()
 
-    def solve(self, qpos: Array, target: Array, iterations: int = 80) -> Array:
+    def solve(self, qpos: Array, target: Array) -> Array:
         """Joint positions (n,) that bring the palm as near to target (3,) m as limits allow, starting from qpos."""
         q = np.array(qpos, float)
         rest = q[self.arm.columns].copy()
         jac = np.zeros((3, self.model.nv))
-        for _ in range(iterations):
+        for _ in range(MAX_IK_ITERATIONS):
             error = target - self.position(q)
             if np.linalg.norm(error) < 1e-4:
                 break
@@ -89,14 +94,8 @@ class HandIK:
 
     def path(self, qpos: Array, targets: Array) -> Array:
         """One posture per target (k, 3), each from the one before: (k, n)."""
-        rows = []
-        for target in targets:
-            qpos = self.solve(qpos, target)
-            rows.append(qpos)
-        return np.array(rows)
+        return np.array(list(accumulate(targets, self.solve, initial=qpos))[1:])
 
-
-Sides = tuple[str, ...]
 
 # Elbows bent, hands in front of the belly: the posture from which people start; (ROLES), rad, left arm.
 READY = np.array([0.15, 0.25, 0.0, 0.35, 0.0])
@@ -122,11 +121,11 @@ class Kit:
             q[self.arms[side].columns] = np.asarray(angles) * (MIRROR if self.arms[side].sign < 0 else 1.0)
         return np.clip(q, self.limits.low, self.limits.high)
 
-    def at(self, q: Array, side: str, point: Array | list[float], roll: float = 0.0) -> Array:
-        """Posture q with that hand at a point given for the left arm, (3,) m, and the wrist rolled by so many rad."""
-        arm = self.arms[side]
-        q = self.ik[side].solve(q, np.asarray(point) * [1.0, arm.sign, 1.0])
-        q[arm.columns[4]] = arm.sign * roll
+    def at(self, q: Array, sides: Sides, point: Array | list[float], roll: float = 0.0) -> Array:
+        """Posture q with these hands at a point given for the left arm, (3,) m, and wrists rolled by so many rad."""
+        for arm in (self.arms[side] for side in sides):
+            q = self.ik[arm.side].solve(q, np.asarray(point) * [1.0, arm.sign, 1.0])
+            q[arm.columns[4]] = arm.sign * roll
         return q
 
 
@@ -136,7 +135,7 @@ def reach(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     for _ in range(4):
         q = kit.ready
         for side in sides:
-            q = kit.at(q, side, rng.uniform([0.25, 0.08, 0.95], [0.5, 0.45, 1.45]), rng.uniform(-1.2, 1.2))
+            q = kit.at(q, (side,), rng.uniform([0.25, 0.08, 0.95], [0.5, 0.45, 1.45]), rng.uniform(-1.2, 1.2))
         stops.append(q)
     return _stops(stops, rng.uniform(0.8, 1.4), 0.4)
 
@@ -149,10 +148,7 @@ def pick_and_place(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
         start, stop = (rng.uniform([0.3, 0.1], [0.45, 0.4]) for _ in range(2))
         roll = rng.uniform(-1.0, 1.0)
         for xy, z in ((start, 0.15), (start, 0.0), (start, 0.18), (stop, 0.18), (stop, 0.0), (stop, 0.15)):
-            q = stops[-1]
-            for side in sides:
-                q = kit.at(q, side, [*xy, height + z], roll)
-            stops.append(q)
+            stops.append(kit.at(stops[-1], sides, [*xy, height + z], roll))
     return _stops(stops, 0.7, 0.15)
 
 
@@ -161,10 +157,7 @@ def lift(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     stops = [kit.ready]
     x, y = rng.uniform(0.3, 0.4), rng.uniform(0.15, 0.3)
     for z in rng.uniform([0.9, 1.3, 0.9, 1.35], [1.0, 1.5, 1.05, 1.55]):
-        q = stops[-1]
-        for side in sides:
-            q = kit.at(q, side, [x, y, z])
-        stops.append(q)
+        stops.append(kit.at(stops[-1], sides, [x, y, z]))
     return _stops([*stops, kit.ready], 1.4, 0.5)
 
 
@@ -174,7 +167,7 @@ def punch(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     stops = [kit.ready, guard]
     for i in range(4):
         side = sides[i % len(sides)]
-        stops += [kit.at(guard, side, rng.uniform([0.48, 0.1, 1.25], [0.56, 0.25, 1.45])), guard]
+        stops += [kit.at(guard, (side,), rng.uniform([0.48, 0.1, 1.25], [0.56, 0.25, 1.45])), guard]
     return _stops(stops, 0.5, 0.25)
 
 
@@ -182,11 +175,10 @@ def wave(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     """Upper arm out and up, then forearm from side to side."""
     raised = kit.posture(**{s: [rng.uniform(-0.6, -0.2), rng.uniform(1.0, 1.4), 0.0, -0.5, 0.0] for s in sides})
     ctrl = _stops([kit.ready, raised], 1.6, 0.4)
-    columns = [kit.arms[s].columns for s in sides]
     steps = round(rng.uniform(4.0, 5.0) / GRID)
     phase = 2 * np.pi * rng.uniform(0.5, 0.9) * np.arange(steps) * GRID
     swing = np.repeat(raised[None], steps, axis=0)
-    for c in columns:
+    for c in (kit.arms[s].columns for s in sides):
         swing[:, c[2]] += 0.4 * np.sin(phase) * fade(steps, GRID, 1.0)
         swing[:, c[3]] += 0.25 * np.sin(phase + 1.0) * fade(steps, GRID, 1.0)
     return np.concatenate([ctrl, swing, _stops([raised, kit.ready], 1.6, 0.4)])
@@ -220,7 +212,7 @@ def carry(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     """Load before the chest while the torso turns and the arms give a little at walking pace."""
     held = kit.ready
     for side in sides:
-        held = kit.at(held, side, rng.uniform([0.33, 0.12, 1.1], [0.42, 0.22, 1.25]))
+        held = kit.at(held, (side,), rng.uniform([0.33, 0.12, 1.1], [0.42, 0.22, 1.25]))
     steps = round(6.0 / GRID)
     time = np.arange(steps) * GRID
     window = fade(steps, GRID, 1.5)
@@ -243,9 +235,7 @@ def wander(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     size = np.array([0.5, 0.35, 0.6, 0.6, 0.9])
     for side in sides:
         for column, amplitude in zip(kit.arms[side].columns, size, strict=True):
-            frequency = rng.uniform(0.1, 0.6, 3)
-            sines = np.sin(2 * np.pi * np.outer(time, frequency) + rng.uniform(0, 2 * np.pi, 3)).mean(axis=1)
-            ctrl[:, column] += amplitude * sines * fade(steps, GRID, 2.0)
+            ctrl[:, column] += amplitude * _sines(time, 0.6, rng) * fade(steps, GRID, 2.0)
     return ctrl
 
 
@@ -254,27 +244,30 @@ BUILDERS: dict[str, Callable[[Kit, Sides, np.random.Generator], Array]] = {
 }
 
 
+def _sines(time: Array, most: float, rng: np.random.Generator) -> Array:
+    """Mean of three sines of random phases and frequencies from 0.1 to `most` Hz, (T,)."""
+    frequency = rng.uniform(0.1, most, 3)
+    return np.asarray(np.sin(2 * np.pi * np.outer(time, frequency) + rng.uniform(0, 2 * np.pi, 3)).mean(axis=1))
+
+
 def _stops(stops: list[Array], move: float, hold: float) -> Array:
     """Move all joints to each posture in turn: `move` s for the way, `hold` s of rest at each."""
     count = len(stops)
     return through(np.array(stops), np.full(count - 1, move), np.full(count, hold), GRID)
 
 
-def _along(kit: Kit, paths: dict[str, Array], every: int = 10) -> Array:
+def _along(kit: Kit, paths: dict[str, Array]) -> Array:
     """Hands along left-arm paths (T, 3), between two moves from and to the ready posture."""
     from scipy.interpolate import CubicSpline
 
     rows = len(next(iter(paths.values())))
-    knots = np.unique(np.append(np.arange(0, rows, every), rows - 1))
+    knots = np.unique(np.append(np.arange(0, rows, KNOT_ROWS), rows - 1))
     q = np.repeat(kit.ready[None], len(knots), axis=0)
     for side, path in paths.items():
         arm: Arm = kit.arms[side]
         q[:, arm.columns] = kit.ik[side].path(kit.ready, path[knots] * [1.0, arm.sign, 1.0])[:, arm.columns]
     middle = CubicSpline(knots, q)(np.arange(rows))
     return np.concatenate([_stops([kit.ready, q[0]], 1.2, 0.3), middle, _stops([q[-1], kit.ready], 1.2, 0.3)])
-
-
-DURATION = 8.0  # s
 
 
 def squat(kit: Kit, rng: np.random.Generator) -> Array:
@@ -287,8 +280,7 @@ def squat(kit: Kit, rng: np.random.Generator) -> Array:
         _add(down, kit, f"{side}_ankle_pitch", -depth * 0.9)
     for arm in kit.arms.values():
         down[arm.columns[0]] -= rng.uniform(0.3, 0.6)
-    stops = np.array([kit.ready, down, kit.ready, down, kit.ready])
-    return through(stops, np.full(4, rng.uniform(1.3, 1.7)), np.full(5, 0.4), GRID)
+    return _stops([kit.ready, down, kit.ready, down, kit.ready], rng.uniform(1.3, 1.7), 0.4)
 
 
 def march(kit: Kit, rng: np.random.Generator) -> Array:
@@ -336,14 +328,13 @@ def limber(kit: Kit, rng: np.random.Generator) -> Array:
     time, ctrl, window = _start(kit)
     low, high = _box(kit, 0.3)
     for j in range(ctrl.shape[1]):
-        frequency = rng.uniform(0.1, 0.5, 3)
-        wave = np.sin(2 * np.pi * np.outer(time, frequency) + rng.uniform(0, 2 * np.pi, 3)).mean(axis=1)
+        wave = _sines(time, 0.5, rng)
         ctrl[:, j] += ((low[j] + high[j]) / 2 - kit.ready[j] + wave * (high[j] - low[j]) / 2) * window
     return ctrl
 
 
-LEGGED = (squat, march, sway)
-ANY = (tour, limber)
+LEGGED, ANY = (squat, march, sway), (tour, limber)
+_LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 WHOLE_BODY: dict[str, Callable[[Kit, np.random.Generator], Array]] = {f.__name__: f for f in LEGGED + ANY}
 
 
@@ -351,9 +342,6 @@ def available(kit: Kit) -> list[str]:
     """Names of the whole-body motions that this robot can play."""
     legs = all(any(n.startswith(f"{s}_{j}") for n in kit.robot.joint_names) for s in ("left", "right") for j in _LEG)
     return [f.__name__ for f in (LEGGED if legs else ()) + ANY]
-
-
-_LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 
 
 def _add(ctrl: Array, kit: Kit, start: str, values: Array | float) -> None:
@@ -364,7 +352,7 @@ def _add(ctrl: Array, kit: Kit, start: str, values: Array | float) -> None:
 
 
 def _start(kit: Kit) -> tuple[Array, Array, Array]:
-    steps = round(DURATION / GRID)
+    steps = round(DURATION_S / GRID)
     return np.arange(steps) * GRID, np.repeat(kit.ready[None], steps, axis=0), fade(steps, GRID, 1.5)
 
 

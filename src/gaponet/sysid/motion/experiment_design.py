@@ -20,12 +20,9 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.dynamics import static_torque
-from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 from gaponet.sysid.evidence import evidence
 from gaponet.sysid.motion.coordinated import ANY
-from gaponet.sysid.motion.feasible import TORQUE_SHARE
 from gaponet.sysid.motion.library import SIGNALS, Library, short
 from gaponet.sysid.motion.motion import GRID, Motion
 from gaponet.sysid.uncertainty import ParameterUncertainty
@@ -35,7 +32,6 @@ MAX_SINGLE_JOINTS = 8  # of a robot with more, no joint moves by itself
 RANGE_SHARE = 0.5  # of a joint's interval, from home, beside others
 WORTH_INTERVAL_S, MIN_WORTH = 30.0, 0.05  # time that must reduce the errors by this share to be worth playing
 MAX_KP_ERROR = 0.1  # relative, after all motions; more means that they do not determine it
-PAYLOADS_KG = (3.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05)  # the heaviest that can be held is tried
 EPSILON = 1e-9
 
 
@@ -57,10 +53,10 @@ class ExperimentDesign:
 
     @classmethod
     def from_recordings(
-        cls, robot: RobotSpec, uncertainty: ParameterUncertainty, recordings: ListOf[Sequence], nthread: int = 0
+        cls, robot: RobotSpec, uncertainty: ParameterUncertainty, recordings: ListOf[Sequence]
     ) -> ExperimentDesign:
         """Make the design from simulated recordings of the identified robot; their names differ."""
-        own = evidence(robot, recordings, uncertainty.fields, 10**6, nthread).by_recording()
+        own = evidence(robot, recordings, uncertainty.fields, 10**6).by_recording()
         covariance = np.stack([uncertainty.array(j, "covariance") for j in robot.operated])
         overdispersion = np.stack([uncertainty.array(j, "overdispersion") for j in robot.operated])
         seconds = np.array([s.duration for s in recordings])
@@ -135,16 +131,16 @@ def candidate_motions(library: Library, progress: Progress = no_progress) -> lis
         *(f"{s}-{short(j)}" for j in single for s in SIGNALS),
         *(f"{kind.__name__}-all-{v}" for kind in ANY for v in range(VARIANTS)),
     ]
-    found = []
+    motions = []
     for k in range(len(names) + MOTIONS_OF_ALL_JOINTS):
         progress(k, len(names) + MOTIONS_OF_ALL_JOINTS, "which motions fit the robot's limits")
         try:
-            found.append(library.make(names[k]) if k < len(names) else _at_once(library, k - len(names)))
+            motions.append(library.make(names[k]) if k < len(names) else _at_once(library, k - len(names)))
         except UsageError:  # does not fit this robot's limits: no candidate
             continue
-    if not found:
+    if not motions:
         raise UsageError(f"{robot.name}: no motion fits its limits; lighten --payloads, or look at collision.toml")
-    return found
+    return motions
 
 
 def _at_once(library: Library, variant: int) -> Motion:
@@ -154,10 +150,9 @@ def _at_once(library: Library, variant: int) -> Motion:
     columns = {}
     for joint in robot.operated:
         i, there = robot.index([joint])[0], library.excitation_range(joint)
-        low, high = (
-            library.kit.ready[i] + RANGE_SHARE * (end - library.kit.ready[i]) for end in (there.low, there.high)
-        )
-        columns[i] = kinds[rng.integers(len(kinds))](min(low, high), max(low, high), rng, GRID)
+        ready = library.kit.ready[i]
+        low, high = sorted(ready + RANGE_SHARE * (end - ready) for end in (there.low, there.high))
+        columns[i] = kinds[rng.integers(len(kinds))](low, high, rng, GRID)
     ctrl = np.repeat(library.kit.ready[None], max(map(len, columns.values())), axis=0)
     for i, column in columns.items():
         ctrl[:, i] = np.concatenate([column, np.full(len(ctrl) - len(column), column[-1])])
@@ -165,54 +160,24 @@ def _at_once(library: Library, variant: int) -> Motion:
     return library.limits.fit(made)
 
 
-def simulated_recordings(robot: RobotSpec, motions: ListOf[Motion], payload: float, nthread: int = 0) -> list[Sequence]:
+def simulated_recordings(robot: RobotSpec, motions: ListOf[Motion], payload: float) -> list[Sequence]:
     """Return recordings of motions that the robot would make as it is identified."""
     commanded = []
     for motion in motions:
         ctrl = motion.sample(robot.dt).astype(np.float32)
         meta = SequenceMeta(robot.name, "expected", f"{motion.name} {payload:g} kg", payload, virtual=True)
         commanded.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl)))
-    replays = replay(commanded, robot, nthread=nthread, lock_idle=True)
+    replays = replay(commanded, robot, lock_idle=True)
     return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(commanded, replays, strict=True)]
 
 
-def undetermined_gains(
-    robot: RobotSpec, uncertainty: ParameterUncertainty, design: ExperimentDesign, motions: ListOf[Motion],
-    payloads: ListOf[float],
-) -> dict[str, str]:  # fmt: skip
-    """Return joint → advice for joints whose kp none of these motions determines."""
-    kp = uncertainty.fields.index("kp")
-
-    def kp_errors(of: ExperimentDesign) -> dict[str, float]:
-        whole = of.after(range(len(of.seconds)))
-        return dict(zip(uncertainty.joints, np.sqrt(whole[:, kp, kp]).tolist(), strict=True))
-
-    errors = {j: e for j, e in kp_errors(design).items() if e > MAX_KP_ERROR}
-    mass = _heaviest_payload(robot, motions) if errors and max(payloads) == 0 else None
-    loaded = {}
-    if mass is not None:
-        added = ExperimentDesign.from_recordings(robot, uncertainty, simulated_recordings(robot, motions, mass))
-        both = np.concatenate([design.information, added.information], axis=1)
-        loaded = kp_errors(replace(design, information=both))
-    return {j: _advice(e, loaded.get(j), mass, bool(robot.payload_mounts), max(payloads)) for j, e in errors.items()}
-
-
-def _advice(error: float, loaded: float | None, mass: float | None, hand: bool, most: float) -> str:
-    """Return what to do about a joint's kp: its error after all motions, and with a payload `mass` in the hand."""
-    why = f"nothing loads it, so no motion separates kp from friction and damping (± {error:.0%} after all of them)"
-    if loaded is not None and loaded < min(MAX_KP_ERROR, 0.5 * error):
-        return f"{why}; {mass:g} kg in the hand would, to ± {loaded:.0%}: weigh it, --payloads 0 {mass:g}"
-    if mass is not None:
-        return f"{why}, nor would {mass:g} kg in the hand (± {loaded:.0%}); take its numbers as a set"
-    if hand and not most:
-        return f"{why}, and no payload can be held in all of them; take its numbers as a set"
-    return f"{why}; take its numbers as a set{'' if hand else ', or give robot.toml a [[payload_mount]]'}"
-
-
-def _heaviest_payload(robot: RobotSpec, motions: ListOf[Motion]) -> float | None:
-    """Return the heaviest of PAYLOADS_KG with which all postures can be held, kg; None if there is none."""
-    postures = np.concatenate([m.ctrl[::50] for m in motions])
-    for mass in PAYLOADS_KG if robot.payload_mounts else ():
-        if (np.abs(static_torque(build_model(robot, mass), postures)) <= TORQUE_SHARE * robot.effort_limit).all():
-            return mass
-    return None
+def undetermined_gains(uncertainty: ParameterUncertainty, design: ExperimentDesign) -> dict[str, str]:
+    """Return joint → advice for joints whose kp all recordings of the design together do not determine."""
+    kp, after = uncertainty.fields.index("kp"), design.after(range(len(design.seconds)))
+    errors = dict(zip(uncertainty.joints, np.sqrt(after[:, kp, kp]).tolist(), strict=True))
+    return {
+        joint: f"nothing loads it, so no motion separates kp from friction and damping (± {error:.0%} after all of "
+        "them); take its numbers as a set, or load it: weigh a payload, --payloads 0 KG"
+        for joint, error in errors.items()
+        if error > MAX_KP_ERROR
+    }

@@ -22,6 +22,7 @@ from gaponet.sysid.motion.motion import GRID, Motion
 
 MAX_PAYLOAD = 3.0  # kg per hand: the heaviest of the SimLifter recipe, and the default
 MAX_SPEED = 4.0  # rad/s: under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf)
+MAX_CHANGES = 40  # of a motion until it fits
 RANGE_MARGIN = 0.02  # rad kept from a hard stop
 MAX_STATIC_SHARE = 0.95  # of the usable torque, to hold a posture: slower motion does not reduce it
 TORQUE_SHARE = 0.85  # of the effort limit, for commands; the rest is for feedback and heavier links
@@ -29,7 +30,7 @@ TORQUE_SHARE = 0.85  # of the effort limit, for commands; the rest is for feedba
 
 @dataclass(frozen=True)
 class Demand:
-    """The worst that a command demand of any joint: 1.0 is the limit."""
+    """The worst that a command demands of any joint; 1.0 is the limit."""
 
     position: float
     speed: float
@@ -50,17 +51,9 @@ class Feasibility:
     """Limits of one robot at payloads from zero to max_payload."""
 
     def __init__(
-        self,
-        robot: RobotSpec,
-        max_payload: float = MAX_PAYLOAD,
-        height: float | None = None,
-        unchecked: bool = False,
+        self, robot: RobotSpec, max_payload: float = MAX_PAYLOAD, height: float | None = None, unchecked: bool = False
     ) -> None:
-        """
-        Args:
-            height: Where the floor or table is, m, instead of what collision.toml says.
-            unchecked: Do without shapes.
-        """
+        """Take the floor's or table's height, m, instead of collision.toml's; `unchecked` ignores all shapes."""
         self.robot = robot
         self.low, self.high = robot.qpos_range[:, 0] + RANGE_MARGIN, robot.qpos_range[:, 1] - RANGE_MARGIN
         self.max_payload = max_payload if robot.payload_mounts else 0.0
@@ -71,9 +64,8 @@ class Feasibility:
     def demand(self, ctrl: Array, dt: float, named: Array | slice = slice(None), need: Array | None = None) -> Demand:
         """Return the demand of a command (T, n) rad at period dt.
 
-        Args:
-            named: The joints that must be within their ranges.
-            need: Free space to be kept, (pairs + shells,) m; default the clearance.
+        Joints `named` must be within their ranges; `need` is the free space to keep, (pairs + shells,) m, if it is not
+        the clearance.
         """
         qvel = np.gradient(ctrl, dt, axis=0)
         qacc = np.gradient(qvel, dt, axis=0)
@@ -96,14 +88,14 @@ class Feasibility:
             clear=bool((free >= (self.collision.clearance if need is None else need)).all()),
         )
 
-    def fit(self, motion: Motion, tries: int = 40, need: Array | None = None) -> Motion:
+    def fit(self, motion: Motion, need: Array | None = None) -> Motion:
         """Slow the motion down, or bring it nearer to a posture that is fine, until it fits.
 
         It is slowed where speed or acceleration demand too much, and brought nearer where even standing still does or
         where limbs meet: to its own start if that is fine, else to the robot's home. Joints that it does not name stay.
 
         Raises:
-            UsageError: It does not fit after `tries` changes; the message says what it still demand for.
+            UsageError: It does not fit after MAX_CHANGES changes; the message says what exceeds a limit.
         """
         named = self.robot.index(motion.named(self.robot))
         low, high = np.full_like(self.low, -np.inf), np.full_like(self.high, np.inf)
@@ -112,7 +104,7 @@ class Feasibility:
         anchor = ctrl[0].copy()
         if not self.can_hold(anchor, need):  # of all joints, those that are only held too
             anchor[named] = np.clip(self.robot.qpos_home, low, high)[named]
-        for _ in range(tries):
+        for _ in range(MAX_CHANGES):
             demand = self.demand(ctrl, motion.dt, named, need)
             if demand.met:
                 return replace(motion, ctrl=ctrl)
@@ -122,9 +114,9 @@ class Feasibility:
                 ctrl = stretch(ctrl, min(max(demand.speed, demand.torque**0.5, 1.03), 1.5))
             ctrl = np.clip(ctrl, low, high)
         raise UsageError(
-            f"motion '{motion.name}' does not fit {self.robot.name} after {tries} changes: {demand.worst_joint} needs "
-            f"{demand.torque:.2f} of its usable torque at {self.max_payload:g} kg, speed is {demand.speed:.2f} of "
-            f"{MAX_SPEED:g} rad/s, {demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at "
+            f"motion '{motion.name}' does not fit {self.robot.name} after {MAX_CHANGES} changes: {demand.worst_joint} "
+            f"needs {demand.torque:.2f} of its usable torque at {self.max_payload:g} kg, speed is {demand.speed:.2f} "
+            f"of {MAX_SPEED:g} rad/s, {demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at "
             f"least {self.collision.clearance * 100:g}). Start it from a posture that is easier to hold, or collect "
             "with a lighter payload"
         )

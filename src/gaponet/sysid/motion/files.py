@@ -27,10 +27,6 @@ SUFFIXES = (".txt", ".csv", ".npz")
 def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
     """A motion from a file; joints that the file does not name are at home, and stay where they are found on a robot.
 
-    Args:
-        path: .txt, .csv or .npz.
-        robot: Decides names, order and home.
-
     Raises:
         LogError: Unreadable; with file, line and what is wrong.
         JointMismatchError: A joint that the robot does not have.

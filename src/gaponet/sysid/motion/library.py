@@ -104,20 +104,11 @@ class Library:
     """Motions of one robot by name; joints' excitation ranges are cached."""
 
     def __init__(
-        self,
-        robot: RobotSpec,
-        seed: int = 0,
-        max_payload: float = MAX_PAYLOAD,
-        height: float | None = None,
+        self, robot: RobotSpec, seed: int = 0, max_payload: float = MAX_PAYLOAD, height: float | None = None,
         unchecked: bool = False,
-    ) -> None:
-        """
-        Args:
-            height: Where the floor or table is, m, instead of what collision.toml says.
-            unchecked: Do without shapes.
-        """
-        self.robot = robot
-        self.seed = seed
+    ) -> None:  # fmt: skip
+        """Make the motions of a seed; height and unchecked as of Feasibility."""
+        self.robot, self.seed = robot, seed
         self.limits = Feasibility(robot, max_payload, height, unchecked)
         self.kit = Kit(self.limits)
         self._ranges: dict[str, ExcitationRange] = {}

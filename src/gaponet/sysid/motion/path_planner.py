@@ -142,11 +142,11 @@ def _grow(straight: _Straight, tree: list[Array], came: list[int], aim: Array, o
 
 def _back(tree: list[Array], came: list[int], at: int) -> list[Array]:
     """Return the nodes from one to the root."""
-    found = []
+    nodes = []
     while at >= 0:
-        found.append(tree[at])
+        nodes.append(tree[at])
         at = came[at]
-    return found
+    return nodes
 
 
 def _cut(straight: _Straight, points: list[Array], rng: np.random.Generator) -> Search[Array]:

@@ -86,10 +86,10 @@ def takes(recipe: Recipe, names: list[str]) -> list[Take]:
     """
     motions: list[str] = []
     for pattern in recipe.motions:
-        found = [name for name in names if fnmatchcase(name, pattern)]
-        if not found and any(c in pattern for c in "*?["):
+        matches = [name for name in names if fnmatchcase(name, pattern)]
+        if not matches and any(c in pattern for c in "*?["):
             raise UsageError(f"recipe '{recipe.name}': no motion of this robot matches '{pattern}'")
-        motions += found or [pattern]
+        motions += matches or [pattern]
     motions += [Path(file).stem for file in recipe.files]
     motions = list(dict.fromkeys(motions))
     count = len(motions) * len(recipe.rates) * len(recipe.payloads) * len(recipe.units) * recipe.repetitions
