@@ -1,14 +1,19 @@
 """The doctor finds what is wrong with a recording, says it in words, and finds nothing wrong with a good one."""
 
+import json
 import re
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from multiprocessing import get_context
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from arm import recordings
 from logs import arm_sequence, late, wave
 
-from gaponet.base.errors import DatasetError
+from gaponet.base.errors import DatasetError, WorkerError
 from gaponet.data.checks.timing import MIN_EARLY_RATIO, _drift
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.sequence import Sequence
@@ -278,6 +283,26 @@ def test_missing_samples_and_jitter_are_reported_from_the_logs_own_clock(arm, tm
     assert found(diagnosis, "gaps", "warning").message.startswith("1 sequence(s) miss samples, at worst 100 ms (m)")
     assert found(diagnosis, "jitter", "warning").values == {"jitter_ms": 80.0}
     assert found(diagnosis, "rate", "note").message == "1 sequence(s) were put on a uniform grid: m"
+
+
+class DyingExecutor(Executor):
+    """An executor whose workers are killed."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        future.set_exception(BrokenProcessPool("killed"))
+        return future
+
+
+def test_other_processes_measure_the_same_and_workers_that_die_are_an_error(arm, tmp_path):
+    dataset = Dataset.create(tmp_path / "data", arm)
+    for sequence in recordings(arm, 3, rows=ROWS):
+        dataset.append(sequence)
+    with ProcessPoolExecutor(2, get_context("spawn")) as processes:
+        there = Diagnosis.of(dataset, arm, executor=processes).as_dict()
+    assert json.dumps(there) == json.dumps(Diagnosis.of(dataset, arm).as_dict())
+    with pytest.raises(WorkerError, match="workers died of it"):
+        Diagnosis.of(dataset, arm, executor=DyingExecutor())
 
 
 def test_two_rates_in_one_dataset_are_a_warning(arm, tmp_path):

@@ -6,7 +6,6 @@
     offsets.json            static offsets of each unit as measured at import (data.offsets); not applied
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, … (data.sequence_file)
     replays/<model>/<id>.parquet  qpos, qvel, tau of the simulator with that model hash; older versions: twins/
-    surveys/<id>.npy        measurements of the doctor (data.checks.check_cache)
     card.json, CARD.md      counts and ranges (data.card)
     splits/<name>.json      train, validation and test sets (data.split)
 
@@ -50,7 +49,6 @@ from gaponet.robot.spec import RobotSpec
 FORMAT = 1
 KIND = "dataset"
 REPLAYS, OLD_REPLAYS = "replays", "twins"
-SURVEYS = "surveys"
 
 
 class _Header(TypedDict):
@@ -270,7 +268,7 @@ class Dataset:
         return entry
 
     def remove(self, patterns: tuple[str, ...]) -> list[Entry]:
-        """Remove the sequences whose ids match a pattern, with their replays and surveys; return their entries.
+        """Remove the sequences whose ids match a pattern, with their replays; return their entries.
 
         Raises:
             DatasetError: A pattern matches no id. Nothing is removed then.
@@ -284,7 +282,7 @@ class Dataset:
                 temporary.write_bytes(b"".join(e.line + b"\n" for e in self.entries if e not in removed))
             for entry in removed:  # if this is cut short, the files that remain are not listed
                 self._file(entry).unlink(missing_ok=True)
-                for pattern in (f"{SURVEYS}/{entry.id}*", f"{REPLAYS}/*/{entry.id}.*", f"{OLD_REPLAYS}/*/{entry.id}.*"):
+                for pattern in (f"{REPLAYS}/*/{entry.id}.*", f"{OLD_REPLAYS}/*/{entry.id}.*"):
                     for file in self.path.glob(pattern):
                         file.unlink(missing_ok=True)
             self._load()
