@@ -21,12 +21,10 @@ from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import WIDEST, Recording, Signal, reading
-from gaponet.data.formats import DESCRIBED, files_under
+from gaponet.data.formats import files_under
 
 SUFFIXES = (".h5", ".hdf5")
-OPTIONS = DESCRIBED
 EXTRA = "hdf5"
-DEFAULT: LogsFile = {}
 ALOHA: LogsFile = {
     "ctrl": "action", "qpos": "observations/qpos", "qvel": "observations/qvel", "tau": "observations/effort",
     "position_unit": "rad",
@@ -34,19 +32,9 @@ ALOHA: LogsFile = {
 DEEPEST, MOST = 6, 5000  # groups in groups; arrays in a file
 
 
-def detects(path: Path) -> bool:
-    """A file of that suffix, or a folder with one at or below it."""
-    return bool(find(path))
-
-
-def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, SUFFIXES)
-
-
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every file, or every demonstration in it."""
-    for file in find(path):
+    for file in files_under(path, SUFFIXES):
         arrays = _listed(file)
         demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")}, key=_by_number)
         for demo in demos or [""]:

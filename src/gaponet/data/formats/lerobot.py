@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 OPTIONS = ("position_unit", "joints", "ignore")
-EXTRA = ""
 POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
 INDEX = ("timestamp", "frame_index", "episode_index")  # columns of data files
 

@@ -22,11 +22,10 @@ from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, reading, restated
-from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.formats import files_under, pickles
 from gaponet.data.log import CHANNELS, DERIVED
 
-OPTIONS = DESCRIBED
-EXTRA = ""
+SUFFIXES = (".npz",)
 DEFAULT: LogsFile = {"time": "time"}
 GAPONET: LogsFile = {
     "ctrl": "real_dof_positions_cmd", "qpos": "real_dof_positions", "qvel": "real_dof_velocities",
@@ -36,19 +35,9 @@ NAMES = ("joint_names", "joint_sequence", "dof_names")
 OURS = "gaponet"  # array with JSON in a file of ours
 
 
-def detects(path: Path) -> bool:
-    """A file of that suffix, or a folder with one at or below it."""
-    return bool(find(path))
-
-
-def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, (".npz",))
-
-
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every file, or every motion in it."""
-    for file in find(path):
+    for file in files_under(path, SUFFIXES):
         arrays = _read(file)
         names = next((tuple(map(str, arrays[n].ravel())) for n in NAMES if n in arrays), ())
         if OURS in arrays:

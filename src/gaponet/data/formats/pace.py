@@ -19,10 +19,9 @@ from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, reading
-from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.formats import files_under, pickles
 
-OPTIONS = DESCRIBED
-EXTRA = ""
+SUFFIXES = (".pt",)
 DEFAULT: LogsFile = {
     "time": "time", "time_unit": "s", "position_unit": "rad", "ctrl": "des_dof_pos", "qpos": "dof_pos",
     "qvel": "dof_vel", "tau": "dof_torque",
@@ -30,19 +29,9 @@ DEFAULT: LogsFile = {
 GAINS = ("kp", "kd")
 
 
-def detects(path: Path) -> bool:
-    """A file of that suffix, or a folder with one at or below it."""
-    return bool(find(path))
-
-
-def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, (".pt",))
-
-
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every file."""
-    for file in find(path):
+    for file in files_under(path, SUFFIXES):
         arrays = _read(file)
         qpos = arrays.get(str(told.get("qpos")))
         gains: LogsFile = {}

@@ -26,10 +26,9 @@ from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal, reading
-from gaponet.data.formats import DESCRIBED, files_under
+from gaponet.data.formats import files_under
 
 SUFFIXES = (".db3", ".mcap", ".bag")
-OPTIONS = DESCRIBED
 EXTRA = "ros"
 DEFAULT: LogsFile = {"time_unit": "s", "position_unit": "rad"}
 PEEK = 200  # messages of a topic in which all its joints are named
@@ -57,11 +56,6 @@ CONTROLLER = (
     f"std_msgs/Header header\nstring[] joint_names\n{POINT} reference\n{POINT} feedback\n{POINT} error\n{POINT} output"
 )
 Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its columns, its numbers)
-
-
-def detects(path: Path) -> bool:
-    """A bag, or a folder with bags."""
-    return bool(find(path))
 
 
 def find(path: Path) -> list[Path]:

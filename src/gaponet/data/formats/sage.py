@@ -26,8 +26,6 @@ from gaponet.robot.spec import RobotSpec
 
 COLUMNS = {"positions": "qpos", "velocities": "qvel", "torques": "tau"}
 FILES = ("control.csv", "state_motor.csv")
-OPTIONS: tuple[str, ...] = ()
-EXTRA = ""
 DIGITS = b"0123456789.+-eE \r"  # what numbers are made of; the rest of a row is its skeleton
 NUMBER = r" *(?:[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf) *"
 

@@ -20,14 +20,12 @@ from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal
-from gaponet.data.formats import DESCRIBED, files_under, joint_rows, parquet
+from gaponet.data.formats import files_under, joint_rows, parquet
 from gaponet.data.log import CHANNELS, skipped_rows
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
 NOT_OBEYED = "gaponet.not_obeyed"  # metadata of a table that is no data, and why (hw/control/recording.py)
-OPTIONS = DESCRIBED
-EXTRA = ""
 DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
 
 
