@@ -6,10 +6,9 @@ softer motors alike; gaponet identify separates them.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
-from gaponet.base.files import write_text
+from gaponet.base.files import write_json
 from gaponet.base.structure import Json, read_json
 from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import Dataset
@@ -89,9 +88,8 @@ def record_offsets(dataset: Dataset, unit_id: str, offsets: dict[str, JointOffse
     file = dataset.path / FILE
     with dataset.writing():
         content = read_offsets(dataset)
-        joints = {name: asdict(offset) for name, offset in offsets.items()}
-        content["units"][unit_id] = {"joints": joints, "simulator": simulator}
-        write_text(file, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        content["units"][unit_id] = {"joints": offsets, "simulator": simulator}
+        write_json(file, content)
     return file
 
 

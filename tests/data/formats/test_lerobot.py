@@ -217,7 +217,7 @@ def test_a_file_cut_short_and_missing_frames_are_named(so101, tmp_path):
     with pytest.raises(LogError, match=r"file-000\.parquet: episode 1 has 40 frames here, meta/episodes says 50"):
         read_stock(folder, so101, tmp_path / "data")
     file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(LogError, match=r"file-000\.parquet: not a readable Parquet file .* download or export"):
+    with pytest.raises(LogError, match=r"file-000\.parquet: not a readable Parquet file .*; it is cut short"):
         read_stock(folder, so101, tmp_path / "data")
 
 

@@ -187,7 +187,7 @@ def test_an_empty_table_is_refused(tmp_path, arm, text, message):
 def test_a_half_written_parquet_file_is_refused(tmp_path, arm):
     file = write_parquet(tmp_path / "wave.parquet", arm_columns())
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file \(.*\); it may be half-written"):
+    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file \(.*\); it is cut short"):
         only(file, arm)
 
 

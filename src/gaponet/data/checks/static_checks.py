@@ -299,8 +299,7 @@ def _judge_sequence(
         text = (
             f"{meta.motion} rests {apart[worst] * 1e3:+.0f} mrad from where the other recordings of unit "
             f"{meta.unit_id} say ({abbreviate(list(apart))}): another robot, or zeros set in between? Import it with "
-            "another "
-            "--unit-id"
+            "another --unit-id"
         )
         return mean_square, Finding("warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart})
     return None

@@ -15,7 +15,7 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
-from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json
+from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, restated
 from gaponet.data.formats import files_under, pickles
@@ -41,9 +41,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
 
 @sandboxed(LogError, "numpy")
 def _read(file: Path) -> Any:
-    if file.stat().st_size > MAX_ARRAYS_BYTES:
-        raise LogError(f"{file}: has more than {MAX_ARRAYS_BYTES >> 20} MiB; split it into files of one motion")
-    return pickles.load(file.read_bytes(), str(file))
+    return pickles.load(read_limited(file, LogError, "split it", MAX_ARRAYS_BYTES), str(file))
 
 
 def _recording(file: Path, name: str, motion: dict[str, Any]) -> Recording:

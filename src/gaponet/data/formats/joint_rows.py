@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, Signal
+from gaponet.data.describe.recording import Recording
 from gaponet.data.formats import parquet
 
 if TYPE_CHECKING:
@@ -52,18 +53,11 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile, delimite
     if len({len(rows) for rows in order}) > 1 or any((stamps[rows] != stamps[order[0]]).any() for rows in order):
         counts = ", ".join(f"{name} {len(rows)}" for name, rows in zip(joints, order, strict=True))
         raise LogError(f"{file}: joints have different times ({counts} rows); write every joint at every time")
-    signals = {n: joints for n in names if n not in (joint, time) and _is_number(table.column(n).type)}
-
-    def load(wanted: list[str]) -> dict[str, Signal]:
-        return {
-            n: Signal(
-                stamps[order[0]] if n == time else np.stack([_numbers(file, table, n)[rows] for rows in order], 1)
-            )
-            for n in wanted
-        }
-
-    default: LogsFile = {"time": time}
-    return Recording(file.stem, str(file), {time: ()} | signals, load, f"{file}:1", (str(file),), default=default)
+    used = {n for n in names if n in logs.values() or not table.column(n).null_count} - {joint, time}
+    numbers = [n for n in names if n in used and _is_number(table.column(n).type)]
+    arrays = {n: np.stack([_numbers(file, table, n)[rows] for rows in order], axis=1) for n in numbers}
+    recording = Recording.of_arrays(file, {time: stamps[order[0]]} | arrays, joints, default={"time": time})
+    return replace(recording, where=f"{file}:1")
 
 
 def _table(file: Path, names: list[str], delimiter: str) -> pa.Table:

@@ -10,7 +10,6 @@ says which array is what; text in joint_names names the columns. Arrays of objec
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,9 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
-from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json
+from gaponet.base.structure import parse_json
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, reading, restated
+from gaponet.data.describe.recording import Recording, restated
 from gaponet.data.formats import files_under, pickles
 from gaponet.data.log import CHANNELS, DERIVED
 
@@ -86,11 +85,8 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
 @sandboxed(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
     """Every array; those of objects by a safe unpickler."""
-    with reading(file, "npz file"), zipfile.ZipFile(file) as packed:
-        parts = packed.infolist()
-        if sum(part.file_size for part in parts) > MAX_ARRAYS_BYTES:
-            raise LogError(f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; split it")
-        return {p.filename.removesuffix(".npy"): _array(packed.read(p), f"{file}: {p.filename}") for p in parts}
+    with pickles.open_zip(file, "npz file") as packed:
+        return {n.removesuffix(".npy"): _array(packed.read(n), f"{file}: {n}") for n in packed.namelist()}
 
 
 def _array(data: bytes, where: str) -> Any:

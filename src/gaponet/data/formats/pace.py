@@ -7,7 +7,6 @@ while recording. Files of other names work as well: logs.toml says which tensor 
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,8 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
-from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, reading
+from gaponet.data.describe.recording import Recording
 from gaponet.data.formats import files_under, pickles
 
 SUFFIXES = (".pt",)
@@ -51,9 +49,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
 @sandboxed(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
     """Every array of numbers; others are left alone."""
-    with reading(file, ".pt file of tensors"), zipfile.ZipFile(file) as packed:  # as torch 1.6 and later write
-        if sum(part.file_size for part in packed.infolist()) > MAX_ARRAYS_BYTES:
-            raise LogError(f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; cut it into shorter logs")
+    with pickles.open_zip(file, ".pt file of tensors") as packed:  # as torch 1.6 and later write
         top = next((n.removesuffix("data.pkl") for n in packed.namelist() if n.endswith("/data.pkl")), None)
         if top is None:
             raise LogError(f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the right file?")

@@ -106,17 +106,10 @@ def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
     import pyarrow as pa
     import pyarrow.csv as csv
 
-    skeletons = set(body.translate(None, DIGITS).split(b"\n"))
+    skeletons = set(body.translate(None, DIGITS).lower().split(b"\n"))
     numbers = b'"[' + b"," * (n - 1) + b']"'
-    kinds = {s.partition(b",")[0] for s in skeletons}
-    if not skeletons <= {b",".join([known, b"", *[numbers] * k]) for known in kinds if known}:
-        _refuse_row(file, body, n, k)
-    if {found.lower() for found in kinds} != {kind.encode().translate(None, DIGITS)}:
-        lines = body.decode("utf-8", errors="replace").split("\n")
-        row, found = next((i, t) for i, line in enumerate(lines) if (t := line.partition(",")[0]).lower() != kind)
-        raise LogError(
-            f"{file}:{row + 2}: a row of type '{found}', not {kind.upper()}: are the files swapped or mixed?"
-        )
+    if skeletons != {b",".join([kind.encode().translate(None, DIGITS), b"", *[numbers] * k])}:
+        _refuse_row(file, body, n, k, kind)
     names = [str(i) for i in range(2 + n * k)]
     try:
         table = csv.read_csv(
@@ -128,18 +121,22 @@ def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
             ),
         )
     except pa.ArrowInvalid as error:
-        _refuse_row(file, body, n, k)
+        _refuse_row(file, body, n, k, kind)
         raise LogError(f"{file}: not readable: {error}; record the motion again") from None
     if any(column.null_count for column in table.columns):
-        _refuse_row(file, body, n, k)
+        _refuse_row(file, body, n, k, kind)
     return np.column_stack([column.to_numpy() for column in table.columns])
 
 
-def _refuse_row(file: Path, body: bytes, n: int, k: int) -> None:
-    """Raise for the first line that is not TYPE,time and k lists of n numbers; return where all are."""
-    row = re.compile(rf'[A-Za-z_]+,{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE)
+def _refuse_row(file: Path, body: bytes, n: int, k: int, kind: str) -> None:
+    """Raise for the first line that is not TYPE,time and k lists of n numbers, or of another type than `kind`."""
+    row = re.compile(rf'([A-Za-z_]+),{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE)
     for i, line in enumerate(body.decode("utf-8", errors="replace").split("\n")):
-        if not row.fullmatch(line.rstrip("\r")):
+        if (match := row.fullmatch(line.rstrip("\r"))) and match[1].lower() != kind:
+            raise LogError(
+                f"{file}:{i + 2}: a row of type '{match[1]}', not {kind.upper()}: are the files swapped or mixed?"
+            )
+        if not match:
             shown = line if len(line) < 60 else line[:57] + "..."
             raise LogError(
                 f"{file}:{i + 2}: expected TYPE,timestamp and {k} list(s) of {n} numbers, got '{shown}'; "

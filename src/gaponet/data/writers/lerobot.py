@@ -11,7 +11,7 @@ has its earlier files again, byte by byte, and a push sends the others only (sha
                             columns of meta/episodes: unit_id, payload_mass, level, repetition, virtual, findings, …
                             meta/gaponet.json: exact period, robot, joint names, licence, source
 
-A reader that knows none of these finds an ordinary set. Not in it: twins, which can be made again.
+A reader that knows none of these finds an ordinary set. Simulated replays are not in it.
 """
 
 from __future__ import annotations
