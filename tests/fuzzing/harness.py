@@ -40,21 +40,13 @@ class AbsurdError(Exception):
 
 @dataclass(frozen=True)
 class Target:
-    """One kind of input.
-
-    Attributes:
-        name: Of the target.
-        files: Its untouched files: path below the folder → content. Called once in each worker.
-        use: Reads the files in the first folder and writes below the second only; raises AbsurdError.
-        share: How many of a run's mutants it gets, beside the others' shares.
-        only: Names of files (suffix) that are changed, all by default; the others stand beside them.
-    """
+    """One kind of input."""
 
     name: str
-    files: Callable[[], Files]
-    use: Callable[[Path, Path], None]
-    share: float = 1.0
-    only: tuple[str, ...] = ("",)
+    files: Callable[[], Files]  # the untouched files: path below the folder → content; called once in each worker
+    use: Callable[[Path, Path], None]  # reads the first folder, writes below the second only; raises AbsurdError
+    share: float = 1.0  # of a run's mutants, beside the others' shares
+    only: tuple[str, ...] = ("",)  # suffixes of the files that are changed; the others stand beside them
 
 
 @dataclass(frozen=True)

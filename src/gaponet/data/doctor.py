@@ -24,15 +24,10 @@ from gaponet.robot.spec import RobotSpec
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Result of examining a dataset.
+    """Result of examining a dataset."""
 
-    Attributes:
-        findings: Worst first.
-        sequences, joints: One row of numbers each, for tables.
-    """
-
-    findings: list[Finding]
-    sequences: list[dict[str, Any]]
+    findings: list[Finding]  # worst first
+    sequences: list[dict[str, Any]]  # one row of numbers each, for tables
     joints: list[dict[str, Any]]
 
     def count(self, level: str) -> int:

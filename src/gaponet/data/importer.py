@@ -35,20 +35,13 @@ UNSTATED_REPETITION = -1
 
 @dataclass(frozen=True)
 class ImportReport:
-    """Result of one import.
-
-    Attributes:
-        entries: Sequences that were added.
-        present: Sequences of this source that the dataset held already, by their content.
-        offsets: Joint → static offset of the unit; None without a gravity model, or if several units were recorded.
-        skipped: Rows that were cut and recordings that were left out, one line each, if skip_bad was given.
-    """
+    """Result of one import."""
 
     dataset: Dataset
-    entries: list[Entry]
-    present: list[Entry]
-    offsets: dict[str, JointOffset] | None
-    skipped: list[str] = field(default_factory=list)
+    entries: list[Entry]  # added
+    present: list[Entry]  # of this source, but in the dataset already, by their content
+    offsets: dict[str, JointOffset] | None  # by joint; None without a gravity model, or if there are several units
+    skipped: list[str] = field(default_factory=list)  # with skip_bad: rows cut and recordings left out, one line each
 
 
 def import_logs(

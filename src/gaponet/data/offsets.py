@@ -30,22 +30,14 @@ Gravity = Callable[[Array, float, str], Array]
 
 @dataclass(frozen=True)
 class JointOffset:
-    """Static error of one joint, rad; None where there are too few static poses.
+    """Static error of one joint, rad; None where there are too few static poses."""
 
-    Attributes:
-        rests_up, rests_down: Static poses approached from below and above.
-        static_error: qpos − ctrl, mean of both approaches.
-        stiction_band: Half the distance between both approaches, without nominal sag; times kp it is a torque.
-        nominal_sag: Static error of the nominal model in the same poses.
-        tracking_offset: static_error − nominal_sag.
-    """
-
-    rests_up: int
-    rests_down: int
-    static_error: float | None
-    stiction_band: float | None
-    nominal_sag: float | None
-    tracking_offset: float | None
+    rests_up: int  # static poses approached from below
+    rests_down: int  # and from above
+    static_error: float | None  # qpos − ctrl, mean of both approaches
+    stiction_band: float | None  # half the distance between both approaches, without nominal sag; times kp a torque
+    nominal_sag: float | None  # static error of the nominal model in the same poses
+    tracking_offset: float | None  # static_error − nominal_sag
 
 
 class _OffsetsFile(TypedDict):

@@ -173,6 +173,11 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
         ("kp = -1.0", "kp"),
         ("rate = 0.0", "rate: should be greater than or equal to 1"),
         ('[columns]\n"speed.elbow" = "t"', "'speed.elbow' is neither time nor ctrl"),
+        ('[columns]\n"ctrl.elbow" = "x"', r"column 'x' \(for ctrl.elbow\) is missing; there are: t, shoulder_des"),
+        ('[joint_units]\nelbow = "grad"', "unit of elbow 'grad' is not one of rad, deg, fraction"),
+        ('[joint_units]\nelbow = ["deg"]', r"logs\.toml: joint_units"),
+        ('tme = "t"', r"logs\.toml: tme: is not a known field; docs/logs.md lists the fields"),
+        ("ctrl", "not valid TOML"),
     ],
 )
 def test_a_wrong_logs_toml_is_refused(tmp_path, arm, toml, message):

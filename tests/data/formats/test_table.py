@@ -123,30 +123,6 @@ def test_a_column_map_names_columns_and_units(tmp_path, arm):
 
 
 @pytest.mark.parametrize(
-    ("toml", "message"),
-    [
-        ('tme = "t"', r"map\.toml: tme: is not a known field; docs/logs.md lists the fields"),
-        ('[columns]\n"control.elbow" = "x"', "'control.elbow' is neither time nor ctrl.<joint>, qpos.<joint>"),
-        (
-            '[columns]\n"ctrl.elbow" = "x"',
-            r"column 'x' \(for ctrl.elbow\) is missing; there are: time, ctrl.shoulder",
-        ),
-        ('time_unit = "min"', "time unit 'min' is not one of s, ms, us, ns"),
-        ('time_unit = "s"\n[joint_units]\nelbow = "grad"', "unit of elbow 'grad' is not one of rad, deg, fraction"),
-        ("time_unit", "not valid TOML"),
-        ("time = 1", r"map\.toml: time"),
-        ('[joint_units]\nelbow = ["deg"]', r"map\.toml: joint_units"),
-    ],
-)
-def test_a_broken_column_map_says_what_is_wrong(tmp_path, arm, toml, message):
-    (tmp_path / "map.toml").write_text(toml)
-    options = {"position_unit": "rad"} | ({} if "time_unit" in toml else {"time_unit": "s"})
-    file = write(tmp_path / "wave.csv", arm_columns())
-    with pytest.raises((UsageError, LogError), match=message):
-        list(read_logs(file, arm, logs=tmp_path / "map.toml", **options))
-
-
-@pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         (

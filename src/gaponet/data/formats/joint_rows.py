@@ -30,13 +30,12 @@ def joint_column(names: list[str], logs: LogsFile) -> str | None:
     return next((name for name in names if name.lower() in JOINT_COLUMNS), None)
 
 
-def recording(file: Path, names: list[str], joint: str, logs: LogsFile, delimiter: str) -> Recording:
+def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> Recording:
     """Return a table with a row per joint and time as a recording whose signals have a column per joint.
 
     Args:
         joint: The column with the joints' names.
         logs: Content of logs.toml, or the defaults.
-        delimiter: Separator of a CSV file's cells.
 
     Raises:
         LogError: The time column is not known, or a joint is missing at a time.
@@ -45,7 +44,7 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile, delimite
     time = logs.get("time") if logs.get("time") in times else next(iter(times), None)
     if time is None:
         raise LogError(f"{file}:1: a row per joint, and no column of times; name it in logs.toml: time = …")
-    table = _table(file, names, delimiter)
+    table = _table(file, names)
     of_row = np.array([str(name) for name in table.column(joint).to_pylist()], dtype=object)
     joints = tuple(dict.fromkeys(of_row.tolist()))
     order = [np.flatnonzero(of_row == name) for name in joints]
@@ -60,13 +59,15 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile, delimite
     return replace(recording, where=f"{file}:1")
 
 
-def _table(file: Path, names: list[str], delimiter: str) -> pa.Table:
+def _table(file: Path, names: list[str]) -> pa.Table:
     if file.suffix.lower() == ".parquet":
         return parquet.read(file, names)
     import pyarrow as pa
     import pyarrow.csv as pc
 
     body = read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
+    header = body.partition(b"\n")[0]
+    delimiter = next((d for d in ",;\t" if d.encode() in header), " ")
     try:
         return pc.read_csv(
             pa.py_buffer(body), pc.ReadOptions(use_threads=False), pc.ParseOptions(delimiter=delimiter)

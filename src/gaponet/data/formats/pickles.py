@@ -134,10 +134,6 @@ class _Tensor:
             self.array = np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
 
 
-def _new(*_: Any) -> _Array:
-    return _Array()
-
-
 def _codec(text: Any, encoding: Any) -> bytes:
     """How Python 3 wrote bytes into old protocols."""
     if encoding not in ("latin1", "latin-1"):
@@ -147,7 +143,7 @@ def _codec(text: Any, encoding: Any) -> bytes:
 
 MEANT = {
     ("numpy", "ndarray"): _Array, ("numpy", "dtype"): _Type,
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): _new for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): _Array for core in ("core", "_core")},
     **{(f"numpy.{core}.multiarray", "scalar"): _Scalar for core in ("core", "_core")},
     **{(f"numpy.{core}.numeric", "_frombuffer"): _frombuffer for core in ("core", "_core")},
     ("joblib.numpy_pickle", "NumpyArrayWrapper"): _Wrapped, ("_codecs", "encode"): _codec,

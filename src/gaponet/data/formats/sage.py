@@ -1,6 +1,6 @@
 """SAGE folder: control.csv and state_motor.csv beside each other.
 
-{real,sim}/{robot}/{source}/{motion}/{control,state_motor,event}.csv and joint_list.txt.
+{real,sim}/{robot}/{source}/{motion}/{control,state_motor}.csv and joint_list.txt; event.csv is not read.
 Rows are TYPE,timestamp,"[...]"; the case of TYPE differs between recordings. Real timestamps are microseconds,
 simulated ones seconds; the reader decides by the period and refuses one that is neither. Joints stand in the unit that
 the robot's `log_unit` says (SO-101's gripper: 0..1 of its range).
@@ -75,7 +75,6 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
             "files": dict.fromkeys(channels, str(state)) | {"ctrl": str(control)},
             "first_line": 2,
             "converted_from": {n: u for n, u in zip(names, units, strict=True) if u != "rad"},
-            "events": _events(folder / "event.csv"),
         },
     )
 
@@ -163,10 +162,3 @@ def _text(file: Path) -> str:
         raise LogError(
             f"{file}: not UTF-8 text ({error.reason} at byte {error.start}); is it the right file?"
         ) from None
-
-
-def _events(file: Path) -> list[list[str]]:
-    if not file.is_file():
-        return []
-    rows = [line.split(",") for line in _text(file).splitlines()[1:] if line.strip()]
-    return [[r[1].strip(), r[2].strip()] for r in rows if len(r) >= 3]
