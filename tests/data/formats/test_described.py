@@ -8,8 +8,9 @@ from logs import arm_columns, table_text, wave
 
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.cli.main import main
+from gaponet.data.describe.guess import guess_logs
 from gaponet.data.describe.joints import resolve_all
-from gaponet.data.formats import detect, read_logs
+from gaponet.data.formats import detect, look, read_logs
 from gaponet.data.log import skip_bad_rows
 from gaponet.data.store import Dataset
 
@@ -215,11 +216,11 @@ def test_the_guess_for_a_strange_table_reads_it(tmp_path, arm, capsys):
         ("time", "des_pos.shoulder", "des_pos.elbow", "pos.shoulder", "pos.elbow"),
     ],
 )
-def test_the_guess_knows_how_others_call_things(tmp_path, arm, capsys, names):
+def test_the_guess_knows_how_others_call_things(tmp_path, arm, names):
     folder = write(tmp_path / "logs", "", columns=dict(zip(names, arm_columns().values(), strict=True)))
     (folder / "logs.toml").unlink()
-    assert main(["import", str(folder), "--robot", str(arm.mjcf.parent), "--guess"]) == 0
-    (folder / "logs.toml").write_text(capsys.readouterr().out)
+    fmt, logs, recordings = look(folder)
+    (folder / "logs.toml").write_text(guess_logs(recordings, arm, fmt, dict(logs)))
     ((_, log),) = read_logs(folder, arm)
     assert np.array_equal(log.channels["ctrl"].values[:, 1], arm_columns()["ctrl.elbow"])
     assert np.array_equal(log.channels["qpos"].values[:, 1], arm_columns()["qpos.elbow"])
