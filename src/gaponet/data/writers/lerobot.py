@@ -26,6 +26,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
+from gaponet.base.files import write_json
 from gaponet.data.formats.lerobot_set import FEATURES, GAINS, OURS, STATED, VERSION
 from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
@@ -197,11 +198,10 @@ class _Set:
 
         meta = self.folder / "meta"
         pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
-        _write_json(meta / "info.json", self._info())
-        lists = {name: {k: v.tolist() for k, v in values.items()} for name, values in stats.items()}
-        _write_json(meta / "stats.json", lists)
+        write_json(meta / "info.json", self._info())
+        write_json(meta / "stats.json", stats)
         header = {k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header}
-        _write_json(meta / OURS, {
+        write_json(meta / OURS, {
             "format": 1, "robot": self.dataset.robot_name, "joint_names": self.dataset.joint_names, "dt": self.dt,
             "dataset_hash": dataset_hash(self.entries), "virtual": any(e.meta.virtual for e in self.entries),
             "dataset": header,
@@ -243,23 +243,14 @@ def _row(episode: _Placed, number: int, stats: FeatureStatistics) -> dict[str, A
 
 
 def _task_table(tasks: dict[str, int]) -> pa.Table:
-    """task_index by task; the metadata make pandas take the text for the index, as LeRobot expects."""
+    """Return task_index by task; the metadata make pandas take the text for the index, as LeRobot expects."""
     import pyarrow as pa
 
-    column = {"metadata": None, "numpy_type": "int64", "pandas_type": "int64"}
-    text = {"metadata": None, "numpy_type": "object", "pandas_type": "unicode"}
-    pandas = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [
-            {"name": "task_index", "field_name": "task_index"} | column,
-            {"name": "task", "field_name": "task"} | text,
-        ],
-        "pandas_version": "2.0.0",
-    }
+    kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": pandas, "numpy_type": numpy, "metadata": None}
+        for name, (pandas, numpy) in kinds.items()
+    ]
+    header = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
     table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.string())})
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    path.write_text(json.dumps(value, indent=4, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+    return table.replace_schema_metadata({"pandas": json.dumps(header)})
