@@ -1,4 +1,4 @@
-"""Good logs of a virtual arm, and twenty-odd faults to put into them, one at a time, before they are imported."""
+"""Good logs of a virtual arm, and faults to put into them, one at a time, before they are imported."""
 
 from __future__ import annotations
 
@@ -41,10 +41,6 @@ class Recording:
             values[:, j] = function(values[:, j])
             changed[name] = values
         return replace(self, **changed)
-
-    def rows(self, keep: np.ndarray | slice) -> Recording:
-        """Only these."""
-        return replace(self, **{f: getattr(self, f)[keep] for f in ("time", "ctrl", "qpos", "qvel", "tau")})
 
 
 def commands(robot: RobotSpec, seed: int) -> np.ndarray:
@@ -121,23 +117,11 @@ def one_of(logs: list[Recording], change: Callable[[Recording], Recording], whic
     return [change(log) if i == which else log for i, log in enumerate(logs)]
 
 
-def cut_file(folder: Path, within: int = 20) -> None:
-    """The logger was killed in the middle of a row, `within` letters behind its beginning."""
+def cut_at_a_row(folder: Path) -> None:
+    """Cut a file at the end of a row: what was written last is a whole row."""
     file = sorted(folder.rglob("state_motor.csv"))[2]
     text = file.read_text()
-    file.write_text(text[: text.index("\n", len(text) * 2 // 3) + 1 + within])
-
-
-def cut_at_a_row(folder: Path) -> None:
-    """What was written last is a whole row."""
-    cut_file(folder, within=0)
-
-
-def swapped(values: np.ndarray) -> np.ndarray:
-    """The columns of J and of the joint before it in each other's place."""
-    other = values.copy()
-    other[:, [J - 1, J]] = values[:, [J, J - 1]]
-    return other
+    file.write_text(text[: text.index("\n", len(text) * 2 // 3) + 1])
 
 
 def rotated(log: Recording) -> Recording:
@@ -172,51 +156,29 @@ def at(rows: slice, values: Callable[[np.ndarray], np.ndarray] | float) -> Calla
 ARM, J = [0, 1, 2, 3, 4], 2  # of an SO-101; a joint that carries weight
 EVERY = slice(None)
 FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, object]]] = {
-    "sign of a state": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: -x, qvel=lambda x: -x)), {}),
     "sign of command and state": (
         lambda logs: all_of(logs, lambda g: g.change(J, **dict.fromkeys(("ctrl", "qpos", "qvel", "tau"), np.negative))),
         {}),
-    "swap of two states": (lambda logs: all_of(logs, lambda g: replace(g, qpos=swapped(g.qpos))), {}),
-    "degrees of all": (
-        lambda logs: all_of(logs, lambda g: g.change(EVERY, ctrl=np.degrees, qpos=np.degrees, qvel=np.degrees)), {}),
     "offset of 20 mrad": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.02)), {}),
     "offset of 150 mrad": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.15)), {}),
     "lag of 100 ms more": (lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=delayed, qvel=delayed)), {}),
     "lag of one joint": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=delayed, qvel=delayed)), {}),
     "scale of 1.2": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: 1.2 * x)), {}),
-    "scale of 0.8": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: 0.8 * x)), {}),
-    "gear of 2": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: 2 * x)), {}),
     "spike of a state": (
         lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(400, 401), lambda x: x + 0.5))), {}),
-    "spike of a torque": (
-        lambda logs: one_of(logs, lambda g: g.change(J, tau=at(slice(400, 401), 3.2))), {}),
-    "dropout of rows": (lambda logs: one_of(logs, lambda g: g.rows(np.r_[0:400, 430 : len(g.time)])), {}),
-    "dropout as zeros": (
-        lambda logs: one_of(logs, lambda g: g.change(EVERY, qpos=at(slice(400, 404), 0.0))), {}),
     "frozen channel": (lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(0, 400), lambda x: x[:1]))), {}),
-    "command is the state": (lambda logs: all_of(logs, lambda g: replace(g, ctrl=g.qpos)), {}),
     "command and state swapped in one": (
         lambda logs: one_of(logs, lambda g: replace(g, ctrl=g.qpos, qpos=g.ctrl)), {}),
-    "clock jumps on": (
-        lambda logs: one_of(logs, lambda g: replace(g, time=g.time + 5 * (np.arange(len(g.time)) > 500))), {}),
-    "clock jumps back": (
-        lambda logs: one_of(logs, lambda g: replace(g, time=g.time - 5 * (np.arange(len(g.time)) > 500))), {}),
-    "mixed rates": (
-        lambda logs: one_of(logs, lambda g: replace(g, time=g.time[0] + (g.time - g.time[0]) / 2)), {}),
-    "two units of measure": (
-        lambda logs: one_of(logs, lambda g: g.change(J, ctrl=np.degrees, qpos=np.degrees, qvel=np.degrees)), {}),
     "two robots in one": (lambda logs: one_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.1)), {}),
     "wrong gains": (list, {"gain": 2.0}),
     "wrong payload label": (lambda logs: one_of(logs, lambda g: replace(g, payload=0.2)), {}),
     "joint order": (lambda logs: all_of(logs, rotated), {}),
     "zero of command and state": (
         lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: x - 0.6, qpos=lambda x: x - 0.6)), {}),
-    "torque unsigned": (lambda logs: all_of(logs, lambda g: g.change(EVERY, tau=np.abs)), {}),
     "torque of the other sign": (lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: -x)), {}),
     "quantised": (lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=lambda x: np.round(x, 2))), {}),
     "saturated torque": (
         lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: np.clip(x, -peak(x) / 2, peak(x) / 2))), {}),
     "saturated command": (lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: np.clip(x, -0.4, 0.4))), {}),
-    "truncated file": (list, {"damage": cut_file}),
     "truncated at a row's end": (list, {"damage": cut_at_a_row}),
 }  # fmt: skip

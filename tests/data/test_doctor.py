@@ -1,14 +1,19 @@
 """The doctor finds what is wrong with a recording, says it in words, and finds nothing wrong with a good one."""
 
+import json
 import re
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from multiprocessing import get_context
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from arm import recordings
 from logs import arm_sequence, late, wave
 
-from gaponet.base.errors import DatasetError
+from gaponet.base.errors import DatasetError, WorkerError
 from gaponet.data.checks.timing import MIN_EARLY_RATIO, _drift
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.sequence import Sequence
@@ -54,6 +59,62 @@ def test_findings_stand_worst_first(arm, tmp_path):
     assert levels[0] == "error"
 
 
+def at(values, rows, new, joint=slice(None)):
+    """The values with other ones in some rows of a joint."""
+    values = values.copy()
+    values[rows, joint] = new
+    return values
+
+
+DEGREES, ELBOW, BEYOND = np.array([1, 57.3]), np.array([1, -1]), np.array([1.2, 0])
+SPIKY = at(at(0.3 * wave(ROWS, 2), 100, 4.5, 1), slice(300, 302), -3.0, 0)
+SLOW = wave(ROWS, 2, 0.02, amplitude=0.4, hertz=0.05)
+# What a recording holds instead of command u and state q; check, level and words of the finding.
+FAULTS = {
+    "mirrored": (lambda u, q: {"qpos": q * ELBOW}, "sign", "error", "elbow moves against its command"),
+    "degrees": (lambda u, q: {"qpos": q * DEGREES}, "unit", "error", "elbow moves 57.3 times as far as commanded"),
+    "velocity in degrees": (lambda u, q: {"qvel": np.gradient(q, 0.02, axis=0) * DEGREES}, "unit", "warning",
+                            "recorded velocity of elbow is 57.3 times the derivative of its position"),
+    "another scale": (lambda u, q: {"qpos": q * [1, 1.3]}, "unit", "warning",
+                      "elbow goes 1.30 rad where its command goes 1 rad: another scale"),
+    "the state as command": (lambda u, q: {"ctrl": q}, "copied", "error",
+                             "command and state of shoulder, elbow are the same numbers in m: one was logged as both"),
+    "velocities as commands": (lambda u, q: {"ctrl": np.gradient(u, 0.02, axis=0)}, "command", "error",
+                               "no position targets; they are most like velocities"),
+    "one sample off": (lambda u, q: {"qpos": at(q, 200, q[200, 1] + 1.0, 1)}, "jumps", "warning",
+                       "elbow jumps and comes back faster than any motor in 3 rows of m"),
+    "beyond the range": (lambda u, q: {"ctrl": u + BEYOND, "qpos": q + BEYOND}, "range", "warning",
+                         "the simulator clips there"),
+    "does not move": (lambda u, q: {"qpos": q * [1, 0]}, "stuck", "error",
+                      "elbow does not move when commanded in m: unplugged, torque off or not read"),
+    "repeats itself": (lambda u, q: {"qpos": at(q, slice(100, 121), q[100]), "qvel": at(q, slice(100, 121), q[100])},
+                       "stuck", "warning", "the whole state repeats itself for up to 0.40 s"),
+    "never commanded": (lambda u, q: {"ctrl": u * [1, 0], "qpos": q * [1, 0]}, "order", "warning",
+                        "no motion commands elbow"),
+    "runs into a stop": (lambda u, q: {"qpos": np.minimum(q, [0.1, 9])}, "blocked", "warning",
+                         "shoulder stood at 0.10 rad for"),
+    "slow": (lambda u, q: {"ctrl": SLOW, "qpos": late(SLOW, 3)}, "lag", "note",
+             "nothing is commanded faster than 0.3 rad/s"),
+    "unsigned torque": (lambda u, q: {"tau": np.abs(wave(ROWS, 2))}, "torque", "warning",
+                        "torque is unsigned (never negative"),
+    "torque spikes": (lambda u, q: {"tau": SPIKY}, "torque", "warning",
+                      "torque spikes: 3 samples in m; worst 4.50 N·m on elbow in m"),
+    "torque beyond the limit": (lambda u, q: {"tau": np.clip(40 * wave(ROWS, 2), -9, 9)}, "saturation", "warning",
+                                "worst 9.00 N·m on shoulder (limit 5.00)"),
+    "constant torque": (lambda u, q: {"tau": np.zeros((ROWS, 2))}, "torque", "warning",
+                        "torque of shoulder, elbow never changes; ignore it"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_in_one_recording_is_found_and_named(arm, tmp_path, fault):
+    ctrl, qpos = good()
+    change, check, level, words = FAULTS[fault]
+    recorded = {"ctrl": ctrl, "qpos": qpos} | change(ctrl, qpos)
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, recorded.pop("ctrl"), recorded.pop("qpos"), **recorded))
+    assert words in found(diagnosis, check, level).message
+
+
 def test_swapped_joints_are_an_error(arm, tmp_path):
     ctrl, qpos = good()
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos[:, ::-1]))
@@ -69,40 +130,6 @@ def test_two_joints_told_the_same_are_not_taken_for_swapped(arm, tmp_path):
     assert found(examine(arm, tmp_path, arm_sequence(arm, ctrl, late(ctrl, 3))), "order", "ok")
 
 
-def test_a_joint_that_moves_the_other_way_is_an_error(arm, tmp_path):
-    ctrl, qpos = good()
-    diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos * [1, -1]))
-    assert found(diagnosis, "sign", "error").joints == ("elbow",)
-    assert found(diagnosis, "order", "ok")
-
-
-def test_states_in_degrees_beside_commands_in_radians_are_an_error(arm, tmp_path):
-    ctrl, qpos = good()
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos * [1, 57.3])), "unit", "error")
-    assert finding.message.startswith("elbow moves 57.3 times as far as commanded")
-
-
-def test_velocities_in_degrees_are_a_warning(arm, tmp_path):
-    ctrl, qpos = good()
-    qvel = np.gradient(qpos, 0.02, axis=0) * 57.3
-    qvel[:, 0] /= 57.3
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos, qvel=qvel)), "unit", "warning")
-    assert finding.message.startswith("recorded velocity of elbow is 57.3 times the derivative of its position")
-
-
-def test_a_state_of_another_scale_is_a_warning(arm, tmp_path):
-    ctrl, qpos = good()
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos * [1, 1.3])), "unit", "warning")
-    assert finding.message.startswith("elbow goes 1.30 rad where its command goes 1 rad: another scale")
-
-
-def test_a_command_that_is_the_state_is_an_error(arm, tmp_path):
-    _, qpos = good()
-    diagnosis = examine(arm, tmp_path, arm_sequence(arm, qpos, qpos))
-    said = found(diagnosis, "copied", "error").message
-    assert said.startswith("command and state of shoulder, elbow are the same numbers in m: one was logged as both")
-
-
 def test_a_state_that_comes_before_its_command_is_an_error(arm, tmp_path):
     ctrl, qpos = good()
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, qpos, ctrl))
@@ -115,14 +142,6 @@ def lively(seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     ctrl = np.repeat(rng.uniform(-0.5, 0.5, (30, 2)), 30, axis=0)
     return ctrl, late(lowpass(ctrl, 0.02, 4.0), 4)
-
-
-def test_velocities_where_position_targets_should_be_are_an_error(arm, tmp_path):
-    ctrl, qpos = good()
-    finding = found(
-        examine(arm, tmp_path, arm_sequence(arm, np.gradient(ctrl, 0.02, axis=0), qpos)), "command", "error"
-    )
-    assert "no position targets; they are most like velocities" in finding.message
 
 
 @pytest.mark.parametrize(("odd", "check", "words"), [
@@ -163,14 +182,6 @@ def test_commands_to_come_explain_states_only_where_states_come_first(ahead, sai
     told = Response.common([Response.of(u[: len(u) - ahead], q[ahead:], 0.02) for u, q in logs])
     assert (told.early > MIN_EARLY_RATIO).tolist() == [said] * 2
     assert (told.onset < 0).tolist() == [said] * 2
-
-
-def test_one_sample_one_radian_off_is_a_warning(arm, tmp_path):
-    ctrl, qpos = good()
-    qpos[200, 1] += 1.0
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos)), "jumps", "warning")
-    assert finding.joints == ("elbow",)
-    assert finding.message.startswith("elbow jumps and comes back faster than any motor in 3 rows of m")
 
 
 @pytest.mark.parametrize("where", ["state", "command", "first rows of the state"])
@@ -228,43 +239,6 @@ def test_a_sign_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_pa
     assert finding.message.startswith("with its angle mirrored at")
 
 
-def test_commands_beyond_the_joint_range_are_a_warning(arm, tmp_path):
-    ctrl, qpos = good()
-    shift = np.array([1.2, 0.0])
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl + shift, qpos + shift)), "range", "warning")
-    assert finding.joints == ("shoulder",)
-    assert finding.values["beyond_rad"] == pytest.approx(0.1, abs=0.005)  # 1.2 + 0.4 against 1.5
-    assert "the simulator clips there" in finding.message
-
-
-def test_a_joint_that_never_moves_when_told_is_an_error(arm, tmp_path):
-    ctrl, qpos = good()
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos * [1, 0])), "stuck", "error")
-    assert finding.message.startswith("elbow does not move when commanded in m: unplugged, torque off or not read")
-
-
-def test_a_state_that_repeats_itself_while_the_command_moves_is_a_warning(arm, tmp_path):
-    ctrl, qpos = good()
-    qpos[100:121] = qpos[100]
-    qvel = np.gradient(qpos, 0.02, axis=0)
-    qvel[100:121] = qvel[100]
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos, qvel=qvel)), "stuck", "warning")
-    assert "the whole state repeats itself for up to 0.40 s" in finding.message
-
-
-def test_a_joint_that_is_never_commanded_is_named(arm, tmp_path):
-    ctrl, qpos = good()
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl * [1, 0], qpos * [1, 0])), "order", "warning")
-    assert finding.joints == ("elbow",)
-
-
-def test_a_joint_that_runs_into_a_stop_is_a_warning(arm, tmp_path):
-    ctrl, qpos = good()
-    qpos[:, 0] = np.minimum(qpos[:, 0], 0.1)
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos)), "blocked", "warning")
-    assert finding.message.startswith("shoulder stood at 0.10 rad for")
-
-
 def test_a_load_that_sags_far_is_not_taken_for_a_stop(arm, tmp_path):
     ctrl, qpos = good()
     hold = np.repeat(ctrl[-1:], 200, axis=0)
@@ -280,6 +254,26 @@ def test_missing_samples_and_jitter_are_reported_from_the_logs_own_clock(arm, tm
     assert found(diagnosis, "rate", "note").message == "1 sequence(s) were put on a uniform grid: m"
 
 
+class DyingExecutor(Executor):
+    """An executor whose workers are killed."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        future.set_exception(BrokenProcessPool("killed"))
+        return future
+
+
+def test_other_processes_measure_the_same_and_workers_that_die_are_an_error(arm, tmp_path):
+    dataset = Dataset.create(tmp_path / "data", arm)
+    for sequence in recordings(arm, 3, rows=ROWS):
+        dataset.append(sequence)
+    with ProcessPoolExecutor(2, get_context("spawn")) as processes:
+        there = Diagnosis.of(dataset, arm, executor=processes).as_dict()
+    assert json.dumps(there) == json.dumps(Diagnosis.of(dataset, arm).as_dict())
+    with pytest.raises(WorkerError, match="workers died of it"):
+        Diagnosis.of(dataset, arm, executor=DyingExecutor())
+
+
 def test_two_rates_in_one_dataset_are_a_warning(arm, tmp_path):
     first = arm_sequence(arm, *good())
     second = replace(arm_sequence(arm, *good(lag=2)), dt=0.01)
@@ -293,12 +287,6 @@ def test_a_lag_of_three_periods_is_reported_as_60_ms(arm, tmp_path):
     assert "elbow 60 ms" in finding.message
 
 
-def test_slow_motions_say_nothing_about_lag(arm, tmp_path):
-    ctrl = wave(ROWS, 2, 0.02, amplitude=0.4, hertz=0.05)
-    message = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, late(ctrl, 3))), "lag", "note").message
-    assert message.startswith("nothing is commanded faster than 0.3 rad/s")
-
-
 def test_sag_is_reported_for_the_lightest_and_the_heaviest_payload(arm, tmp_path):
     ctrl, qpos = good()
     still = np.repeat(ctrl[-1:], 60, axis=0)
@@ -309,29 +297,6 @@ def test_sag_is_reported_for_the_lightest_and_the_heaviest_payload(arm, tmp_path
     assert "shoulder +30" in finding.message
     assert "shoulder +130" in finding.message
     assert "0.5 kg" not in finding.message
-
-
-def test_torque_that_is_never_negative_is_unsigned(arm, tmp_path):
-    diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), tau=np.abs(wave(ROWS, 2))))
-    assert found(diagnosis, "torque", "warning").message.startswith("torque is unsigned (never negative")
-
-
-def test_torque_spikes_are_counted_and_the_worst_is_named(arm, tmp_path):
-    tau = 0.3 * wave(ROWS, 2)
-    tau[100, 1], tau[300:302, 0] = 4.5, -3.0
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, *good(), tau=tau)), "torque", "warning")
-    assert finding.message == "torque spikes: 3 samples in m; worst 4.50 N·m on elbow in m"
-
-
-def test_torque_beyond_the_limit_is_a_warning(arm, tmp_path):
-    tau = np.clip(40 * wave(ROWS, 2), -9, 9)
-    finding = found(examine(arm, tmp_path, arm_sequence(arm, *good(), tau=tau)), "saturation", "warning")
-    assert "worst 9.00 N·m on shoulder (limit 5.00)" in finding.message
-
-
-def test_a_torque_channel_that_never_changes_is_a_warning(arm, tmp_path):
-    diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), tau=np.zeros((ROWS, 2))))
-    assert found(diagnosis, "torque", "warning").message == "torque of shoulder, elbow never changes; ignore it"
 
 
 def test_one_recording_under_two_payloads_is_an_error(arm, tmp_path):

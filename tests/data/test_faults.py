@@ -1,4 +1,4 @@
-"""Each fault, put into good logs of a virtual arm, is found and named, or refused; the logs are good."""
+"""Faults that need gravity or several recordings, put into good logs of a virtual arm, are found or refused."""
 
 import numpy as np
 import pytest
@@ -12,41 +12,27 @@ from gaponet.robot.spec import load_robot
 
 # Check, level and words of the finding that names it; no level: the import refuses with these words.
 NAMED = {
-    "sign of a state": ("sign", "error", "elbow_flex moves against its command"),
     "sign of command and state": ("gravity", "warning", "with its angle mirrored at elbow_flex"),
-    "swap of two states": ("order", "error", "the command of shoulder_lift moves elbow_flex"),
-    "degrees of all": ("", "", "these look like degrees"),
     "offset of 20 mrad": ("offset", "note", "elbow_flex rests +2"),
     "offset of 150 mrad": ("offset", "warning", "more than assembly leaves"),
     "lag of 100 ms more": ("lag", "warning", "as dead time very long"),
     "lag of one joint": ("lag", "warning", "elbow_flex lags 1"),
     "scale of 1.2": ("scale", "warning", "elbow_flex goes 1.2"),
-    "scale of 0.8": ("scale", "warning", "elbow_flex goes 0.8"),
-    "gear of 2": ("unit", "warning", "elbow_flex goes 2.0"),
     "spike of a state": ("jumps", "warning", "elbow_flex jumps and comes back"),
-    "spike of a torque": ("torque", "warning", "torque spikes: 1 samples in m2"),
-    "dropout of rows": ("gaps", "warning", "miss samples, at worst 620 ms (m2)"),
-    "dropout as zeros": ("jumps", "warning", "all joints are exactly 0 for 4 rows of m2"),
     "frozen channel": ("stuck", "warning", "elbow_flex repeats one number"),
-    "command is the state": ("copied", "error", "are the same numbers"),
     "command and state swapped in one": ("copied", "error", "before their commands in m2, not in other recordings"),
-    "clock jumps on": ("", "", "s after the row before it"),
-    "clock jumps back": ("", "", "time does not increase"),
-    "mixed rates": ("rate", "warning", "1 at 100.00 Hz"),
-    "two units of measure": ("", "", "these look like degrees"),
     "two robots in one": ("unit_id", "warning", "m2 rests +10"),
     "wrong gains": ("gains", "warning", "times as far as the stated kp says"),
     "wrong payload label": ("payload", "warning", "m2 rests as with 0"),
     "joint order": ("gravity", "warning", "the order of joints one place back"),
     "zero of command and state": ("gravity", "warning", "with its zero turned by +0.60 rad at elbow_flex"),
-    "torque unsigned": ("torque", "warning", "torque is unsigned"),
     "torque of the other sign": ("gravity", "warning", "with its torque negated at elbow_flex"),
     "quantised": ("resolution", "warning", "come in steps of up to 10.0 mrad"),
     "saturated torque": ("saturation", "warning", "torque of elbow_flex is cut off flat at"),
     "saturated command": ("unit", "warning", "elbow_flex goes 1."),
-    "truncated file": ("", "", "the file may be cut short"),
     "truncated at a row's end": ("", "", "its states end"),
 }
+MENDED = ("sign of command and state", "zero of command and state", "joint order")  # by lines for logs.toml
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +45,12 @@ def logs(robot):
     return recordings(robot)
 
 
-@pytest.mark.parametrize("kp", [0.7, 0.9, 1.2])
+@pytest.mark.parametrize("kp", [0.7, 1.2])
 def test_good_logs_of_soft_and_stiff_motors_are_good(robot, tmp_path, kp):
     diagnosis = examine(robot, recordings(robot, kp), tmp_path)
     assert diagnosis.verdict == "Good: nothing found that training should not see."
     assert not {f.check for f in diagnosis.findings} & {"offset", "scale", "gains", "payload", "unit_id"}
+    assert Finding.proposal(diagnosis.findings) == "# gaponet doctor --fix: nothing to mend.\n"
 
 
 def test_encoder_steps_of_12_bits_are_no_fault(robot, logs, tmp_path):
@@ -72,11 +59,7 @@ def test_encoder_steps_of_12_bits_are_no_fault(robot, logs, tmp_path):
     assert examine(robot, coarse, tmp_path).verdict.startswith("Good")
 
 
-def test_every_fault_has_its_name():
-    assert NAMED.keys() == FAULTS.keys()
-
-
-@pytest.mark.parametrize("fault", NAMED)
+@pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_found_and_named_or_refused(robot, logs, tmp_path, fault):
     change, how = FAULTS[fault]
     check, level, words = NAMED[fault]
@@ -88,19 +71,11 @@ def test_a_fault_is_found_and_named_or_refused(robot, logs, tmp_path, fault):
     assert [f for f in answer.findings if (f.check, f.level) == (check, level) and words in f.message]
     others = {f.check for f in answer.findings if f.level in ("warning", "error")} - {check}
     assert others <= {"jitter", "blocked", "jumps", "unit", "stuck", "range"}  # what follows from it
-
-
-@pytest.mark.parametrize("fault", ["sign of command and state", "zero of command and state", "joint order"])
-def test_the_doctors_proposal_for_logs_toml_mends_what_it_can(robot, logs, tmp_path, fault):
-    faulty = FAULTS[fault][0](logs)
-    proposed = Finding.proposal(examine(robot, faulty, tmp_path / "faulty").findings)
-    assert "applied to nothing" in proposed
-    mended = examine(robot, faulty, tmp_path / "mended", logs_toml=proposed)
-    assert [f.message for f in mended.findings if f.level in ("warning", "error")] == []
-
-
-def test_good_logs_need_no_mending(robot, logs, tmp_path):
-    assert Finding.proposal(examine(robot, logs, tmp_path).findings) == "# gaponet doctor --fix: nothing to mend.\n"
+    if fault in MENDED:
+        proposed = Finding.proposal(answer.findings)
+        assert "applied to nothing" in proposed
+        mended = examine(robot, change(logs), tmp_path / "mended", logs_toml=proposed)
+        assert [f.message for f in mended.findings if f.level in ("warning", "error")] == []
 
 
 def test_each_finding_has_a_picture(robot, logs, tmp_path):

@@ -113,19 +113,16 @@ def test_velocity_of_a_joint_logged_as_a_fraction_is_computed_too(arm):
     assert np.allclose(to_sequence(log, arm, META).qvel, [7.0, 2.0], atol=1e-4)
 
 
-def test_a_rate_can_be_forced(arm):
-    assert to_sequence(arm_log(0.02 * np.arange(ROWS)), arm, META, dt=0.01).rate == pytest.approx(100)
-
-
-@pytest.mark.parametrize("mass", [-0.1, float("nan"), 1000.0])
-def test_a_payload_no_hand_can_carry_is_refused(mass):
-    with pytest.raises(LogError, match=r"payload_mass is .*; give kg, 0 when empty"):
-        replace(META, payload_mass=mass)
-
-
-def test_a_level_nobody_knows_is_refused():
-    with pytest.raises(LogError, match="level 'legs' is not one of joint, upper_body, whole_body"):
-        replace(META, level="legs")
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        *(("payload_mass", mass, r"payload_mass is .*; give kg, 0 when empty") for mass in (-0.1, np.nan, 1000.0)),
+        ("level", "legs", "level 'legs' is not one of joint, upper_body, whole_body"),
+    ],
+)
+def test_labels_that_make_no_sense_are_refused(field, value, message):
+    with pytest.raises(LogError, match=message):
+        replace(META, **{field: value})
 
 
 def test_samples_that_are_not_numbers_are_refused(arm):

@@ -48,11 +48,7 @@ def test_a_split_holds_every_motion_once():
     split = split_motions(motions)
     assert {part: len(names) for part, names in split.items()} == {"train": 25, "val": 5, "test": 10}
     assert sorted(name for names in split.values() for name in names) == sorted(motions)
-
-
-def test_a_split_depends_on_names_alone_and_not_on_their_order_or_number():
-    motions = [f"m{i}" for i in range(40)]
-    assert split_motions(motions) == split_motions([*reversed(motions), *motions])
+    assert split == split_motions([*reversed(motions), *motions])
 
 
 def test_two_motions_cannot_be_split_in_three():
@@ -106,25 +102,15 @@ def test_what_cannot_be_held_out_is_refused(dataset, by, holdout, complaint):
         make_split(dataset, by, holdout)
 
 
-def test_one_unit_cannot_be_split_by_unit(arm, tmp_path):
-    data = Dataset.create(tmp_path / "data", arm)
-    data.append(arm_sequence(arm, wave(60, 2), wave(60, 2)))
-    with pytest.raises(UsageError, match=r"one unit only \(a\); split it by another property"):
-        make_split(data, "unit")
-
-
 def test_the_same_samples_under_another_unit_are_found(dataset):
     twice = dataset.read(dataset.entries[0])
     dataset.append(replace(twice, meta=replace(twice.meta, unit_id="two")))
+    told = []
+    require_distinct_samples(dataset, make_split(dataset, "motion"), lambda *what: told.append(what))
+    assert told[-1][:2] == (len(dataset), len(dataset))
     parts = make_split(dataset, "unit", ("two",))
     with pytest.raises(DatasetError, match=r"'a-two-0kg-.*' \(test\) and 'a-one-0kg-.*' \(.*\) hold the same samples"):
         require_distinct_samples(dataset, parts)
-
-
-def test_distinct_samples_pass_and_progress_is_told(dataset):
-    told = []
-    require_distinct_samples(dataset, make_split(dataset, "unit"), lambda *what: told.append(what))
-    assert told[-1][:2] == (len(dataset), len(dataset))
 
 
 def test_a_split_file_is_read_back(dataset):
@@ -136,16 +122,12 @@ def test_a_split_file_is_read_back(dataset):
     assert (record["by"], record["held_out"], record["virtual"]) == ("unit", ["two"], False)
 
 
-def test_a_split_finds_sequences_by_content_whatever_their_order(dataset, arm, tmp_path):
+def test_a_split_finds_sequences_by_content_and_is_refused_where_one_is_missing(dataset, arm, tmp_path):
     path = write_split(dataset, make_split(dataset, "motion"), "motion")
     copy = Dataset.create(tmp_path / "copy", arm)
     for entry in reversed(dataset.entries):
         copy.append(dataset.read(entry))
     assert {e.hash for e in read_split(path, copy)["test"]} == {e.hash for e in read_split(path, dataset)["test"]}
-
-
-def test_a_split_of_another_dataset_is_refused_by_name(dataset, arm, tmp_path):
-    path = write_split(dataset, make_split(dataset, "motion"), "motion")
     with pytest.raises(DatasetError, match=r"motion\.json: '.*' is not in .*other; split that dataset anew"):
         read_split(path, Dataset.create(tmp_path / "other", arm))
 
@@ -160,25 +142,14 @@ def test_a_split_file_with_a_sequence_in_two_parts_is_refused(dataset):
         read_split(path, dataset)
 
 
-def test_what_is_no_split_file_is_refused(dataset, tmp_path):
-    (tmp_path / "x.json").write_text("[1]")
-    for path in (tmp_path / "x.json", tmp_path / "nowhere.json"):
-        with pytest.raises(DatasetError, match=r": .*; make one with gaponet data split"):
-            read_split(path, dataset)
-
-
 # Mutants of make fuzz --only samples (seed 0) that once ended in a traceback; the number is the mutant's.
 @pytest.mark.parametrize(
     "change",
     [
         pytest.param(lambda text: re.sub(rb'"train": .', b'"train": [], "was": {', text), id="244"),
-        pytest.param(lambda text: re.sub(rb'"val": .', b'"val": [], "was": {', text), id="542"),
         pytest.param(lambda text: re.sub(rb'("train": \{\s*"[^"]*": )"[^"]*"', rb'\1["x"]', text), id="301"),
-        pytest.param(lambda text: re.sub(rb'("val": \{\s*"[^"]*": )"[^"]*"', rb"\1[[]]", text), id="516"),
         pytest.param(lambda text: text[:126] + b"\xff" + text[126:], id="518"),
-        pytest.param(lambda text: text[:36] + b"\xfb" + text[36:], id="607"),
-        pytest.param(lambda text: text[:7] + b"\x80" + text[7:], id="675"),
-        pytest.param(lambda text: text[:253] + b"\xf0" + text[253:], id="803"),
+        pytest.param(lambda text: b"[1]", id="no object"),
     ],
 )
 def test_a_split_file_that_was_changed_at_random_is_refused_in_one_line(dataset, change):

@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from arm import write_arm
 from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import DatasetError, FolderError
@@ -39,6 +38,7 @@ def test_what_was_appended_is_read_back_bit_by_bit(dataset, sequence):
     for name in ("ctrl", "qpos", "qvel", "tau"):
         assert np.array_equal(getattr(read, name), getattr(sequence, name))
     assert read.qacc is None
+    assert list(back.channels(back.entries[0], ("tau", "ctrl"))) == ["tau", "ctrl"]
     assert read.meta == sequence.meta
     assert read.content_hash() == sequence.content_hash() == back.entries[0].hash
     assert back.entries[0].findings == {"delay_s": {"shoulder": 0.04}}
@@ -72,13 +72,6 @@ def no_space(*_):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_the_same_recording_is_refused_by_name(dataset, sequence):
-    renamed = replace(sequence, meta=replace(sequence.meta, motion="other", source="other.csv"))
-    with pytest.raises(DatasetError, match=rf"other\.csv: already in .* as '{dataset.entries[0].id}'"):
-        dataset.append(renamed)
-    assert len(Dataset(dataset.path)) == 1
-
-
 def test_what_is_removed_leaves_no_file_and_the_rest_stays_as_it_is(dataset, sequence):
     other = dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
     with pytest.raises(DatasetError, match=r"no sequence '\*-3kg-\*'; sequences.jsonl in it lists the ids"):
@@ -87,11 +80,6 @@ def test_what_is_removed_leaves_no_file_and_the_rest_stays_as_it_is(dataset, seq
     (left,) = Dataset(dataset.path).entries
     assert [f.stem for f in (dataset.path / "sequences").iterdir()] == [left.id]
     assert Dataset(dataset.path).read(left).content_hash() == left.hash
-
-
-def test_another_payload_of_the_same_motion_is_another_sequence(dataset, sequence):
-    dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
-    assert [e.meta.payload_mass for e in Dataset(dataset.path).entries] == [0.0, 1.0]
 
 
 def test_of_many_none_is_listed_twice_or_lost_where_the_block_ends_badly(dataset, sequence):
@@ -148,31 +136,9 @@ def test_a_listed_file_that_is_gone_is_named(dataset):
         Dataset(dataset.path)
 
 
-def test_a_half_written_file_is_named(dataset):
-    file = next((dataset.path / "sequences").iterdir())
-    file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(DatasetError, match=r"\.parquet: not a readable Parquet file .* import the log again"):
-        dataset.read(dataset.entries[0])
-
-
 def test_a_dataset_belongs_to_one_robot(dataset, so101):
     with pytest.raises(DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'so101' .* use --robot arm"):
         Dataset.create(dataset.path, so101)
-
-
-def test_a_robot_with_other_joints_and_the_same_name_is_another_robot(dataset, tmp_path):
-    swapped = write_arm(tmp_path / "swapped")
-    object.__setattr__(swapped, "joint_names", ("elbow", "shoulder"))
-    with pytest.raises(DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'arm' \(elbow, shoulder\)"):
-        dataset.require_robot(swapped)
-
-
-def test_a_folder_with_other_things_in_it_is_not_taken(arm, tmp_path):
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / ".cat.jpg").touch()
-    with pytest.raises(FolderError, match=r"holds \.cat\.jpg, so it is no dataset of gaponet; choose an empty folder"):
-        Dataset.create(tmp_path / "photos", arm)
-    assert [f.name for f in (tmp_path / "photos").iterdir()] == [".cat.jpg"]
 
 
 def test_peeking_makes_nothing(arm, tmp_path):
@@ -183,17 +149,12 @@ def test_peeking_makes_nothing(arm, tmp_path):
         Dataset.open_existing(tmp_path / "file", arm)
 
 
-def test_a_newer_format_asks_for_an_upgrade(dataset):
+def test_a_newer_format_asks_for_an_upgrade_and_another_folder_says_how_to_make_a_dataset(dataset, tmp_path):
     header = dataset.path / "dataset.json"
     header.write_text(json.dumps(json.loads(header.read_text()) | {"format": 99}))
     with pytest.raises(DatasetError, match="format 99 is newer than this gaponet reads"):
         Dataset(dataset.path)
-
-
-def test_a_folder_that_is_no_dataset_says_how_to_make_one(tmp_path):
-    with pytest.raises(
-        DatasetError, match=r"not a dataset \(no dataset.json\); make one with gaponet import, collect or pull"
-    ):
+    with pytest.raises(DatasetError, match=r"not a dataset \(no dataset.json\); make one with gaponet import"):
         Dataset(tmp_path)
 
 
@@ -213,20 +174,6 @@ def test_a_replay_belongs_to_one_simulator(dataset, sequence):
         dataset.pair(entry, "xyz")
 
 
-def test_licence_and_source_are_kept_in_the_header(dataset):
-    dataset.set_provenance(licence="CC0-1.0", source="here")
-    assert Dataset(dataset.path).header["licence"] == "CC0-1.0"
-    dataset.set_provenance(licence="")
-    assert "licence" not in Dataset(dataset.path).header
-    assert Dataset(dataset.path).header["source"] == "here"
-
-
-def test_some_channels_are_read_without_the_others(dataset, sequence):
-    arrays = dataset.channels(dataset.entries[0], ("tau", "ctrl"))
-    assert list(arrays) == ["tau", "ctrl"]
-    assert np.array_equal(arrays["ctrl"], sequence.ctrl)
-
-
 def test_files_of_earlier_versions_are_read_as_before(dataset, sequence):
     file = next((dataset.path / "sequences").iterdir())
     n, columns = 2, ("ctrl", "qpos", "qvel", "tau")
@@ -242,24 +189,14 @@ def test_the_identity_of_a_set_does_not_depend_on_its_order(dataset, sequence):
     assert dataset_hash(dataset.entries) != dataset_hash(dataset.entries[:1])
 
 
-def test_a_line_separator_in_a_name_does_not_break_the_journal(dataset, sequence):
-    odd = replace(sequence, meta=replace(sequence.meta, payload_mass=1.0, source="a\u2028b.csv"))
-    dataset.append(odd)
-    assert Dataset(dataset.path).entries[1].meta.source == "a\u2028b.csv"
-
-
 @pytest.mark.parametrize(
     ("field", "value", "said"),
     [
         ("id", "../../../etc/passwd", "id: should be 1 to 200 letters"),
-        ("id", 7, "id: should be a valid string"),
         ("dt", float("nan"), "dt: should be a finite number"),
-        ("dt", 0, "dt: should be greater than"),
         ("rows", 10**12, "rows: should be less than"),
         ("channels", ["qpos", "qvel", "qacc"], "channels: .* lack ctrl"),
-        ("channels", ["ctrl", "qpos", "qvel", "__class__"], "channels: .* unknown one"),
         ("meta", {"robot": "arm"}, r"meta\.unit_id: is missing"),
-        ("meta", [], "meta: should be an object"),
         ("findings", {"delay_s": {"a": float("inf")}}, "findings.* finite"),
     ],
 )
@@ -298,9 +235,7 @@ def test_a_line_listed_twice_is_refused(dataset):
         Dataset(dataset.path)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "null", "[]", '{"format": 1}', '{"format": "1"}', '{"format": 1, "robot": "../x"}']
-)
+@pytest.mark.parametrize("text", ["", "null", '{"format": 1}', '{"format": 1, "robot": "../x"}'])
 def test_a_damaged_header_is_named(dataset, text):
     (dataset.path / "dataset.json").write_text(text)
     with pytest.raises(DatasetError, match=r"dataset\.json: .* restore the file"):
@@ -318,9 +253,7 @@ def columns(rows=40, n=2, kind="float32", value=0.0):
     [
         (columns(rows=39), "holds 39 rows, the journal says 40"),
         (columns(n=3), "ctrl is fixed_size_list"),
-        (columns(kind="float64"), "ctrl is fixed_size_list"),
         (columns(value=np.nan), "ctrl lacks values or holds NaN"),
-        (columns(value=None), "ctrl lacks values or holds NaN"),
         (pa.table({"ctrl": [1.0] * 40}), "ctrl is double"),
         (pa.table({"time": [1.0] * 40}), "not a readable Parquet file"),
     ],
@@ -332,7 +265,7 @@ def test_samples_of_another_shape_are_refused(dataset, table, said):
 
 
 def test_a_name_that_is_not_text_is_written_and_read_with_its_bytes_escaped(dataset, sequence):
-    odd = replace(sequence.meta, motion="\udcff\n[red]", source="/logs/\udcff.csv", payload_mass=2.0)
+    odd = replace(sequence.meta, motion="\udcff\n[red]", source="/logs/\u2028\udcff.csv", payload_mass=2.0)
     dataset.append(replace(sequence, meta=odd))
     assert Dataset(dataset.path).entries[1].meta.motion == "\\udcff\n[red]"
 

@@ -2,12 +2,13 @@
 
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from logs import arm_sequence, late, wave, write_so101
 
-from gaponet.base.errors import UsageError
+from gaponet.base.errors import LogError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.formats import detect
 from gaponet.data.importer import import_logs
@@ -31,8 +32,6 @@ def dataset(arm, tmp_path):
         more = {"tau": 2 * ctrl, "qacc": 3 * ctrl, "tau_eq": ctrl, "temperature": 30 + ctrl} if i else {"tau": ctrl}
         sequence = arm_sequence(arm, ctrl, late(ctrl, 2), f"wave {i}", 0.1 * i, unit=f"u{i}", **more)
         meta = {"kp": gains, "kd": (0.0, 1 / 3), "virtual": bool(i), "level": "joint", "repetition": 4}
-        from dataclasses import replace
-
         data.append(replace(sequence, dt=1 / 30 if i else 0.02006, meta=replace(sequence.meta, **meta)))
     return data
 
@@ -84,12 +83,9 @@ def test_asap_finds_its_fields_and_the_targets_that_its_action_means(dataset, ar
     assert np.allclose(motion["pose_aa"][:, 1:, 1], motion["dof"])  # both joints turn about y
 
 
-def test_the_command_writes_each_and_says_how_to_come_back(dataset, tmp_path, capsys):
-    for to in WRITERS:
-        assert main(["data", "export", str(dataset.path), "--out", str(tmp_path / to), "--to", to]) == 0
-        assert f"gaponet import {tmp_path / to}" in " ".join(capsys.readouterr().out.split()).replace(" ", "").replace(
-            "gaponetimport", "gaponet import "
-        )
+def test_the_command_says_how_to_come_back_and_overwrites_nothing(dataset, tmp_path, capsys):
+    assert main(["data", "export", str(dataset.path), "--out", str(tmp_path / "npz"), "--to", "npz"]) == 0
+    assert f"gaponetimport{tmp_path / 'npz'}" in "".join(capsys.readouterr().out.split())
     assert main(["data", "export", str(dataset.path), "--out", str(tmp_path / "npz"), "--to", "npz"]) == 2
     assert "exists and is not an empty folder" in capsys.readouterr().err
 
@@ -108,7 +104,5 @@ def test_what_an_export_says_of_a_recording_is_checked(dataset, arm, tmp_path):
     told = json.loads(str(held["gaponet"]))
     told["stated"]["payload_mass"] = "heavy"
     np.savez(file, **held | {"gaponet": np.array(json.dumps(told))})
-    from gaponet.base.errors import LogError
-
     with pytest.raises(LogError, match=r"payload_mass: should be a valid number, not 'heavy'; export it again"):
         import_logs(tmp_path / "out", arm, None, None, tmp_path / "again")

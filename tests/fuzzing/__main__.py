@@ -37,7 +37,7 @@ def main() -> int:
     known = {t.name: (t,) for group in GROUPS.values() for t in group} | GROUPS
     chosen = [t for name in (args.only or ",".join(GROUPS)).split(",") for t in known[name]]
     shown = lambda done, failed: print(f"\r{done} done, {failed} failed", end="", file=sys.stderr)  # noqa: E731
-    result = run(chosen, args.mutants, args.seed, args.workers, args.keep, shown if sys.stderr.isatty() else None)
+    result = run(chosen, args.mutants, args.seed, args.workers, args.keep, *([shown] if sys.stderr.isatty() else []))
     for text, count, failure in grouped(result.failures):
         print(f"{count:6d}  {text}\n        first: {failure.target} {failure.number}", file=sys.stderr)
     kinds = Counter(f.kind for f in result.failures)

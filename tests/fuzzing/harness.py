@@ -17,9 +17,11 @@ import sys
 import tempfile
 import time
 import traceback
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -38,21 +40,13 @@ class AbsurdError(Exception):
 
 @dataclass(frozen=True)
 class Target:
-    """One kind of input.
-
-    Attributes:
-        name: Of the target.
-        files: Its untouched files: path below the folder → content. Called once in each worker.
-        use: Reads the files in the first folder and writes below the second only; raises AbsurdError.
-        share: How many of a run's mutants it gets, beside the others' shares.
-        only: Names of files (suffix) that are changed, all by default; the others stand beside them.
-    """
+    """One kind of input."""
 
     name: str
-    files: Callable[[], Files]
-    use: Callable[[Path, Path], None]
-    share: float = 1.0
-    only: tuple[str, ...] = ("",)
+    files: Callable[[], Files]  # the untouched files: path below the folder → content; called once in each worker
+    use: Callable[[Path, Path], None]  # reads the first folder, writes below the second only; raises AbsurdError
+    share: float = 1.0  # of a run's mutants, beside the others' shares
+    only: tuple[str, ...] = ("",)  # suffixes of the files that are changed; the others stand beside them
 
 
 @dataclass(frozen=True)
@@ -83,152 +77,123 @@ def run(
     seed: int = 0,
     workers: int = 1,
     keep: Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, failed: None,
 ) -> Result:
     """Try so many mutants, spread over the targets by their shares.
 
     Args:
-        targets: What to try.
-        mutants: How many in all.
         seed: Of all changes.
         workers: Processes.
         keep: Folder for the files of failed mutants, in a folder each; default: they are not kept.
-        progress: Called with done and failures.
+        progress: Called with the numbers of mutants done and of failures.
 
     Returns:
         The counts; of what was done so far where Ctrl-C ends it.
     """
     chosen = list(targets)
     total = sum(t.share for t in chosen)
-    plan = [(i, k) for i, t in enumerate(chosen) for k in range(round(mutants * t.share / total))]
+    plan = [(t, k) for t in chosen for k in range(round(mutants * t.share / total))]
     random.Random(seed).shuffle(plan)
-    crew = [_Crew(chosen, plan[w::workers], seed, keep) for w in range(workers)]
-    start, failures, counts = time.monotonic(), [], Counter()
-    by_target = Counter(chosen[i].name for i, _ in plan)
+    crew = [_Worker(plan[w::workers], seed, keep) for w in range(workers)]
+    start, counts, failures = time.monotonic(), Counter[str](), list[Failure]()
     try:
-        while any(member.busy for member in crew):
-            for member in crew:
-                failures += member.look(counts)
-            if progress:
-                progress(counts["done"], len(failures))
+        while busy := [worker for worker in crew if worker.plan]:
+            wait([worker.pipe for worker in busy], 0.2)
+            for worker in busy:
+                for outcome, failure in worker.outcomes():
+                    counts[outcome] += 1
+                    failures += [failure] if failure else []
+            progress(counts.total(), len(failures))
     except KeyboardInterrupt:
         pass  # the counts so far are true
     finally:
-        for member in crew:
-            member.close()
-    return Result(
-        counts["done"], counts["refused"], counts["taken"], time.monotonic() - start, dict(by_target), failures
-    )
+        for worker in crew:
+            worker.close()
+    by_target = dict(Counter(t.name for t, _ in plan))
+    return Result(counts.total(), counts["refused"], counts["taken"], time.monotonic() - start, by_target, failures)
 
 
-def one(target: Target, number: int, seed: int, folder: Path) -> Failure | None:
-    """Make one mutant below a folder, for a look, and try it in this process."""
-    return _attempt(target, target.files(), number, seed, folder)[1]
+Outcome = tuple[str, Failure | None]  # "refused", "taken" or "failed", and what went wrong
 
 
-class _Crew:
-    """One worker at a time on one list of mutants, replaced when it is used up, hangs or dies."""
+class _Worker:
+    """A process that tries the mutants of a plan; it is replaced when it is used up, hangs or dies."""
 
-    def __init__(self, targets: list[Target], plan: list[tuple[int, int]], seed: int, keep: Path | None) -> None:
-        self.targets, self.plan, self.seed, self.keep, self.at = targets, plan, seed, keep, 0
-        self.process: Any = None
-        self.since = 0.0
-
-    @property
-    def busy(self) -> bool:
-        return self.at < len(self.plan)
-
-    def look(self, counts: Counter[str]) -> list[Failure]:
-        """Wait shortly for what the worker reports; one report for each mutant begun and each one ended."""
-        if not self.busy:
-            return []
-        if self.process is None:
-            self._start()
-        found = []
-        if not self.pipe.poll(0.2):
-            if time.monotonic() - self.since > PATIENCE * HANG_S and self.begun:
-                found.append(self._lost("hang", f"no answer after {PATIENCE * HANG_S:g} s", counts))
-            return found
-        try:
-            while self.busy and self.process and self.pipe.poll(0):
-                found += self._report(self.pipe.recv(), counts)
-        except (EOFError, OSError):
-            self.process.join()
-            if not self.begun:
-                raise RuntimeError("a fuzzing worker died before its first mutant") from None
-            found.append(self._lost("died", f"exit code {self.process.exitcode}", counts))
-        return found
-
-    def _report(self, said: Any, counts: Counter[str]) -> list[Failure]:
-        self.begun, self.since = True, time.monotonic()
-        if said in ("begin", "renew"):
-            if said == "renew":
-                self.close()
-            return []
-        outcome, failure = said
-        self.at += 1
-        counts["done"] += 1
-        counts[outcome] += 1
-        return [failure] if failure else []
-
-    def _lost(self, kind: str, text: str, counts: Counter[str]) -> Failure:
-        index, number = self.plan[self.at]
-        self.close()
-        self.at += 1
-        counts["done"] += 1
-        return Failure(self.targets[index].name, number, kind, text)
+    def __init__(self, plan: list[tuple[Target, int]], seed: int, keep: Path | None) -> None:
+        self.plan, self.seed, self.keep = deque(plan), seed, keep
+        self._start()
 
     def _start(self) -> None:
-        self.pipe, theirs = mp.get_context("fork").Pipe(duplex=False)
-        memory = Path("/dev/shm")
+        context, memory = mp.get_context("fork"), Path("/dev/shm")
         self.room = Path(tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
-        what = (self.targets, self.plan[self.at : self.at + RENEW], self.seed, self.keep, self.room, theirs)
-        self.process = mp.get_context("fork").Process(target=_work, args=what, daemon=True)
+        self.pipe, theirs = context.Pipe(duplex=False)
+        what = (list(islice(self.plan, RENEW)), self.seed, self.keep, self.room, theirs)
+        self.process = context.Process(target=_work, args=what, daemon=True)
         self.begun, self.since = False, time.monotonic()
         self.process.start()
         theirs.close()
 
-    def close(self) -> None:
-        """End the worker."""
-        if self.process is not None:
-            self.process.kill()
+    def outcomes(self) -> Iterator[Outcome]:
+        """Yield the outcomes since the last call, without waiting for more."""
+        kind, text, ended = "", "", False
+        try:
+            while self.plan and self.pipe.poll(0):
+                outcome = self.pipe.recv()
+                self.since = time.monotonic()
+                if self.begun:
+                    self.plan.popleft()
+                    yield outcome
+                self.begun = True
+        except (EOFError, OSError):
             self.process.join()
-            self.pipe.close()
-            self.process = None
-            shutil.rmtree(self.room, ignore_errors=True)
+            if not self.begun:
+                raise RuntimeError("a fuzzing worker died before its first mutant") from None
+            ended = True
+            if self.process.exitcode:
+                kind, text = "died", f"exit code {self.process.exitcode}"
+        if self.begun and time.monotonic() - self.since > PATIENCE * HANG_S:
+            kind, text = "hang", f"no answer after {PATIENCE * HANG_S:g} s"
+        if kind and self.plan:
+            target, number = self.plan.popleft()
+            yield "failed", Failure(target.name, number, kind, text)
+        if (kind or ended) and self.plan:
+            self.close()
+            self._start()
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+        shutil.rmtree(self.room, ignore_errors=True)
 
 
-def _work(
-    targets: list[Target], plan: list[tuple[int, int]], seed: int, keep: Path | None, room: Path, pipe: Any
-) -> None:
-    """A worker: its mutants one after the other, below an empty folder."""
-    untouched = {i: targets[i].files() for i in sorted({i for i, _ in plan})}
-    for i, files in untouched.items():  # must be taken: a fuzzer of what is refused anyway finds nothing
-        _lay(files, room)
-        targets[i].use(room / "in", room / "out")
+def _work(plan: list[tuple[Target, int]], seed: int, keep: Path | None, room: Path, pipe: Any) -> None:
+    """Try mutants one after the other, below an empty folder, and report when the first begins and when each ends."""
+    untouched = {target.name: target.files() for target, _ in plan}
+    for target in {target.name: target for target, _ in plan}.values():
+        _lay(untouched[target.name], room)
+        target.use(room / "in", room / "out")  # must be taken: changes of what is refused anyway find nothing
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
     sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
     sys.addaudithook(_watch)
     _limit_memory()
-    pipe.send("begin")
     parent = os.getppid()
-    for index, number in plan:
+    pipe.send("begin")
+    for target, number in plan:
         if os.getppid() != parent:  # it was killed
             return
-        outcome, failure = _attempt(targets[index], untouched[index], number, seed, room)
+        outcome, failure = _attempt(target, untouched[target.name], number, seed, room)
         if failure and keep:
             to = keep / f"{failure.kind}-{failure.target}-{number}"
             shutil.copytree(room / "in", to, dirs_exist_ok=True, symlinks=True)
             (to / "WHY.txt").write_text(failure.text, encoding="utf-8")
         pipe.send((outcome, failure))
-    pipe.send("renew")
-    time.sleep(60)  # until it is ended
 
 
-def _attempt(target: Target, files: Files, number: int, seed: int, room: Path) -> tuple[str, Failure | None]:
-    """("refused", "taken" or "failed", what went wrong)."""
+def _attempt(target: Target, files: Files, number: int, seed: int, room: Path) -> Outcome:
     mutant = mutate(files, random.Random(f"{seed} {target.name} {number}"), target.only)
     _lay(mutant, room)
     _WATCHED[:] = [str(room / "out")]

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 Files = dict[str, bytes | None]  # path below a folder → content; None is a folder where a file is expected
 Change = Callable[[bytes, random.Random], bytes]
@@ -178,58 +180,51 @@ def _structure(value: Any, rng: random.Random) -> Any:
 
 
 def _parquet(content: bytes, rng: random.Random) -> bytes:
-    """One column of other numbers, another type, another name, twice, or gone; or rows gone or twice."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+    """One column gone, renamed, twice, of other values or of another type; or rows gone or twice."""
     table = pq.read_table(io.BytesIO(content))
-    rows, at = table.num_rows, rng.randrange(table.num_columns)
-    name, kind = table.column_names[at], rng.randrange(9)
+    rows, at, kind = table.num_rows, rng.randrange(table.num_columns), rng.randrange(9)
+    name, values = table.column_names[at], table.column(at).to_pylist()
     if kind == 0:
         table = table.remove_column(at)
     elif kind == 1:
-        names = list(table.column_names)
-        names[at] = rng.choice((*WORDS, *names))
-        table = table.rename_columns(names)
+        new = rng.choice((*WORDS, *table.column_names))
+        table = table.rename_columns([new if i == at else n for i, n in enumerate(table.column_names)])
     elif kind == 2:
         table = table.append_column(rng.choice((name, "x")), table.column(at))
     elif kind == 3:
-        a = rng.randrange(rows + 1)
-        table = rng.choice((table.slice(0, a), table.slice(a), pa.concat_tables([table, table])))
+        cut = rng.randrange(rows + 1)
+        table = rng.choice((table.slice(0, cut), table.slice(cut), pa.concat_tables([table, table])))
     elif kind == 4:
-        column = pa.array([rng.choice((*VALUES[:3], 1, "x"))] * rows)
-        table = table.set_column(at, name, column)
+        table = table.set_column(at, name, pa.array([rng.choice((None, True, False, 1, "x"))] * rows))
     elif kind == 5:
-        new = rng.choice(("int8", "string", "bool_", "float16", "uint64", "timestamp", "list", "struct"))
-        types = {
-            "timestamp": pa.timestamp("ns"),
-            "list": pa.list_(pa.float64()),
-            "struct": pa.struct([("a", pa.int8())]),
-        }
-        values = [None if rng.random() < 0.5 else table.column(at)[i].as_py() for i in range(rows)]
-        try:
-            column = pa.array(values).cast(types.get(new) or getattr(pa, new)())
-        except (pa.ArrowException, TypeError):
-            column = pa.nulls(rows, types.get(new) or getattr(pa, new)())
-        table = table.set_column(at, name, column)
-    else:
-        column = [v.as_py() for v in table.column(at)]
-        i = rng.randrange(max(1, rows))
-        numbers = (None, float("nan"), float("inf"), 1e30, -1, 0, 10**9, 2**62, 0.5)
-        if column and isinstance(column[i], list):
-            j = rng.randrange(len(column[i]) + 1)
-            column[i] = rng.choice((column[i][:j], column[i] + [1.0], [rng.choice(numbers)] * len(column[i]), None))
-        elif column and isinstance(column[i], str):
-            column[i] = rng.choice(WORDS)
-        elif column:
-            column[i] = rng.choice(numbers)
-        try:
-            table = table.set_column(at, name, pa.array(column, from_pandas=False))
-        except (pa.ArrowException, OverflowError):
-            table = table.set_column(at, name, pa.array([None if c is None else str(c) for c in column]))
+        table = table.set_column(
+            at, name, _column([v if rng.random() < 0.5 else None for v in values], rng.choice(TYPES))
+        )
+    elif values:
+        i = rng.randrange(rows)
+        number = rng.choice((None, float("nan"), float("inf"), 1e30, -1, 0, 10**9, 2**62, 0.5))
+        if isinstance(values[i], list):
+            cut = rng.randrange(len(values[i]) + 1)
+            values[i] = rng.choice((values[i][:cut], [*values[i], 1.0], [number] * len(values[i]), None))
+        else:
+            values[i] = rng.choice(WORDS) if isinstance(values[i], str) else number
+        table = table.set_column(at, name, _column(values, None))
     out = io.BytesIO()
     pq.write_table(table, out)
     return out.getvalue()
+
+
+TYPES = (pa.int8(), pa.string(), pa.bool_(), pa.float16(), pa.uint64(), pa.timestamp("ns"), pa.list_(pa.float64()),
+         pa.struct([("a", pa.int8())]))  # fmt: skip
+
+
+def _column(values: list[Any], kind: pa.DataType | None) -> pa.Array:
+    """The values as an array of a type, of None or of text where they cannot be converted."""
+    try:
+        array = pa.array(values, from_pandas=False)
+        return array if kind is None else array.cast(kind)
+    except (pa.ArrowException, OverflowError, TypeError):
+        return pa.nulls(len(values), kind) if kind else pa.array([None if v is None else str(v) for v in values])
 
 
 def _npz(content: bytes, rng: random.Random) -> bytes:

@@ -53,7 +53,9 @@ def written(write: Callable[[Path], object]) -> Callable[[], Files]:
         with tempfile.TemporaryDirectory() as folder:
             write(Path(folder))
             return {
-                p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file()
+                p.relative_to(folder).as_posix(): p.read_bytes()
+                for p in sorted(Path(folder).rglob("*"))
+                if p.is_file() and not p.name.startswith(".gaponet")
             }
 
     return files
@@ -136,12 +138,7 @@ def _export(folder: Path) -> None:
             ctrl = wave(ROWS, 2, hertz=0.4 + 0.1 * i)
             data.append(arm_sequence(arm(), ctrl, late(ctrl, 2), f"m{i}", 0.1, tau=ctrl, tau_eq=ctrl, qacc=ctrl))
         data.set_provenance(licence="CC0-1.0")
-        export(data, arm(), Path(place) / "out", "lerobot")
-        for file in sorted((Path(place) / "out").rglob("*")):
-            if file.is_file():
-                to = folder / file.relative_to(Path(place) / "out")
-                to.parent.mkdir(parents=True, exist_ok=True)
-                to.write_bytes(file.read_bytes())
+        export(data, arm(), folder / "set", "lerobot")
 
 
 def _motions(folder: Path) -> None:
@@ -194,7 +191,7 @@ TARGETS = (
     Target("asap", written(write_asap), importing(arm, allow_pickle=True), 1.0, (".pkl",)),
     Target("lerobot", written(lambda f: stock(f / "set", rows=(25, 15))), importing(so101, position_unit="deg"), 2.5),
     Target("bam", written(lambda f: write_bam(f / "a.json", ROWS, 30)), importing(bench, stated="payload"), 1.0),
-    Target("export", written(_export), importing(arm, stated="all", fmt="lerobot"), 2.0),
+    Target("export", written(_export), importing(arm, "set", stated="all", fmt="lerobot"), 2.0),
     Target("motion", written(_motions), _read_motions, 1.5),
     Target("recipe", written(lambda f: (f / "mine.toml").write_text(RECIPE)), _read_recipe, 0.7, (".toml",)),
 )  # fmt: skip

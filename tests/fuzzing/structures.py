@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
@@ -46,25 +45,15 @@ IDENTIFIED = "[identified.elbow]\nkp = 18.0\ndelay = 0.01\noffset = 0.01\n"
 
 
 def _dataset(folder: Path) -> None:
-    with tempfile.TemporaryDirectory() as place:
-        data = Dataset.create(Path(place) / "set", arm())
-        for i in range(4):
-            ctrl = wave(ROWS, 2, hertz=0.4 + 0.1 * i)
-            entry = data.append(arm_sequence(arm(), ctrl, late(ctrl, 2), f"m{i}", 0.1, tau=ctrl))
-            data.write_replay(entry, SimulatedReplay("0123456789ab", ctrl, ctrl, ctrl))
-        data.set_provenance(licence="CC0-1.0")
-        write_split(data, make_split(data, "motion"), "motion")
-        (data.path / "offsets.json").write_text(json.dumps({"applied": False, "unit": "rad", "units": {}}))
-        (data.path / "collect.json").write_text(json.dumps({"fleet": "easy", "seed": 0}))
-        _copy(data.path, folder)
-
-
-def _copy(source: Path, folder: Path) -> None:
-    for file in sorted(source.rglob("*")):
-        if file.is_file() and not file.name.startswith(".gaponet"):
-            to = folder / file.relative_to(source)
-            to.parent.mkdir(parents=True, exist_ok=True)
-            to.write_bytes(file.read_bytes())
+    data = Dataset.create(folder, arm())
+    for i in range(4):
+        ctrl = wave(ROWS, 2, hertz=0.4 + 0.1 * i)
+        entry = data.append(arm_sequence(arm(), ctrl, late(ctrl, 2), f"m{i}", 0.1, tau=ctrl))
+        data.write_replay(entry, SimulatedReplay("0123456789ab", ctrl, ctrl, ctrl))
+    data.set_provenance(licence="CC0-1.0")
+    write_split(data, make_split(data, "motion"), "motion")
+    (folder / "offsets.json").write_text(json.dumps({"applied": False, "unit": "rad", "units": {}}))
+    (folder / "collect.json").write_text(json.dumps({"fleet": "easy", "seed": 0}))
 
 
 def _open_dataset(source: Path, out: Path) -> None:

@@ -16,7 +16,6 @@ from gaponet.base.files import lock_folder
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Json, Source, like
 from gaponet.cli.out import Out
-from gaponet.plugins import attempt
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot
 
@@ -126,11 +125,9 @@ def doctor(
 
 
 def _show_formats(out: Out) -> None:
-    from gaponet.data.formats import about, module
-    from gaponet.data.formats import formats as known
+    from gaponet.data.formats import about, extra_of, formats
 
-    extras = {fmt: attempt(where, lambda fmt=fmt: str(module(fmt).EXTRA), None) for fmt, where in known().items()}  # type: ignore[misc]
-    rows = {fmt: (about(fmt), extra) for fmt, extra in extras.items() if extra is not None}
+    rows = {fmt: (about(fmt), extra) for fmt in formats() if (extra := extra_of(fmt)) is not None}
     out.table("Formats that gaponet import reads", ["format", "what it is", "needs"], [
         [fmt, what, f"gaponet[{extra}]" if extra else ""] for fmt, (what, extra) in rows.items()
     ])  # fmt: skip

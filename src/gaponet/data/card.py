@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from gaponet import __version__
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
-from gaponet.base.files import write_text
+from gaponet.base.files import write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.result_table import ResultTable
 from gaponet.base.structure import read_json
@@ -135,7 +134,7 @@ def _number_or_name(text: str) -> tuple[float, str]:
 def write_card(dataset: Dataset, card: dict[str, Any]) -> None:
     """Write card.json and CARD.md into the dataset folder."""
     with dataset.writing():
-        write_text(dataset.path / "card.json", json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        write_json(dataset.path / "card.json", card)
         write_text(dataset.path / "CARD.md", card_markdown(card))
 
 

@@ -12,11 +12,10 @@ import numpy as np
 from gaponet.base.executor import LOCAL
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.checks import CHECKS
-from gaponet.data.checks.check_cache import CheckCache
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
 from gaponet.data.checks.static_checks import static_checks
-from gaponet.data.checks.survey import Survey
+from gaponet.data.checks.survey import Survey, survey_all
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import LEVELS, Finding
@@ -25,15 +24,10 @@ from gaponet.robot.spec import RobotSpec
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Result of examining a dataset.
+    """Result of examining a dataset."""
 
-    Attributes:
-        findings: Worst first.
-        sequences, joints: One row of numbers each, for tables.
-    """
-
-    findings: list[Finding]
-    sequences: list[dict[str, Any]]
+    findings: list[Finding]  # worst first
+    sequences: list[dict[str, Any]]  # one row of numbers each, for tables
     joints: list[dict[str, Any]]
 
     def count(self, level: str) -> int:
@@ -64,20 +58,20 @@ class Diagnosis:
         progress: Progress = no_progress,
         executor: str | Executor = LOCAL,
     ) -> Diagnosis:
-        """Examine every sequence, and judge them together. Measurements are stored (checks.check_cache).
+        """Examine every sequence, and judge them together.
 
         Args:
             robot: The dataset's robot.
             gravity_model: Gravity of the nominal model, which shows wrong zeros, signs, gains and payload labels; these
                 are not examined without it.
-            executor: Measures new sequences, if there are many; default: this machine's cores.
+            executor: Measures the sequences, if there are many; default: this machine's cores.
 
         Raises:
             DatasetError: The dataset is empty, damaged or another robot's.
         """
         dataset.require_robot(robot)
         dataset.require_sequences()
-        surveys = CheckCache(dataset, robot).surveys(progress, executor)
+        surveys = survey_all(dataset, robot, progress, executor)
         findings = [f for check in CHECKS for f in check.run(surveys, robot)]
         if gravity_model is not None:
             findings += _examine_loads(findings, surveys, robot, gravity_model)

@@ -35,32 +35,13 @@ UNSTATED_REPETITION = -1
 
 @dataclass(frozen=True)
 class ImportReport:
-    """Result of one import.
-
-    Attributes:
-        entries: Sequences that were added.
-        present: Sequences of this source that the dataset held already, by their content.
-        offsets: Joint → static offset of the unit; None without a gravity model, or if several units were recorded.
-        skipped: Rows that were cut and recordings that were left out, one line each, if skip_bad was given.
-    """
+    """Result of one import."""
 
     dataset: Dataset
-    entries: list[Entry]
-    present: list[Entry]
-    offsets: dict[str, JointOffset] | None
-    skipped: list[str] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class _Labels:
-    """Labels that the user gives for all recordings; None if the format states them, or for the default."""
-
-    unit_id: str | None
-    payload_mass: float | None
-    payload_side: str | None
-    level: str | None
-    kp: tuple[float, ...] | None
-    kd: tuple[float, ...] | None
+    entries: list[Entry]  # added
+    present: list[Entry]  # of this source, but in the dataset already, by their content
+    offsets: dict[str, JointOffset] | None  # by joint; None without a gravity model, or if there are several units
+    skipped: list[str] = field(default_factory=list)  # with skip_bad: rows cut and recordings left out, one line each
 
 
 def import_logs(
@@ -112,8 +93,11 @@ def import_logs(
     src, out = Path(src), Path(out)
     if payload_side is not None:
         _require_side(robot, payload_side)
-    gains = (_parse_gains("kp", kp, robot), _parse_gains("kd", kd, robot))
-    labels = _Labels(unit_id, payload_mass, payload_side, level, *gains)
+    labels = {
+        "unit_id": unit_id, "payload_mass": payload_mass, "payload_side": payload_side, "level": level,
+        "kp": _parse_gains("kp", kp, robot), "kd": _parse_gains("kd", kd, robot),
+    }  # fmt: skip
+    labels = {name: value for name, value in labels.items() if value is not None}
     if cut is not None and not cut >= MIN_PIECE_S:
         raise UsageError(f"--cut {cut:g}: pieces are {MIN_PIECE_S} s long or more")
     with lock_folder(out, KIND):
@@ -122,10 +106,10 @@ def import_logs(
             read_offsets(existing)  # a damaged file is refused before anything is read
         source = _Source(src, robot, labels, fmt, cut, options)
         with skip_bad_rows(skip_bad) as skipped:
-            recordings = source.check(existing, progress)
+            source.check(existing, progress)
             dataset = Dataset.create(out, robot)
             poses: dict[str, StaticPoses] = {}
-            added, present = source.write(dataset, recordings, poses if gravity else None)
+            added, present = source.write(dataset, poses if gravity else None)
         units = dict.fromkeys(e.meta.unit_id for e in (*present, *added)) if gravity else {}
         offsets = {unit: unit_offsets(dataset, robot, unit, gravity, poses) for unit in units} if gravity else {}
         for unit, of_unit in offsets.items():
@@ -135,72 +119,67 @@ def import_logs(
 
 
 @dataclass
-class _Checked:
-    """Recordings of a source after the first reading; `held` is None if they are too large to hold."""
+class _Source:
+    """Logs to import, with what the user states of them.
 
+    `check` fills hashes, of the content of each recording; provenance; and held: the recordings, None if they are too
+    large to hold.
+    """
+
+    src: Path
+    robot: RobotSpec
+    labels: dict[str, Any]
+    fmt: str | None
+    cut: float | None
+    options: dict[str, Any]
     hashes: list[str] = field(default_factory=list)
     held: list[Sequence] | None = field(default_factory=list)
     provenance: dict[str, str] = field(default_factory=dict)
 
-
-@dataclass(frozen=True)
-class _Source:
-    """Logs to import, with what the user states of them."""
-
-    src: Path
-    robot: RobotSpec
-    labels: _Labels
-    fmt: str | None
-    cut: float | None
-    options: dict[str, Any]
-
-    def check(self, existing: Dataset | None, progress: Progress) -> _Checked:
+    def check(self, existing: Dataset | None, progress: Progress) -> None:
         """Read and check every recording."""
-        checked, total = _Checked(), len(find_logs(self.src, self.fmt))
+        total = len(find_logs(self.src, self.fmt))
         source_of: dict[str, str] = {}  # content hash → source
         duplicates: list[tuple[str, str]] = []
         size = 0
         for sequence, log in self.sequences():
             content_hash, source = sequence.content_hash(), sequence.meta.source
-            checked.hashes.append(content_hash)
+            self.hashes.append(content_hash)
             # Pieces of one recording may be equal, where the robot rested.
             if content_hash in source_of and not (self.cut and source_of[content_hash] == source):
                 duplicates.append((source, source_of[content_hash]))
             source_of.setdefault(content_hash, source)
             if existing is not None:
                 _refuse_relabelled(sequence, existing)
-            checked.provenance |= log.meta.get("dataset", {})
+            self.provenance |= log.meta.get("dataset", {})
             size += sum(x.nbytes for c in ARRAYS if (x := getattr(sequence, c)) is not None)
             if size > MAX_HELD_BYTES:
-                checked.held = None
-            if checked.held is not None:
-                checked.held.append(sequence)
-            progress(len(checked.hashes), max(total, len(checked.hashes)), sequence.meta.motion)
-        if not checked.hashes:
+                self.held = None
+            if self.held is not None:
+                self.held.append(sequence)
+            progress(len(self.hashes), max(total, len(self.hashes)), sequence.meta.motion)
+        if not self.hashes:
             raise LogError("no recording found")
         if duplicates:
             raise DatasetError(
-                f"{len(duplicates)} of {len(checked.hashes)} recordings are there twice (same samples, unit and "
+                f"{len(duplicates)} of {len(self.hashes)} recordings are there twice (same samples, unit and "
                 f"payload): {duplicates[0][0]} is {duplicates[0][1]}. Nothing was imported; leave one of them out"
             )
-        return checked
 
-    def write(
-        self, dataset: Dataset, checked: _Checked, poses: dict[str, StaticPoses] | None
-    ) -> tuple[list[Entry], list[Entry]]:
+    def write(self, dataset: Dataset, poses: dict[str, StaticPoses] | None) -> tuple[list[Entry], list[Entry]]:
         """Append what is new; return the added and the present entries.
 
         Args:
             poses: Filled with content hash → static poses.
         """
-        if checked.provenance and not dataset.entries:
-            dataset.set_provenance(**checked.provenance)
-        present = [entry for content_hash in checked.hashes if (entry := dataset.find(content_hash))]
+        if self.provenance and not dataset.entries:
+            dataset.set_provenance(**self.provenance)
+        present = [entry for content_hash in self.hashes if (entry := dataset.find(content_hash))]
         repetitions = Counter(e.meta.repetition_key for e in dataset.entries)
-        sequences = checked.held if checked.held is not None else (s for s, _ in self.sequences())
+        sequences = self.held if self.held is not None else (s for s, _ in self.sequences())
         added = []
         with dataset.appending():
-            for content_hash, sequence in zip(checked.hashes, sequences, strict=True):
+            for content_hash, sequence in zip(self.hashes, sequences, strict=True):
                 if poses is not None:
                     poses[content_hash] = StaticPoses.of(sequence, self.robot.operated_index)
                 if dataset.find(content_hash):
@@ -231,19 +210,18 @@ class _Source:
         """Combine what the user and the format state; refuse contradictions and gaps."""
         stated = {k: v for k, v in log.meta.get("stated", {}).items() if v is not None}
         stated |= {k: tuple(stated[k]) for k in ("kp", "kd") if k in stated}
-        given = {name: value for name, value in vars(self.labels).items() if value is not None}
-        for name, value in given.items():
+        for name, value in self.labels.items():
             if name in stated and stated[name] != value:
                 flag = "--" + name.replace("_", "-")
                 raise UsageError(f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out")
         needed = {"unit_id": "--unit-id NAME", "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)"}
-        missing = [flag for name, flag in needed.items() if name not in given | stated]
+        missing = [flag for name, flag in needed.items() if name not in self.labels | stated]
         if missing:
             raise UsageError(f"{log.source}: this format does not say it: give {' and '.join(missing)}")
         # A relative path: no home folder gets into a dataset.
         source = Path(os.path.relpath(log.source, Path(os.path.abspath(self.src)).parent)).as_posix()
         origin = {"source": source, "source_sha256": sha256, "repetition": UNSTATED_REPETITION}
-        fields: dict[str, Any] = origin | given | {"robot": self.robot.name, "motion": motion} | stated
+        fields: dict[str, Any] = origin | self.labels | {"robot": self.robot.name, "motion": motion} | stated
         return SequenceMeta(**fields)
 
 

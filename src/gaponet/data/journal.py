@@ -53,29 +53,16 @@ class _JournalLine(EntryHeader):
 
 @dataclass(frozen=True)
 class Entry(EntryHeader):
-    """One sequence of a dataset, as the journal lists it.
+    """One sequence of a dataset, as the journal lists it."""
 
-    Attributes:
-        line: The journal line, JSON without line end.
-        where: File and line number, for errors.
-    """
-
-    line: bytes = field(compare=False, repr=False)
-    where: str = field(default="", compare=False, repr=False)
+    line: bytes = field(compare=False, repr=False)  # JSON without line end
+    where: str = field(default="", compare=False, repr=False)  # file and line number, for errors
 
     @classmethod
     def create(
-        cls,
-        header: EntryHeader,
-        meta: SequenceMeta,
-        findings: Findings,
-        command: CommandFingerprint | None = None,
+        cls, header: EntryHeader, meta: SequenceMeta, findings: Findings, command: CommandFingerprint | None = None
     ) -> Entry:
-        """Return the entry of a new sequence.
-
-        Args:
-            command: Fingerprint of its commands, to recognise them in other sequences.
-        """
+        """Return the entry of a new sequence; `command` is the fingerprint of its commands."""
         content = asdict(header) | {"meta": asdict(meta), "findings": findings, "command": command}
         return cls(**vars(header), line=json.dumps(content, ensure_ascii=False, allow_nan=False).encode())
 

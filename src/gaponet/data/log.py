@@ -48,19 +48,15 @@ class Channel(NamedTuple):
 class Log:
     """One recording.
 
-    Attributes:
-        joint_names: The robot's own names, (n).
-        channels: Channels among CHANNELS and DERIVED, at least ctrl and qpos.
-        source: File or folder it was read from, for errors and for the manifest.
-        meta: Whatever the format also says (events, firmware). Acted on are: dt, the exact period of regular rows,
-            s; kp and kd, gains of joint_names; notes, for SequenceMeta; stated, fields of SequenceMeta that the format
-            itself holds.
+    Acted on of meta are: dt, the exact period of regular rows, s; kp and kd, gains of joint_names; notes, for
+    SequenceMeta; stated, fields of SequenceMeta that the format itself holds; for errors, first_line and the files by
+    channel.
     """
 
     robot: str
-    joint_names: tuple[str, ...]
-    channels: dict[str, Channel]
-    source: str
+    joint_names: tuple[str, ...]  # the robot's own names, (n)
+    channels: dict[str, Channel]  # among CHANNELS and DERIVED, at least ctrl and qpos
+    source: str  # file or folder it was read from
     meta: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -6,10 +6,9 @@ softer motors alike; gaponet identify separates them.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
-from gaponet.base.files import write_text
+from gaponet.base.files import write_json
 from gaponet.base.structure import Json, read_json
 from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import Dataset
@@ -31,22 +30,14 @@ Gravity = Callable[[Array, float, str], Array]
 
 @dataclass(frozen=True)
 class JointOffset:
-    """Static error of one joint, rad; None where there are too few static poses.
+    """Static error of one joint, rad; None where there are too few static poses."""
 
-    Attributes:
-        rests_up, rests_down: Static poses approached from below and above.
-        static_error: qpos − ctrl, mean of both approaches.
-        stiction_band: Half the distance between both approaches, without nominal sag; times kp it is a torque.
-        nominal_sag: Static error of the nominal model in the same poses.
-        tracking_offset: static_error − nominal_sag.
-    """
-
-    rests_up: int
-    rests_down: int
-    static_error: float | None
-    stiction_band: float | None
-    nominal_sag: float | None
-    tracking_offset: float | None
+    rests_up: int  # static poses approached from below
+    rests_down: int  # and from above
+    static_error: float | None  # qpos − ctrl, mean of both approaches
+    stiction_band: float | None  # half the distance between both approaches, without nominal sag; times kp a torque
+    nominal_sag: float | None  # static error of the nominal model in the same poses
+    tracking_offset: float | None  # static_error − nominal_sag
 
 
 class _OffsetsFile(TypedDict):
@@ -89,9 +80,8 @@ def record_offsets(dataset: Dataset, unit_id: str, offsets: dict[str, JointOffse
     file = dataset.path / FILE
     with dataset.writing():
         content = read_offsets(dataset)
-        joints = {name: asdict(offset) for name, offset in offsets.items()}
-        content["units"][unit_id] = {"joints": joints, "simulator": simulator}
-        write_text(file, json.dumps(content, indent=1, allow_nan=False) + "\n")
+        content["units"][unit_id] = {"joints": offsets, "simulator": simulator}
+        write_json(file, content)
     return file
 
 

@@ -60,19 +60,12 @@ def _tracking_difference(a: Sequence, b: Sequence, columns: list[int]) -> Array 
 
 @dataclass(frozen=True)
 class RepetitionResult:
-    """Result of the repetitions of one motion.
+    """Result of the repetitions of one motion."""
 
-    Attributes:
-        count: Repetitions of the first command.
-        other_commands: Repetitions with another command, which are left out.
-        moved: Joints that were commanded to move, (n) bool.
-        variance: Channel → variance over repetitions, averaged over rows, (n).
-    """
-
-    count: int
-    other_commands: int
-    moved: Array
-    variance: dict[str, Array]
+    count: int  # of the first command
+    other_commands: int  # repetitions with another command, which are left out
+    moved: Array  # joints that were commanded to move, (n) bool
+    variance: dict[str, Array]  # channel → over repetitions, averaged over rows, (n)
 
 
 class Repetitions:

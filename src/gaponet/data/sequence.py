@@ -197,7 +197,7 @@ def require_same_gains(metas: Iterable[SequenceMeta], joint_names: tuple[str, ..
                     )
 
 
-def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None = None) -> Sequence:
+def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     """Put a log on a uniform grid.
 
     Where all channels share timestamps and every period is within 10 % of the median, rows are kept as they are and dt
@@ -212,25 +212,23 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
         log: The recording; its joints are reordered to the robot's, and missing ones stand where its posture (meta
             "posture", {joint: rad}) says, else at home, which is noted.
         robot: Decides the joint order; its gains stand where neither meta nor the log (meta "kp", "kd") says them.
-        dt: Force this period, s.
     """
     time = log.channels["qpos"].time
     _require_both_ends(log)
     period = np.diff(time)
     median = _median_period(log)
     shared = all(len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values())
-    even = shared and dt is None and bool((np.abs(period - median) <= 0.1 * median).all())
+    even = shared and bool((np.abs(period - median) <= 0.1 * median).all())
     mean = round(float(period.mean()), 7)
     exact = (mean,) if np.abs(period - mean).max() < 2e-6 else ()  # a clock that does not waver
     periods = (log.meta["dt"],) if "dt" in log.meta else (*exact, round(median, 5), mean)
-    kept = _row_period(time, periods) if even else None
-    regular = kept is not None
-    if kept is not None:
-        dt = kept
+    dt = _row_period(time, periods) if even else None
+    regular = dt is not None
+    if dt is not None:
         arrays = {name: channel.values for name, channel in log.channels.items()}
     else:
-        free = shared and dt is None and "dt" not in log.meta
-        begin, dt = _loop(time, median, robot.dt) if free else (None, round(median, 5) if dt is None else dt)
+        free = shared and "dt" not in log.meta
+        begin, dt = _loop(time, median, robot.dt) if free else (None, round(median, 5))
         arrays = _resample(log, dt, begin)
     arrays = {name: _to_robot(name, values, log, robot) for name, values in arrays.items()}
     converted = log.meta.get("converted_from", {})
@@ -238,17 +236,14 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     if odd:  # a joint logged as a fraction of its range has its velocity in any unit at all
         qvel = differentiate(arrays["qpos"], dt)
         arrays.setdefault("qvel", qvel)[:, odd] = qvel[:, odd]
-    notes = (
-        meta.notes
-        | log.meta.get("notes", {})
-        | {
-            "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated",
-            "rate_hz": round(1 / median, 3),
-            "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
-            "longest_gap_ms": round(float(period.max()) * 1e3, 3),
-            "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
-        }
-    )
+    notes = meta.notes | log.meta.get("notes", {})
+    notes |= {
+        "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated",
+        "rate_hz": round(1 / median, 3),
+        "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
+        "longest_gap_ms": round(float(period.max()) * 1e3, 3),
+        "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
+    }
     posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
     absent = [name for name in robot.joint_names if name not in log.joint_names and name not in posture]
     notes |= ({"posture": posture} if posture else {}) | ({"held_at_home": absent} if absent else {})

@@ -139,19 +139,13 @@ class Response:
 
     They add up over recordings. The velocity of a joint is modelled as a weighted sum of earlier commanded velocities.
     The weights show when a joint begins to move, and by how much a recording follows later than others.
-
-    Attributes:
-        own: Correlations of the command with itself, at lags 0 … BEFORE_S + AFTER_S, (SPLITS, n, L).
-        cross: Correlations of the command with the later state, at lags −BEFORE_S … AFTER_S, (SPLITS, n, L).
-        power: Power of the state, (SPLITS, n).
-        duration: s.
     """
 
-    step: float
-    own: Array
-    cross: Array
-    power: Array
-    duration: float
+    step: float  # s
+    own: Array  # command with itself, at lags 0 … BEFORE_S + AFTER_S, (SPLITS, n, L)
+    cross: Array  # command with the later state, at lags −BEFORE_S … AFTER_S, (SPLITS, n, L)
+    power: Array  # of the state, (SPLITS, n)
+    duration: float  # s
 
     @classmethod
     def of(cls, ctrl: Array, qpos: Array, dt: float) -> Response:
@@ -233,18 +227,13 @@ class Response:
 class CommonResponse:
     """How joints follow their commands in several recordings.
 
-    Attributes:
-        onset: Time after which a joint has covered ONSET_SHARE of its way, (n) s; NaN if it does not follow, or if its
-            commands are too smooth to show it.
-        early: Unexplained power without weights of future commands over that with them, (n).
-        shifts: Delay of each part of each recording against all, (recordings, SPLITS) s.
-        whole: The same of whole recordings, (recordings) s.
+    onset is NaN if a joint does not follow, or if its commands are too smooth to show it.
     """
 
-    onset: Array
-    early: Array
-    shifts: Array
-    whole: Array
+    onset: Array  # time after which a joint has covered ONSET_SHARE of its way, (n) s
+    early: Array  # unexplained power without weights of future commands over that with them, (n)
+    shifts: Array  # delay of each part of each recording against all, (recordings, SPLITS) s
+    whole: Array  # delay of whole recordings, (recordings) s
 
 
 def _best_shifts(fits: Array) -> Array:

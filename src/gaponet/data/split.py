@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -21,7 +20,7 @@ from typing import Any
 from typing_extensions import TypedDict
 
 from gaponet.base.errors import DatasetError, UsageError
-from gaponet.base.files import write_text
+from gaponet.base.files import write_json
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json
 from gaponet.data.fingerprint import CommandFingerprint, equal_commands, fingerprint
@@ -109,7 +108,7 @@ def split_entries(
         return splits | {s: [e for e in splits[s] if not held_out(e)] for s in ("train", "val")}
     motions = _split_by_joints({canonical[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries})
     motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
-    entries = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
+    entries = [e for e in dataset.entries if not rates or any(abs(r - 1 / e.dt) < RATE_TOLERANCE * r for r in rates)]
     splits = {
         s: [e for e in entries if canonical[e.meta.motion] in motions[s] and (s == "test" or not held_out(e))]
         for s in SPLITS
@@ -126,18 +125,13 @@ def _require_present(
     known_units = sorted({e.meta.unit_id for e in dataset.entries})
     if missing_units := [u for u in units if u not in known_units]:
         raise UsageError(f"unit '{missing_units[0]}' is not in {dataset.path}; it holds {', '.join(known_units)}")
-    known_payloads = sorted({e.meta.payload_mass for e in dataset.entries})
-    if missing := [p for p in payloads if p not in known_payloads]:
-        text = ", ".join(f"{p:g}" for p in known_payloads)
-        raise UsageError(f"no recording with {missing[0]:g} kg in {dataset.path}; it holds {text} kg")
-    known_rates = sorted({round(1 / e.dt, 2) for e in dataset.entries})
-    if missing := [r for r in rates if not any(_same_rate(r, h) for h in known_rates)]:
-        text = ", ".join(f"{h:g}" for h in known_rates)
-        raise UsageError(f"no recording at {missing[0]:g} Hz in {dataset.path}; it holds {text} Hz")
-
-
-def _same_rate(a: float, b: float) -> bool:
-    return abs(a - b) < RATE_TOLERANCE * a
+    for wanted, known, text, tolerance in (
+        (payloads, {e.meta.payload_mass for e in dataset.entries}, "with {:g} kg", 0.0),
+        (rates, {round(1 / e.dt, 2) for e in dataset.entries}, "at {:g} Hz", RATE_TOLERANCE),
+    ):
+        if missing := [x for x in wanted if not any(abs(x - k) <= tolerance * x for k in known)]:
+            present, unit = ", ".join(f"{k:g}" for k in sorted(known)), text[-2:]
+            raise UsageError(f"no recording {text.format(missing[0])} in {dataset.path}; it holds {present} {unit}")
 
 
 def split_by_order(dataset: Dataset, by: str) -> Splits:
@@ -334,7 +328,7 @@ def write_split(dataset: Dataset, splits: Splits, by: str, holdout: tuple[str, .
     }
     with dataset.writing():
         path.parent.mkdir(exist_ok=True)
-        write_text(path, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+        write_json(path, record)
     return path
 
 

@@ -26,18 +26,12 @@ BLOCK_ROWS = 1024  # extremes of blocks are searched before the rows
 
 @dataclass(frozen=True)
 class StaticPoses:
-    """k static poses of one or more sequences, one row each; n joints.
+    """k static poses of one or more sequences, one row each; n joints."""
 
-    Attributes:
-        qpos, ctrl: (k, n), rad; qpos averaged over the window.
-        approach: (k, n), +1 if the joint's last motion was upwards, −1 downwards, 0 if it had not moved.
-        distinct: (k, n) bool; False if neither joint nor command moved since the previous pose.
-    """
-
-    qpos: Array
-    ctrl: Array
-    approach: Array
-    distinct: Array
+    qpos: Array  # averaged over the window, (k, n) rad
+    ctrl: Array  # (k, n) rad
+    approach: Array  # (k, n), +1 if the joint's last motion was upwards, −1 downwards, 0 if it had not moved
+    distinct: Array  # (k, n) bool; False if neither joint nor command moved since the previous pose
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -82,18 +76,12 @@ class StaticPoses:
 
 @dataclass(frozen=True)
 class StaticError:
-    """qpos − ctrl of one joint at rest.
+    """qpos − ctrl of one joint at rest."""
 
-    Attributes:
-        middle: Mean of the medians of both approaches, rad; the plain median if one side is missing.
-        half_band: Half their distance, rad; NaN if one side is missing. Times kp it is the stiction torque.
-        up, down: Number of poses reached from below and from above.
-    """
-
-    middle: float
-    half_band: float
-    up: int
-    down: int
+    middle: float  # mean of the medians of both approaches, rad; the plain median if one side is missing
+    half_band: float  # half their distance, rad; NaN if one side is missing; times kp it is the stiction torque
+    up: int  # poses reached from below
+    down: int  # poses reached from above
 
     @property
     def balanced(self) -> bool:

@@ -5,8 +5,7 @@
     sequences.jsonl         one line per sequence: metadata, hash, delays (data.journal)
     offsets.json            static offsets of each unit as measured at import (data.offsets); not applied
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, … (data.sequence_file)
-    replays/<model>/<id>.parquet  qpos, qvel, tau of the simulator with that model hash; older versions: twins/
-    surveys/<id>.npy        measurements of the doctor (data.checks.check_cache)
+    replays/<model>/<id>.parquet  qpos, qvel, tau of the simulator with that model hash
     card.json, CARD.md      counts and ranges (data.card)
     splits/<name>.json      train, validation and test sets (data.split)
 
@@ -18,7 +17,6 @@ data is never rewritten; replays can be computed again.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -35,7 +33,7 @@ from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
-from gaponet.base.files import atomic_write, lock_folder, require_own_folder, write_text
+from gaponet.base.files import atomic_write, lock_folder, require_own_folder, write_json
 from gaponet.base.structure import Name, read_format
 from gaponet.data.fingerprint import fingerprint
 from gaponet.data.journal import FILE as JOURNAL
@@ -49,8 +47,7 @@ from gaponet.robot.spec import RobotSpec
 
 FORMAT = 1
 KIND = "dataset"
-REPLAYS, OLD_REPLAYS = "replays", "twins"
-SURVEYS = "surveys"
+REPLAYS = "replays"
 
 
 class _Header(TypedDict):
@@ -122,7 +119,7 @@ class Dataset:
         with lock_folder(path, KIND):
             if not (path / "dataset.json").is_file():
                 header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": UNITS}
-                write_text(path / "dataset.json", json.dumps(header, indent=1, ensure_ascii=False) + "\n")
+                write_json(path / "dataset.json", header)
             if not has_stored_robot(path):
                 save_robot(robot.nominal or robot, path / STORED_ROBOT)
         return cls.create(path, robot)
@@ -240,7 +237,7 @@ class Dataset:
         """Write licence or source into dataset.json; an empty text removes the field."""
         with self.writing():
             self.header = {k: v for k, v in (self.header | fields).items() if v != ""}
-            write_text(self.path / "dataset.json", json.dumps(self.header, indent=1, ensure_ascii=False) + "\n")
+            write_json(self.path / "dataset.json", self.header)
 
     def append(self, sequence: Sequence, findings: Findings | None = None, content_hash: str | None = None) -> Entry:
         """Add a sequence. Its content hash is computed if it is not given.
@@ -270,7 +267,7 @@ class Dataset:
         return entry
 
     def remove(self, patterns: tuple[str, ...]) -> list[Entry]:
-        """Remove the sequences whose ids match a pattern, with their replays and surveys; return their entries.
+        """Remove the sequences whose ids match a pattern, with their replays; return their entries.
 
         Raises:
             DatasetError: A pattern matches no id. Nothing is removed then.
@@ -284,9 +281,8 @@ class Dataset:
                 temporary.write_bytes(b"".join(e.line + b"\n" for e in self.entries if e not in removed))
             for entry in removed:  # if this is cut short, the files that remain are not listed
                 self._file(entry).unlink(missing_ok=True)
-                for pattern in (f"{SURVEYS}/{entry.id}*", f"{REPLAYS}/*/{entry.id}.*", f"{OLD_REPLAYS}/*/{entry.id}.*"):
-                    for file in self.path.glob(pattern):
-                        file.unlink(missing_ok=True)
+                for file in self.path.glob(f"{REPLAYS}/*/{entry.id}.*"):
+                    file.unlink(missing_ok=True)
             self._load()
         return removed
 
@@ -331,8 +327,7 @@ class Dataset:
         return self.path / "sequences" / f"{entry.id}.parquet"
 
     def _replay_file(self, entry: Entry, model: str) -> Path:
-        folders = (self._replay_root / REPLAYS, self.path / REPLAYS, self.path / OLD_REPLAYS)
-        files = [folder / model / f"{entry.id}.parquet" for folder in folders]
+        files = [folder / REPLAYS / model / f"{entry.id}.parquet" for folder in (self._replay_root, self.path)]
         return next((file for file in files if file.is_file()), files[0])
 
 

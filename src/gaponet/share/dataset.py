@@ -46,7 +46,7 @@ def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
     contents = tuple(sorted(entry.hash for entry in dataset.select()))
     with progress_bar("reading") as update:
         done = iter(range(1, len(dataset) + 1))
-        sets = write(dataset, robot, folder, lambda motion: update(next(done), len(dataset), motion))
+        sets = write(dataset, folder, lambda motion: update(next(done), len(dataset), motion))
     (folder / SIDECAR).mkdir()
     save_robot(robot.nominal or robot, folder / SIDECAR / STORED_ROBOT)
     (folder / SIDECAR / STORED_ROBOT / ".gaponet").unlink()

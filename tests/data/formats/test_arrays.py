@@ -1,6 +1,8 @@
 """npz, HDF5, .mat, .pt and ASAP's pickle: the same motion in each, and what may not be opened."""
 
+import os
 import pickle
+import subprocess
 import zipfile
 from pathlib import Path
 
@@ -21,20 +23,6 @@ WRITERS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("fmt", WRITERS)
-def test_the_same_motion_comes_out_of_each(tmp_path, arm, fmt):
-    WRITERS[fmt](tmp_path)
-    assert detect(tmp_path) == fmt
-    ((name, log),) = read_logs(tmp_path, arm, allow_pickle=True)
-    ctrl, qpos = motion()
-    assert name == {"hdf5": "episode_0", "asap": "walk"}.get(fmt, "a")
-    assert log.joint_names == ("shoulder", "elbow")
-    assert np.allclose(log.channels["ctrl"].values, ctrl)
-    assert np.allclose(log.channels["qpos"].values, qpos)
-    assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(len(qpos)), atol=1e-6)
-    assert (log.meta.get("kp"), log.meta.get("kd")) == (([20.0, 30.0], [1.0, 1.5]) if fmt == "pace" else (None, None))
-
-
 PAGE = (Path(__file__).parents[3] / "docs" / "logs.md").read_text(encoding="utf-8")
 HEADINGS = {"hdf5": "### HDF5", "npz": "### NumPy", "mat": "### MATLAB", "pace": "### PACE", "asap": "### ASAP"}
 
@@ -45,11 +33,19 @@ def documented(heading):
 
 
 @pytest.mark.parametrize("fmt", WRITERS)
-def test_the_lines_that_the_docs_give_for_a_format_work(tmp_path, arm, fmt):
+def test_the_same_motion_comes_out_of_each_also_by_the_lines_of_the_docs(tmp_path, arm, fmt):
     WRITERS[fmt](tmp_path)
+    assert detect(tmp_path) == fmt
+    ((name, log),) = read_logs(tmp_path, arm, allow_pickle=True)
+    ctrl, qpos = motion()
+    assert name == {"hdf5": "episode_0", "asap": "walk"}.get(fmt, "a")
+    assert log.joint_names == ("shoulder", "elbow")
+    assert np.allclose(log.channels["qpos"].values, qpos)
+    assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(len(qpos)), atol=1e-6)
+    assert (log.meta.get("kp"), log.meta.get("kd")) == (([20.0, 30.0], [1.0, 1.5]) if fmt == "pace" else (None, None))
     (tmp_path / "logs.toml").write_text(documented(HEADINGS[fmt]))
-    ((_, log),) = read_logs(tmp_path, arm, allow_pickle=True)
-    assert np.allclose(log.channels["ctrl"].values, motion()[0])
+    for by in (log, next(read_logs(tmp_path, arm, allow_pickle=True))[1]):
+        assert np.allclose(by.channels["ctrl"].values, ctrl)
 
 
 def test_the_lines_that_the_docs_give_for_tables_and_bags_work(tmp_path, arm):
@@ -182,56 +178,62 @@ class Evil:
         return self.call
 
 
-def evil(tmp_path):
-    import os
-    import subprocess
-
-    mark = str(tmp_path / "ran")
+def evil(mark):
+    """Objects that make the file `mark` or ask for terabytes when they are unpickled as usual."""
     yield from (Evil(os.system, (f"touch {mark}",)), Evil(subprocess.call, (["touch", mark],)))
     yield from (Evil(eval, (f"open({mark!r}, 'w')",)), Evil(np.load, (mark,)))
     yield from (Evil(np.fromfile, (mark,)), Evil(np.ndarray, ((1 << 40,),)), Evil(bytearray, (1 << 60,)))
 
 
-def test_a_hostile_pickle_runs_nothing(tmp_path, arm):
-    (tmp_path / "logs.toml").write_text('joints = ["shoulder", "elbow"]\naction_scale = 0.25\n')
-    for thing in evil(tmp_path):
-        for data in ({"walk": {"dof": thing}}, [thing], {"walk": {"dof": np.array([thing], object), "fps": 50}}):
-            (tmp_path / "a.pkl").write_bytes(pickle.dumps(data))
-            with pytest.raises(LogError):
-                list(read_logs(tmp_path, arm, allow_pickle=True))
+def write_evil_npz(folder, thing):
+    np.savez(folder / "a.npz", real_dof_positions=np.array([thing], object), real_dof_positions_cmd=np.zeros(1))
+
+
+def write_evil_pt(folder, thing):
+    import torch
+
+    torch.save({"time": thing}, folder / "a.pt")
+
+
+def write_evil_pickle(folder, thing):
+    (folder / "a.pkl").write_bytes(pickle.dumps({"walk": {"dof": np.array([thing], object), "fps": 50}}))
+
+
+@pytest.mark.parametrize("write", [write_evil_npz, write_evil_pt, write_evil_pickle])
+def test_hostile_objects_in_a_file_run_nothing(tmp_path, arm, write):
+    for thing in evil(str(tmp_path / "ran")):
+        write(tmp_path, thing)
+        with pytest.raises(LogError, match="nothing of it was run"):
+            list(read_logs(tmp_path, arm, allow_pickle=True))
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_hostile_pickle_runs_nothing_and_a_good_one_of_any_protocol_is_read(tmp_path):
+    for thing in evil(str(tmp_path / "ran")):
+        for data in ({"walk": {"dof": thing}}, [thing]):
+            with pytest.raises(LogError, match="nothing of it was run"):
+                pickles.load(pickle.dumps(data), "x")
+    assert not (tmp_path / "ran").exists()
     for protocol in range(6):
         found = pickles.load(pickle.dumps({"a": np.arange(6.0).reshape(2, 3), "b": [1, "x", None]}, protocol), "x")
         assert np.array_equal(found["a"], np.arange(6.0).reshape(2, 3))
         assert found["b"] == [1, "x", None]
-    assert not (tmp_path / "ran").exists()
 
 
-def test_hostile_objects_in_an_npz_run_nothing(tmp_path, arm):
-    for thing in evil(tmp_path):
-        np.savez(tmp_path / "a.npz", real_dof_positions=np.array([thing], object), real_dof_positions_cmd=np.zeros(1))
-        with pytest.raises(LogError, match="nothing of it was run"):
-            list(read_logs(tmp_path, arm))
-    assert not (tmp_path / "ran").exists()
-
-
-def test_a_pt_file_that_is_no_tensors_runs_nothing(tmp_path, arm):
+def test_a_tensor_that_repeats_one_number_a_trillion_times_is_left_alone(tmp_path, arm):
     import torch
 
-    for thing in evil(tmp_path):
-        torch.save({"time": thing}, tmp_path / "a.pt")
-        with pytest.raises(LogError, match=r"a\.pt: not a pickle .*; nothing of it was run"):
-            list(read_logs(tmp_path, arm))
     big = torch.zeros(1).expand(1 << 40)
     torch.save({"time": big, "dof_pos": big, "des_dof_pos": big}, tmp_path / "a.pt")
     with pytest.raises(LogError, match="no column holds ctrl"):
         list(read_logs(tmp_path, arm))
-    assert not (tmp_path / "ran").exists()
 
 
 def test_an_array_that_says_it_is_huge_is_refused(tmp_path, arm):
     strange_logs.write_npz(tmp_path)
     huge = tmp_path / "a.npz"
     with zipfile.ZipFile(huge, "w", zipfile.ZIP_DEFLATED) as packed:
-        packed.writestr("q.npy", bytes(600 << 20))
+        packed.writestr("q.npy", b"")
+        packed.infolist()[0].file_size = 600 << 20
     with pytest.raises(LogError, match="unpacks to more than 512 MiB"):
         list(read_logs(tmp_path, arm))

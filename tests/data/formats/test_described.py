@@ -8,8 +8,9 @@ from logs import arm_columns, table_text, wave
 
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.cli.main import main
+from gaponet.data.describe.guess import guess_logs
 from gaponet.data.describe.joints import resolve_all
-from gaponet.data.formats import detect, read_logs
+from gaponet.data.formats import detect, look, read_logs
 from gaponet.data.log import skip_bad_rows
 from gaponet.data.store import Dataset
 
@@ -32,13 +33,6 @@ def write(folder, toml, name="wave.csv", columns=None):
 
 
 NAMES = 'time = "t"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
-
-
-def test_a_pattern_stands_for_all_joints(tmp_path, arm):
-    ((name, log),) = read_logs(write(tmp_path / "logs", NAMES), arm)
-    assert name == "wave"
-    assert np.array_equal(log.channels["ctrl"].values[:, 1], arm_columns()["ctrl.elbow"])
-    assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(60))
 
 
 def test_the_name_of_a_file_says_motion_payload_repetition_and_gain(tmp_path, arm):
@@ -180,6 +174,11 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
         ("kp = -1.0", "kp"),
         ("rate = 0.0", "rate: should be greater than or equal to 1"),
         ('[columns]\n"speed.elbow" = "t"', "'speed.elbow' is neither time nor ctrl"),
+        ('[columns]\n"ctrl.elbow" = "x"', r"column 'x' \(for ctrl.elbow\) is missing; there are: t, shoulder_des"),
+        ('[joint_units]\nelbow = "grad"', "unit of elbow 'grad' is not one of rad, deg, fraction"),
+        ('[joint_units]\nelbow = ["deg"]', r"logs\.toml: joint_units"),
+        ('tme = "t"', r"logs\.toml: tme: is not a known field; docs/logs.md lists the fields"),
+        ("ctrl", "not valid TOML"),
     ],
 )
 def test_a_wrong_logs_toml_is_refused(tmp_path, arm, toml, message):
@@ -217,23 +216,18 @@ def test_the_guess_for_a_strange_table_reads_it(tmp_path, arm, capsys):
         ("time", "des_pos.shoulder", "des_pos.elbow", "pos.shoulder", "pos.elbow"),
     ],
 )
-def test_the_guess_knows_how_others_call_things(tmp_path, arm, capsys, names):
+def test_the_guess_knows_how_others_call_things(tmp_path, arm, names):
     folder = write(tmp_path / "logs", "", columns=dict(zip(names, arm_columns().values(), strict=True)))
     (folder / "logs.toml").unlink()
-    assert main(["import", str(folder), "--robot", str(arm.mjcf.parent), "--guess"]) == 0
-    (folder / "logs.toml").write_text(capsys.readouterr().out)
+    fmt, logs, recordings = look(folder)
+    (folder / "logs.toml").write_text(guess_logs(recordings, arm, fmt, dict(logs)))
     ((_, log),) = read_logs(folder, arm)
     assert np.array_equal(log.channels["ctrl"].values[:, 1], arm_columns()["ctrl.elbow"])
     assert np.array_equal(log.channels["qpos"].values[:, 1], arm_columns()["qpos.elbow"])
 
 
-def test_clocks_that_were_swapped_for_others_do_not_stretch_anything(tmp_path, arm):
-    """Command and state each on its own clock; where these do not overlap, it is said."""
+def test_a_channel_may_have_a_clock_of_its_own(tmp_path, arm):
     columns = theirs() | {"t_cmd": 0.02 * np.arange(60) + 0.007}
     folder = write(tmp_path / "logs", NAMES + '[clock]\nctrl = "t_cmd"\n', columns=columns)
     ((_, log),) = read_logs(folder, arm)
     assert log.channels["ctrl"].time[0] - log.channels["qpos"].time[0] == pytest.approx(0.007)
-    write(folder, NAMES + '[clock]\nctrl = "t_cmd"\n', columns=columns | {"t_cmd": 1e3 + columns["t_cmd"]})
-    told = ["--robot", str(arm.mjcf.parent), "--unit-id", "lab", "--payload-mass", "0", "--out", str(tmp_path / "data")]
-    assert main(["import", str(folder), *told]) == 2
-    assert not (tmp_path / "data").exists()

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from logs import SO101, arm_sequence, late, stock, wave
 
-from gaponet.base.errors import DatasetError, JointMismatchError, LogError, UsageError
+from gaponet.base.errors import LogError, UsageError
 from gaponet.base.progress import no_progress
 from gaponet.data.formats import detect, read_logs
 from gaponet.data.importer import import_logs
@@ -149,26 +149,20 @@ def test_an_interrupted_export_leaves_nothing(dataset, tmp_path):
     assert not [f for f in tmp_path.iterdir() if "out" in f.name]
 
 
-def test_a_folder_with_something_in_it_is_not_overwritten(dataset, tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mine.txt").touch()
-    with pytest.raises(DatasetError, match="out: exists and is not an empty folder; choose a new one"):
-        export_lerobot(dataset, tmp_path / "out")
-
-
-@pytest.mark.parametrize(("option", "said"), [({"unit_id": "three"}, "one"), ({"payload_mass": 1.0}, "0.0")])
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ({"unit_id": "three"}, "contradicts the file's one; leave it out"),
+        ({"payload_mass": 1.0}, r"contradicts the file's 0\.0; leave it out"),
+        ({"position_unit": "deg"}, r"--position-unit deg: .*info\.json says rad; leave it out"),
+    ],
+)
 def test_options_that_contradict_the_export_are_refused(dataset, arm, tmp_path, option, said):
     export_lerobot(dataset, tmp_path / "out")
     fields = {"unit_id": None, "payload_mass": None} | option
-    with pytest.raises(UsageError, match=rf"contradicts the file's {said}; leave it out"):
+    with pytest.raises(UsageError, match=said):
         import_logs(tmp_path / "out", arm, out=tmp_path / "again", **fields)
     assert not (tmp_path / "again").exists()
-
-
-def test_an_export_is_not_in_degrees(dataset, arm, tmp_path):
-    export_lerobot(dataset, tmp_path / "out")
-    with pytest.raises(UsageError, match=r"--position-unit deg: .*info\.json says rad; leave it out"):
-        back(tmp_path / "out", arm, tmp_path / "again", position_unit="deg")
 
 
 def read_stock(folder, so101, out, **options):
@@ -188,22 +182,11 @@ def test_a_stock_set_in_degrees_becomes_radians(so101, tmp_path):
     low, high = so101.qpos_range[5]
     assert first.ctrl[0, 5] == pytest.approx(low + 0.10 * (high - low))  # the gripper is 0..100
     assert entry.meta.notes["converted_from"]["gripper"] == "percent"
-
-
-def test_older_sets_are_minus_100_to_100_of_the_range(so101, tmp_path):
-    data = read_stock(stock(tmp_path / "set"), so101, tmp_path / "data", position_unit="signed_percent")
+    older = read_stock(tmp_path / "set", so101, tmp_path / "older", position_unit="signed_percent")
     low, high = so101.qpos_range[0]
-    assert data.read(data.entries[0]).ctrl[0, 0] == pytest.approx((low + high) / 2 + 0.05 * (high - low))
-
-
-def test_the_unit_has_no_default(so101, tmp_path):
+    assert older.read(older.entries[0]).ctrl[0, 0] == pytest.approx((low + high) / 2 + 0.05 * (high - low))
     with pytest.raises(UsageError, match=r"unit of positions is not written in the set; say --position-unit deg"):
-        read_stock(stock(tmp_path / "set"), so101, tmp_path / "data", position_unit=None)
-
-
-def test_degrees_called_radians_are_noticed(so101, tmp_path):
-    with pytest.raises(LogError, match=r"file-000\.parquet:\d+: ctrl of shoulder_pan is 13\.900, outside its range"):
-        read_stock(stock(tmp_path / "set"), so101, tmp_path / "data", position_unit="rad")
+        read_stock(tmp_path / "set", so101, tmp_path / "none", position_unit=None)
 
 
 def test_joints_are_taken_by_name(so101, tmp_path):
@@ -211,13 +194,6 @@ def test_joints_are_taken_by_name(so101, tmp_path):
     values = [np.tile([50.0, 1, 2, 3, 4, 5], (30, 1)) + np.arange(30)[:, None] / 10]
     data = read_stock(stock(tmp_path / "set", values, names=names), so101, tmp_path / "data")
     assert np.allclose(data.read(data.entries[0]).ctrl[0, :5], np.radians([1, 2, 3, 4, 5]))
-
-
-def test_names_are_mapped(so101, tmp_path):
-    folder = stock(tmp_path / "set", names=("base", *SO101[1:]))
-    with pytest.raises(JointMismatchError, match="names joint 'base'"):
-        read_stock(folder, so101, tmp_path / "data")
-    assert len(read_stock(folder, so101, tmp_path / "data", joint_map={"base": "shoulder_pan"})) == 2
 
 
 def test_timestamps_that_are_not_regular_are_believed(so101, tmp_path):
@@ -233,25 +209,6 @@ def test_timestamps_that_are_not_regular_are_believed(so101, tmp_path):
     assert "resampled" in entry.meta.notes["rows"]
 
 
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        (
-            {"codebase_version": "v1.6"},
-            r"codebase_version is v1\.6, this reads v3 and v2; convert the set with lerobot's",
-        ),
-        ({"fps": 0}, r"info\.json: fps: should be greater than or equal to 1, not 0; download or"),
-        ({"fps": None}, r"info\.json: fps: should be a valid number, not None"),
-        ({"features": {}}, "no feature 'action'"),
-    ],
-    ids=["older version", "no rate", "damaged", "no action"],
-)
-def test_what_cannot_be_read_is_said(so101, tmp_path, change, complaint):
-    with pytest.raises(LogError, match=complaint):
-        read_stock(stock(tmp_path / "set", **change), so101, tmp_path / "data")
-    assert not (tmp_path / "data").exists()
-
-
 def test_a_file_cut_short_and_missing_frames_are_named(so101, tmp_path):
     folder = stock(tmp_path / "set")
     file = folder / "data" / "chunk-000" / "file-000.parquet"
@@ -260,18 +217,7 @@ def test_a_file_cut_short_and_missing_frames_are_named(so101, tmp_path):
     with pytest.raises(LogError, match=r"file-000\.parquet: episode 1 has 40 frames here, meta/episodes says 50"):
         read_stock(folder, so101, tmp_path / "data")
     file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(LogError, match=r"file-000\.parquet: not a readable Parquet file .* download or export"):
-        read_stock(folder, so101, tmp_path / "data")
-
-
-def test_joints_without_names_are_refused(so101, tmp_path):
-    folder = stock(tmp_path / "set")
-    info = json.loads((folder / "meta" / "info.json").read_text())
-    info["features"]["action"]["names"] = None
-    (folder / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.raises(
-        LogError, match=r"info\.json: action does not name its \[6\] values; write joints = \[their names"
-    ):
+    with pytest.raises(LogError, match=r"file-000\.parquet: not a readable Parquet file .*; it is cut short"):
         read_stock(folder, so101, tmp_path / "data")
 
 
@@ -282,8 +228,6 @@ def test_joints_without_names_are_refused(so101, tmp_path):
         "data/{file_index}/../../../other/file-000.parquet",
         "/etc/passwd",
         "data/{chunk_index:0999999999d}",
-        "data/{chunk_index.__class__}",
-        "data/{0}",
         "data/\x00",
     ],
 )
@@ -297,17 +241,21 @@ def test_a_data_path_cannot_leave_the_set_or_fill_the_memory(so101, tmp_path, pl
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"features": []}, "features: should be an object"),
+        ({"codebase_version": "v1.6"}, r"codebase_version is v1\.6, this reads v3 and v2; convert the set with"),
+        ({"features": {}}, "no feature 'action'"),
         ({"features": {"action": 3}}, r"features\.action: should be an object"),
-        ({"fps": "30"}, "fps: should be a valid number"),
-        ({"fps": float("nan")}, "fps: "),
+        (
+            {"features": {f: {"shape": [6], "names": None} for f in ("action", "observation.state")}},
+            r"action does not name its \[6\] values; write joints = \[their names",
+        ),
+        ({"fps": 0}, "fps: should be greater than or equal to 1, not 0; download or"),
         ({"data_path": None}, "data_path: should be a valid string"),
-        ({"codebase_version": 3.0}, "codebase_version: should be a valid string"),
     ],
 )
-def test_metadata_of_other_types_are_refused_by_field(so101, tmp_path, change, complaint):
+def test_metadata_that_cannot_be_read_are_refused_by_field(so101, tmp_path, change, complaint):
     with pytest.raises(LogError, match=rf"info\.json: {complaint}"):
         read_stock(stock(tmp_path / "set", **change), so101, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
 
 
 def rewrite(file, **columns):
@@ -323,7 +271,6 @@ def rewrite(file, **columns):
     ("columns", "complaint"),
     [
         ({"length": pa.array([-1, 50])}, r"\[0\]\.length: should be greater than or equal to 1, not -1"),
-        ({"length": pa.array(["x", "y"])}, r"\[0\]\.length: should be a valid integer, not 'x'"),
         ({"data/file_index": pa.array([None, 0])}, r"\[0\]\.data/file_index: should be a valid integer, not None"),
         ({"episode_index": None}, "column 'episode_index' is missing"),
         ({"tasks": pa.array([1, 2])}, r"\[0\]\.tasks: should be a valid (array|list), not 1"),
@@ -343,7 +290,6 @@ def test_episodes_of_other_types_are_refused_by_field(so101, tmp_path, columns, 
         ({"timestamp": None}, "column 'timestamp' is missing"),
         ({"action": pa.array(["x"] * 90)}, "action is string, not 6 numbers a row"),
         ({"frame_index": pa.array([None] * 90, pa.int64())}, "frame_index is not 1 numbers"),
-        ({"action": pa.array([[1.0] * 5] * 90)}, "action is not 6 numbers"),
         ({"action": pa.array([[1.0] * 5 + [None]] * 90)}, "action is not 6 numbers"),
     ],
 )
@@ -358,7 +304,6 @@ def test_frames_of_other_types_are_refused_by_feature(so101, tmp_path, columns, 
     ("column", "value", "complaint"),
     [
         ("payload_mass", float("nan"), "payload_mass"),
-        ("payload_mass", 1e30, "payload_mass"),
         ("notes", "[1", "notes: "),
         ("notes", "3", "notes: should be an object"),
         ("level", "legs", "level"),
@@ -375,35 +320,18 @@ def test_what_an_export_says_of_a_recording_is_checked(dataset, arm, tmp_path, c
     assert not (tmp_path / "again").exists()
 
 
-@pytest.mark.parametrize(
-    "change", [{"dt": 0}, {"dt": "x"}, {"dataset": {"joint_names": []}, "dt": 0.02}, {"dataset": 3}]
-)
+@pytest.mark.parametrize("change", [{"dt": 0}, {"dataset": 3}])
 def test_gaponet_json_cannot_say_what_it_likes(dataset, arm, tmp_path, change):
     export_lerobot(dataset, tmp_path / "out")
     file = tmp_path / "out" / "meta" / "gaponet.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
-    if "joint_names" in str(change):
-        back(tmp_path / "out", arm, tmp_path / "again")
-        assert Dataset(tmp_path / "again").joint_names == arm.joint_names
-    else:
-        with pytest.raises(LogError, match=r"gaponet\.json: "):
-            back(tmp_path / "out", arm, tmp_path / "again")
-
-
-def test_a_unit_that_is_no_text_is_no_unit(dataset, arm, tmp_path):
-    export_lerobot(dataset, tmp_path / "out")
-    file = tmp_path / "out" / "meta" / "info.json"
-    info = json.loads(file.read_text())
-    info["features"]["action"]["info"] = {"unit": {"x": 1}}
-    file.write_text(json.dumps(info))
-    with pytest.raises(UsageError, match="unit of positions is not written in the set"):
+    with pytest.raises(LogError, match=r"gaponet\.json: "):
         back(tmp_path / "out", arm, tmp_path / "again")
 
 
-@pytest.mark.parametrize("column", [pa.array([1], pa.timestamp("ns")), pa.array([[1]]), pa.array([None], pa.int64())])
-def test_tasks_of_other_types_are_refused(so101, tmp_path, column):
+def test_tasks_of_another_type_are_refused(so101, tmp_path):
     folder = stock(tmp_path / "set")
-    rewrite(folder / "meta" / "tasks.parquet", task_index=column)
+    rewrite(folder / "meta" / "tasks.parquet", task_index=pa.array([1], pa.timestamp("ns")))
     with pytest.raises(LogError, match=r"tasks\.parquet: "):
         read_stock(folder, so101, tmp_path / "data")
 

@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 from logs import arm_columns, table_text
 
-from gaponet.base.errors import JointMismatchError, LogError, UsageError
+from gaponet.base.errors import LogError, UsageError
 from gaponet.data.formats import detect, find_logs, read_logs
 
 SI = {"position_unit": "rad", "time_unit": "s"}
@@ -100,13 +100,10 @@ def test_90_degrees_are_half_pi_and_1500_ms_are_one_and_a_half_seconds(tmp_path,
     assert log.channels["ctrl"].values[0] == pytest.approx([np.pi / 2] * 2)
     assert log.channels["qvel"].values[0] == pytest.approx([np.pi, 0])
     assert log.channels["qpos"].time[-1] == pytest.approx(1.5)
-
-
-def test_a_clock_that_counts_nanoseconds_since_1970_starts_at_zero(tmp_path, arm):
-    columns = arm_columns() | {"time": 1_700_000_000_000_000_000 + 20_000_000 * np.arange(60)}
-    time = only(write_parquet(tmp_path / "wave.parquet", columns), arm, time_unit="ns").channels["qpos"].time
-    assert time[0] == 0
-    assert np.diff(time) == pytest.approx(0.02, abs=1e-6)
+    columns = {name: np.full(4, 0.75) for name in arm_columns()} | {"time": 1.7e18 + 2e7 * np.arange(4)}
+    log = only(write(tmp_path / "wave.csv", columns), arm, position_unit="fraction", time_unit="ns")
+    assert log.channels["qpos"].values[0] == pytest.approx([0.75, 0.75])  # −1.5 + 0.75 · 3 rad
+    assert log.channels["qpos"].time == pytest.approx(0.02 * np.arange(4), abs=1e-6)  # from any start
 
 
 def test_a_column_map_names_columns_and_units(tmp_path, arm):
@@ -123,40 +120,6 @@ def test_a_column_map_names_columns_and_units(tmp_path, arm):
     assert np.allclose(log.channels["qpos"].values[:, 1], theirs["pos_2"] * np.pi / 180)
     assert log.channels["qpos"].time[-1] == pytest.approx(1.18)
     assert log.meta["converted_from"] == {"elbow": "deg"}
-
-
-def test_a_joint_at_three_quarters_of_its_range_of_three_radians(tmp_path, arm):
-    columns = {name: np.full(4, 0.75) for name in arm_columns()} | {"time": 0.02 * np.arange(4)}
-    log = only(write(tmp_path / "wave.csv", columns), arm, position_unit="fraction")
-    assert log.channels["qpos"].values[0] == pytest.approx([0.75, 0.75])  # -1.5 + 0.75 * 3
-
-
-@pytest.mark.parametrize(
-    ("toml", "message"),
-    [
-        ('tme = "t"', r"map\.toml: tme: is not a known field; docs/logs.md lists the fields"),
-        ('[columns]\n"control.elbow" = "x"', "'control.elbow' is neither time nor ctrl.<joint>, qpos.<joint>"),
-        (
-            '[columns]\n"ctrl.elbow" = "x"',
-            r"column 'x' \(for ctrl.elbow\) is missing; there are: time, ctrl.shoulder",
-        ),
-        ('time_unit = "min"', "time unit 'min' is not one of s, ms, us, ns"),
-        ('time_unit = "s"\n[joint_units]\nelbow = "grad"', "unit of elbow 'grad' is not one of rad, deg, fraction"),
-        ("time_unit", "not valid TOML"),
-    ],
-)
-def test_a_broken_column_map_says_what_is_wrong(tmp_path, arm, toml, message):
-    (tmp_path / "map.toml").write_text(toml)
-    options = {"position_unit": "rad"} | ({} if "time_unit" in toml else {"time_unit": "s"})
-    file = write(tmp_path / "wave.csv", arm_columns())
-    with pytest.raises((UsageError, LogError), match=message):
-        list(read_logs(file, arm, logs=tmp_path / "map.toml", **options))
-
-
-def test_a_column_map_that_is_not_there_is_named(tmp_path, arm):
-    file = write(tmp_path / "wave.csv", arm_columns())
-    with pytest.raises(UsageError, match=r"no\.toml: is missing, or not a file; docs/logs.md"):
-        only(file, arm, logs=tmp_path / "no.toml")
 
 
 @pytest.mark.parametrize(
@@ -183,25 +146,13 @@ def test_a_broken_table_is_refused_by_file_and_line(tmp_path, arm, old, new, mes
         only(file, arm)
 
 
-def test_nan_is_refused_by_line_and_joint(tmp_path, arm):
-    columns = arm_columns()
-    columns["qpos.elbow"] = np.where(np.arange(60) == 7, np.nan, columns["qpos.elbow"])
-    with pytest.raises(LogError, match=r"wave\.csv:9: qpos of elbow is not finite"):
-        only(write(tmp_path / "wave.csv", columns), arm)
-    with pytest.raises(LogError, match=r"wave\.parquet:8: qpos of elbow is not finite"):
-        only(write_parquet(tmp_path / "wave.parquet", columns), arm)
-
-
-def test_a_table_cut_short_names_its_last_line(tmp_path, arm):
-    file = write(tmp_path / "wave.csv", arm_columns())
-    text = file.read_text()
-    file.write_text(text[: text.rindex(",")])
-    with pytest.raises(LogError, match=r"wave\.csv:61: 4 cells, the header has 5; the file may be cut short"):
-        only(file, arm)
-
-
 @pytest.mark.parametrize(
-    ("text", "message"), [("", "empty; a table needs a header"), ("time\n", "no column holds ctrl")]
+    ("text", "message"),
+    [
+        ("", "empty; a table needs a header"),
+        ("time\n", "no column holds ctrl"),
+        (",".join(arm_columns()) + "\n", r"wave\.csv: holds a header and no rows"),
+    ],
 )
 def test_an_empty_table_is_refused(tmp_path, arm, text, message):
     (tmp_path / "wave.csv").write_text(text)
@@ -209,16 +160,10 @@ def test_an_empty_table_is_refused(tmp_path, arm, text, message):
         only(tmp_path / "wave.csv", arm)
 
 
-def test_a_header_without_rows_is_refused(tmp_path, arm):
-    (tmp_path / "wave.csv").write_text(table_text(arm_columns()).split("\n")[0] + "\n")
-    with pytest.raises(LogError, match=r"wave\.csv: holds a header and no rows"):
-        only(tmp_path / "wave.csv", arm)
-
-
 def test_a_half_written_parquet_file_is_refused(tmp_path, arm):
     file = write_parquet(tmp_path / "wave.parquet", arm_columns())
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file \(.*\); it may be half-written"):
+    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file \(.*\); it is cut short"):
         only(file, arm)
 
 
@@ -231,21 +176,6 @@ def test_a_parquet_cell_that_is_empty_or_no_number_is_refused(tmp_path, arm):
     pq.write_table(pa.table(columns | {"ctrl.elbow": pa.array(["1.0"] * 60)}), tmp_path / "text.parquet")
     with pytest.raises(LogError, match=r"text\.parquet: column 'ctrl.elbow' is string, not numbers"):
         only(tmp_path / "text.parquet", arm)
-
-
-def test_a_strange_joint_says_how_to_map_it(tmp_path, arm):
-    file = write(tmp_path / "wave.csv", {k.replace("elbow", "knee"): v for k, v in arm_columns().items()})
-    with pytest.raises(
-        JointMismatchError, match=r"wave\.csv:1 names joint 'knee', which robot 'arm' does not have; nearest: "
-    ):
-        only(file, arm)
-    assert only(file, arm, joint_map={"knee": "elbow"}).joint_names == ("shoulder", "elbow")
-
-
-def test_radians_that_are_degrees_are_refused(tmp_path, arm):
-    columns = {k: v * (1 if k == "time" else 57.3) for k, v in arm_columns().items()}
-    with pytest.raises(LogError, match=r"wave\.csv:\d+: .* these look like degrees \(--position-unit deg\)"):
-        only(write(tmp_path / "wave.csv", columns), arm)
 
 
 def test_a_folder_without_logs_names_the_known_formats(tmp_path, arm):
@@ -265,17 +195,3 @@ def test_a_cell_longer_than_the_csv_module_takes_is_refused_by_line(tmp_path, ar
     file.write_text("x" * 140_000 + "\n1\n2\n")
     with pytest.raises(LogError, match=r"wave\.csv:1: not a header of a table"):
         only(file, arm)
-
-
-def test_names_in_a_parquet_file_that_are_no_text_are_refused(tmp_path, arm):
-    file = write_parquet(tmp_path / "wave.parquet", arm_columns())
-    file.write_bytes(file.read_bytes().replace(b"ctrl.elbow", b"ctrl.\xff\xfebow"))
-    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file"):
-        only(file, arm)
-
-
-@pytest.mark.parametrize("toml", ["time = 1", "columns = 3", '[joint_units]\nelbow = ["deg"]', "x = " + "9" * 5000])
-def test_a_column_map_of_other_types_is_refused(tmp_path, arm, toml):
-    (tmp_path / "map.toml").write_text(toml)
-    with pytest.raises(UsageError, match=r"map\.toml: "):
-        only(write(tmp_path / "wave.csv", arm_columns()), arm, logs=tmp_path / "map.toml")

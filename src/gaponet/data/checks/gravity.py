@@ -9,8 +9,7 @@ joint turned or mirrored, or with joints in another order. A mirrored joint with
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from collections.abc import Iterable, Iterator
 from itertools import combinations
 from typing import NamedTuple
 
@@ -36,16 +35,25 @@ MIN_LOAD = 0.01  # of the torque limit: a joint that gravity loads less shows no
 
 
 class _Hypothesis(NamedTuple):
-    """One way in which the logs may be wrong.
+    """One way in which the logs may be wrong: the angles are sign · logged[order] + turn.
 
-    words: Description. joints: Indices. torque: Gravity's torque (k, n) under the hypothesis. mend: Its correction in
-    logs.toml.
+    words: Description. joints: Indices. mend: Its correction in logs.toml.
     """
 
     words: str
     joints: tuple[int, ...]
-    torque: Callable[[Array, Payload], Array]
     mend: Mend
+    order: Array  # column order[i] of the log belongs to joint i, (n)
+    sign: Array | float = 1.0  # (n)
+    turn: Array | float = 0.0  # (n) rad
+    torque_sign: Array | float = 1.0  # (n)
+
+    def torque(self, model: Gravity, qpos: Array, payload: Payload) -> Array:
+        """Return gravity's torque (k, n) under the hypothesis, in the log's order."""
+        torque = np.empty_like(qpos)
+        angles = self.sign * qpos[:, self.order] + self.turn
+        torque[:, self.order] = self.torque_sign * model(angles, *payload)
+        return torque
 
 
 class _Best(NamedTuple):
@@ -93,8 +101,8 @@ def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Bes
     loaded = np.flatnonzero(rms > MIN_LOAD * robot.effort_limit)
     unexplained = _unexplained(as_logged, loads, loaded, centred)
     best = _Best(0.0, None, 1 - float(unexplained.mean()) if len(unexplained) else 0.0, 0.0)
-    for hypothesis in [*_joint_faults(robot, loaded, model), *_order_faults(robot, model)]:
-        torques = {key: hypothesis.torque(qpos, key) for key, (qpos, _) in loads.items()}
+    for hypothesis in [*_joint_faults(robot, loaded), *_order_faults(robot)]:
+        torques = {key: hypothesis.torque(model, qpos, key) for key, (qpos, _) in loads.items()}
         otherwise = _unexplained(torques, loads, loaded, centred)
         evidence = float(np.log(unexplained / otherwise).sum())
         if evidence > best.evidence:
@@ -102,30 +110,20 @@ def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Bes
     return best
 
 
-def _joint_faults(robot: RobotSpec, loaded: Array, model: Gravity) -> Iterator[_Hypothesis]:
+def _joint_faults(robot: RobotSpec, loaded: Array) -> Iterator[_Hypothesis]:
     """Yield hypotheses with one joint mirrored, its zero turned, or its torque negated."""
     for j in loaded.tolist():
         name = robot.joint_names[j]
-        for fault in JOINT_FAULTS:
-            sign, turn, _ = fault
+        one = np.eye(len(robot.joint_names))[j]
+        for sign, turn, torque_sign in JOINT_FAULTS:
             words = f"its zero turned by {turn:+.2f} rad" if turn else "its torque negated"
             words = "its angle mirrored" if sign < 0 else words
             mend: Mend = {"offsets": {name: turn}} if turn else {"signs": {name: sign}} if sign < 0 else {}
-            yield _Hypothesis(f"{words} at {name}", (j,), partial(_torque_with_fault, model, j, fault), mend)
+            factors = (1 + (sign - 1) * one, turn * one, 1 + (torque_sign - 1) * one)
+            yield _Hypothesis(f"{words} at {name}", (j,), mend, np.arange(len(one)), *factors)
 
 
-def _torque_with_fault(
-    model: Gravity, j: int, fault: tuple[int, float, int], qpos: Array, payload: Payload
-) -> Array:  # fmt: skip
-    sign, turn, torque_sign = fault
-    turned = qpos.copy()
-    turned[:, j] = sign * turned[:, j] + turn
-    torque = model(turned, *payload).copy()
-    torque[:, j] *= torque_sign
-    return torque
-
-
-def _order_faults(robot: RobotSpec, model: Gravity) -> Iterator[_Hypothesis]:
+def _order_faults(robot: RobotSpec) -> Iterator[_Hypothesis]:
     """Yield hypotheses with two operated joints swapped, or all of them moved by one place, or reversed."""
     op = robot.operated_index
     orders = [
@@ -142,14 +140,7 @@ def _order_faults(robot: RobotSpec, model: Gravity) -> Iterator[_Hypothesis]:
         order = np.arange(len(robot.joint_names))
         order[list(joints)] = replaced
         names = {robot.joint_names[o]: robot.joint_names[i] for i, o in enumerate(order) if i != o}
-        yield _Hypothesis(words, joints, partial(_torque_in_order, model, order), {"names": names})
-
-
-def _torque_in_order(model: Gravity, order: Array, qpos: Array, payload: Payload) -> Array:
-    """Return gravity's torque in the log's own order, in which column order[i] belongs to joint i."""
-    torque = np.empty_like(qpos)
-    torque[:, order] = model(qpos[:, order], *payload)
-    return torque
+        yield _Hypothesis(words, joints, {"names": names}, order)
 
 
 def _recorded_torques(surveys: list[Survey]) -> Loads:

@@ -137,8 +137,7 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         samples = sum(int(t.spikes.sum()) for _, t in spiky)
         text = (
             f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; worst {height[k, i]:.2f} "
-            "N·m "
-            f"on {robot.joint_names[i]} in {spiky[k][0].motion}"
+            f"N·m on {robot.joint_names[i]} in {spiky[k][0].motion}"
         )
         values = {"samples": samples, "worst": height[k, i]}
         yield Finding("warning", "torque", text, (robot.joint_names[i],), values)

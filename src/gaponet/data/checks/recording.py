@@ -93,8 +93,7 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         joints = tuple(dict.fromkeys(j for n in notes for j in n["joints"]))
         text = (
             f"{channel} of {abbreviate(list(joints))} was what no joint does (first {notes[0]['worst']:.4g}) in {rows} "
-            "rows "
-            f"of {_motions(hit)}, a counter or a bad read: there it is {done}"
+            f"rows of {_motions(hit)}, a counter or a bad read: there it is {done}"
         )
         yield Finding("warning", "nonsense", text, joints, {"rows": rows})
 

@@ -41,20 +41,13 @@ MAX_ODD_SEQUENCES = 10  # that are reported
 
 @dataclass(frozen=True)
 class _Poses:
-    """Distinct static poses of single joints (k), ordered by sequence.
+    """Distinct static poses of single joints (k), ordered by sequence."""
 
-    Attributes:
-        sequence, joint: Indices.
-        error: qpos − ctrl, rad.
-        columns: Regressors of the four coefficients, (k, 4).
-        per_kg: Change of the softness regressor with 1 kg more payload, rad.
-    """
-
-    sequence: Array
+    sequence: Array  # indices, (k)
     joint: Array
-    error: Array
-    columns: Array
-    per_kg: Array
+    error: Array  # qpos − ctrl, (k) rad
+    columns: Array  # regressors of the four coefficients, (k, 4)
+    per_kg: Array  # change of the softness regressor with 1 kg more payload, (k) rad
 
     def only(self, keep: Array | slice) -> _Poses:
         """Return some of the poses."""
@@ -299,8 +292,7 @@ def _judge_sequence(
         text = (
             f"{meta.motion} rests {apart[worst] * 1e3:+.0f} mrad from where the other recordings of unit "
             f"{meta.unit_id} say ({abbreviate(list(apart))}): another robot, or zeros set in between? Import it with "
-            "another "
-            "--unit-id"
+            "another --unit-id"
         )
         return mean_square, Finding("warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart})
     return None

@@ -1,14 +1,22 @@
-"""Survey: measurements of one sequence about its own recording, without judgement (data.checks judges)."""
+"""Survey: measurements of one sequence about its own recording, without judgement (data.checks judges).
+
+`survey_all` measures the sequences of a dataset, in several processes if there are many.
+"""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.base.executor import LOCAL, open_pool
+from gaponet.base.progress import Progress
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import (
     FAST_COMMAND_RAD_S,
@@ -20,7 +28,7 @@ from gaponet.data.signals import (
     lowpass,
 )  # fmt: skip
 from gaponet.data.static_poses import StaticPoses
-from gaponet.data.store import Entry
+from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
 MAX_LAG_S = 0.4
@@ -39,90 +47,61 @@ COMMAND_STEP_RAD = 0.05  # step of a command; the torque may follow it
 SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
 SPECTRUM_HZ = np.arange(0.5, 60, 0.1)
 MOVING_RAD = 0.05
+JOB_ROWS, MIN_PARALLEL_ROWS = 40_000, 600_000  # of one job; from which starting processes pays
+OVERHEAD_ROWS = 1500  # rows that take as long as the fixed costs of a recording
 LEVELS, LEVEL_TOLERANCE = 8, 0.1  # distinct positions from which a step is known; deviation in steps
 
 
-@dataclass(frozen=True)
-class Torque:
-    """Torques of one sequence per joint, (n).
+class Torque(NamedTuple):
+    """Torques of one sequence per joint, (n)."""
 
-    Attributes:
-        low, high: Least and greatest, N·m.
-        over_limit, spikes: Rows above the torque limit, and far above the rows around.
-        flat: Rows at exactly the greatest magnitude.
-    """
-
-    low: Array
+    low: Array  # N·m
     high: Array
-    over_limit: Array
-    spikes: Array
-    flat: Array
+    over_limit: Array  # rows above the torque limit
+    spikes: Array  # rows far above the rows around
+    flat: Array  # rows at exactly the greatest magnitude
 
 
 @dataclass(frozen=True)
 class Survey:
     """Measurements of one sequence; n joints in robot order.
 
-    Attributes:
-        samples: Hash of command and state alone, without unit and payload.
-        rate_hz, jitter_ms, longest_gap_ms: From the state's timestamps; jitter is the largest deviation from median.
-        ctrl_limits, qpos_limits: (n, 2), least and greatest, rad.
-        speed: signals.fast_speed of the command, (n), rad/s.
-        delay: Lag of the state behind the command, (n) s, NaN where the motion does not show it.
-        lead: Lead of the state before the command, (n) s, NaN where there is none.
-        follows, opposes: (n, n); [i, j] is the greatest correlation of commanded velocity i with measured velocity j,
-            and with its negative, at lags up to MAX_LAG_S; 0 where one does not move. Periodic motion shows both.
-        slope: Motion of the state per motion of the command, (n); NaN where the motion does not show it.
-        equals_command: Joints whose state is the command itself, (n).
-        jump_rows: Rows with a position that no joint can reach and leave in a period, (n).
-        zero_rows: Rows in which every joint is exactly 0, far from the rows around.
-        qvel_ratio: Recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves.
-        blocked_s, blocked_at: Longest standstill far from a moving command, (n) s, and its position, rad.
-        standstill_s: Longest standstill of all joints while the commands of half of them move, s.
-        repeated_s: Longest stretch in which a joint repeats one number while its command moves, (n) s.
-        all_repeated_s: Longest stretch in which the whole state repeats itself while the command moves, s.
-        resolution: Step between positions, (n) rad; 0 where positions are continuous, or too few.
-        torque: None if no torque was recorded.
-        static_poses: Moments at rest.
-        response: Correlations of operated joints with their commands (data.signals).
-        spectra: Log power of command and state, (2, H) at SPECTRUM_HZ.
-        command_distance: Distance of the nearest state from the command of up to MAX_LAG_S before, over the state's
-            standard deviation, (n); NaN where the joint does not move.
-        velocity_correlation, torque_correlation: Command against measured velocity and torque, (n).
-        gravity_samples: Positions and torques in slow rows, (2, k, n); None if no torque was recorded.
+    follows and opposes [i, j] are the greatest correlation of commanded velocity i with measured velocity j, and with
+    its negative, at lags up to MAX_LAG_S; 0 where one does not move. Periodic motion shows both.
     """
 
     entry: Entry
-    samples: str
-    rate_hz: float
-    jitter_ms: float
+    samples: str  # hash of command and state alone, without unit and payload
+    rate_hz: float  # from the state's timestamps, like the two below
+    jitter_ms: float  # largest deviation of a period from the median
     longest_gap_ms: float
-    ctrl_limits: Array
+    ctrl_limits: Array  # least and greatest, (n, 2) rad
     qpos_limits: Array
-    speed: Array
-    delay: Array
-    lead: Array
-    follows: Array
+    speed: Array  # signals.fast_speed of the command, (n) rad/s
+    delay: Array  # of the state behind the command, (n) s; NaN where the motion does not show it
+    lead: Array  # of the state before the command, (n) s; NaN where there is none
+    follows: Array  # (n, n)
     opposes: Array
-    slope: Array
-    equals_command: Array
-    jump_rows: Array
-    zero_rows: int
-    qvel_ratio: Array
-    blocked_s: Array
-    blocked_at: Array
-    standstill_s: float
-    repeated_s: Array
-    all_repeated_s: float
-    resolution: Array
-    torque: Torque | None
+    slope: Array  # motion of the state per motion of the command, (n); NaN where the motion does not show it
+    equals_command: Array  # joints whose state is the command itself, (n)
+    jump_rows: Array  # rows with a position that no joint can reach and leave in a period, (n)
+    zero_rows: int  # rows in which every joint is exactly 0, far from the rows around
+    qvel_ratio: Array  # recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves
+    blocked_s: Array  # longest standstill far from a moving command, (n) s
+    blocked_at: Array  # its position, (n) rad
+    standstill_s: float  # longest standstill of all joints while the commands of half of them move
+    repeated_s: Array  # longest stretch in which a joint repeats one number while its command moves, (n) s
+    all_repeated_s: float  # longest stretch in which the whole state repeats itself while the command moves
+    resolution: Array  # step between positions, (n) rad; 0 where positions are continuous, or too few
+    torque: Torque | None  # None if no torque was recorded
     static_poses: StaticPoses
-    response: Response
-    spectra: Array
-    command_distance: Array
-    velocity_correlation: Array
-    torque_correlation: Array
-    gravity_samples: Array | None
+    response: Response  # of the operated joints
+    spectra: Array  # log power of command and state at SPECTRUM_HZ, (2, H)
+    command_distance: Array  # nearest state to the command of up to MAX_LAG_S before, in standard deviations of the
+    # state, (n); NaN where the joint does not move
+    velocity_correlation: Array  # of the command with the measured velocity, (n)
+    torque_correlation: Array  # of the command with the measured torque, (n)
+    gravity_samples: Array | None  # positions and torques in slow rows, (2, k, n); None if no torque was recorded
 
     @property
     def motion(self) -> str:
@@ -182,6 +161,44 @@ class Survey:
             **_kind_of_command(sequence),
             gravity_samples=_gravity_samples(sequence),
         )
+
+
+def survey_all(dataset: Dataset, robot: RobotSpec, progress: Progress, executor: str | Executor) -> list[Survey]:
+    """Return one survey per sequence, in the order of the dataset's entries.
+
+    Args:
+        executor: Measures the sequences, if there are many.
+
+    Raises:
+        WorkerError: Workers of the executor died.
+    """
+    surveys = []
+    for survey in _measure(dataset, robot, executor):
+        surveys.append(survey)
+        progress(len(surveys), len(dataset), survey.motion)
+    return surveys
+
+
+def _measure(dataset: Dataset, robot: RobotSpec, executor: str | Executor) -> Iterator[Survey]:
+    jobs, rows, total = list[list[Entry]](), JOB_ROWS, 0
+    for entry in dataset.entries:
+        if rows + entry.rows > JOB_ROWS:
+            jobs, rows = [*jobs, []], 0
+        jobs[-1].append(entry)
+        rows += entry.rows + OVERHEAD_ROWS
+        total += entry.rows + OVERHEAD_ROWS
+    if executor == LOCAL and (len(jobs) < 2 or total < MIN_PARALLEL_ROWS):
+        for entry in dataset.entries:
+            yield Survey.of(entry, dataset.read(entry), robot)
+        return
+    loaded = ([(entry, dataset.read(entry)) for entry in job] for job in jobs)
+    with open_pool(executor, 0, 1) as pool:
+        for surveys in pool.map(partial(_survey_job, robot=robot), loaded):
+            yield from surveys
+
+
+def _survey_job(job: list[tuple[Entry, Sequence]], robot: RobotSpec) -> list[Survey]:
+    return [Survey.of(entry, sequence, robot) for entry, sequence in job]
 
 
 def _correlations(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:

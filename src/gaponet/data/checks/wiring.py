@@ -134,8 +134,7 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         motions = [motion for of_joint in copies.values() for motion in of_joint]
         text = (
             f"command and state of {abbreviate(list(copies))} are the same numbers in {abbreviate(motions)}: one was "
-            "logged as "
-            "both; log the command that the servo was sent"
+            "logged as both; log the command that the servo was sent"
         )
         yield Finding("error", "copied", text, tuple(copies))
 

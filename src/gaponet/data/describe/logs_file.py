@@ -1,29 +1,6 @@
 """logs.toml: what a lab's logs mean, said once. It lies in the folder of the logs, or is given with --logs.
 
-format = "table"                          # where it cannot be seen
-motion = "{motion}_{payload:g}kg_{rep}"   # what the name of a recording says; with a slash: of its path
-manifest = "sheet.csv"                    # or a table: file, motion, unit, payload, rep, kp, kp.<joint>, …; estimated
-                                          # says which of these are no more than that, leave_out is yes or no
-unit = "lab-1"                            # of all recordings; payload = 0.0, side = "both" likewise
-time = "t"                                # column of the clock; or rate = 50.0 (Hz) where the log has none
-time_unit = "ms"                          # s, ms, us, ns
-position_unit = "deg"                     # rad, deg, fraction (0..1 of the joint's range); velocities: per second
-ctrl = "{joint}_des"                      # columns of commanded positions; qpos, qvel, tau, temperature likewise
-command_file = "{name}_cmd.csv"           # where commands lie in a file beside the state's
-header = ["t", "q1_des", "q1"]            # names of the columns of a table that has none
-joints = ["shoulder", "elbow"]            # of the columns of an array that does not name them, in its order
-ignore = ["left_*"]                       # columns that are no joints of this robot; "" in joints does the same
-action_scale = 0.25                       # ctrl holds a policy's action: the target is home + scale · action
-kp = 20.0                                 # while recording, N·m/rad; kd likewise; [kp] elbow = 20.0 for one joint,
-                                          # or the name of an array that holds them, in the order of `joints`
-[columns]                                 # single columns: ours = the log's
-"ctrl.elbow" = "cmd_1"
-[names]                                   # the log's joint = the robot's
-[joint_units]                             # where one joint's position is in another unit
-[signs]                                   # elbow = -1: the log counts the other way round
-[offsets]                                 # rad to add to positions, after unit and sign
-[posture]                                 # elbow = 0.9: where a joint stood, rad, that the log does not hold
-[clock]                                   # a channel's own clock: ctrl = "t_cmd"
+docs/logs.md shows examples.
 """
 
 from __future__ import annotations
@@ -62,37 +39,40 @@ NUMBERS = ("payload_mass", "repetition", "kp", "kd")
 
 
 class LogsFile(TypedDict, total=False):
-    """The fields of logs.toml, as the module says."""
+    """The fields of logs.toml, all optional."""
 
-    format: Text
-    motion: Text
-    manifest: Text
-    unit: Text
+    format: Text  # where it cannot be seen
+    motion: Text  # pattern of the recordings' names, or with a slash of their paths: "{motion}_{payload:g}kg_{rep}"
+    manifest: Text  # or a table: file, motion, unit, payload, side, rep, level, virtual, kp, kd, kp.<joint>, estimated
+    # (which of these are no more than that), leave_out (yes or no)
+    unit: Text  # of all recordings, like payload (kg) and side
     payload: Annotated[float, Interval(ge=0, le=100)]
     side: Text
-    time: Text
-    rate: Annotated[float, Interval(ge=1, le=10_000)]
-    time_unit: Text
-    position_unit: Text
-    ctrl: Text
+    time: Text  # column of the clock
+    rate: Annotated[float, Interval(ge=1, le=10_000)]  # Hz, where the log has no clock
+    time_unit: Text  # s, ms, us, ns
+    position_unit: Text  # rad, deg, fraction (0..1 of the joint's range); velocities: per second
+    ctrl: Text  # columns of commanded positions, as "{joint}_des", or the name of an array
     qpos: Text
     qvel: Text
     tau: Text
     temperature: Text
-    command_file: Text
-    header: Annotated[list[str], Len(1, 2000)]
-    joints: Annotated[list[str], Len(1, 500)]
-    ignore: list[str]
-    action_scale: Annotated[float, Interval(ge=1e-6, le=1e3)]
-    kp: Gain | dict[str, Gain] | Text
-    kd: Gain | dict[str, Gain] | Text
-    columns: dict[str, str]
-    names: dict[str, str]
-    joint_units: dict[str, str]
-    signs: dict[str, Sign]
-    offsets: dict[str, Offset]
-    posture: dict[str, Offset]
-    clock: dict[str, str]
+    command_file: Text  # where commands lie in a file beside the state's: "{name}_cmd.csv"
+    header: Annotated[list[str], Len(1, 2000)]  # names of the columns of a table that has none
+    joints: Annotated[list[str], Len(1, 500)]  # of the columns of an array that does not name them, in its order
+    ignore: list[str]  # columns that are no joints of this robot; "" in joints does the same
+    action_scale: Annotated[
+        float, Interval(ge=1e-6, le=1e3)
+    ]  # ctrl is a policy's action: target = home + scale · action
+    kp: Gain | dict[str, Gain] | Text  # while recording, N·m/rad: of all joints, by joint, or an array's name
+    kd: Gain | dict[str, Gain] | Text  # N·m·s/rad
+    columns: dict[str, str]  # single columns, ours = the log's: "ctrl.elbow" = "cmd_1"
+    names: dict[str, str]  # the log's joint = the robot's
+    joint_units: dict[str, str]  # where one joint's position is in another unit
+    signs: dict[str, Sign]  # −1: the log counts the other way round
+    offsets: dict[str, Offset]  # rad to add to positions, after unit and sign
+    posture: dict[str, Offset]  # rad at which a joint stood that the log does not hold
+    clock: dict[str, str]  # a channel's own clock: ctrl = "t_cmd"
 
 
 def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile, Path | None]:
@@ -185,18 +165,14 @@ def _fields(said: dict[str, str], where: str) -> dict[str, Any]:
                 raise LogError(f"{where}: {word} is '{text}', not a number ≥ 0; mend it") from None
             value = int(value) if field == "repetition" else value
         if field in ("virtual", "leave_out"):
-            value = _yes(field, text, where)
+            if value not in ("yes", "no"):
+                raise LogError(f"{where}: {field} is '{text}'; write yes or no")
+            value = value == "yes"
         if joint:
             gains = found.get(field, {})
             value = (gains if isinstance(gains, dict) else {"": gains}) | {joint: value}
         found[field] = value
     return found
-
-
-def _yes(word: str, text: str, where: str) -> bool:
-    if text.strip() not in ("yes", "no"):
-        raise LogError(f"{where}: {word} is '{text}'; write yes or no")
-    return text.strip() == "yes"
 
 
 def _stem(file: str) -> str:

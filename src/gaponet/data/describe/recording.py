@@ -6,7 +6,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,27 +45,18 @@ class Signal(NamedTuple):
 class Recording:
     """One recording.
 
-    Attributes:
-        name: Its motion, unless something says better.
-        source: File or folder, with #part where a file holds several.
-        signals: Name → names of its columns, (n); digits where the file does not name them; () for a single column.
-        load: Reads the signals of these names.
-        where: What to call the place of the names in errors.
-        files: What it was read from, for the hash.
-        first_line: The line in the file where its rows begin.
-        meta: What the format says beside: stated, dt, notes, as in Log.meta.
-        default: What of logs.toml this recording itself shows, unless something else is said.
+    A signal's columns are named by digits where the file does not name them, and by () for a single column.
     """
 
-    name: str
-    source: str
-    signals: dict[str, tuple[str, ...]]
-    load: Callable[[list[str]], dict[str, Signal]]
-    where: str = ""
-    files: tuple[str, ...] = ()
-    first_line: int = 1
-    meta: dict[str, Any] = field(default_factory=dict)
-    default: LogsFile = field(default_factory=lambda: LogsFile())
+    name: str  # motion, unless logs.toml states another
+    source: str  # file or folder, with #part where a file holds several
+    signals: dict[str, tuple[str, ...]]  # name → names of its columns
+    load: Callable[[list[str]], dict[str, Signal]]  # reads the signals of these names
+    where: str = ""  # place of the names, for errors
+    files: tuple[str, ...] = ()  # of which it was read, for the hash
+    first_line: int = 1  # line in the file where its rows begin
+    meta: dict[str, Any] = field(default_factory=dict)  # stated, dt, notes, as in Log.meta
+    default: LogsFile = field(default_factory=lambda: LogsFile())  # unless something else is stated
 
     @property
     def columns(self) -> dict[str, tuple[str, int | None]]:
@@ -90,10 +81,7 @@ class Recording:
             return self.load([n for n in names if not n.startswith(COMMAND)]) | loaded
 
         signals = self.signals | {COMMAND + n: labels for n, labels in commands.signals.items()}
-        files = self.files + commands.files
-        return Recording(
-            self.name, self.source, signals, load, self.where, files, self.first_line, self.meta, self.default
-        )
+        return replace(self, signals=signals, load=load, files=self.files + commands.files)
 
     @classmethod
     def of_arrays(

@@ -1,20 +1,21 @@
-"""One file per log format, imported when its format is asked for or looked for; heavy libraries only when it reads.
+"""Log formats: one module each, imported when its format is asked for; heavy libraries are imported when it reads.
 
-A format is a module whose docstring begins with what it is, in one line, and which has
+The first line of a format's docstring says what the format is. A format whose columns logs.toml explains has
 
-    detects(path)           whether a file, or the files directly in a folder, look like it
-    find(path)              the recordings under a path: files or folders, sorted
-    EXTRA                   the extra of the package that it needs, or ""
-    OPTIONS                 fields of logs.toml that it acts on beside names, signs, offsets, motion and the like
+    recordings(path, told)  yields Recordings (data.describe.recording)
+    DEFAULT                 content of logs.toml unless the recording or the user states something else; default nothing
 
-and either
+and a format that says itself what its columns are has
 
-    read(path, robot, joint_map, **options)    yields (motion name, what reads its Log), in the order of find
+    read(path, robot, joint_map, **options)    yields (motion name, function that reads its Log), in the order of find
+    OPTIONS                 fields of logs.toml that it acts on beside ALWAYS; default none
 
-where the format itself says what its columns are, or
+Both have SUFFIXES, of files that are recordings, at or below a folder; or, if that is not enough,
 
-    recordings(path, told)  yields Recordings, whose signals logs.toml explains (data.describe.recording)
-    DEFAULT                 what of logs.toml holds unless something else is said
+    detects(path)           whether a file, or the files directly in a folder, look like it; default: find returns any
+    find(path)              the recordings under a path: files or folders, sorted; default: files with SUFFIXES
+
+and, if it needs an extra of the package, EXTRA.
 """
 
 from __future__ import annotations
@@ -68,6 +69,15 @@ def about(fmt: str) -> str:
     return (doc or "").split("\n")[0].rstrip(".")
 
 
+def extra_of(fmt: str) -> str | None:
+    """Return the extra of the package that a format needs, "" for none; None if its module cannot be loaded."""
+    return attempt(formats()[fmt], lambda: str(getattr(module(fmt), "EXTRA", "")), None)
+
+
+def _options(reader: ModuleType) -> tuple[str, ...]:
+    return DESCRIBED if hasattr(reader, "recordings") else getattr(reader, "OPTIONS", ())
+
+
 def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
     """The file, or those with these suffixes in a folder and below it; hidden ones are left alone."""
     if path.is_file():
@@ -80,8 +90,7 @@ def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    detects = lambda fmt: bool(module(fmt).detects(path))  # noqa: E731
-    found = [fmt for fmt, where in formats().items() if attempt(where, partial(detects, fmt), False)]
+    found = [fmt for fmt, where in formats().items() if attempt(where, partial(_detects, fmt, path), False)]
     if len(found) > 1:
         ways = " or ".join(f"--format {fmt}" for fmt in found)
         raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in found)}; say {ways}")
@@ -91,9 +100,18 @@ def detect(path: Path) -> str:
     return found[0]
 
 
+def _detects(fmt: str, path: Path) -> bool:
+    reader = module(fmt)
+    return bool(reader.detects(path) if hasattr(reader, "detects") else _find(reader, path))
+
+
+def _find(reader: ModuleType, path: Path) -> list[Path]:
+    return reader.find(path) if hasattr(reader, "find") else files_under(path, reader.SUFFIXES)
+
+
 def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
     """The recordings under a path, without reading them."""
-    return cast("list[Path]", _reader(path, fmt or read_logs_file(path)[0].get("format")).find(path))
+    return _find(_reader(path, fmt or read_logs_file(path)[0].get("format")), path)
 
 
 def read_logs(
@@ -132,7 +150,7 @@ def read_logs(
     told = told | {k: v for k, v in by_hand.items() if v is not None}  # type: ignore[assignment]
     kind = _require_allowed(reader, path, allow_pickle)
     for name in told:
-        if name not in ALWAYS and name not in reader.OPTIONS:
+        if name not in ALWAYS and name not in _options(reader):
             said = f"--{name.replace('_', '-')}" if by_hand.get(name) is not None else f"{file}: {name}"
             raise UsageError(f"{said} means nothing to the {kind} format, which fixes it itself; leave it out")
     names = told.get("names", {}) | (joint_map or {})
@@ -190,11 +208,13 @@ def _loaders(
 ) -> Iterator[tuple[str, Callable[[], Log]]]:
     """(name, what reads it) of every recording."""
     if not hasattr(reader, "recordings"):
-        yield from reader.read(path, robot, names or None, **{k: v for k, v in told.items() if k in reader.OPTIONS})
+        yield from reader.read(
+            path, robot, names or None, **{k: v for k, v in told.items() if k in getattr(reader, "OPTIONS", ())}
+        )
         return
     found = _recordings(reader, path, told)
     if "command_file" in told:
-        full = cast("LogsFile", reader.DEFAULT | told)
+        full = _defaults(reader) | told
         told = cast("LogsFile", told | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
         found = _with_commands(list(found), told["command_file"])
     for recording in found:
@@ -203,8 +223,12 @@ def _loaders(
 
 def _recordings(reader: ModuleType, path: Path, told: LogsFile) -> Iterator[Recording]:
     """Read the logs. Values of the format apply unless the recording or `told` states others."""
-    for recording in reader.recordings(path, reader.DEFAULT | told):
-        yield replace(recording, default=cast("LogsFile", reader.DEFAULT | recording.default))
+    for recording in reader.recordings(path, _defaults(reader) | told):
+        yield replace(recording, default=_defaults(reader) | recording.default)
+
+
+def _defaults(reader: ModuleType) -> LogsFile:
+    return getattr(reader, "DEFAULT", LogsFile())
 
 
 def _with_commands(found: list[Recording], pattern: str) -> Iterator[Recording]:

@@ -15,32 +15,21 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
-from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json
+from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, restated
-from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.formats import files_under, pickles
 from gaponet.data.sequence import OPTIONAL
 
-OPTIONS = DESCRIBED
-EXTRA = ""
+SUFFIXES = (".pkl",)
 PICKLED = True
 DEFAULT: LogsFile = {"ctrl": "action", "qpos": "dof", "qvel": "dof_vel", "position_unit": "rad", "time_unit": "s"}
 TARGETS = "target"  # signal made of action, where the file says how
 
 
-def detects(path: Path) -> bool:
-    """A file of that suffix, or a folder with one at or below it."""
-    return bool(find(path))
-
-
-def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, (".pkl",))
-
-
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every motion of every file."""
-    for file in find(path):
+    for file in files_under(path, SUFFIXES):
         found = _read(file)
         motions = found if isinstance(found, dict) else {}
         motions = {str(k): v for k, v in motions.items() if isinstance(v, dict) and "dof" in v}
@@ -52,9 +41,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
 
 @sandboxed(LogError, "numpy")
 def _read(file: Path) -> Any:
-    if file.stat().st_size > MAX_ARRAYS_BYTES:
-        raise LogError(f"{file}: has more than {MAX_ARRAYS_BYTES >> 20} MiB; split it into files of one motion")
-    return pickles.load(file.read_bytes(), str(file))
+    return pickles.load(read_limited(file, LogError, "split it", MAX_ARRAYS_BYTES), str(file))
 
 
 def _recording(file: Path, name: str, motion: dict[str, Any]) -> Recording:

@@ -24,8 +24,6 @@ from gaponet.base.structure import read_json
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 
-OPTIONS: tuple[str, ...] = ()
-EXTRA = ""
 MAX_VOLTS_RATIO = 0.1  # difference of stated and measured supply voltage, relative
 Size = Annotated[float, Gt(0), Interval(le=1e3)]
 

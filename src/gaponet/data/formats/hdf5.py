@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,12 +21,10 @@ from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import WIDEST, Recording, Signal, reading
-from gaponet.data.formats import DESCRIBED, files_under
+from gaponet.data.formats import files_under
 
 SUFFIXES = (".h5", ".hdf5")
-OPTIONS = DESCRIBED
 EXTRA = "hdf5"
-DEFAULT: LogsFile = {}
 ALOHA: LogsFile = {
     "ctrl": "action", "qpos": "observations/qpos", "qvel": "observations/qvel", "tau": "observations/effort",
     "position_unit": "rad",
@@ -34,19 +32,9 @@ ALOHA: LogsFile = {
 DEEPEST, MOST = 6, 5000  # groups in groups; arrays in a file
 
 
-def detects(path: Path) -> bool:
-    """A file of that suffix, or a folder with one at or below it."""
-    return bool(find(path))
-
-
-def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, SUFFIXES)
-
-
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every file, or every demonstration in it."""
-    for file in find(path):
+    for file in files_under(path, SUFFIXES):
         arrays = _listed(file)
         demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")}, key=_by_number)
         for demo in demos or [""]:
@@ -54,14 +42,11 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
             part = demo.rpartition("/")[2]
             name = f"{file.stem}-{part}" if part else file.stem
             aloha = not demo and {"action", "observations/qpos"} <= members.keys()
+            default = {k: v for k, v in ALOHA.items() if v in members or k == "position_unit"} if aloha else {}
             yield Recording(
                 name, f"{file}#{part}" if part else str(file), members, partial(_load, file, demo), str(file),
-                (str(file),), default=_there(ALOHA, members) if aloha else LogsFile(),
+                (str(file),), default=cast("LogsFile", default),
             )  # fmt: skip
-
-
-def _there(told: LogsFile, signals: dict[str, Any]) -> LogsFile:
-    return {k: v for k, v in told.items() if v in signals or k == "position_unit"}  # type: ignore[return-value]
 
 
 def _by_number(demo: str) -> tuple[int, str]:
@@ -80,32 +65,27 @@ def _opened(file: Path) -> Iterator[Any]:
 
 @sandboxed(LogError, "h5py")
 def _listed(file: Path) -> dict[str, tuple[str, ...]]:
-    with _opened(file) as root:
-        return _arrays(root)
-
-
-def _arrays(root: Any) -> dict[str, tuple[str, ...]]:
     """Arrays of numbers with one row per sample, by path, and names of their columns. Links are not followed."""
     import h5py
 
-    found: dict[str, tuple[str, ...]] = {}
-    todo = [("", root, 0)]
-    while todo:
-        place, group, depth = todo.pop()
-        for name in group:
-            path = f"{place}/{name}".lstrip("/")
-            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                continue  # a soft link may make a circle, an external one open another file
-            item = group[name]
-            if isinstance(item, h5py.Group) and depth < DEEPEST:
-                todo.append((path, item, depth + 1))
-            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and 1 <= item.ndim <= 2:
-                width = item.shape[1] if item.ndim == 2 else 0
-                if len(item) > 0 and width <= WIDEST and item.external is None and not item.is_virtual:
-                    found[path] = tuple(map(str, range(width)))
-            if len(found) > MOST:
-                raise LogError(f"{root.filename}: more than {MOST} arrays; give one recording per file")
-    return dict(sorted(found.items()))
+    arrays: dict[str, tuple[str, ...]] = {}
+    with _opened(file) as root:
+        groups = [("", root, 0)]
+        for place, group, depth in groups:
+            for name in group:
+                path = f"{place}/{name}".lstrip("/")
+                if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                    continue  # a soft link may make a circle, an external one open another file
+                item = group[name]
+                if isinstance(item, h5py.Group) and depth < DEEPEST:
+                    groups.append((path, item, depth + 1))
+                elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and 1 <= item.ndim <= 2:
+                    width = item.shape[1] if item.ndim == 2 else 0
+                    if len(item) > 0 and width <= WIDEST and item.external is None and not item.is_virtual:
+                        arrays[path] = tuple(map(str, range(width)))
+                if len(arrays) > MOST:
+                    raise LogError(f"{file}: more than {MOST} arrays; give one recording per file")
+    return dict(sorted(arrays.items()))
 
 
 @sandboxed(LogError, "h5py")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, Signal
+from gaponet.data.describe.recording import Recording
 from gaponet.data.formats import parquet
 
 if TYPE_CHECKING:
@@ -29,13 +30,12 @@ def joint_column(names: list[str], logs: LogsFile) -> str | None:
     return next((name for name in names if name.lower() in JOINT_COLUMNS), None)
 
 
-def recording(file: Path, names: list[str], joint: str, logs: LogsFile, delimiter: str) -> Recording:
+def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> Recording:
     """Return a table with a row per joint and time as a recording whose signals have a column per joint.
 
     Args:
         joint: The column with the joints' names.
         logs: Content of logs.toml, or the defaults.
-        delimiter: Separator of a CSV file's cells.
 
     Raises:
         LogError: The time column is not known, or a joint is missing at a time.
@@ -44,7 +44,7 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile, delimite
     time = logs.get("time") if logs.get("time") in times else next(iter(times), None)
     if time is None:
         raise LogError(f"{file}:1: a row per joint, and no column of times; name it in logs.toml: time = …")
-    table = _table(file, names, delimiter)
+    table = _table(file, names)
     of_row = np.array([str(name) for name in table.column(joint).to_pylist()], dtype=object)
     joints = tuple(dict.fromkeys(of_row.tolist()))
     order = [np.flatnonzero(of_row == name) for name in joints]
@@ -52,27 +52,22 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile, delimite
     if len({len(rows) for rows in order}) > 1 or any((stamps[rows] != stamps[order[0]]).any() for rows in order):
         counts = ", ".join(f"{name} {len(rows)}" for name, rows in zip(joints, order, strict=True))
         raise LogError(f"{file}: joints have different times ({counts} rows); write every joint at every time")
-    signals = {n: joints for n in names if n not in (joint, time) and _is_number(table.column(n).type)}
-
-    def load(wanted: list[str]) -> dict[str, Signal]:
-        return {
-            n: Signal(
-                stamps[order[0]] if n == time else np.stack([_numbers(file, table, n)[rows] for rows in order], 1)
-            )
-            for n in wanted
-        }
-
-    default: LogsFile = {"time": time}
-    return Recording(file.stem, str(file), {time: ()} | signals, load, f"{file}:1", (str(file),), default=default)
+    used = {n for n in names if n in logs.values() or not table.column(n).null_count} - {joint, time}
+    numbers = [n for n in names if n in used and _is_number(table.column(n).type)]
+    arrays = {n: np.stack([_numbers(file, table, n)[rows] for rows in order], axis=1) for n in numbers}
+    recording = Recording.of_arrays(file, {time: stamps[order[0]]} | arrays, joints, default={"time": time})
+    return replace(recording, where=f"{file}:1")
 
 
-def _table(file: Path, names: list[str], delimiter: str) -> pa.Table:
+def _table(file: Path, names: list[str]) -> pa.Table:
     if file.suffix.lower() == ".parquet":
         return parquet.read(file, names)
     import pyarrow as pa
     import pyarrow.csv as pc
 
     body = read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
+    header = body.partition(b"\n")[0]
+    delimiter = next((d for d in ",;\t" if d.encode() in header), " ")
     try:
         return pc.read_csv(
             pa.py_buffer(body), pc.ReadOptions(use_threads=False), pc.ParseOptions(delimiter=delimiter)

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 OPTIONS = ("position_unit", "joints", "ignore")
-EXTRA = ""
 POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
 INDEX = ("timestamp", "frame_index", "episode_index")  # columns of data files
 
@@ -131,7 +130,10 @@ class _Frames:
                 raise JointMismatchError(
                     f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both action and {FEATURES[channel]}"
                 )
-        self.units = [self._joint_unit(j, unit) for j in self.joints]
+        # A gripper is 0..100 of its range wherever the other joints are not SI.
+        shares = {j for j, u in zip(robot.joint_names, robot.log_units, strict=True) if u == "fraction"}
+        scaled = shares if unit in ("deg", "signed_percent") else ()
+        self.units = ["percent" if j in scaled else unit for j in self.joints]
         table = read_table(file, (*present.values(), *INDEX), table=table)
         self.columns = {
             c: _matrix(file, table, f, len(names[c]))[:, [names[c].index(j) for j in self.joints]]
@@ -155,11 +157,6 @@ class _Frames:
         short = [str(name).removesuffix(".pos") for name in names]
         ours = iter(resolve_all([n for n in short if not ignored(n, self.ignore)], self.robot, where, joint_map))
         return ["" if ignored(n, self.ignore) else next(ours) for n in short]
-
-    def _joint_unit(self, joint: str, unit: str) -> str:
-        """A gripper is 0..100 of its range wherever the other joints are not SI."""
-        share = self.robot.log_units[self.robot.joint_names.index(joint)] == "fraction"
-        return "percent" if share and unit in ("deg", "signed_percent") else unit
 
     def episode(self, row: dict[str, Any]) -> Log:
         """The frames of an episode as a Log, in SI."""

@@ -76,13 +76,6 @@ class Listed(TypedDict):
 NEEDED = tuple(k for k in Episode.__annotations__ if k != "tasks")
 
 
-class Task(TypedDict):
-    """One row of meta/tasks."""
-
-    index: Count
-    text: str
-
-
 class Stated(TypedDict):
     """Contents of meta/info.json."""
 
@@ -223,8 +216,8 @@ def tasks_of(part: Set) -> dict[int, str]:
     table = read_table(file, ("task_index",), ("task", "__index_level_0__"))
     if table.num_columns != 2:
         raise LogError(f"{file}: no task and task_index in it; {AGAIN}")
-    rows = validated(list[Task], _rows(file, table.rename_columns(["index", "text"])), file, LogError, AGAIN)
-    return {row["index"]: row["text"] for row in rows}
+    rows = [tuple(row.values()) for row in _rows(file, table)]
+    return dict(validated(list[tuple[Count, str]], rows, file, LogError, AGAIN))
 
 
 def read_table(

@@ -15,26 +15,15 @@ from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, reading
-from gaponet.data.formats import DESCRIBED, files_under
+from gaponet.data.formats import files_under
 
-OPTIONS = DESCRIBED
-EXTRA = ""
+SUFFIXES = (".mat",)
 DEFAULT: LogsFile = {"time": "time"}
-
-
-def detects(path: Path) -> bool:
-    """A file of that suffix, or a folder with one at or below it."""
-    return bool(find(path))
-
-
-def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, (".mat",))
 
 
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every file."""
-    for file in find(path):
+    for file in files_under(path, SUFFIXES):
         yield Recording.of_arrays(file, _read(file))
 
 

@@ -10,7 +10,6 @@ says which array is what; text in joint_names names the columns. Arrays of objec
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,14 +18,13 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
-from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json
+from gaponet.base.structure import parse_json
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, reading, restated
-from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.describe.recording import Recording, restated
+from gaponet.data.formats import files_under, pickles
 from gaponet.data.log import CHANNELS, DERIVED
 
-OPTIONS = DESCRIBED
-EXTRA = ""
+SUFFIXES = (".npz",)
 DEFAULT: LogsFile = {"time": "time"}
 GAPONET: LogsFile = {
     "ctrl": "real_dof_positions_cmd", "qpos": "real_dof_positions", "qvel": "real_dof_velocities",
@@ -36,19 +34,9 @@ NAMES = ("joint_names", "joint_sequence", "dof_names")
 OURS = "gaponet"  # array with JSON in a file of ours
 
 
-def detects(path: Path) -> bool:
-    """A file of that suffix, or a folder with one at or below it."""
-    return bool(find(path))
-
-
-def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, (".npz",))
-
-
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every file, or every motion in it."""
-    for file in find(path):
+    for file in files_under(path, SUFFIXES):
         arrays = _read(file)
         names = next((tuple(map(str, arrays[n].ravel())) for n in NAMES if n in arrays), ())
         if OURS in arrays:
@@ -97,11 +85,8 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
 @sandboxed(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
     """Every array; those of objects by a safe unpickler."""
-    with reading(file, "npz file"), zipfile.ZipFile(file) as packed:
-        parts = packed.infolist()
-        if sum(part.file_size for part in parts) > MAX_ARRAYS_BYTES:
-            raise LogError(f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; split it")
-        return {p.filename.removesuffix(".npy"): _array(packed.read(p), f"{file}: {p.filename}") for p in parts}
+    with pickles.open_zip(file, "npz file") as packed:
+        return {n.removesuffix(".npy"): _array(packed.read(n), f"{file}: {n}") for n in packed.namelist()}
 
 
 def _array(data: bytes, where: str) -> Any:

@@ -7,7 +7,6 @@ while recording. Files of other names work as well: logs.toml says which tensor 
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,11 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
-from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, reading
-from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.describe.recording import Recording
+from gaponet.data.formats import files_under, pickles
 
-OPTIONS = DESCRIBED
-EXTRA = ""
+SUFFIXES = (".pt",)
 DEFAULT: LogsFile = {
     "time": "time", "time_unit": "s", "position_unit": "rad", "ctrl": "des_dof_pos", "qpos": "dof_pos",
     "qvel": "dof_vel", "tau": "dof_torque",
@@ -30,19 +27,9 @@ DEFAULT: LogsFile = {
 GAINS = ("kp", "kd")
 
 
-def detects(path: Path) -> bool:
-    """A file of that suffix, or a folder with one at or below it."""
-    return bool(find(path))
-
-
-def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, (".pt",))
-
-
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every file."""
-    for file in find(path):
+    for file in files_under(path, SUFFIXES):
         arrays = _read(file)
         qpos = arrays.get(str(told.get("qpos")))
         gains: LogsFile = {}
@@ -62,9 +49,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
 @sandboxed(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
     """Every array of numbers; others are left alone."""
-    with reading(file, ".pt file of tensors"), zipfile.ZipFile(file) as packed:  # as torch 1.6 and later write
-        if sum(part.file_size for part in packed.infolist()) > MAX_ARRAYS_BYTES:
-            raise LogError(f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; cut it into shorter logs")
+    with pickles.open_zip(file, ".pt file of tensors") as packed:  # as torch 1.6 and later write
         top = next((n.removesuffix("data.pkl") for n in packed.namelist() if n.endswith("/data.pkl")), None)
         if top is None:
             raise LogError(f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the right file?")

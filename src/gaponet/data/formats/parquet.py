@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES
+from gaponet.data.describe.recording import reading
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -20,7 +19,7 @@ def header(file: Path) -> tuple[list[str], dict[str, str]]:
     """Names of the columns, in their order, and what the file says of itself beside."""
     import pyarrow.parquet as pq
 
-    with _readable(file):
+    with reading(file, "Parquet file"):
         schema = pq.read_schema(file)
         said = (schema.metadata or {}).items()
         return list(schema.names), {k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in said}
@@ -35,7 +34,7 @@ def read(file: Path, wanted: list[str]) -> pa.Table:
     """
     import pyarrow.parquet as pq
 
-    with _readable(file):
+    with reading(file, "Parquet file"):
         source = pq.ParquetFile(file)
         parts = [source.metadata.row_group(i) for i in range(source.metadata.num_row_groups)]
         chunks = (part.column(k) for part in parts for k in range(part.num_columns))
@@ -46,18 +45,3 @@ def read(file: Path, wanted: list[str]) -> pa.Table:
                 f"{MAX_ARRAYS_BYTES >> 20} MiB; cut the log into shorter ones"
             )
         return source.read(columns=wanted, use_threads=False).select(wanted)
-
-
-@contextmanager
-def _readable(file: Path) -> Iterator[None]:
-    import pyarrow as pa
-
-    try:
-        yield
-    except MemoryError:
-        raise
-    except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
-        reason = str(error).split("\n")[0].rstrip(".")
-        raise LogError(
-            f"{file}: not a readable Parquet file ({reason}); it may be half-written: download or export it again"
-        ) from None

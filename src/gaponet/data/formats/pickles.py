@@ -10,19 +10,36 @@ from __future__ import annotations
 import io
 import math
 import pickle
+import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES
+from gaponet.data.describe.recording import reading
 
 KINDS = "biufUS"  # of dtypes: numbers and text of fixed size
 STORAGES = {"Float": "f4", "Double": "f8", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1",
             "Byte": "u1", "Bool": "b1"}  # torch's name → dtype  # fmt: skip
 MOST_STEPS = 1 << 20  # values of a tree that is walked; shared ones count each time
+
+
+@contextmanager
+def open_zip(file: Path, what: str) -> Iterator[zipfile.ZipFile]:
+    """Open a zip file of arrays.
+
+    Raises:
+        LogError: It is damaged, or unpacks to more than MAX_ARRAYS_BYTES.
+    """
+    with reading(file, what), zipfile.ZipFile(file) as packed:
+        if sum(part.file_size for part in packed.infolist()) > MAX_ARRAYS_BYTES:
+            raise LogError(f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; cut it into shorter logs")
+        yield packed
 
 
 class _RefusedError(Exception):
@@ -117,10 +134,6 @@ class _Tensor:
             self.array = np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
 
 
-def _new(*_: Any) -> _Array:
-    return _Array()
-
-
 def _codec(text: Any, encoding: Any) -> bytes:
     """How Python 3 wrote bytes into old protocols."""
     if encoding not in ("latin1", "latin-1"):
@@ -130,7 +143,7 @@ def _codec(text: Any, encoding: Any) -> bytes:
 
 MEANT = {
     ("numpy", "ndarray"): _Array, ("numpy", "dtype"): _Type,
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): _new for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): _Array for core in ("core", "_core")},
     **{(f"numpy.{core}.multiarray", "scalar"): _Scalar for core in ("core", "_core")},
     **{(f"numpy.{core}.numeric", "_frombuffer"): _frombuffer for core in ("core", "_core")},
     ("joblib.numpy_pickle", "NumpyArrayWrapper"): _Wrapped, ("_codecs", "encode"): _codec,

@@ -26,10 +26,9 @@ from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal, reading
-from gaponet.data.formats import DESCRIBED, files_under
+from gaponet.data.formats import files_under
 
 SUFFIXES = (".db3", ".mcap", ".bag")
-OPTIONS = DESCRIBED
 EXTRA = "ros"
 DEFAULT: LogsFile = {"time_unit": "s", "position_unit": "rad"}
 PEEK = 200  # messages of a topic in which all its joints are named
@@ -57,11 +56,6 @@ CONTROLLER = (
     f"std_msgs/Header header\nstring[] joint_names\n{POINT} reference\n{POINT} feedback\n{POINT} error\n{POINT} output"
 )
 Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its columns, its numbers)
-
-
-def detects(path: Path) -> bool:
-    """A bag, or a folder with bags."""
-    return bool(find(path))
 
 
 def find(path: Path) -> list[Path]:
@@ -148,7 +142,8 @@ def _peek(bag: Path, reader: Any) -> dict[str, dict[str, tuple[str, ...]]]:
                 mine = sets.setdefault(field, [])
                 at = next((k for k, s in enumerate(mine) if set(s) == set(labels)), len(mine))
                 mine += [labels] * (at == len(mine))
-                topics.setdefault(_numbered(connection.topic, at), {}).setdefault(field, labels)
+                topic = f"{connection.topic}#{at + 1}" if at else connection.topic
+                topics.setdefault(topic, {}).setdefault(field, labels)
             if i == PEEK:
                 break
     if not topics:
@@ -157,10 +152,6 @@ def _peek(bag: Path, reader: Any) -> dict[str, dict[str, tuple[str, ...]]]:
         why = f"; the bag does not define {', '.join(strange)}: record as .mcap, which does" if strange else ""
         raise LogError(f"{bag}: none of its topics is about joints; it has {types}{why}")
     return topics
-
-
-def _numbered(topic: str, at: int) -> str:
-    return topic if at == 0 else f"{topic}#{at + 1}"
 
 
 def _load(bag: Path, meta: dict[str, Any], names: list[str]) -> dict[str, Signal]:
@@ -177,12 +168,16 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
         asked = {t: {f: labels for f, labels in fields.items() if f"{t}.{f}" in names} for t, fields in topics.items()}
         wanted = {topic: fields for topic, fields in asked.items() if fields}
         rows: dict[str, list[Any]] = {topic: [] for topic in wanted}
-        for connection, time, fields, stamp in _messages(reader, [c for c in _known(reader) if _base(c.topic, wanted)]):
+        used = {topic.split("#")[0] for topic in wanted}
+        for connection, time, fields, stamp in _messages(reader, [c for c in _known(reader) if c.topic in used]):
             for topic, known in wanted.items():
                 if topic.split("#")[0] == connection.topic and all(
                     f in fields and set(fields[f][0]) == set(labels) for f, labels in known.items()
                 ):
-                    values = [_ordered(*fields[f], labels) for f, labels in known.items()]
+                    values = []
+                    for f, labels in known.items():
+                        own, numbers = fields[f]
+                        values.append(list(numbers) if own == labels else [numbers[own.index(name)] for name in labels])
                     rows[topic].append((time, time if stamp is None else stamp, stamp is not None, values))
     notes: dict[str, Any] = {}
     times = _clocks({t: np.array([r[:3] for r in found], float).reshape(-1, 3) for t, found in rows.items()}, notes)
@@ -194,14 +189,6 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
             notes["repeated"] = notes.get("repeated", 0) + int((~fresh).sum())
         loaded |= {f"{topic}.{f}": Signal(v[fresh], times[topic][fresh]) for f, v in zip(known, columns, strict=True)}
     return {name: loaded[name] for name in names}, notes
-
-
-def _base(topic: str, wanted: dict[str, Any]) -> bool:
-    return any(w.split("#")[0] == topic for w in wanted)
-
-
-def _ordered(labels: tuple[str, ...], values: Any, order: tuple[str, ...]) -> list[float]:
-    return [float(values[labels.index(name)]) for name in order] if labels != order else list(values)
 
 
 def _fresh(time: Array, values: list[Array]) -> Array:

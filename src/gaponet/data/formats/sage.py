@@ -1,6 +1,6 @@
 """SAGE folder: control.csv and state_motor.csv beside each other.
 
-{real,sim}/{robot}/{source}/{motion}/{control,state_motor,event}.csv and joint_list.txt.
+{real,sim}/{robot}/{source}/{motion}/{control,state_motor}.csv and joint_list.txt; event.csv is not read.
 Rows are TYPE,timestamp,"[...]"; the case of TYPE differs between recordings. Real timestamps are microseconds,
 simulated ones seconds; the reader decides by the period and refuses one that is neither. Joints stand in the unit that
 the robot's `log_unit` says (SO-101's gripper: 0..1 of its range).
@@ -26,8 +26,6 @@ from gaponet.robot.spec import RobotSpec
 
 COLUMNS = {"positions": "qpos", "velocities": "qvel", "torques": "tau"}
 FILES = ("control.csv", "state_motor.csv")
-OPTIONS: tuple[str, ...] = ()
-EXTRA = ""
 DIGITS = b"0123456789.+-eE \r"  # what numbers are made of; the rest of a row is its skeleton
 NUMBER = r" *(?:[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf) *"
 
@@ -77,7 +75,6 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
             "files": dict.fromkeys(channels, str(state)) | {"ctrl": str(control)},
             "first_line": 2,
             "converted_from": {n: u for n, u in zip(names, units, strict=True) if u != "rad"},
-            "events": _events(folder / "event.csv"),
         },
     )
 
@@ -108,17 +105,10 @@ def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
     import pyarrow as pa
     import pyarrow.csv as csv
 
-    skeletons = set(body.translate(None, DIGITS).split(b"\n"))
+    skeletons = set(body.translate(None, DIGITS).lower().split(b"\n"))
     numbers = b'"[' + b"," * (n - 1) + b']"'
-    kinds = {s.partition(b",")[0] for s in skeletons}
-    if not skeletons <= {b",".join([known, b"", *[numbers] * k]) for known in kinds if known}:
-        _refuse_row(file, body, n, k)
-    if {found.lower() for found in kinds} != {kind.encode().translate(None, DIGITS)}:
-        lines = body.decode("utf-8", errors="replace").split("\n")
-        row, found = next((i, t) for i, line in enumerate(lines) if (t := line.partition(",")[0]).lower() != kind)
-        raise LogError(
-            f"{file}:{row + 2}: a row of type '{found}', not {kind.upper()}: are the files swapped or mixed?"
-        )
+    if skeletons != {b",".join([kind.encode().translate(None, DIGITS), b"", *[numbers] * k])}:
+        _refuse_row(file, body, n, k, kind)
     names = [str(i) for i in range(2 + n * k)]
     try:
         table = csv.read_csv(
@@ -130,18 +120,22 @@ def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
             ),
         )
     except pa.ArrowInvalid as error:
-        _refuse_row(file, body, n, k)
+        _refuse_row(file, body, n, k, kind)
         raise LogError(f"{file}: not readable: {error}; record the motion again") from None
     if any(column.null_count for column in table.columns):
-        _refuse_row(file, body, n, k)
+        _refuse_row(file, body, n, k, kind)
     return np.column_stack([column.to_numpy() for column in table.columns])
 
 
-def _refuse_row(file: Path, body: bytes, n: int, k: int) -> None:
-    """Raise for the first line that is not TYPE,time and k lists of n numbers; return where all are."""
-    row = re.compile(rf'[A-Za-z_]+,{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE)
+def _refuse_row(file: Path, body: bytes, n: int, k: int, kind: str) -> None:
+    """Raise for the first line that is not TYPE,time and k lists of n numbers, or of another type than `kind`."""
+    row = re.compile(rf'([A-Za-z_]+),{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE)
     for i, line in enumerate(body.decode("utf-8", errors="replace").split("\n")):
-        if not row.fullmatch(line.rstrip("\r")):
+        if (match := row.fullmatch(line.rstrip("\r"))) and match[1].lower() != kind:
+            raise LogError(
+                f"{file}:{i + 2}: a row of type '{match[1]}', not {kind.upper()}: are the files swapped or mixed?"
+            )
+        if not match:
             shown = line if len(line) < 60 else line[:57] + "..."
             raise LogError(
                 f"{file}:{i + 2}: expected TYPE,timestamp and {k} list(s) of {n} numbers, got '{shown}'; "
@@ -168,10 +162,3 @@ def _text(file: Path) -> str:
         raise LogError(
             f"{file}: not UTF-8 text ({error.reason} at byte {error.start}); is it the right file?"
         ) from None
-
-
-def _events(file: Path) -> list[list[str]]:
-    if not file.is_file():
-        return []
-    rows = [line.split(",") for line in _text(file).splitlines()[1:] if line.strip()]
-    return [[r[1].strip(), r[2].strip()] for r in rows if len(r) >= 3]

@@ -20,14 +20,12 @@ from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal
-from gaponet.data.formats import DESCRIBED, files_under, joint_rows, parquet
+from gaponet.data.formats import files_under, joint_rows, parquet
 from gaponet.data.log import CHANNELS, skipped_rows
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
 NOT_OBEYED = "gaponet.not_obeyed"  # metadata of a table that is no data, and why (hw/control/recording.py)
-OPTIONS = DESCRIBED
-EXTRA = ""
 DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
 
 
@@ -61,7 +59,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
             if names.count(name) > 1:
                 raise LogError(f"{file}:1: column '{name}' stands twice; rename one")
         if joint := joint_rows.joint_column(names, told):
-            yield joint_rows.recording(file, names, joint, told, "," if _is_parquet(file) else _file_delimiter(file))
+            yield joint_rows.recording(file, names, joint, told)
             continue
         where, line = f"{file}:1", 1 if _is_parquet(file) else first + 1
         yield Recording(file.stem, str(file), dict.fromkeys(names, ()), load, where, (str(file),), line)
@@ -79,11 +77,6 @@ def _is_table(file: Path) -> bool:
 def _delimiter(line: str) -> str:
     """Return the separator of cells; a space for any white space."""
     return next((d for d in (",", ";", "\t") if d in line), " ")
-
-
-def _file_delimiter(file: Path) -> str:
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        return _delimiter(lines.readline(1 << 20))
 
 
 def _cells(line: str, delimiter: str) -> list[str]:

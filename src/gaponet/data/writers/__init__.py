@@ -1,15 +1,15 @@
 """Datasets out again, one file per format that others read. A writer loses nothing that its format can hold.
 
-A writer is a module with `write(dataset, robot, folder, tell)`, which writes below an empty folder and calls tell with
-the motion of each recording. A format that cannot hold unit, payload, gains and the like says SHEET = True: it gets a
-logs.toml and a sheet beside it that do, by which gaponet import reads it back without a word.
+A writer is a module with `write_recording(entry, sequence, robot, folder)`, which writes one recording below the folder
+and returns the path in it; or, for a format that holds several in a file, with `write(dataset, folder, tell)`, which
+calls tell with the motion of each recording. A format that cannot hold unit, payload and gains says SHEET = True: it
+gets a logs.toml and a sheet, by which gaponet import reads it back without options.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -68,7 +68,14 @@ def export(
     with lock_folder(temporary, "export"):
         _empty(temporary)  # of an export that was killed
         try:
-            written = writer.write(dataset, robot, temporary, tell)
+            written: list[Written] = []
+            if hasattr(writer, "write"):
+                written = writer.write(dataset, temporary, tell)
+            else:
+                for entry in dataset.entries:
+                    path = writer.write_recording(entry, dataset.read(entry), robot, temporary)
+                    written.append(Written(path, 1, entry.rows, 1 / entry.dt))
+                    tell(entry.meta.motion)
             if getattr(writer, "SHEET", False):
                 _describe(dataset, temporary)
             for path in temporary.rglob("*"):
@@ -102,10 +109,9 @@ def _describe(dataset: Dataset, folder: Path) -> None:
     write_text(folder / "logs.toml", 'manifest = "sheet.csv"\n')
 
 
-def stated(entry: Entry) -> str:
-    """All of a recording's metadata but the robot, as JSON."""
-    told: dict[str, Any] = asdict(entry.meta)
-    return json.dumps({k: v for k, v in told.items() if k != "robot" and v is not None}, ensure_ascii=False)
+def stated(entry: Entry) -> dict[str, Any]:
+    """Return all of a recording's metadata but the robot."""
+    return {k: v for k, v in asdict(entry.meta).items() if k != "robot" and v is not None}
 
 
 def _empty(folder: Path) -> None:

@@ -11,7 +11,7 @@ has its earlier files again, byte by byte, and a push sends the others only (sha
                             columns of meta/episodes: unit_id, payload_mass, level, repetition, virtual, findings, …
                             meta/gaponet.json: exact period, robot, joint names, licence, source
 
-A reader that knows none of these finds an ordinary set. Not in it: twins, which can be made again.
+A reader that knows none of these finds an ordinary set. Simulated replays are not in it.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
+from gaponet.base.files import write_json
 from gaponet.data.formats.lerobot_set import FEATURES, GAINS, OURS, STATED, VERSION
 from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
+from gaponet.data.statistics import Statistics, pool, statistics
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.data.writers import Tell, Written
-from gaponet.data.writers.lerobot_stats import EpisodeStats, episode_stats, plain, pool
-from gaponet.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 Group = tuple[float, tuple[str, ...]]  # dt, channels
+FeatureStatistics = dict[str, Statistics]  # feature → of its samples
 
 FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults, at most
 USUAL_MB, SHARE = 2.0, 1 / 2000  # of a file, and of all bytes before it
@@ -58,7 +59,7 @@ class _Placed:
     file: int
 
 
-def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
+def write(dataset: Dataset, folder: Path, tell: Tell) -> list[Written]:
     """Write LeRobot sets: into the folder itself where one will do, else into folders named after rate.
 
     Raises:
@@ -100,7 +101,7 @@ class _Set:
 
     def write(self, tell: Tell) -> None:
         """Write all files."""
-        self._write_meta(pool([self._write_block(*block, tell) for block in enumerate(self._blocks())]))
+        self._write_meta(_pooled([self._write_block(*block, tell) for block in enumerate(self._blocks())]))
 
     def _blocks(self) -> Iterator[list[_Placed]]:
         """Episodes of whole data files that one file of meta/episodes lists; the journal alone decides the ends."""
@@ -127,7 +128,7 @@ class _Set:
         place.parent.mkdir(parents=True, exist_ok=True)
         return place
 
-    def _write_block(self, number: int, episodes: list[_Placed], tell: Tell) -> EpisodeStats:
+    def _write_block(self, number: int, episodes: list[_Placed], tell: Tell) -> FeatureStatistics:
         """Write data files and the file of meta/episodes; returns the statistics of their frames."""
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -146,14 +147,14 @@ class _Set:
                     )
                 assert writer is not None
                 writer.write_table(self._table(columns))
-                stats.append(episode_stats(columns))
+                stats.append({name: statistics(values) for name, values in columns.items()})
                 rows.append(_row(episode, number, stats[-1]))
                 tell(episode.entry.meta.motion)
         finally:
             if writer is not None:
                 writer.close()
         pq.write_table(pa.Table.from_pylist(rows), self._place("meta/episodes", number), compression="snappy")
-        return pool(stats)
+        return _pooled(stats)
 
     def _read(self, entry: Entry) -> Sequence:
         sequence = self.dataset.read(entry)
@@ -191,16 +192,16 @@ class _Set:
         ]  # fmt: skip
         return pa.table(arrays, schema=schema)
 
-    def _write_meta(self, stats: EpisodeStats) -> None:
+    def _write_meta(self, stats: FeatureStatistics) -> None:
         """Write what is of the whole set, with the statistics of all frames."""
         import pyarrow.parquet as pq
 
         meta = self.folder / "meta"
         pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
-        _write_json(meta / "info.json", self._info())
-        _write_json(meta / "stats.json", plain(stats))
+        write_json(meta / "info.json", self._info())
+        write_json(meta / "stats.json", stats)
         header = {k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header}
-        _write_json(meta / OURS, {
+        write_json(meta / OURS, {
             "format": 1, "robot": self.dataset.robot_name, "joint_names": self.dataset.joint_names, "dt": self.dt,
             "dataset_hash": dataset_hash(self.entries), "virtual": any(e.meta.virtual for e in self.entries),
             "dataset": header,
@@ -222,7 +223,11 @@ class _Set:
         }  # fmt: skip
 
 
-def _row(episode: _Placed, number: int, stats: EpisodeStats) -> dict[str, Any]:
+def _pooled(parts: list[FeatureStatistics]) -> FeatureStatistics:
+    return {name: pool([part[name] for part in parts]) for name in parts[0]}
+
+
+def _row(episode: _Placed, number: int, stats: FeatureStatistics) -> dict[str, Any]:
     """The episode's row in the file of meta/episodes that has this number."""
     entry, meta = episode.entry, asdict(episode.entry.meta)
     return {
@@ -238,23 +243,14 @@ def _row(episode: _Placed, number: int, stats: EpisodeStats) -> dict[str, Any]:
 
 
 def _task_table(tasks: dict[str, int]) -> pa.Table:
-    """task_index by task; the metadata make pandas take the text for the index, as LeRobot expects."""
+    """Return task_index by task; the metadata make pandas take the text for the index, as LeRobot expects."""
     import pyarrow as pa
 
-    column = {"metadata": None, "numpy_type": "int64", "pandas_type": "int64"}
-    text = {"metadata": None, "numpy_type": "object", "pandas_type": "unicode"}
-    pandas = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [
-            {"name": "task_index", "field_name": "task_index"} | column,
-            {"name": "task", "field_name": "task"} | text,
-        ],
-        "pandas_version": "2.0.0",
-    }
+    kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": pandas, "numpy_type": numpy, "metadata": None}
+        for name, (pandas, numpy) in kinds.items()
+    ]
+    header = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
     table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.string())})
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    path.write_text(json.dumps(value, indent=4, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+    return table.replace_schema_metadata({"pandas": json.dumps(header)})

@@ -13,29 +13,23 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.files import write_text
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import Dataset
-from gaponet.data.writers import Tell, Written
+from gaponet.data.store import Entry
 from gaponet.robot.spec import RobotSpec
 
 SHEET = True
 
 
-def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
-    """One motion folder per recording."""
-    written = []
-    for entry in dataset.entries:
-        sequence = dataset.read(entry)
-        place = Path("real") / dataset.robot_name / "gaponet" / entry.id
-        (folder / place).mkdir(parents=True)
-        state = {"positions": sequence.qpos, "velocities": sequence.qvel}
-        state |= {"torques": sequence.tau} if sequence.tau is not None else {}
-        for name, columns in (("control", {"positions": sequence.ctrl}), ("state_motor", state)):
-            values = [_in_log_units(kind, x, robot) for kind, x in columns.items()]
-            write_text(folder / place / f"{name}.csv", _text(name.upper(), sequence, list(columns), values))
-        write_text(folder / place / "joint_list.txt", "\n".join(sequence.joint_names) + "\n")
-        written.append(Written(place, 1, len(sequence), sequence.rate))
-        tell(entry.meta.motion)
-    return written
+def write_recording(entry: Entry, sequence: Sequence, robot: RobotSpec, folder: Path) -> Path:
+    """Write one motion folder."""
+    place = Path("real") / robot.name / "gaponet" / entry.id
+    (folder / place).mkdir(parents=True)
+    state = {"positions": sequence.qpos, "velocities": sequence.qvel}
+    state |= {"torques": sequence.tau} if sequence.tau is not None else {}
+    for name, columns in (("control", {"positions": sequence.ctrl}), ("state_motor", state)):
+        values = [_in_log_units(kind, x, robot) for kind, x in columns.items()]
+        write_text(folder / place / f"{name}.csv", _text(name.upper(), sequence, list(columns), values))
+    write_text(folder / place / "joint_list.txt", "\n".join(sequence.joint_names) + "\n")
+    return place
 
 
 def _in_log_units(kind: str, values: Array, robot: RobotSpec) -> Array:
