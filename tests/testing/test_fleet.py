@@ -1,6 +1,5 @@
-import shutil
 import tomllib
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -8,26 +7,22 @@ import pytest
 from gaponet.base.errors import UsageError
 from gaponet.experiments.virtual.goals import GoalPlanner
 from gaponet.robot.spec import load_robot
-from gaponet.testing import fleet as fleets
-from gaponet.testing.fleet import FLEETS, UNITS_MARKER, load_fleet, sample_unit, to_toml
+from gaponet.testing.fleet import FLEETS, load_fleet
 from gaponet.testing.physics import EFFECTS, Physics, neutral
 from gaponet.testing.virtual_robot import VirtualRobot
 
-NAMES = ("easy", "hard", "shifted")
+DIGESTS = {"easy": "470699a7d760", "hard": "1d49d40c608d", "shifted": "d2cc972792f1", "unnamed": "6e07b3021441"}
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_saved_units_are_what_the_distributions_and_the_seed_give(name):
-    robot = load_robot("h1_2")
-    fleet = load_fleet(name, robot)
+@pytest.mark.parametrize("name", DIGESTS)
+def test_units_of_a_seed_do_not_change(name):
+    """Data sets name this hash: other numbers, as of another random generator, would make another fleet of them."""
+    fleet = load_fleet(name, load_robot("h1_2"))
+    assert fleet.digest() == DIGESTS[name]
     assert list(fleet.units) == ["virtual-1", "virtual-2", "virtual-3", "virtual-4"]
-    for k, unit in enumerate(fleet.units.values(), 1):
-        again = sample_unit(robot, fleet.distributions, fleet.seed, k)
-        for f in fields(Physics):
-            assert np.array_equal(getattr(unit, f.name), getattr(again, f.name)), f.name
 
 
-@pytest.mark.parametrize("name", [*NAMES, "unnamed"])
+@pytest.mark.parametrize("name", DIGESTS)
 def test_every_number_has_a_source_and_the_file_says_virtual(name):
     table = tomllib.loads((FLEETS / f"{name}.toml").read_text(encoding="utf-8"))
     assert table["virtual"] is True
@@ -102,24 +97,6 @@ def test_switching_all_effects_off_leaves_nothing():
     assert np.array_equal(kept.backlash, unit.backlash)
 
 
-def test_a_fleet_can_be_written_and_read(arm, tmp_path):
-    head = (FLEETS / "easy.toml").read_text(encoding="utf-8").split("\n# ---- drawn units ----\n")[0]
-    fleet = load_fleet("easy", arm)
-    file = tmp_path / "mine.toml"
-    file.write_text(
-        head.replace('name = "easy"', 'name = "mine"') + to_toml(arm, fleet.units, fleet.distributions),
-        encoding="utf-8",
-    )
-    assert load_fleet(file, arm).digest() == fleet.digest()
-
-
-def test_units_that_are_sampled_again_are_the_stored_ones(tmp_path, monkeypatch):
-    shutil.copyfile(FLEETS / "easy.toml", tmp_path / "easy.toml")
-    monkeypatch.setattr(fleets, "FLEETS", tmp_path)
-    fleets.main("easy", "h1_2")
-    assert (tmp_path / "easy.toml").read_text() == (FLEETS / "easy.toml").read_text()
-
-
 def test_errors_say_what_there_is(arm, tmp_path):
     with pytest.raises(
         UsageError,
@@ -144,22 +121,13 @@ def test_errors_say_what_there_is(arm, tmp_path):
         ("type_spread = 0.03", "type_spread = nan", r"distribution\[0\]\.type_spread: should be"),
         ("low = 0.6", "lov = 0.6", r"distribution\[0\]\.lov: is not a known field"),
         ('name = "kd_scale"', 'name = "kp_scale"', "names 'kp_scale' twice"),
-        ("mean = 0.89", "mean = -5.0\nlow = -9.0", "(already defined|Cannot overwrite|kp_scale is )"),
+        ("mean = 0.01\nunit_spread = 0.002\nlow = 0.002", "mean = 3600.0", "unit 'virtual-1': delay is "),
+        ("mean = 0.01\nunit_spread = 0.002\nlow = 0.002", "mean = -0.1", "unit 'virtual-1': delay is "),
+        ("mean = 0.002\nunit_spread = 0.0005", "mean = 2.0", "unit 'virtual-1': drop is "),
     ],
 )
 def test_a_fleet_of_numbers_that_no_robot_has_is_refused_with_file_and_field(arm, tmp_path, old, new, said):
     file = tmp_path / "mine.toml"
     file.write_text((FLEETS / "easy.toml").read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8")
     with pytest.raises(UsageError, match=rf"mine\.toml: .*{said}"):
-        load_fleet(file, arm)
-
-
-@pytest.mark.parametrize(("parameter", "value"), [("delay", 3600.0), ("delay", -0.1), ("drop", 2.0)])
-def test_a_unit_that_cannot_be_is_refused(arm, tmp_path, parameter, value):
-    drawn = load_fleet("easy", arm)
-    units = {u: replace(p, **{parameter: np.array([value])}) for u, p in drawn.units.items()}
-    file = tmp_path / "mine.toml"
-    head = (FLEETS / "easy.toml").read_text(encoding="utf-8").split(UNITS_MARKER)[0]
-    file.write_text(head + UNITS_MARKER + to_toml(arm, units, drawn.distributions), encoding="utf-8")
-    with pytest.raises(UsageError, match=rf"mine\.toml: unit 'virtual-1': {parameter} is \[{value}\]"):
         load_fleet(file, arm)
