@@ -93,16 +93,6 @@ def test_a_row_is_the_state_before_its_command(whole, spec):
     assert told < moved < told + 15
 
 
-def test_events_tell_begin_and_end(whole):
-    dataset = Dataset(whole[0])
-    for entry in dataset.entries:
-        events = entry.meta.notes["events"]
-        assert events[0] == {"time": 0.0, "kind": "motion_start"}
-        assert events[-1] == {"time": pytest.approx(entry.rows * entry.dt), "kind": "motion_end"}
-        assert all(e["kind"] in ("packet_lost", "torque_limit", "hot") for e in events[1:-1])
-    assert any(e["kind"] == "packet_lost" for entry in dataset.entries for e in entry.meta.notes["events"])
-
-
 def test_repetitions_differ_a_little(whole):
     dataset = Dataset(whole[0])
     same = [e for e in dataset.entries if e.meta.motion == "tour-all-0" and e.dt == 0.02 and e.meta.payload_mass == 0.2]

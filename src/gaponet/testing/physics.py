@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-
-Array = np.ndarray
 
 
 def _joint(effect: str, neutral: float, unit: str) -> dict[str, Any]:

@@ -5,12 +5,12 @@ It is used like a robot: send targets for one control period, then read encoders
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, expand_differences
 from gaponet.sim.model import build_model, qpos_range, stiffen_friction
@@ -30,23 +30,11 @@ from gaponet.testing.motor import (
 )
 from gaponet.testing.physics import Physics, stack
 
-Array = np.ndarray
-
 MAX_PHYSICS_STEP_S = 0.001
 MAX_EFFECT_PERIOD_S = 0.002  # of the hidden effects; bristles and current loops are evaluated at every physics step
 NOISE_PERIODS = 50  # control periods of noise that are sampled at a time
-HOT_WINDING = 80.0  # °C above which a unit reports "hot"
 REST_STD = 0.1  # of the friction band: a joint that always arrives in the same way stops in nearly the same place
 SETTLING_STEPS = 40  # each reduces the error by gravity stiffness / kp, 0.4 at worst on H1-2
-
-
-@dataclass(frozen=True)
-class UnitEvent:
-    """Event that a unit reports beside its readings: kind is packet_lost, torque_limit or hot."""
-
-    time: float  # s since reset
-    kind: str
-    joint: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,7 +58,6 @@ class VirtualRobot:
         dt: float | None = None,
         timestep: float | None = None,
         locked: tuple[str, ...] = (),
-        nthread: int = 1,
     ) -> None:
         """
         Args:
@@ -80,7 +67,6 @@ class VirtualRobot:
             dt: Control period, s; default the robot's.
             timestep: Physics step, s; default the largest one up to 1 ms that divides dt.
             locked: Joints clamped at home (sim.model.idle_joints).
-            nthread: Threads; 0 for all cores.
         """
         self.robot = robot
         self.dt = robot.dt if dt is None else dt
@@ -94,7 +80,7 @@ class VirtualRobot:
         self.substeps = 1 if stiff else _substeps(self.decimation, self.timestep)
         self.all_joints = stack(units, np.arange(len(robot.joint_names)))
         models = _models(robot, units, payloads, self.dt, self.timestep, locked)
-        model, b, p = models[0], Batch(models[0], nsim=len(units), nthread=nthread), self.physics
+        model, b, p = models[0], Batch(models[0], nsim=len(units), nthread=1), self.physics
         self.batch = b
         expand_differences(b, models)
         self.num_envs, self.n = len(units), len(robot.joint_names)
@@ -104,9 +90,6 @@ class VirtualRobot:
         self._gain, self._bias = b.expand("actuator_gainprm"), b.expand("actuator_biasprm")
         self._range, self._frictionloss = b.expand("actuator_forcerange"), b.expand("dof_frictionloss")
         self._applied, self._force = b.bind("qfrc_applied"), b.bind("actuator_force")
-        self._cogs, self._fast = bool((p.cogging != 0).any()), bool(np.isfinite(p.no_load_speed).any())
-        self._thins, self._lags = bool((p.thinning != 0).any()), bool((p.current_time > 0).any())
-        self._churns = bool((p.churning > 0).any())
         self._damping = b.expand("dof_damping")
         self._cold_damping, self._thinning = self._damping.copy(), np.ones((1, 1))
         self._nominal_friction = model.dof_frictionloss.copy()
@@ -114,7 +97,10 @@ class VirtualRobot:
         self._kd = robot.kd[self.active] * p.kd_scale
         self._added = np.zeros_like(self._kp)
         self._effort = robot.effort_limit[self.active]
-        self._compliance, self._twists = p.windup / self._effort, bool((p.windup > 0).any())  # rad per N·m
+        self._compliance = p.windup / self._effort  # rad per N·m
+        # Effects that most fleets lack cost a tenth of the time each step.
+        self._fast, self._lags = bool(np.isfinite(p.no_load_speed).any()), bool((p.current_time > 0).any())
+        self._twists = bool((p.windup > 0).any())
         self._limits = qpos_range(model)
         self.backlash = Backlash(p, model.dof_armature)
         self.bristles = Bristles(p, self._nominal_friction)
@@ -126,8 +112,6 @@ class VirtualRobot:
         self._idle_temperature = np.zeros((self.num_envs, self.n))
         self._noise, self._chance, self._row, self._now = np.zeros(0), np.zeros(0), NOISE_PERIODS, 0.0
         self._rng: list[np.random.Generator] = []
-        self.events: list[list[UnitEvent]] = []
-        self._reported = np.zeros((2, *self._kp.shape), bool)
 
     def reset(self, ctrl: Array, seeds: list[int], warmth: Array | float = 0.0, start: Array | None = None) -> None:
         """Put the robots at rest under a command, as before a recording.
@@ -161,8 +145,6 @@ class VirtualRobot:
         self.bristles.reset(self._passed - load, self._friction_limit(self._passed))
         self.backlash.reset(self._motor_torque())
         self._squares = np.zeros_like(target)
-        self.events = [[] for _ in seeds]
-        self._reported = np.zeros((2, *target.shape), bool)
 
     def set_gains(self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0) -> None:
         """Set the drives to other gains than the robot's, (n) or (N, n); each drive delivers its kp_scale and kd_scale.
@@ -202,7 +184,7 @@ class VirtualRobot:
 
     def _friction_limit(self, torque: Array) -> Array:
         """Return the present friction limit under a motor torque at the joint, (N, active), N·m."""
-        dry = self._nominal_friction + (self.couplings.drag(self._qpos) if self.couplings.drags else 0.0)
+        dry = self._nominal_friction + self.couplings.drag(self._qpos)
         return friction_limit(self.physics, dry, self._qvel, torque, self._push, self._thinning)
 
     def _motor_torque(self) -> Array:
@@ -228,9 +210,8 @@ class VirtualRobot:
         factor = kt * self._gain_factor()
         self._max_torque = self._effort * kt * np.minimum(self._supply, 1.0)
         self._range[:, :, 1], self._range[:, :, 0] = self._max_torque, -self._max_torque
-        if self._thins:
-            self._thinning = self.thermal.thinning_factor()
-            self._damping[:] = self._cold_damping * self._thinning
+        self._thinning = self.thermal.thinning_factor()
+        self._damping[:] = self._cold_damping * self._thinning
         kp, kd, added = self._kp * factor, self._kd * factor, self._added * factor
         for k in range(count):
             target = self.link.read(self._now + k * period)
@@ -248,7 +229,6 @@ class VirtualRobot:
                 self._passed = self._force.copy()
                 self._twist = self._compliance * (self._passed - self._push)
         self._end_period(count)
-        self._report(range(self.num_envs) if rows is None else rows.tolist())
         self._now += self.dt
         self._row += 1
 
@@ -270,44 +250,21 @@ class VirtualRobot:
         if self._fast:
             self._range[:, :, 1] = self._max_torque * speed_factor(self.physics, self._qvel)
             self._range[:, :, 0] = -self._max_torque * speed_factor(self.physics, -self._qvel)
-        self._friction(joint_torque, period)
-
-    def _friction(self, joint_torque: Array, period: float) -> None:
-        """Set friction limits and applied torques."""
         limit = self._friction_limit(joint_torque)
-        ripple = cogging_torque(self.physics, self._qpos) if self._cogs else 0.0
-        if self._churns:
-            ripple = ripple - self.physics.churning * self._qvel * np.abs(self._qvel)
+        self._applied[:] = -self.physics.churning * self._qvel * np.abs(self._qvel)
+        self._applied += cogging_torque(self.physics, self._qpos)
         if self.bristles.any:
-            self._applied[:] = ripple - self.bristles.step(limit, self._qvel, period)
-            self._frictionloss[:] = np.where(self.bristles.soft, 0.0, limit)
-            return
+            self._applied -= self.bristles.step(limit, self._qvel, period)
+            limit = np.where(self.bristles.soft, 0.0, limit)
         self._frictionloss[:] = limit
-        if self._cogs or self._churns:
-            self._applied[:] = ripple
 
     def _end_period(self, count: int) -> None:
         """Advance temperatures and supply by a control period with `count` effect periods."""
         squares = self._squares / count
         self.thermal.step(squares, self.dt)
         work = np.maximum(self._motor_torque() * self._qvel, 0.0)
-        if self.couplings.limits:
-            self._chain_gain = self.couplings.gain_factor(self._motor_torque())
+        self._chain_gain = self.couplings.gain_factor(self._motor_torque())
         self._supply = supply_factor(self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True))
-
-    def _report(self, rows: Iterable[int]) -> None:
-        """Add events: lost packets, and joints that reach their torque limit or get hot (once until they leave it)."""
-        lost = self._chance[:, self._row, 1] < self.physics.drop[:, 0]
-        now = np.stack([np.abs(self._motor_torque()) >= self._effort, self.thermal.winding > HOT_WINDING])
-        new, self._reported = now & ~self._reported, now
-        if not (lost.any() or new.any()):
-            return
-        for i in rows:
-            if lost[i]:
-                self.events[i].append(UnitEvent(round(self._now, 4), "packet_lost"))
-            for kind, column in zip(*np.nonzero(new[:, i]), strict=True):
-                joint = self.robot.joint_names[self.active[column]]
-                self.events[i].append(UnitEvent(round(self._now, 4), ("torque_limit", "hot")[kind], joint))
 
     def _sample_noise(self) -> None:
         """Sample noise (N, periods, 3, n) and chances of jitter and loss (N, periods, 2)."""
