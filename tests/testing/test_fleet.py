@@ -8,7 +8,7 @@ from gaponet.base.errors import UsageError
 from gaponet.experiments.virtual.goals import GoalPlanner
 from gaponet.robot.spec import load_robot
 from gaponet.testing.fleet import FLEETS, load_fleet
-from gaponet.testing.physics import EFFECTS, Physics, neutral
+from gaponet.testing.physics import Physics, neutral
 from gaponet.testing.virtual_robot import VirtualRobot
 
 DIGESTS = {"easy": "470699a7d760", "hard": "1d49d40c608d", "shifted": "d2cc972792f1", "unnamed": "6e07b3021441"}
@@ -88,13 +88,12 @@ def test_a_robot_that_the_file_does_not_hold_is_drawn_from_the_same_distribution
     assert 0.005 * 5 < a.unit("virtual-1").friction.mean() < 0.05 * 5  # parts of the 5 N·m limit
 
 
-def test_switching_all_effects_off_leaves_nothing():
-    unit = load_fleet("shifted", load_robot("h1_2")).unit("virtual-1")
-    off, none = unit.without(*EFFECTS), neutral(27)
-    assert all(np.array_equal(getattr(off, f.name), getattr(none, f.name)) for f in fields(Physics))
-    kept = unit.without("friction")
-    assert (kept.friction == 0).all()
-    assert np.array_equal(kept.backlash, unit.backlash)
+def test_an_effect_alone_leaves_nothing_of_the_others():
+    unit, none = load_fleet("shifted", load_robot("h1_2")).unit("virtual-1"), neutral(27)
+    alone = unit.only(["backlash"])
+    for f in fields(Physics):
+        kept = unit if f.name == "backlash" else none
+        assert np.array_equal(getattr(alone, f.name), getattr(kept, f.name)), f.name
 
 
 def test_errors_say_what_there_is(arm, tmp_path):
@@ -106,7 +105,7 @@ def test_errors_say_what_there_is(arm, tmp_path):
     with pytest.raises(UsageError, match="fleet 'easy' has no unit 'robot-7'; it has virtual-1, virtual-2"):
         load_fleet("easy", arm).unit("robot-7")
     with pytest.raises(UsageError, match="effect 'magic' is unknown; effects are gain, torque_constant"):
-        neutral(2).without("magic")
+        neutral(2).only(["magic"])
     file = tmp_path / "bad.toml"
     file.write_text('seed = 1\n[[distribution]]\nname = "charm"\nmean = 1\nsource = "none"\n')
     with pytest.raises(UsageError, match=r"bad.toml: \[\[distribution\]\] names 'charm' twice, or not one of kp_scale"):

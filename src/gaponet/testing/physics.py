@@ -129,11 +129,6 @@ class Physics:
         }
         return replace(self, **off)
 
-    def without(self, *effects: str) -> Physics:
-        """Return the unit with these effects switched off."""
-        self.only(effects)  # raises an error for an unknown effect
-        return self.only([e for e in EFFECTS if e not in effects])
-
 
 EFFECTS: tuple[str, ...] = tuple(dict.fromkeys(f.metadata["effect"] for f in fields(Physics)))
 

@@ -58,6 +58,7 @@ class VirtualRobot:
         dt: float | None = None,
         timestep: float | None = None,
         locked: tuple[str, ...] = (),
+        nthread: int = 1,
     ) -> None:
         """
         Args:
@@ -67,6 +68,7 @@ class VirtualRobot:
             dt: Control period, s; default the robot's.
             timestep: Physics step, s; default the largest one up to 1 ms that divides dt.
             locked: Joints clamped at home (sim.model.idle_joints).
+            nthread: Threads; 0 for all cores.
         """
         self.robot = robot
         self.dt = robot.dt if dt is None else dt
@@ -80,7 +82,7 @@ class VirtualRobot:
         self.substeps = 1 if stiff else _substeps(self.decimation, self.timestep)
         self.all_joints = stack(units, np.arange(len(robot.joint_names)))
         models = _models(robot, units, payloads, self.dt, self.timestep, locked)
-        model, b, p = models[0], Batch(models[0], nsim=len(units), nthread=1), self.physics
+        model, b, p = models[0], Batch(models[0], nsim=len(units), nthread=nthread), self.physics
         self.batch = b
         expand_differences(b, models)
         self.num_envs, self.n = len(units), len(robot.joint_names)
