@@ -316,7 +316,7 @@ def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path,
         assert facts["plain"]["elbow"]["kp"] == 20.0
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "newton/robot.xml")).nu == 0
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "mjlab/robot.xml")).nu == 2
-    for to in ("mjlab", "isaaclab", "newton", "drake"):
+    for to in ("newton", "drake"):
         compile((tmp_path / to / "robot_cfg.py").read_text(), to, "exec")
     assert main(["export", str(robot.folder), "--to", "torch"]) == 2
     assert "is a robot, which has no network" in capsys.readouterr().err

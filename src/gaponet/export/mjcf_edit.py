@@ -13,17 +13,16 @@ import os
 import re
 import shutil
 import xml.parsers.expat as expat
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError
 from gaponet.base.files import lock_folder
-from gaponet.export.simulator_facts import Joints, ServoFacts
+from gaponet.export.simulator_facts import Joints
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import PAYLOAD_DENSITY, STIFF_SOLIMP, STIFF_SOLREF, TABLE, TOLERANCE, build_model
@@ -138,9 +137,19 @@ class Source:
             out[file] = out[file][:start] + new + out[file][end:]
         return out
 
-    def one(self, what: str, matches: Callable[[Tag], bool]) -> Tag | None:
-        """Return the only element that matches, None if there is none; refuse several."""
-        tags = [tag for tag in self.tags if matches(tag)]
+    def one(self, what: str, kind: str, **attribute: str) -> Tag | None:
+        """Return the only element with an attribute, None if there is none; refuse several.
+
+        Args:
+            kind: Name of the element, or "actuator/" for any element in an <actuator>.
+        """
+        tags = [
+            tag
+            for tag in self.tags
+            if kind == ("actuator/" if tag.parent == "actuator" else tag.name)
+            and tag.parent != "equality"
+            and attribute.items() <= tag.attributes.items()
+        ]
         if len(tags) > 1:
             raise RobotError(f"{self.main}: has {len(tags)} {what}; one is needed. Delete or rename the others")
         return tags[0] if tags else None
@@ -185,16 +194,16 @@ def edit_mjcf(
     source, added, not_rad = Source(path), list[str](), list[str]()
     for name, servo in joints.items():
         full = prefix + name
-        tag = source.one(f"joints '{full}'", partial(_is_joint, name=full))
+        tag = source.one(f"joints '{full}'", "joint", name=full)
         if tag is None:
             names = ", ".join(before.joint(i).name for i in range(before.njnt))
             raise RobotError(
                 f"{path}: has no joint '{full}' in its text (--prefix is the text before names); it has {names}"
             )
-        actuator = source.one(f"servos of '{full}'", partial(_drives, joint=full))
+        actuator = source.one(f"servos of '{full}'", "actuator/", joint=full)
         if actuator is not None and name not in robot.operated:
             continue
-        changed = {f: text_of(servo[f]) for f in JOINT_ATTRIBUTES}  # type: ignore[literal-required]
+        changed = {f: text_of(servo[f]) for f in JOINT_ATTRIBUTES}
         if servo["zero"]:
             ref = before.qpos0[before.joint(full).qposadr[0]] - servo["zero"]
             changed["ref"] = text_of(math.degrees(ref) if spec.compiler.degree else ref)
@@ -216,15 +225,7 @@ def edit_mjcf(
     return target, source.difference(), tuple(not_rad)
 
 
-def _is_joint(tag: Tag, name: str) -> bool:
-    return tag.name == "joint" and tag.attributes.get("name") == name and tag.parent != "equality"
-
-
-def _drives(tag: Tag, joint: str) -> bool:
-    return tag.parent == "actuator" and tag.attributes.get("joint") == joint
-
-
-def _servo(servo: ServoFacts, samples: int, own: dict[str, str]) -> str:
+def _servo(servo: dict[str, Any], samples: int, own: dict[str, str]) -> str:
     """Return a servo as a <general> actuator.
 
     Args:
@@ -270,7 +271,7 @@ def _add_surroundings(
     option = {"tolerance": text_of(TOLERANCE)} if model.opt.tolerance > TOLERANCE else {}
 
     def body(name: str, what: str) -> Tag:
-        tag = source.one(f"bodies '{name}'", lambda t: t.name == "body" and t.attributes.get("name") == name)
+        tag = source.one(f"bodies '{name}'", "body", name=name)
         if tag is None:
             raise RobotError(f"{source.main}: a [[{what}]] names body '{name}', which is not in its text")
         return tag
