@@ -24,7 +24,7 @@ from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import Finding
 from gaponet.robot.new import RobotOptions, new_robot
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import PayloadMount, RobotSpec
 from gaponet.sim.dynamics import gravity_of
 
 MOTIONS, SECONDS = 8, 18.0
@@ -180,9 +180,10 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place)
             (folder / "vendor.xml").write_text(robot.file())
-            mounts = (f"hand={robot.bodies[-1]}:0,0,0",) if robot.payload else ()
-            wanted = RobotOptions(rate=robot.rate, mounts=mounts, name="stranger", joints=robot.joints)
+            wanted = RobotOptions(rate=robot.rate, name="stranger", joints=robot.joints)
             spec = new_robot(folder / "vendor.xml", folder / "robot", wanted).robot
+            if robot.payload:
+                spec = replace(spec, payload_mounts=(PayloadMount("hand", robot.bodies[-1], (0.0, 0.0, 0.0)),))
             robot = replace(robot, joints=spec.joint_names) if "/" not in robot.joints[0] else robot
             logs = list(robot.recordings(MOTIONS, MOTIONS * SECONDS))
             good = examine(robot, spec, logs, folder / "good")

@@ -68,7 +68,7 @@ def tested(spec: RobotSpec, plain: RobotSpec, robot: Path, exported: Path) -> No
     facts = read(exported / "facts.json")
     forms = {"in gaponet": rollout_error(motions, spec), "in gaponet, without the law": rollout_error(motions, plain)}
     for form, what in (("joints", "MJCF with servo_law.py"), ("plain", "MJCF alone")):
-        forms[what] = exporting._played(exported / facts["file"], facts, motions, spec, form)
+        forms[what] = exporting._error_in_mujoco(exported / facts["file"], facts, motions, spec, form)
     print(f"\n{len(motions)} test motions: " + ", ".join(f"{k} {1e3 * x:.2f} mrad" for k, x in forms.items()))
 
 
@@ -98,7 +98,7 @@ def main(
         notes_file = work / f"{to}.json"
         if not notes_file.is_file():
             made = exporting.export_robot(spec, to, work / to, recordings, payload_mass=mass)
-            write_text(notes_file, json.dumps({"left": made.left, "notes": made.notes}))
+            write_text(notes_file, json.dumps({"notes": made.notes}))
         notes = [n for n in json.loads(notes_file.read_text())["notes"] if "met something" not in n]
         for name, (_, check, package) in ((n, c) for n, c in CHECKS.items() if c[0] == to):
             got = checked(environments / name / "bin" / "python", check, package, work / to)

@@ -259,7 +259,7 @@ def test_a_delay_buffer_of_five_lines_is_mujocos_own_delay(robot, tmp_path):
 
 
 def test_the_nearest_servos_without_a_law_are_nearer_than_those_with_the_law_struck_out(lawful):
-    motions = [s.rows(slice(0, 250)) for s in own_motions(lawful, count=4)]
+    motions = [s.rows(slice(0, 150)) for s in own_motions(lawful, count=4)]
     struck = lawful.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND})
     plain = fit_plain_servos(lawful, motions[:2])
     assert not plain.has_servo_model

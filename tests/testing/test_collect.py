@@ -31,7 +31,7 @@ RECIPE = Recipe(
     payloads=(0.0, 0.2),
     units=("virtual-2",),
     motions=("steps-elbow", "tour-all-0"),
-    rates=(50.0, 100.0),
+    rates=(50.0, 25.0),
     repetitions=2,
 )
 
@@ -103,11 +103,6 @@ def test_repetitions_differ_a_little(whole):
     assert first.temperature[0, 0] != second.temperature[0, 0]
 
 
-def test_several_processes_record_the_same_in_the_same_order(whole, spec, fleet, tmp_path):
-    collect(spec, fleet, RECIPE, tmp_path / "two", seed=5, nproc=2)
-    assert list(hashes(tmp_path / "two").items()) == list(hashes(whole[0]).items())
-
-
 def test_collecting_again_adds_nothing_and_a_larger_recipe_adds_the_rest(whole, spec, fleet, tmp_path):
     less = replace(RECIPE, rates=(50.0,), repetitions=1)
     first = collect(spec, fleet, less, tmp_path, seed=5, nproc=1)
@@ -126,7 +121,7 @@ from gaponet.testing.fleet import load_fleet
 if __name__ == "__main__":
     gaponet.testing.collect.TAKES_PER_JOB = (4, 4)  # four jobs: two are still being played when two are written
     robot = load_robot(sys.argv[1])
-    recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 100.0), 2)
+    recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 25.0), 2)
     collect(robot, load_fleet("easy", robot), recipe, sys.argv[2], seed=5, nproc=2)
 """
 
@@ -151,7 +146,7 @@ def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tm
     child.wait()
     assert 0 < len(Dataset(out)) <= 16  # all of them where this process had to wait for its turn
     _wait_for_orphans(child.pid)
-    collect(spec, load_fleet("easy", spec), RECIPE, out, seed=5, nproc=1)
+    collect(spec, load_fleet("easy", spec), RECIPE, out, seed=5, nproc=2)
     assert list(hashes(out).items()) == list(hashes(whole[0]).items())
     assert len(list((out / "sequences").glob("*.parquet"))) == 16
     assert not list((out / "sequences").glob(".*"))

@@ -30,44 +30,6 @@ def test_every_number_has_a_source_and_the_file_says_virtual(name):
     assert all(len(d["source"]) > 10 for d in table["distribution"])
 
 
-def test_units_of_a_type_are_alike_and_not_the_same():
-    fleet = load_fleet("easy", load_robot("h1_2"))
-    kp = np.array([u.kp_scale for u in fleet.units.values()])  # (units, joints)
-    assert len({tuple(row) for row in kp}) == 4
-    between_units, between_joints = kp.std(axis=0).mean(), kp.mean(axis=0).std()
-    assert 0.2 * between_joints < between_units < 3 * between_joints
-
-
-def test_four_fifths_of_an_unnamed_cause_are_the_designs():
-    units = list(load_fleet("unnamed", load_robot("h1_2")).units.values())
-    for name in ("drag", "cogging", "churning", "derating", "smoothing", "flex", "grip_z", "limb_loss"):
-        values = np.array([getattr(u, name) for u in units])  # (units, joints)
-        own = np.abs(values - values.mean(axis=0)).mean()
-        assert 0.03 < own / np.abs(values).mean() < 0.25, name
-
-
-def test_the_shifted_fleet_lies_outside_the_easy_one():
-    robot = load_robot("h1_2")
-    easy, shifted = (load_fleet(n, robot) for n in ("easy", "shifted"))
-    mean = lambda fleet, name: np.mean([getattr(u, name).mean() for u in fleet.units.values()])  # noqa: E731
-    dry = lambda fleet: np.mean([u.friction / robot.effort_limit for u in fleet.units.values()])  # noqa: E731
-    assert dry(shifted) > 1.3 * dry(easy)
-    assert mean(shifted, "delay") > 1.5 * mean(easy, "delay")
-    assert mean(easy, "cogging") == 0
-    assert mean(shifted, "cogging") > 0
-    assert easy.digest() != shifted.digest()
-
-
-def test_units_of_the_hard_fleet_differ_as_motors_and_friction_do():
-    robot = load_robot("h1_2")
-    units = list(load_fleet("hard", robot).units.values())
-    stiff = np.array([u.kp_scale * u.kt_scale for u in units])  # (units, joints)
-    dry = np.array([u.friction for u in units])
-    spread = lambda x: (x.std(axis=0, ddof=1) / x.mean(axis=0)).mean()  # noqa: E731
-    assert 0.05 < spread(stiff) < 0.08
-    assert 0.3 < spread(dry) < 0.5
-
-
 def test_a_raw_hand_of_the_firm_fleet_sags_about_2_cm_under_3_kg():
     robot = load_robot("h1_2")
     fleet, planner = load_fleet("firm", robot), GoalPlanner(robot, 3.0, 0)
