@@ -143,13 +143,9 @@ class Source:
         Args:
             kind: Name of the element, or "actuator/" for any element in an <actuator>.
         """
-        tags = [
-            tag
-            for tag in self.tags
-            if kind == ("actuator/" if tag.parent == "actuator" else tag.name)
-            and tag.parent != "equality"
-            and attribute.items() <= tag.attributes.items()
-        ]
+        kinds = {"actuator": "actuator/", "equality": ""}  # parent → kind; else the element's name
+        same = [tag for tag in self.tags if kinds.get(tag.parent, tag.name) == kind]
+        tags = [tag for tag in same if attribute.items() <= tag.attributes.items()]
         if len(tags) > 1:
             raise RobotError(f"{self.main}: has {len(tags)} {what}; one is needed. Delete or rename the others")
         return tags[0] if tags else None
@@ -196,10 +192,9 @@ def edit_mjcf(
         full = prefix + name
         tag = source.one(f"joints '{full}'", "joint", name=full)
         if tag is None:
-            names = ", ".join(before.joint(i).name for i in range(before.njnt))
-            raise RobotError(
-                f"{path}: has no joint '{full}' in its text (--prefix is the text before names); it has {names}"
-            )
+            have = ", ".join(before.joint(i).name for i in range(before.njnt))
+            what = f"has no joint '{full}' in its text (--prefix is the text before names)"
+            raise RobotError(f"{path}: {what}; it has {have}")
         actuator = source.one(f"servos of '{full}'", "actuator/", joint=full)
         if actuator is not None and name not in robot.operated:
             continue
@@ -322,20 +317,14 @@ def _require(
     now: mujoco.MjModel, before: mujoco.MjModel, joints: Joints, robot: RobotSpec, prefix: str, path: Path
 ) -> None:
     """Refuse a copy that lacks the wanted servos, or another element of the original."""
-    wrong = [
-        f"{f} {getattr(before, f)} → {getattr(now, f)}"
-        for f in UNCHANGED_COUNTS
-        if getattr(before, f) != getattr(now, f)
-    ]
+    counts = {f: (getattr(before, f), getattr(now, f)) for f in UNCHANGED_COUNTS}
+    wrong = [f"{f} {old} → {new}" for f, (old, new) in counts.items() if old != new]
     for name in robot.operated:
-        servo, joint = joints[name], now.joint(prefix + name)
-        i = _actuator(now, prefix + name)
-        actual = [now.dof_armature[joint.dofadr[0]], np.ravel(now.dof_damping[joint.dofadr[0]])[0],
-                  now.dof_frictionloss[joint.dofadr[0]], now.actuator_gainprm[i, 0], *now.actuator_biasprm[i, :3],
-                  now.actuator_forcerange[i, 1]]  # fmt: skip
-        kp = servo["kp"]
-        wanted = [servo["armature"], servo["damping"], servo["frictionloss"], kp, kp * servo["offset"], -kp,
-                  -servo["kd"], servo["effort_limit"]]  # fmt: skip
+        servo, dof, i = joints[name], now.joint(prefix + name).dofadr[0], _actuator(now, prefix + name)
+        passive = [float(np.ravel(getattr(now, f"dof_{field}")[dof])[0]) for field in JOINT_ATTRIBUTES]
+        actual = [*passive, now.actuator_gainprm[i, 0], *now.actuator_biasprm[i, :3], now.actuator_forcerange[i, 1]]
+        kp, bias = servo["kp"], servo["kp"] * servo["offset"]
+        wanted = [*(servo[f] for f in JOINT_ATTRIBUTES), kp, bias, -kp, -servo["kd"], servo["effort_limit"]]
         if not np.allclose(actual, wanted, rtol=1e-5, atol=1e-9):
             wrong.append(f"{name}: {np.round(actual, 6)} instead of {np.round(wanted, 6)}")
     if wrong:

@@ -14,20 +14,7 @@ from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, expand_differences
 from gaponet.sim.model import build_model, qpos_range, stiffen_friction
-from gaponet.testing.motor import (
-    Backlash,
-    Bristles,
-    CommandLink,
-    Couplings,
-    Firmware,
-    Thermal,
-    cogging_torque,
-    derating_factor,
-    friction_limit,
-    quantised,
-    speed_factor,
-    supply_factor,
-)
+from gaponet.testing import motor
 from gaponet.testing.physics import Physics, stack
 
 MAX_PHYSICS_STEP_S = 0.001
@@ -104,11 +91,11 @@ class VirtualRobot:
         self._fast, self._lags = bool(np.isfinite(p.no_load_speed).any()), bool((p.current_time > 0).any())
         self._twists = bool((p.windup > 0).any())
         self._limits = qpos_range(model)
-        self.backlash = Backlash(p, model.dof_armature)
-        self.bristles = Bristles(p, self._nominal_friction)
-        self.thermal = Thermal(p)
-        self.link, self.firmware = CommandLink(p, self.dt), Firmware(p)
-        self.couplings = Couplings(p, model, b, self._effort)
+        self.backlash = motor.Backlash(p, model.dof_armature)
+        self.bristles = motor.Bristles(p, self._nominal_friction)
+        self.thermal = motor.Thermal(p)
+        self.link, self.firmware = motor.CommandLink(p, self.dt), motor.Firmware(p)
+        self.couplings = motor.Couplings(p, model, b, self._effort)
         self._supply = np.ones((self.num_envs, 1))
         self._chain_gain = self._push = self._passed = self._twist = self._squares = self._max_torque = self._kp * 0.0
         self._idle_temperature = np.zeros((self.num_envs, self.n))
@@ -167,7 +154,7 @@ class VirtualRobot:
 
     def _settle(self, target: Array) -> None:
         """Move to the balance of PD and gravity, with a small offset: friction holds a joint where it stopped."""
-        full = self._kp * self.thermal.kt() * derating_factor(self.physics, self.thermal.winding)
+        full = self._kp * self.thermal.kt() * motor.derating_factor(self.physics, self.thermal.winding)
         self._qpos[:] = target
         for _ in range(SETTLING_STEPS):
             load = self._load()
@@ -187,7 +174,7 @@ class VirtualRobot:
     def _friction_limit(self, torque: Array) -> Array:
         """Return the present friction limit under a motor torque at the joint, (N, active), N·m."""
         dry = self._nominal_friction + self.couplings.drag(self._qpos)
-        return friction_limit(self.physics, dry, self._qvel, torque, self._push, self._thinning)
+        return motor.friction_limit(self.physics, dry, self._qvel, torque, self._push, self._thinning)
 
     def _motor_torque(self) -> Array:
         """Return the torque that the drive sets, at the rated torque constant, (N, active), N·m."""
@@ -197,7 +184,7 @@ class VirtualRobot:
     def _gain_factor(self) -> Array:
         """Return the factor of the drives' gain by supply, temperature and load of the chain, (N, active)."""
         supply = 1.0 + self.physics.supply_gain * (self._supply - 1.0)
-        return supply * derating_factor(self.physics, self.thermal.winding) * self._chain_gain
+        return supply * motor.derating_factor(self.physics, self.thermal.winding) * self._chain_gain
 
     def step(self, ctrl: Array, rows: Array | None = None) -> None:
         """Send targets (N, n) rad and simulate one control period, only for `rows` (k,) if given."""
@@ -250,11 +237,11 @@ class VirtualRobot:
         self._bias[:, :, 1] = -kp
         self._bias[:, :, 2] = -kd
         if self._fast:
-            self._range[:, :, 1] = self._max_torque * speed_factor(self.physics, self._qvel)
-            self._range[:, :, 0] = -self._max_torque * speed_factor(self.physics, -self._qvel)
+            self._range[:, :, 1] = self._max_torque * motor.speed_factor(self.physics, self._qvel)
+            self._range[:, :, 0] = -self._max_torque * motor.speed_factor(self.physics, -self._qvel)
         limit = self._friction_limit(joint_torque)
         self._applied[:] = -self.physics.churning * self._qvel * np.abs(self._qvel)
-        self._applied += cogging_torque(self.physics, self._qpos)
+        self._applied += motor.cogging_torque(self.physics, self._qpos)
         if self.bristles.any:
             self._applied -= self.bristles.step(limit, self._qvel, period)
             limit = np.where(self.bristles.soft, 0.0, limit)
@@ -266,7 +253,7 @@ class VirtualRobot:
         self.thermal.step(squares, self.dt)
         work = np.maximum(self._motor_torque() * self._qvel, 0.0)
         self._chain_gain = self.couplings.gain_factor(self._motor_torque())
-        self._supply = supply_factor(self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True))
+        self._supply = motor.supply_factor(self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True))
 
     def _sample_noise(self) -> None:
         """Sample noise (N, periods, 3, n) and chances of jitter and loss (N, periods, 2)."""
@@ -280,7 +267,7 @@ class VirtualRobot:
             self._sample_noise()
         p, noise = self.all_joints, self._noise[:, self._row]
         true = self._full(self._qpos + self._twist, self.robot.qpos_home)  # the encoder is on the motor's side
-        qpos = quantised(true + p.zero_offset + p.encoder_noise * noise[:, 0], p.encoder_step)
+        qpos = motor.quantised(true + p.zero_offset + p.encoder_noise * noise[:, 0], p.encoder_step)
         qvel = self._full(self._qvel, 0.0) + p.velocity_noise * noise[:, 1]
         tau = self._full(self._motor_torque(), 0.0) + p.current_offset + p.current_noise * noise[:, 2]
         temperature = self._idle_temperature.copy()
