@@ -48,8 +48,8 @@ live: setup
 peers: setup
 	$(BIN)/python -m pytest -m peers -s tests/hw
 
-# MuJoCo, MJX, mjlab, Isaac Lab, Newton and Drake (environments of their own in ~/.cache/gaponet, 14 GB) play exports beside ours,
-# and mjlab and Isaac Lab train in one: half an hour.
+# MuJoCo, MJX, mjlab, Isaac Lab, Newton and Drake (environments of their own in ~/.cache/gaponet, 14 GB) play exports beside ours:
+# half an hour.
 engines: setup
 	$(BIN)/python -m pytest -m peers -s tests/export
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 from pathlib import Path
@@ -88,14 +87,3 @@ def test_a_drawn_unit_moves_in_mjlab_as_in_gaponet(exported: Path, tmp_path: Pat
     print(f"{said}the unit in gaponet: {here:.2f}")
     assert here > 5
     assert abs(there - here) <= 0.05 * here
-
-
-@pytest.mark.parametrize("name", ["mjlab-1.6", "isaaclab-3"])
-def test_their_own_train_command_takes_the_exported_robot(exported: Path, tmp_path: Path, name: str) -> None:
-    to, _, version, packages = ENGINES[name]
-    python = environment(name, version, *((package,) for package in packages))
-    peer = Path(__file__).parent / f"{to}_train.py"
-    there = {**os.environ, "PYTHONPATH": f"{exported / to}{os.pathsep}{peer.parent}"}
-    subprocess.run([python, peer, tmp_path], cwd=exported / to, env=there, check=True)
-    trained = sorted(f.name for folder in (tmp_path, exported / to / "logs") for f in folder.rglob("model_*.pt"))
-    assert "model_1.pt" in trained

@@ -103,8 +103,7 @@ def test_a_past_made_in_inference_mode_is_begun_anew_outside_it(place):
     assert not torch.equal(now[1], first[1])
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-@pytest.mark.parametrize("when", [0, 2])
+@pytest.mark.parametrize(("bad", "when"), [(float("nan"), 0), (float("inf"), 2)])
 def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(place, model, bad, when):
     aligners = [Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu") for _ in range(2)]
     step = program(delta_step(model, place / "run")).module()

@@ -12,7 +12,6 @@ import torch
 from environments import environment
 from runs import random_run
 
-from gaponet.cli.main import main
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.export.export_folder import export_model
 from gaponet.nn.artifact import GapModel
@@ -96,25 +95,6 @@ def differs(model: mujoco.MjModel, key: str, value: np.ndarray) -> str:
     pairs = own.ravel(), value.ravel()
     same = np.allclose(pairs[0][:count], pairs[1][:count], rtol=SINGLE, atol=1e-9)
     return "" if same and not any(x[count:].any() for x in pairs) else f"{key}: {value} there, {own} here"
-
-
-def test_a_trained_model_moves_mjlab_as_it_moves_alignedsim(python, tmp_path):
-    data, run = str(tmp_path / "data"), str(tmp_path / "run")
-    recipe = ["--robot", "h1_2", "--fleet", "easy", "--recipe", "demo", "--units", "virtual-1", "--nproc", "1"]
-    assert main(["collect", "--out", data, *recipe]) == 0
-    start = [
-        "--pretraining.num-envs",
-        "64",
-        "--pretraining.steps",
-        "100",
-        "--pretraining.rounds",
-        "4",
-        "--pretraining.rows",
-        "4000",
-    ]
-    assert main(["train", data, "--out", run, "--budget", "25600", *start]) == 0
-    model = GapModel.load(run)
-    compare(python, model, 2.0, tmp_path, "H1-2, trained on virtual robots (25,600 steps), 2 kg per hand")
 
 
 def test_identified_servos_move_in_mjlab_as_here(python, tmp_path):

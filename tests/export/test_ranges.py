@@ -12,7 +12,7 @@ from arm import XML, write_arm
 
 from gaponet.base.errors import NoGainError
 from gaponet.cli.main import main
-from gaponet.export.drawn_robots import draw_robots, robots_of
+from gaponet.export import drawn_robots
 from gaponet.export.plain_servos import own_motions, rollout_error
 from gaponet.export.randomization import judge_units, sample_units
 from gaponet.robot.folder import save_robot
@@ -128,22 +128,29 @@ def test_events_in_an_engine_s_words_compile(arm, tmp_path, capsys, engine):
     assert f"({low:.6g}, {high:.6g})" in text
 
 
-def test_units_that_follow_the_recordings_are_kept_and_worse_ones_than_by_hand_refused(arm, tmp_path):
+def test_units_that_follow_the_recordings_are_retained_and_stored_and_worse_ones_refused(arm, tmp_path, monkeypatch):
+    monkeypatch.setattr(drawn_robots, "DRAWN", 32)
+    monkeypatch.setattr(drawn_robots, "JUDGED", 4)
     folder = written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3]))
     robot = load_robot(folder)
-    motions = own_motions(robot, count=4)
-    drawn = sample_units(robot)
-    made = draw_robots(robot, drawn.units, (motions[::2], motions[1::2]))
+    motions = [s.rows(slice(0, 200)) for s in own_motions(robot, count=4)]
+    recordings, drawn = (motions[::2], motions[1::2]), sample_units(robot)
+    made = drawn_robots.draw_robots(robot, drawn.units, recordings)
     assert made.errors["exported"] < 1e-4  # the motions are the robot's own
-    first = np.mean([rollout_error(motions[1::2], r) for r in robots_of(robot, drawn.units)[:8]])
+    first = np.mean([rollout_error(motions[1::2], r) for r in drawn_robots.robots_of(robot, drawn.units)[:8]])
     assert made.errors["units"] < 0.5 * first
-    assert len(made.units["kp"]) == 32
-    written_units = judge_units(drawn, robot, (motions[::2], motions[1::2]))
-    low, value, high = written_units.ranges["elbow"]["kp"]
-    inside = (written_units.units["kp"][:, 1] >= low) & (written_units.units["kp"][:, 1] <= high)
-    assert 0.85 <= inside.mean() <= 0.95
-    assert value == drawn.ranges["elbow"]["kp"][1]
+    assert len(made.units["kp"]) == 8
     other_gains = [replace(s, meta=replace(s.meta, kp=(5.0, 5.0))) for s in motions]
     assert "were not compared with recordings" in judge_units(drawn, robot, (other_gains, other_gains)).notes[-1]
     with pytest.raises(NoGainError, match=r"nothing is written: .* drawn units are \d"):
         replace(made, errors=made.errors | {"by hand": made.errors["units"] / 2}).require_better_than_by_hand()
+    rollouts = []
+    monkeypatch.setattr(drawn_robots, "rollout_error", lambda *given: rollouts.append(given) or rollout_error(*given))
+    again = judge_units(drawn, robot, recordings)
+    assert not rollouts
+    np.testing.assert_array_equal(again.units["kp"], made.units["kp"])
+    assert again.judged.ranges == made.ranges
+    low, value, high = again.ranges["elbow"]["kp"]
+    assert low < value == drawn.ranges["elbow"]["kp"][1] < high
+    drawn_robots.draw_robots(robot, sample_units(robot, seed=1).units, recordings)
+    assert rollouts

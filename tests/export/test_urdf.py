@@ -1,4 +1,4 @@
-"""A user's URDF or SDF takes along what its tags hold, and is told what they do not."""
+"""A user's URDF takes along what its tags hold, and is told what they do not."""
 
 import json
 import subprocess
@@ -32,12 +32,6 @@ URDF = f"""<robot name="arm"><!-- by hand -->
   </transmission>
 </robot>
 """
-SDF = """<sdf version="1.9"><model name="arm"><link name="a"/><link name="b"/><link name="c"/>
-  <joint name="shoulder" type="revolute"><parent>a</parent><child>b</child><axis><xyz>0 1 0</xyz>
-    <limit><effort>9</effort></limit><dynamics><damping>0.1</damping></dynamics></axis></joint>
-  <joint name="elbow" type="revolute"><parent>b</parent><child>c</child><axis><xyz>0 1 0</xyz></axis></joint>
-</model></sdf>
-"""
 
 
 @pytest.fixture(scope="module")
@@ -66,15 +60,6 @@ def test_a_urdf_keeps_all_but_its_dynamics_and_efforts_and_the_loss_has_its_pric
     assert sum(line[:1] in "+-" and line[:3] not in ("+++", "---") for line in changed) == 9
 
 
-def test_an_sdf_likewise(robot, tmp_path):
-    file = tmp_path / "mine.sdf"
-    file.write_text(SDF)
-    root = ET.parse(export_robot(robot, "urdf", tmp_path / "out", source=file).file).getroot()
-    told = [[float(j.find(f"axis/dynamics/{f}").text) for f in ("damping", "friction")] for j in root.iter("joint")]
-    assert told == [[0.8, 0.1], [0.6, 0.07]]
-    assert next(root.iter("effort")).text == "5"
-
-
 def test_a_file_that_is_none_or_has_other_joints_is_refused(robot, tmp_path, capsys):
     with pytest.raises(UsageError, match="--into FILE"):
         export_robot(robot, "urdf", tmp_path / "a")
@@ -99,10 +84,9 @@ print(json.dumps({name: plant.GetJointByName(name).default_damping() for name in
 
 
 @pytest.mark.peers
-@pytest.mark.parametrize(("name", "text"), [("mine.urdf", URDF), ("mine.sdf", SDF)])
-def test_drakes_parser_reads_the_damping(robot, tmp_path, name, text):
-    (tmp_path / name).write_text(text)
-    made = export_robot(robot, "urdf", tmp_path / "out", source=tmp_path / name)
+def test_drakes_parser_reads_the_damping(robot, tmp_path):
+    (tmp_path / "mine.urdf").write_text(URDF)
+    made = export_robot(robot, "urdf", tmp_path / "out", source=tmp_path / "mine.urdf")
     python = environment("drake", "3.12", ("drake",))
     done = subprocess.run([python, "-c", DRAKE, made.file], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == {"shoulder": 0.8, "elbow": 0.6}

@@ -27,7 +27,7 @@ from gaponet.report.candidate import split_of_run as read_run_split
 from gaponet.robot.collision import Collision
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
-from gaponet.testing.fleet import FLEETS, UNITS_MARKER, load_fleet, to_toml
+from gaponet.testing.fleet import FLEETS, load_fleet
 
 COLLISION = """same_limb = ["upper fore"]
 [[capsule]]
@@ -155,11 +155,7 @@ def _use_run(source: Path, out: Path) -> None:
 
 
 def _fleet(folder: Path) -> None:
-    head = (FLEETS / "easy.toml").read_text(encoding="utf-8").split(UNITS_MARKER)[0]
-    fleet = load_fleet("easy", arm())
-    (folder / "mine.toml").write_text(
-        head + UNITS_MARKER + to_toml(arm(), fleet.units, fleet.distributions), encoding="utf-8"
-    )
+    (folder / "mine.toml").write_text((FLEETS / "easy.toml").read_text(encoding="utf-8"), encoding="utf-8")
 
 
 def _use_fleet(source: Path, out: Path) -> None:

@@ -28,11 +28,10 @@ BIG = '<worldbody><replicate count="200000"><body><geom size="1"/></body></repli
         ('name="elbow"', 'name="wing"', "elbow"),
     ],
 )
-@pytest.mark.parametrize("ask", [build_model, lambda robot: robot.qpos_range])
-def test_an_oversized_or_invalid_mjcf_is_refused(tmp_path, old, new, said, ask):
+def test_an_oversized_or_invalid_mjcf_is_refused(tmp_path, old, new, said):
     robot = write_arm(tmp_path / "arm", xml=XML.replace(old, new))
     with pytest.raises(RobotError, match=said) as error:
-        ask(robot)
+        build_model(robot)
     assert "\n" not in str(error.value)
 
 

@@ -116,12 +116,6 @@ def test_the_payload_hangs_at_the_tool_s_site(tmp_path):
     assert (mount.side, mount.body, mount.pos) == ("hand", "wrist", (0.12, 0.0, 0.01))
 
 
-def test_mounts_and_operated_joints_are_what_the_user_says(tmp_path):
-    made = make(tmp_path, mounts=("left=fore:0.1,0,0.02",), operated=("*l*ow*", "roll"))
-    assert [(m.side, m.body, m.pos) for m in made.robot.payload_mounts] == [("left", "fore", (0.1, 0.0, 0.02))]
-    assert made.robot.operated == ("elbow", "roll")
-
-
 def test_contacts_are_an_option(tmp_path):
     made = make(tmp_path, contacts=True)
     assert made.robot.contacts
@@ -218,7 +212,6 @@ def test_the_folder_of_a_package_is_an_option(tmp_path):
         ({"kd": ("toe=2",)}, "--kd toe=2: no such joint"),
         ({"effort_limit": ("-3",)}, "--effort-limit -3"),
         ({"keyframe": "high"}, "vendor.xml has home, low"),
-        ({"mounts": ("hand=claw",)}, "--mounts hand=claw: write SIDE=BODY"),
         ({"rate": 0.0}, "--rate 0.0"),
     ],
 )

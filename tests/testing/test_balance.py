@@ -33,7 +33,7 @@ def moving(arm):
     return robots, model, [np.array(x) for x in zip(*rows, strict=True)]
 
 
-def test_work_becomes_energy_and_heat(moving):
+def test_work_becomes_energy_and_heat_and_torques_add_up_to_what_moves_the_links(moving):
     robots, model, (energy, qpos, qvel, force, friction) = moving
     h = 0.001
     cogging = robots.physics.cogging * np.sin(robots.physics.cogging_count * qpos + robots.physics.cogging_phase)
@@ -45,13 +45,8 @@ def test_work_becomes_energy_and_heat(moving):
         work - heat, abs=0.02 * turned_over
     )  # within 2 % of the motor's work
     assert (middle(friction) * middle(qvel)).sum() < 0  # friction only takes
-
-
-def test_torques_add_up_to_what_moves_the_links(moving):
-    robots, model, (_, qpos, qvel, force, friction) = moving
     data = mujoco.MjData(model)
     acceleration = np.gradient(qvel, 0.001, axis=0)
-    cogging = robots.physics.cogging * np.sin(robots.physics.cogging_count * qpos + robots.physics.cogging_phase)
     needed, given = [], []
     flags = model.opt.disableflags
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT

@@ -31,7 +31,7 @@ RECIPE = Recipe(
     payloads=(0.0, 0.2),
     units=("virtual-2",),
     motions=("steps-elbow", "tour-all-0"),
-    rates=(50.0, 100.0),
+    rates=(50.0, 25.0),
     repetitions=2,
 )
 
@@ -93,16 +93,6 @@ def test_a_row_is_the_state_before_its_command(whole, spec):
     assert told < moved < told + 15
 
 
-def test_events_tell_begin_and_end(whole):
-    dataset = Dataset(whole[0])
-    for entry in dataset.entries:
-        events = entry.meta.notes["events"]
-        assert events[0] == {"time": 0.0, "kind": "motion_start"}
-        assert events[-1] == {"time": pytest.approx(entry.rows * entry.dt), "kind": "motion_end"}
-        assert all(e["kind"] in ("packet_lost", "torque_limit", "hot") for e in events[1:-1])
-    assert any(e["kind"] == "packet_lost" for entry in dataset.entries for e in entry.meta.notes["events"])
-
-
 def test_repetitions_differ_a_little(whole):
     dataset = Dataset(whole[0])
     same = [e for e in dataset.entries if e.meta.motion == "tour-all-0" and e.dt == 0.02 and e.meta.payload_mass == 0.2]
@@ -111,11 +101,6 @@ def test_repetitions_differ_a_little(whole):
     assert not np.array_equal(first.qpos, second.qpos)
     assert np.abs(first.qpos - second.qpos).mean() < 0.01
     assert first.temperature[0, 0] != second.temperature[0, 0]
-
-
-def test_several_processes_record_the_same_in_the_same_order(whole, spec, fleet, tmp_path):
-    collect(spec, fleet, RECIPE, tmp_path / "two", seed=5, nproc=2)
-    assert list(hashes(tmp_path / "two").items()) == list(hashes(whole[0]).items())
 
 
 def test_collecting_again_adds_nothing_and_a_larger_recipe_adds_the_rest(whole, spec, fleet, tmp_path):
@@ -136,7 +121,7 @@ from gaponet.testing.fleet import load_fleet
 if __name__ == "__main__":
     gaponet.testing.collect.TAKES_PER_JOB = (4, 4)  # four jobs: two are still being played when two are written
     robot = load_robot(sys.argv[1])
-    recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 100.0), 2)
+    recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 25.0), 2)
     collect(robot, load_fleet("easy", robot), recipe, sys.argv[2], seed=5, nproc=2)
 """
 
@@ -161,7 +146,7 @@ def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tm
     child.wait()
     assert 0 < len(Dataset(out)) <= 16  # all of them where this process had to wait for its turn
     _wait_for_orphans(child.pid)
-    collect(spec, load_fleet("easy", spec), RECIPE, out, seed=5, nproc=1)
+    collect(spec, load_fleet("easy", spec), RECIPE, out, seed=5, nproc=2)
     assert list(hashes(out).items()) == list(hashes(whole[0]).items())
     assert len(list((out / "sequences").glob("*.parquet"))) == 16
     assert not list((out / "sequences").glob(".*"))

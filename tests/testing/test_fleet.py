@@ -1,6 +1,5 @@
-import shutil
 import tomllib
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -8,69 +7,27 @@ import pytest
 from gaponet.base.errors import UsageError
 from gaponet.experiments.virtual.goals import GoalPlanner
 from gaponet.robot.spec import load_robot
-from gaponet.testing import fleet as fleets
-from gaponet.testing.fleet import FLEETS, UNITS_MARKER, load_fleet, sample_unit, to_toml
-from gaponet.testing.physics import EFFECTS, Physics, neutral
+from gaponet.testing.fleet import FLEETS, load_fleet
+from gaponet.testing.physics import Physics, neutral
 from gaponet.testing.virtual_robot import VirtualRobot
 
-NAMES = ("easy", "hard", "shifted")
+DIGESTS = {"easy": "470699a7d760", "hard": "1d49d40c608d", "shifted": "d2cc972792f1", "unnamed": "6e07b3021441"}
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_saved_units_are_what_the_distributions_and_the_seed_give(name):
-    robot = load_robot("h1_2")
-    fleet = load_fleet(name, robot)
+@pytest.mark.parametrize("name", DIGESTS)
+def test_units_of_a_seed_do_not_change(name):
+    """Data sets name this hash: other numbers, as of another random generator, would make another fleet of them."""
+    fleet = load_fleet(name, load_robot("h1_2"))
+    assert fleet.digest() == DIGESTS[name]
     assert list(fleet.units) == ["virtual-1", "virtual-2", "virtual-3", "virtual-4"]
-    for k, unit in enumerate(fleet.units.values(), 1):
-        again = sample_unit(robot, fleet.distributions, fleet.seed, k)
-        for f in fields(Physics):
-            assert np.array_equal(getattr(unit, f.name), getattr(again, f.name)), f.name
 
 
-@pytest.mark.parametrize("name", [*NAMES, "unnamed"])
+@pytest.mark.parametrize("name", DIGESTS)
 def test_every_number_has_a_source_and_the_file_says_virtual(name):
     table = tomllib.loads((FLEETS / f"{name}.toml").read_text(encoding="utf-8"))
     assert table["virtual"] is True
     assert {d["name"] for d in table["distribution"]} <= {f.name for f in fields(Physics)}
     assert all(len(d["source"]) > 10 for d in table["distribution"])
-
-
-def test_units_of_a_type_are_alike_and_not_the_same():
-    fleet = load_fleet("easy", load_robot("h1_2"))
-    kp = np.array([u.kp_scale for u in fleet.units.values()])  # (units, joints)
-    assert len({tuple(row) for row in kp}) == 4
-    between_units, between_joints = kp.std(axis=0).mean(), kp.mean(axis=0).std()
-    assert 0.2 * between_joints < between_units < 3 * between_joints
-
-
-def test_four_fifths_of_an_unnamed_cause_are_the_designs():
-    units = list(load_fleet("unnamed", load_robot("h1_2")).units.values())
-    for name in ("drag", "cogging", "churning", "derating", "smoothing", "flex", "grip_z", "limb_loss"):
-        values = np.array([getattr(u, name) for u in units])  # (units, joints)
-        own = np.abs(values - values.mean(axis=0)).mean()
-        assert 0.03 < own / np.abs(values).mean() < 0.25, name
-
-
-def test_the_shifted_fleet_lies_outside_the_easy_one():
-    robot = load_robot("h1_2")
-    easy, shifted = (load_fleet(n, robot) for n in ("easy", "shifted"))
-    mean = lambda fleet, name: np.mean([getattr(u, name).mean() for u in fleet.units.values()])  # noqa: E731
-    dry = lambda fleet: np.mean([u.friction / robot.effort_limit for u in fleet.units.values()])  # noqa: E731
-    assert dry(shifted) > 1.3 * dry(easy)
-    assert mean(shifted, "delay") > 1.5 * mean(easy, "delay")
-    assert mean(easy, "cogging") == 0
-    assert mean(shifted, "cogging") > 0
-    assert easy.digest() != shifted.digest()
-
-
-def test_units_of_the_hard_fleet_differ_as_motors_and_friction_do():
-    robot = load_robot("h1_2")
-    units = list(load_fleet("hard", robot).units.values())
-    stiff = np.array([u.kp_scale * u.kt_scale for u in units])  # (units, joints)
-    dry = np.array([u.friction for u in units])
-    spread = lambda x: (x.std(axis=0, ddof=1) / x.mean(axis=0)).mean()  # noqa: E731
-    assert 0.05 < spread(stiff) < 0.08
-    assert 0.3 < spread(dry) < 0.5
 
 
 def test_a_raw_hand_of_the_firm_fleet_sags_about_2_cm_under_3_kg():
@@ -93,31 +50,12 @@ def test_a_robot_that_the_file_does_not_hold_is_drawn_from_the_same_distribution
     assert 0.005 * 5 < a.unit("virtual-1").friction.mean() < 0.05 * 5  # parts of the 5 N·m limit
 
 
-def test_switching_all_effects_off_leaves_nothing():
-    unit = load_fleet("shifted", load_robot("h1_2")).unit("virtual-1")
-    off, none = unit.without(*EFFECTS), neutral(27)
-    assert all(np.array_equal(getattr(off, f.name), getattr(none, f.name)) for f in fields(Physics))
-    kept = unit.without("friction")
-    assert (kept.friction == 0).all()
-    assert np.array_equal(kept.backlash, unit.backlash)
-
-
-def test_a_fleet_can_be_written_and_read(arm, tmp_path):
-    head = (FLEETS / "easy.toml").read_text(encoding="utf-8").split("\n# ---- drawn units ----\n")[0]
-    fleet = load_fleet("easy", arm)
-    file = tmp_path / "mine.toml"
-    file.write_text(
-        head.replace('name = "easy"', 'name = "mine"') + to_toml(arm, fleet.units, fleet.distributions),
-        encoding="utf-8",
-    )
-    assert load_fleet(file, arm).digest() == fleet.digest()
-
-
-def test_units_that_are_sampled_again_are_the_stored_ones(tmp_path, monkeypatch):
-    shutil.copyfile(FLEETS / "easy.toml", tmp_path / "easy.toml")
-    monkeypatch.setattr(fleets, "FLEETS", tmp_path)
-    fleets.main("easy", "h1_2")
-    assert (tmp_path / "easy.toml").read_text() == (FLEETS / "easy.toml").read_text()
+def test_an_effect_alone_leaves_nothing_of_the_others():
+    unit, none = load_fleet("shifted", load_robot("h1_2")).unit("virtual-1"), neutral(27)
+    alone = unit.only(["backlash"])
+    for f in fields(Physics):
+        kept = unit if f.name == "backlash" else none
+        assert np.array_equal(getattr(alone, f.name), getattr(kept, f.name)), f.name
 
 
 def test_errors_say_what_there_is(arm, tmp_path):
@@ -129,7 +67,7 @@ def test_errors_say_what_there_is(arm, tmp_path):
     with pytest.raises(UsageError, match="fleet 'easy' has no unit 'robot-7'; it has virtual-1, virtual-2"):
         load_fleet("easy", arm).unit("robot-7")
     with pytest.raises(UsageError, match="effect 'magic' is unknown; effects are gain, torque_constant"):
-        neutral(2).without("magic")
+        neutral(2).only(["magic"])
     file = tmp_path / "bad.toml"
     file.write_text('seed = 1\n[[distribution]]\nname = "charm"\nmean = 1\nsource = "none"\n')
     with pytest.raises(UsageError, match=r"bad.toml: \[\[distribution\]\] names 'charm' twice, or not one of kp_scale"):
@@ -144,22 +82,13 @@ def test_errors_say_what_there_is(arm, tmp_path):
         ("type_spread = 0.03", "type_spread = nan", r"distribution\[0\]\.type_spread: should be"),
         ("low = 0.6", "lov = 0.6", r"distribution\[0\]\.lov: is not a known field"),
         ('name = "kd_scale"', 'name = "kp_scale"', "names 'kp_scale' twice"),
-        ("mean = 0.89", "mean = -5.0\nlow = -9.0", "(already defined|Cannot overwrite|kp_scale is )"),
+        ("mean = 0.01\nunit_spread = 0.002\nlow = 0.002", "mean = 3600.0", "unit 'virtual-1': delay is "),
+        ("mean = 0.01\nunit_spread = 0.002\nlow = 0.002", "mean = -0.1", "unit 'virtual-1': delay is "),
+        ("mean = 0.002\nunit_spread = 0.0005", "mean = 2.0", "unit 'virtual-1': drop is "),
     ],
 )
 def test_a_fleet_of_numbers_that_no_robot_has_is_refused_with_file_and_field(arm, tmp_path, old, new, said):
     file = tmp_path / "mine.toml"
     file.write_text((FLEETS / "easy.toml").read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8")
     with pytest.raises(UsageError, match=rf"mine\.toml: .*{said}"):
-        load_fleet(file, arm)
-
-
-@pytest.mark.parametrize(("parameter", "value"), [("delay", 3600.0), ("delay", -0.1), ("drop", 2.0)])
-def test_a_unit_that_cannot_be_is_refused(arm, tmp_path, parameter, value):
-    drawn = load_fleet("easy", arm)
-    units = {u: replace(p, **{parameter: np.array([value])}) for u, p in drawn.units.items()}
-    file = tmp_path / "mine.toml"
-    head = (FLEETS / "easy.toml").read_text(encoding="utf-8").split(UNITS_MARKER)[0]
-    file.write_text(head + UNITS_MARKER + to_toml(arm, units, drawn.distributions), encoding="utf-8")
-    with pytest.raises(UsageError, match=rf"mine\.toml: unit 'virtual-1': {parameter} is \[{value}\]"):
         load_fleet(file, arm)

@@ -87,7 +87,6 @@ def test_bristles_keep_their_torque_at_rest_and_start_with_what_they_are_given()
     assert slide(bristles, [0.0] * 1000) == 0.7
     bristles.reset(np.array([[-9.0]]), np.array([[1.2]]))
     assert slide(bristles, []) == -1.2
-    assert not Bristles(one(friction=1.0), np.array([0.2])).any
 
 
 def test_torque_falls_from_the_corner_to_the_no_load_speed():

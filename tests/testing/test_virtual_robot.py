@@ -151,60 +151,11 @@ def test_the_current_loop_delays_by_its_time_constant(arm):
     assert given[1] == pytest.approx(0.1 * KP * (1 - np.exp(-0.02 / 0.05)), rel=0.02)
 
 
-def test_a_joint_does_not_reach_its_no_load_speed(arm):
-    fastest = []
-    for limit in (np.inf, 2.0):
-        path, _ = run(arm, [unit(no_load_speed=limit, corner=0.5)], pushed(1.2), start=HANGING)
-        fastest.append(np.diff(path[:, 0, 1]).max() / 0.02)
-    assert fastest[0] > 3.0
-    # where 5 N·m · (1 − v/2) / 0.5 is what damping and friction take, 0.5 v + 0.05: v = 1.8
-    assert fastest[1] == pytest.approx(1.8, abs=0.05)
-
-
-def test_a_warm_joint_has_less_friction(arm):
-    ramp = np.stack([np.full(220, HANGING[0]), HANGING[1] + np.minimum(np.arange(220) / 1000, 0.2)], axis=1)
-    short = []
-    for warmth in (0.0, 50.0):
-        robots = VirtualRobot(arm, [unit(friction=1.0, thinning=0.014)], [(0.0, "both")])
-        robots.reset(ramp[:1], [0], warmth, start=HANGING[None])
-        for row in ramp:
-            robots.step(row[None])
-        short.append(ramp[-1, 1] - robots.true_qpos()[0, 1])
-    # it stops short by its friction over kp: 1.05 / 20 cold, exp(−0.7) of that 50 K warmer
-    assert short == pytest.approx([1.05 / KP, 1.05 / KP * np.exp(-0.7)], rel=0.1)
-
-
-def test_load_friction_widens_with_the_payload(arm):
-    time = np.arange(0, 8, 0.02)
-    ctrl = np.stack([0.2 * np.abs((time / 4 + 1) % 2 - 1), np.zeros_like(time)], axis=1)
-    width = []
-    for payload in (0.0, 0.4):
-        path, _ = run(arm, [unit(efficiency=0.85)], ctrl, payload)
-        width.append(path[300, 0, 0] - path[100, 0, 0])
-    # (1 − η + 1/η − 1)·Δτ / kp with Δτ = 9.81 · 0.4 · 0.4 m = 1.57 N·m
-    assert width[1] - width[0] == pytest.approx((1 / 0.85 - 0.85) * 1.57 / KP, rel=0.25)
-
-
 def test_delay_holds_the_joint_still_until_it_has_passed(arm):
     ctrl = np.concatenate([hold(1.0, seconds=0.2), hold(1.2, seconds=0.3)])
     path, _ = run(arm, [unit(), unit(delay=0.06)], ctrl)
     begun = np.abs(path - path[0]) > 1e-4
     assert [int(begun[:, i, 0].argmax()) for i in range(2)] == [10, 13]  # three periods of 20 ms later
-
-
-def test_backlash_delays_a_reversal(arm):
-    # hanging, so that the PD torque turns with the command
-    ctrl = np.stack([np.full(150, np.pi / 2 - 0.08), np.where(np.arange(150) < 75, 0.1, -0.1)], axis=1)
-    path, _ = run(arm, [unit(), unit(backlash=0.02)], ctrl)
-    late = path[78, 1, 1] - path[78, 0, 1]
-    assert late > 0.01
-
-
-def test_damping_lags_in_proportion_to_speed(arm):
-    time = np.arange(0, 2, 0.02)
-    ctrl = np.stack([1.0 + 0.0 * time, 0.5 * time - 0.5], axis=1)
-    path, _ = run(arm, [unit(), unit(damping=1.0)], ctrl)
-    assert path[60, 0, 1] - path[60, 1, 1] == pytest.approx(1.0 * 0.5 / KP, rel=0.1)
 
 
 def test_a_cable_pulls_towards_its_angle(arm):
@@ -221,28 +172,6 @@ def test_heavier_links_and_a_leaning_base_change_the_sag(arm):
     # 0.883 N·m of weight at the shoulder, ± friction band of 0.05 N·m on each
     assert sag[1] / sag[0] == pytest.approx(1.5, abs=0.17)
     assert sag[2] < sag[0]
-
-
-def test_cogging_ripples_along_the_way(arm):
-    time = np.arange(0, 6, 0.02)
-    ctrl = np.stack([np.full_like(time, 1.2), 0.2 * time - 0.6], axis=1)
-    path, _ = run(arm, [unit(), unit(cogging=0.3, cogging_count=12.0)], ctrl)
-    ripple = path[:, 1, 1] - path[:, 0, 1]
-    q = path[:, 0, 1]
-    assert np.corrcoef(ripple[20:], np.sin(12 * q[20:]))[0, 1] > 0.8
-    assert np.ptp(ripple[20:]) == pytest.approx(2 * 0.3 / KP, rel=0.5)
-
-
-def test_a_hot_motor_sags_more(arm):
-    physics = unit(kt_drift=0.002)
-    sag = []
-    for warmth in (0.0, 50.0):
-        robots = VirtualRobot(arm, [physics], [(0.3, "both")])
-        robots.reset(np.zeros((1, 2)), [0], warmth)
-        for _ in range(100):
-            robots.step(np.zeros((1, 2)))
-        sag.append(robots.true_qpos()[0, 0])
-    assert sag[1] / sag[0] == pytest.approx(1 / 0.9, abs=0.04)
 
 
 def test_a_bent_cable_widens_the_loop_of_its_neighbour(arm):
@@ -296,12 +225,6 @@ def test_firmware_smooths_small_steps_more_than_large_ones(arm):
     assert share[0] > 1.5 * share[1] > 0
 
 
-def test_targets_come_in_steps(arm):
-    ctrl = hold(0.0) + np.linspace(0, 0.05, 50)[:, None]
-    path, _ = run(arm, [unit(), unit(target_step=0.02)], ctrl)
-    assert 4e-3 < np.abs(path[:, 0, 1] - path[:, 1, 1]).max() < 0.03
-
-
 def test_a_hot_drive_takes_gain_back(arm):
     robots = VirtualRobot(arm, [unit(derating=0.02)], [(0.2, "both")])
     sag = []
@@ -309,17 +232,6 @@ def test_a_hot_drive_takes_gain_back(arm):
         robots.reset(hold(1.0)[:1], [0], warmth)
         sag.append(abs(1.0 - robots.true_qpos()[0, 0]))
     assert sag[1] > 1.2 * sag[0] > 0
-
-
-def test_supply_sag_lowers_the_torque_limit(arm):
-    far = hold(-1.4, -1.4, 0.06)  # from where it stands: the drive saturates
-    units = [unit(), unit(supply_voltage=24.0, supply_resistance=2.0, motor_constant=1.0)]
-    _, robots = run(arm, units, far, start=np.array([1.4, 1.4]))
-    bound = robots.batch.bind("actuator_force")  # of the calls after this
-    robots.step(np.repeat(far[:1], 2, axis=0))
-    force = np.abs(bound)
-    assert force[0].max() == pytest.approx(5.0)
-    assert force[1].max() < 4.9
 
 
 def test_readings_are_quantised_shifted_and_noisy_but_the_robot_is_not(arm):
@@ -349,21 +261,6 @@ def test_current_tells_the_torque_that_the_motor_was_asked_for(arm):
     force = robots.batch.bind("actuator_force")  # of the calls after this
     robots.step(hold(0.3, 0.2)[:1])
     assert robots.read().tau[0] * 0.8 == pytest.approx(force[0], abs=1e-3)
-
-
-def test_repetitions_differ_far_less_than_the_gap():
-    robot = load_robot("h1_2")
-    physics = load_fleet("easy", robot).unit("virtual-2")
-    time = np.arange(150)[:, None] * robot.dt
-    ctrl = np.zeros((150, 27))
-    ctrl[:, robot.operated_index] = 0.4 * (1 - np.cos(1.5 * time)) * np.resize([-1.0, 0.5], 10)
-    locked = idle_joints(robot, robot.operated)
-    path, _ = run(robot, [physics] * 3, ctrl, 3.0, locked=locked)
-    nominal, _ = run(robot, [neutral(27)], ctrl, 3.0, locked=locked)
-    op = robot.operated_index
-    gap = np.abs(path - nominal)[..., op].mean()
-    spread = path[..., op].std(axis=1).mean()
-    assert 0 < spread < 0.1 * gap
 
 
 @pytest.mark.parametrize("effect", EFFECTS)

@@ -34,8 +34,8 @@ def export_robot(
 
     Args:
         robot: Robot folder, or run folder of `train`.
-        to: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py that needs no gaponet; urdf (or
-            SDF: damping, friction, effort limits); json (the numbers).
+        to: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py that needs no gaponet; urdf
+            (damping, friction, effort limits); json (the numbers).
         out: Folder; default one with that name in the robot or run.
         data: Dataset on which a servo model's nearest plain servos are fitted, and every form is measured; default the
             one that the robot was identified from, and without any the robot's own simulated motions.

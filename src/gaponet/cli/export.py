@@ -55,7 +55,7 @@ def export(
 
     Args:
         to: For a robot or a run's simulator: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a
-            check.py that needs no gaponet; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a
+            check.py that needs no gaponet; urdf (damping, friction, effort limits); json (the numbers). Of a
             run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac
             Lab), actuator-net (one network per joint: past of target − position and speed in, torque out). Of a robot,
             randomization: what to randomise in training. lerobot: put the correction behind the LeRobot policy in

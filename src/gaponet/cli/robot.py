@@ -82,11 +82,9 @@ def new(
     model: Model,
     out: Path,
     joints: tuple[str, ...] = (),
-    operated: tuple[str, ...] = (),
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
     effort_limit: tuple[str, ...] = (),
-    mounts: tuple[str, ...] = (),
     packages: tuple[str, ...] = (),
     rate: float = 50.0,
     keyframe: str = "",
@@ -101,12 +99,10 @@ def new(
         out: New robot folder.
         joints: Those in the logs, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with
             an actuator, or all hinges.
-        operated: Those of them that are to be corrected; default all.
         kp: The gain of the controller that recorded the logs, N·m/rad: 100 for all, '*wrist*=20' for some, the later
             wins. Default: the model's actuators.
         kd: Likewise, N·m·s/rad.
         effort_limit: Likewise, N·m.
-        mounts: Where payloads go: SIDE=BODY, or SIDE=BODY:x,y,z in m. Default: found by name.
         packages: NAME=FOLDER of package://NAME in a URDF. Default: looked for around it.
         rate: How many commands a second, Hz.
         keyframe: At which frozen joints stand, and home. Default: the first, or the model's zero.
@@ -119,8 +115,7 @@ def new(
     from gaponet.robot.new import RobotOptions, new_robot
 
     screen = Out(json)
-    made = new_robot(model, out, RobotOptions(joints, operated, kp, kd, effort_limit, mounts, packages, rate, keyframe,
-                                        contacts, name))  # fmt: skip
+    made = new_robot(model, out, RobotOptions(joints, kp, kd, effort_limit, packages, rate, keyframe, contacts, name))
     for note in made.notes:
         screen.say(f"  {note}", "   note", "cyan")
     for what, field in (("kp", "kp_source"), ("kd", "kd_source"), ("effort_limit", "limit_source")):

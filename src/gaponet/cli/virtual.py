@@ -88,8 +88,8 @@ def virtual(
         _live(humanoid, limit, out, f"{label}: rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}")
     finally:
         if heard:
-            humanoid.heard.save(heard)
-    told = f"heard {len(humanoid.heard.time)} commands, refused {humanoid.refused}, late {humanoid.missed} periods"
+            humanoid.save_heard(heard)
+    told = f"heard {len(humanoid.heard)} commands, refused {humanoid.refused}, late {humanoid.missed} periods"
     out.say(f"{label}: {told}")
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor, nn
 
 from gaponet.base.errors import UsageError
@@ -28,7 +29,6 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.split import stratified_subset
 from gaponet.export.plain_servos import comparable, mean_error
 from gaponet.export.shipped.mujoco_servos import delay_weights
-from gaponet.export.simulator_facts import ServoFacts
 from gaponet.report.candidate import split_of_run
 from gaponet.report.run_files import read_config
 from gaponet.robot.spec import RobotSpec
@@ -53,7 +53,7 @@ class ActuatorNet(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, joint: ServoFacts, step: float, length: int) -> None:
+    def __init__(self, joint: dict[str, Any], step: float, length: int) -> None:
         """
         Args:
             joint: The servo, as in facts.json.
@@ -154,22 +154,15 @@ def _samples(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs of joint i's network in random physics steps of a rollout, (k, 2L), and delayed Δa, (k, 1) rad."""
     count, length = facts["decimation"], len(net.mean) // 2
-    q, v = _interpolated(rollout.qpos[:, i], rollout.qvel[:, i], s.dt, count)
+    path = CubicHermiteSpline(np.arange(len(s)) * s.dt, rollout.qpos[:, i], rollout.qvel[:, i])
+    time = np.arange((len(s) - 1) * count) * (s.dt / count)
+    q, v = path(time), path(time, 1)
     target = np.repeat(s.ctrl[:-1, i], count)
     delta = np.repeat(rollout.ctrl[:-1, i] - s.ctrl[:-1, i], count)
     chosen = rng.integers(0, len(target), rows)
     past = np.maximum(chosen[:, None] - np.arange(length), 0)
     weights = net.servo[:length, 0].numpy() / facts["joints"][s.joint_names[i]]["kp"]
     return np.concatenate([target[past] - q[past], v[past]], axis=1), (delta[past] @ weights)[:, None]
-
-
-def _interpolated(q: np.ndarray, v: np.ndarray, dt: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and velocity at every physics step, `count` per row, by cubic interpolation of rows dt apart."""
-    u = (np.arange(count) / count)[None]
-    a, b, va, vb = (x[:, None] for x in (q[:-1], q[1:], dt * v[:-1], dt * v[1:]))
-    qpos = (2 * u**3 - 3 * u**2 + 1) * a + (3 * u**2 - 2 * u**3) * b + (u**3 - 2 * u**2 + u) * va + (u**3 - u**2) * vb
-    qvel = (6 * u**2 - 6 * u) * (a - b) + (3 * u**2 - 4 * u + 1) * va + (3 * u**2 - 2 * u) * vb
-    return qpos.ravel(), (qvel / dt).ravel()
 
 
 def _fit(net: ActuatorNet, x: Tensor, y: Tensor) -> None:

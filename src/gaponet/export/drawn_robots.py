@@ -12,17 +12,20 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import NoGainError
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
-from gaponet.export.plain_servos import fit_plain_servos, rollout_error
+from gaponet.export.plain_servos import fit_plain_servos, rollout_error, stored_result
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.uncertainty import from_axes, to_axes
 
 Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
+
+CACHES = "drawn_robots.json", "drawn_plain_robots.json"  # in the robot folder: with the servo model, without it
 
 DRAWN, KEPT_SHARE = 128, 0.25  # number of units, and the share that is retained
 NEAR = 0.5  # every second unit deviates by this share of what was drawn
@@ -30,6 +33,15 @@ WINDOWS, WINDOW_S = 8, 8.0  # rollouts that choose
 JUDGED = 12  # units whose error on validation motions is stated
 BY_HAND, BY_HAND_FIELDS = 0.2, ("kp", "damping", "frictionloss", "armature")  # the usual randomisation: ± 20 %
 NARROWINGS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)  # of ranges from which numbers are drawn one by one
+
+
+class _Drawn(TypedDict):
+    """A `DrawnRobots` as it is stored, without its robot."""
+
+    units: dict[str, list[list[float]]]
+    errors: dict[str, float]
+    ranges: dict[str, dict[str, tuple[float, float]]]
+    narrowing: float
 
 
 @dataclass(frozen=True)
@@ -74,6 +86,8 @@ def draw_robots(
 ) -> DrawnRobots:
     """Choose units by training motions and judge them by validation motions.
 
+    The result is stored in the robot folder, and read from there if nothing changed.
+
     Args:
         robot: Identified.
         drawn: Units of `randomization.sample_units`.
@@ -83,7 +97,20 @@ def draw_robots(
     """
     train, validation = recordings
     base = fit_plain_servos(robot, train, progress=progress) if plain else robot
-    drawn = _moved(robot, base, {f: v[:DRAWN] for f, v in drawn.items()})
+    first = {f: v[:DRAWN] for f, v in drawn.items()}
+
+    def draw() -> _Drawn:
+        return _draw(base, _moved(robot, base, first), train, validation, progress)
+
+    inputs = *first.values(), np.array([len(train), len(validation)])
+    result = stored_result(robot.folder / CACHES[plain], _Drawn, draw, robot, [*train, *validation], *inputs)
+    units = {f: np.array(v) for f, v in result["units"].items()}
+    return DrawnRobots(base, units, result["errors"], result["ranges"], result["narrowing"])
+
+
+def _draw(
+    base: RobotSpec, drawn: Units, train: ListOf[Sequence], validation: ListOf[Sequence], progress: Progress
+) -> _Drawn:
     every, windows = robots_of(base, drawn), _windows(train)
     costs = []
     for i, one in enumerate(every):
@@ -111,7 +138,8 @@ def draw_robots(
     ranges = {
         joint: {f: (float(ends[0][f][i]), float(ends[1][f][i])) for f in units} for i, joint in enumerate(base.operated)
     }
-    return DrawnRobots(base, units, errors, ranges, narrowing)
+    stored = {field: values.tolist() for field, values in units.items()}
+    return {"units": stored, "errors": errors, "ranges": ranges, "narrowing": narrowing}
 
 
 def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:

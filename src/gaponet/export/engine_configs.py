@@ -1,4 +1,4 @@
-"""Servos in the classes of other engines, as robot_cfg.py: one template per engine.
+"""Servos in the classes of other engines, as robot_cfg.py: one template per engine without an action term.
 
 The numbers are those of facts["plain"], fitted without a servo model, which these classes do not have.
 """
@@ -8,44 +8,6 @@ from __future__ import annotations
 from string import Template
 from typing import Any
 
-MJLAB = Template('''"""Servos of $robot as identified, for mjlab; SI units.$note"""
-
-from mjlab.actuator import BuiltinPositionActuatorCfg
-
-ACTUATORS = (  # EntityArticulationInfoCfg(actuators=ACTUATORS); $rounding
-$servos)
-# A servo aims at its target plus this, rad: add it to targets (JointPositionActionCfg has `offset`).
-OFFSETS = $offset
-TIMESTEP, DECIMATION = $timestep, $decimation
-''')
-MJLAB_SERVO = Template("""\
-    BuiltinPositionActuatorCfg(
-        target_names_expr=("$name",), stiffness=$kp, damping=$kd, effort_limit=$effort_limit,
-        armature=$armature, frictionloss=$frictionloss, viscous_damping=$damping,
-        delay_min_lag=$lag, delay_max_lag=$lag,
-    ),
-""")
-ISAACLAB = Template('''"""Servos of $robot as identified, for Isaac Lab; SI units.$note"""
-
-from isaaclab.actuators import DelayedPDActuatorCfg
-
-ACTUATORS = {  # of ArticulationCfg, on a USD without drives; $rounding
-$servos}
-# A servo aims at its target plus this, rad: add it to targets (JointPositionActionCfg has `offset`).
-OFFSETS = $offset
-''')
-ISAACLAB_SERVOS = Template("""\
-    "servos_$lag": DelayedPDActuatorCfg(
-        joint_names_expr=$names,
-        min_delay=$lag, max_delay=$lag,
-        stiffness=$kp,
-        damping=$kd,
-        actuator_effort_limit=$effort_limit,
-        armature=$armature,
-        friction=$frictionloss,
-        viscous_friction=$damping,
-    ),
-""")
 NEWTON = Template('''"""Servos of $robot as identified, for Newton; SI units.$note"""
 
 SERVOS = {  # fields of a ModelBuilder, by joint; robot.xml has armature, damping and friction as well
@@ -109,32 +71,16 @@ def friction(plant, context, target, sweeps=10):
             torques[i] = new
     return torques
 ''')
-TEMPLATES = {"mjlab": MJLAB, "isaaclab": ISAACLAB, "newton": NEWTON, "drake": DRAKE}
+TEMPLATES = {"newton": NEWTON, "drake": DRAKE}
 
 
 def engine_config(engine: str, robot: str, facts: dict[str, Any]) -> str:
     """Return robot_cfg.py of an engine, one of TEMPLATES, for a robot's name and facts.json."""
-    step, joints = facts["options"]["timestep"], facts["plain"]
-    lags = {name: round(s["delay"] / step) for name, s in joints.items()}
-    rounded = max(abs(s["delay"] - step * lags[name]) for name, s in joints.items())
-    law = ", ".join(facts["law"])
-    servos = ""
-    if engine == "mjlab":
-        servos = "".join(MJLAB_SERVO.substitute(s, name=name, lag=lags[name]) for name, s in joints.items())
-    if engine == "isaaclab":
-        for lag in dict.fromkeys(lags.values()):
-            group = {name: s for name, s in joints.items() if lags[name] == lag}
-            servos += ISAACLAB_SERVOS.substitute(_columns(group), lag=lag, names=list(group))
-    if engine == "drake":
-        fields = ("kp", "kd", "effort_limit", "armature", "damping", "frictionloss")
-        servos = "".join(f"    {name!r}: { {f: s[f] for f in fields} },\n" for name, s in joints.items())
+    joints, law = facts["plain"], ", ".join(facts["law"])
+    fields = ("kp", "kd", "effort_limit", "armature", "damping", "frictionloss")
+    columns = {field: {name: s[field] for name, s in joints.items()} for field in (*fields, "offset", "delay")}
     return TEMPLATES[engine].substitute(
-        _columns(joints), robot=robot, servos=servos, timestep=step, decimation=facts["decimation"],
+        columns, robot=robot,
+        servos="".join(f"    {name!r}: { {f: s[f] for f in fields} },\n" for name, s in joints.items()),
         note=f" They lack the servo model ({law}); these numbers were fitted without it." if law else "",
-        rounding=f"delays are whole steps of {1e3 * step:g} ms, by at most {1e3 * rounded:.1f} ms off",
     )  # fmt: skip
-
-
-def _columns(joints: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the values of each field by joint."""
-    return {field: {name: s[field] for name, s in joints.items()} for field in next(iter(joints.values()))}

@@ -18,7 +18,7 @@ from gaponet.base.arrays import array_module
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder, write_text
 from gaponet.data.sequence import Sequence
-from gaponet.export.engine_configs import engine_config
+from gaponet.export.engine_configs import TEMPLATES, engine_config
 from gaponet.export.mjcf_edit import edit_mjcf
 from gaponet.export.plain_servos import (
     check_motions,
@@ -74,8 +74,6 @@ DELAY_NOTES = {
     "newton": "Newton has no delays: check.py has a buffer of five lines",
     "drake": "Drake has no delays: check.py has a buffer of five lines; robot_cfg.py has the friction",
     "mjcf": "delays need MuJoCo 3.5; MJX and Newton ignore them without a message: check_mjx.py has a buffer",
-    "isaaclab": "robot_cfg.py rounds delays to physics steps; the action term does not",
-    "mjlab": "robot_cfg.py rounds delays to physics steps; robot.xml does not",
 }
 
 
@@ -126,7 +124,7 @@ def export_robot(
         UsageError: No recording was made with this payload and the robot's gains.
     """
     if to == "urdf" and source is None:
-        raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf, or .sdf")
+        raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf")
     if recordings is None:
         motions = own_motions(robot, payload_mass, 24 if robot.has_servo_model else 2)
         recordings = motions[::2], motions[1::2] or motions
@@ -160,7 +158,8 @@ def export_robot(
         elif to != "json":
             file = out / ROBOT
             _write_scene(robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab")
-            write_text(out / "robot_cfg.py", engine_config(to, robot.name, facts))
+            if to in TEMPLATES:
+                write_text(out / "robot_cfg.py", engine_config(to, robot.name, facts))
         _write_motions(out / CHECK, motions)
         _write_shipped(out, to, facts)
     return ExportedFolder(file, errors, len(validation), validation[0].meta.virtual, tuple(notes))

@@ -13,17 +13,16 @@ import os
 import re
 import shutil
 import xml.parsers.expat as expat
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError
 from gaponet.base.files import lock_folder
-from gaponet.export.simulator_facts import Joints, ServoFacts
+from gaponet.export.simulator_facts import Joints
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import PAYLOAD_DENSITY, STIFF_SOLIMP, STIFF_SOLREF, TABLE, TOLERANCE, build_model
@@ -138,9 +137,15 @@ class Source:
             out[file] = out[file][:start] + new + out[file][end:]
         return out
 
-    def one(self, what: str, matches: Callable[[Tag], bool]) -> Tag | None:
-        """Return the only element that matches, None if there is none; refuse several."""
-        tags = [tag for tag in self.tags if matches(tag)]
+    def one(self, what: str, kind: str, **attribute: str) -> Tag | None:
+        """Return the only element with an attribute, None if there is none; refuse several.
+
+        Args:
+            kind: Name of the element, or "actuator/" for any element in an <actuator>.
+        """
+        kinds = {"actuator": "actuator/", "equality": ""}  # parent → kind; else the element's name
+        same = [tag for tag in self.tags if kinds.get(tag.parent, tag.name) == kind]
+        tags = [tag for tag in same if attribute.items() <= tag.attributes.items()]
         if len(tags) > 1:
             raise RobotError(f"{self.main}: has {len(tags)} {what}; one is needed. Delete or rename the others")
         return tags[0] if tags else None
@@ -185,16 +190,15 @@ def edit_mjcf(
     source, added, not_rad = Source(path), list[str](), list[str]()
     for name, servo in joints.items():
         full = prefix + name
-        tag = source.one(f"joints '{full}'", partial(_is_joint, name=full))
+        tag = source.one(f"joints '{full}'", "joint", name=full)
         if tag is None:
-            names = ", ".join(before.joint(i).name for i in range(before.njnt))
-            raise RobotError(
-                f"{path}: has no joint '{full}' in its text (--prefix is the text before names); it has {names}"
-            )
-        actuator = source.one(f"servos of '{full}'", partial(_drives, joint=full))
+            have = ", ".join(before.joint(i).name for i in range(before.njnt))
+            what = f"has no joint '{full}' in its text (--prefix is the text before names)"
+            raise RobotError(f"{path}: {what}; it has {have}")
+        actuator = source.one(f"servos of '{full}'", "actuator/", joint=full)
         if actuator is not None and name not in robot.operated:
             continue
-        changed = {f: text_of(servo[f]) for f in JOINT_ATTRIBUTES}  # type: ignore[literal-required]
+        changed = {f: text_of(servo[f]) for f in JOINT_ATTRIBUTES}
         if servo["zero"]:
             ref = before.qpos0[before.joint(full).qposadr[0]] - servo["zero"]
             changed["ref"] = text_of(math.degrees(ref) if spec.compiler.degree else ref)
@@ -216,15 +220,7 @@ def edit_mjcf(
     return target, source.difference(), tuple(not_rad)
 
 
-def _is_joint(tag: Tag, name: str) -> bool:
-    return tag.name == "joint" and tag.attributes.get("name") == name and tag.parent != "equality"
-
-
-def _drives(tag: Tag, joint: str) -> bool:
-    return tag.parent == "actuator" and tag.attributes.get("joint") == joint
-
-
-def _servo(servo: ServoFacts, samples: int, own: dict[str, str]) -> str:
+def _servo(servo: dict[str, Any], samples: int, own: dict[str, str]) -> str:
     """Return a servo as a <general> actuator.
 
     Args:
@@ -270,7 +266,7 @@ def _add_surroundings(
     option = {"tolerance": text_of(TOLERANCE)} if model.opt.tolerance > TOLERANCE else {}
 
     def body(name: str, what: str) -> Tag:
-        tag = source.one(f"bodies '{name}'", lambda t: t.name == "body" and t.attributes.get("name") == name)
+        tag = source.one(f"bodies '{name}'", "body", name=name)
         if tag is None:
             raise RobotError(f"{source.main}: a [[{what}]] names body '{name}', which is not in its text")
         return tag
@@ -321,20 +317,14 @@ def _require(
     now: mujoco.MjModel, before: mujoco.MjModel, joints: Joints, robot: RobotSpec, prefix: str, path: Path
 ) -> None:
     """Refuse a copy that lacks the wanted servos, or another element of the original."""
-    wrong = [
-        f"{f} {getattr(before, f)} → {getattr(now, f)}"
-        for f in UNCHANGED_COUNTS
-        if getattr(before, f) != getattr(now, f)
-    ]
+    counts = {f: (getattr(before, f), getattr(now, f)) for f in UNCHANGED_COUNTS}
+    wrong = [f"{f} {old} → {new}" for f, (old, new) in counts.items() if old != new]
     for name in robot.operated:
-        servo, joint = joints[name], now.joint(prefix + name)
-        i = _actuator(now, prefix + name)
-        actual = [now.dof_armature[joint.dofadr[0]], np.ravel(now.dof_damping[joint.dofadr[0]])[0],
-                  now.dof_frictionloss[joint.dofadr[0]], now.actuator_gainprm[i, 0], *now.actuator_biasprm[i, :3],
-                  now.actuator_forcerange[i, 1]]  # fmt: skip
-        kp = servo["kp"]
-        wanted = [servo["armature"], servo["damping"], servo["frictionloss"], kp, kp * servo["offset"], -kp,
-                  -servo["kd"], servo["effort_limit"]]  # fmt: skip
+        servo, dof, i = joints[name], now.joint(prefix + name).dofadr[0], _actuator(now, prefix + name)
+        passive = [float(np.ravel(getattr(now, f"dof_{field}")[dof])[0]) for field in JOINT_ATTRIBUTES]
+        actual = [*passive, now.actuator_gainprm[i, 0], *now.actuator_biasprm[i, :3], now.actuator_forcerange[i, 1]]
+        kp, bias = servo["kp"], servo["kp"] * servo["offset"]
+        wanted = [*(servo[f] for f in JOINT_ATTRIBUTES), kp, bias, -kp, -servo["kd"], servo["effort_limit"]]
         if not np.allclose(actual, wanted, rtol=1e-5, atol=1e-9):
             wrong.append(f"{name}: {np.round(actual, 6)} instead of {np.round(wanted, 6)}")
     if wrong:

@@ -9,16 +9,18 @@ from collections.abc import Sequence as ListOf
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
 from typing_extensions import TypedDict
 
 from gaponet import __version__
+from gaponet.base.arrays import Array
 from gaponet.base.errors import FolderError, RobotError
 from gaponet.base.files import lock_folder, write_json
-from gaponet.base.structure import read_json
+from gaponet.base.progress import Progress, no_progress
+from gaponet.base.structure import read_json, validated
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.report.candidate import read_origin
@@ -30,17 +32,18 @@ from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
 
+T = TypeVar("T")
+Servos = dict[str, dict[str, float]]  # joint → SERVO_FIELDS
+
 CACHE = "plain_servos.json"  # in the robot folder
 MAX_CHECK_MOTIONS = 5
 MAX_CHECK_MOTION_S = 30.0
 OWN_MOTION_S = 10.0
 
 
-class _Cache(TypedDict):
-    """Content of CACHE: hash of the inputs of a fit, and the fitted values by joint (SERVO_FIELDS)."""
-
+class _Stored(TypedDict):
     key: str
-    servos: dict[str, dict[str, float]]
+    content: Any
 
 
 def read_recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[list[Sequence], list[Sequence]] | None:
@@ -72,7 +75,7 @@ def read_recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[l
 def fit_plain_servos(
     robot: RobotSpec,
     recordings: ListOf[Sequence],
-    progress: Callable[[float, float, str], None] = lambda done, total, note: None,
+    progress: Progress = no_progress,
 ) -> RobotSpec:
     """Fit the parameters of PD servos, without a servo model, to recordings.
 
@@ -87,23 +90,26 @@ def fit_plain_servos(
         return robot
     without: dict[str, Any] = dict.fromkeys(SERVO_TERMS, np.array(0.0))
     start = replace(robot, **without)
-    key, cache = _fit_key(start, recordings), robot.folder / CACHE
-    with suppress(RobotError):  # missing or damaged
-        stored = read_json(_Cache, cache, RobotError)
-        if stored["key"] == key:
-            return start.with_servos(stored["servos"])
-    fitted = identify(recordings, start, terms=(), table=False, progress=progress).robot
-    servos = {
-        joint: {name: float(v) for name in SERVO_FIELDS if np.isfinite(v := getattr(fitted, name)[i])}
-        for i, joint in enumerate(robot.joint_names)
-    }
-    with suppress(FolderError, OSError), lock_folder(robot.folder, "robot"):  # not of gaponet, or not writable
-        write_json(cache, {"key": key, "servos": servos})
-    return fitted
+
+    def fit() -> Servos:
+        fitted = identify(recordings, start, terms=(), table=False, progress=progress).robot
+        return {
+            joint: {name: float(v) for name in SERVO_FIELDS if np.isfinite(v := getattr(fitted, name)[i])}
+            for i, joint in enumerate(robot.joint_names)
+        }
+
+    return start.with_servos(stored_result(robot.folder / CACHE, Servos, fit, start, recordings))
 
 
-def _fit_key(robot: RobotSpec, recordings: ListOf[Sequence]) -> str:
-    """Return the hash of everything that the fit depends on."""
+def stored_result(
+    file: Path, kind: type[T], compute: Callable[[], T], robot: RobotSpec, recordings: ListOf[Sequence], *other: Array
+) -> T:
+    """Return a result from a file in the robot folder if its inputs are the same, else compute and store it.
+
+    Args:
+        kind: Type of the result, for `validated`.
+        robot, recordings, other: All that the result depends on.
+    """
     key = hashlib.sha256(f"{__version__} {mujoco.__version__} {model_hash(robot)} {robot.operated}".encode())
     for one in (robot, robot.before_identification):
         for name in SERVO_FIELDS:
@@ -113,7 +119,16 @@ def _fit_key(robot: RobotSpec, recordings: ListOf[Sequence]) -> str:
         key.update(json.dumps(meta).encode())
         for channel in (s.ctrl, s.qpos, s.qvel):
             key.update(np.ascontiguousarray(channel).tobytes())
-    return key.hexdigest()
+    for values in other:
+        key.update(np.ascontiguousarray(values).tobytes())
+    with suppress(RobotError):  # missing or damaged
+        stored = read_json(_Stored, file, RobotError)
+        if stored["key"] == key.hexdigest():
+            return validated(kind, stored["content"], file, RobotError)
+    result = compute()
+    with suppress(FolderError, OSError), lock_folder(file.parent, "robot"):  # not of gaponet, or not writable
+        write_json(file, {"key": key.hexdigest(), "content": result})
+    return result
 
 
 def own_motions(robot: RobotSpec, payload_mass: float = 0.0, count: int = 24) -> list[Sequence]:

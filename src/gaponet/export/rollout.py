@@ -10,6 +10,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
+from gaponet.export.drawn_robots import robots_of
 from gaponet.export.randomization import sample_units
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
@@ -51,11 +52,7 @@ def sample_robots(robot: RobotSpec, samples: int = SAMPLED_ROBOTS, seed: int = 0
     Raises:
         UsageError: The robot folder has no uncertainties.
     """
-    units = sample_units(robot, samples=samples, seed=seed).units
-    return [
-        robot.with_servos({j: {f: float(v[k, i]) for f, v in units.items()} for i, j in enumerate(robot.operated)})
-        for k in range(samples)
-    ]
+    return robots_of(robot, sample_units(robot, samples=samples, seed=seed).units)
 
 
 def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from typing import Any, TypedDict
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -31,24 +31,7 @@ MEANING = {
 }
 
 
-class ServoFacts(TypedDict):
-    """An identified servo and its joint, SI units."""
-
-    home: float
-    range: list[float] | None
-    kp: float
-    kd: float
-    effort_limit: float
-    armature: float
-    damping: float
-    frictionloss: float
-    delay: float
-    offset: float
-    zero: float
-    target_speed: float
-
-
-Joints = dict[str, ServoFacts]
+Joints = dict[str, dict[str, Any]]  # joint → an identified servo and its joint, as of `servo_facts`
 
 
 def simulator_facts(
@@ -78,7 +61,7 @@ def simulator_facts(
     }  # fmt: skip
 
 
-def servo_facts(robot: RobotSpec, model: mujoco.MjModel, i: int) -> ServoFacts:
+def servo_facts(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
     """Return joint i of a robot as its compiled model has it."""
     joint = model.joint(robot.joint_names[i])
     dof = joint.dofadr[0]

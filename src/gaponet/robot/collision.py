@@ -99,8 +99,7 @@ class Collision:
         self.above = np.array(above, int)
 
     def distances(self, qpos: Array) -> Array:
-        """Return the distance of every pair, then of every capsule to the plane, (T, n) rad → (T, pairs + capsules) "
-        "m."""
+        """Return distances of pairs, then of capsules to the plane, (T, n) rad → (T, pairs + capsules) m."""
         position, rotation = np.empty((len(qpos), len(self.body), 3)), np.empty((len(qpos), len(self.body), 9))
         data, body = self.data, self.body
         for t, q in enumerate(qpos):

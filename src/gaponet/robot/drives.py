@@ -80,10 +80,8 @@ def drives(
     if without_gain:
         raise UsageError(
             f"{file} has no position gain for {abbreviate(without_gain)}: give those of the controller that recorded "
-            "the "
-            "logs, "
-            "--kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); if they are unknown, a guess is enough, "
-            "gaponet identify corrects it within a factor of 50"
+            "the logs, --kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); if they are unknown, a guess is "
+            "enough, gaponet identify corrects it within a factor of 50"
         )
     return tuple(result)
 

@@ -37,8 +37,7 @@ class Finding:
         """Return lines for logs.toml: corrections, and as comments the findings that it cannot correct."""
         bad = [f for f in findings if f.level in ("warning", "error")]
         lines = [
-            "# gaponet doctor --fix: a proposal, applied to nothing. Look it over, add it to the logs.toml of these "
-            "logs,",
+            "# gaponet doctor --fix: a proposal, applied to nothing. Check it, add it to the logs.toml of these logs,",
             "# import into a new folder and call the doctor again. Joints have the robot's names.",
             "",
         ]
@@ -48,11 +47,7 @@ class Finding:
             for table, values in finding.mend.items():
                 tables.setdefault(table, {}).update(values)
         for table, values in tables.items():
-            lines += [
-                "",
-                f"[{table}]",
-                *(f"{json.dumps(joint)} = {json.dumps(value)}" for joint, value in values.items()),
-            ]
+            lines += ["", f"[{table}]", *(f"{json.dumps(joint)} = {json.dumps(v)}" for joint, v in values.items())]
         if not bad:
             lines = ["# gaponet doctor --fix: nothing to mend."]
         return "\n".join(lines) + "\n"

@@ -46,9 +46,7 @@ def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
     for j in range(model.njnt):
         yield from _joint(model, data, j, link)
     for i in range(model.nu):
-        text = " ".join(
-            f"{f} {_exact(getattr(model, f'actuator_{f}', np.zeros(model.nu))[i])}" for f in ACTUATOR_FIELDS
-        )
+        text = _fields(model, "actuator", ACTUATOR_FIELDS, i)
         limits = [_range(model, "actuator", kind, i) for kind in ("force", "ctrl", "act")]
         yield f"actuator of {model.joint(model.actuator_trnid[i, 0]).name} {text} {' '.join(limits)}"
     for body in range(1, model.nbody):
@@ -100,8 +98,8 @@ def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, link: dict[int, i
     dampers = [model.dof_damping[dof], *np.ravel(_row(model, "dof_dampingpoly", dof))]
     rest = model.qpos_spring[at] if any(springs) else 0.0
     yield f"ref {_exact(model.qpos0[at])} spring {_exact(springs)} at {_exact(rest)} damping {_exact(dampers)}"
-    yield " ".join(f"{f} {_exact(getattr(model, f'jnt_{f}')[j])}" for f in JOINT_FIELDS)
-    yield " ".join(f"{f} {_exact(getattr(model, f'dof_{f}')[dof])}" for f in DOF_FIELDS)
+    yield _fields(model, "jnt", JOINT_FIELDS, j)
+    yield _fields(model, "dof", DOF_FIELDS, dof)
     limits = f"{_exact(model.jnt_range[j])}" if model.jnt_limited[j] else "none"
     yield f"range {limits} {_range(model, 'jnt', 'actfrc', j)}"
 
@@ -127,16 +125,15 @@ def _geoms(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int], tou
         if not collides and not model.geom_fluid[g].any():
             continue
         position, rotation = data.geom_xpos[g], data.geom_xmat[g].reshape(3, 3)
-        text = " ".join(f"{f} {_exact(getattr(model, f'geom_{f}')[g])}" for f in GEOM_FIELDS)
+        text = _fields(model, "geom", GEOM_FIELDS, g)
         if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
             start, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
             v = position + model.mesh_vert[start : start + count].astype(float) @ rotation.T
             shape = f"{count} vertices {_rounded([v.mean(axis=0), v.min(axis=0), v.max(axis=0)], MESH_STEP)}"
         else:
-            shape = (
-                f"{_exact(model.geom_size[g])} at {_rounded(position, LENGTH_STEP)} {_rounded(rotation, LENGTH_STEP)}"
-            )
+            frame = f"{_rounded(position, LENGTH_STEP)} {_rounded(rotation, LENGTH_STEP)}"
+            shape = f"{_exact(model.geom_size[g])} at {frame}"
         yield f"geom on {link[int(model.geom_bodyid[g])]} {text} {shape}"
     if touching:
         yield f"exclude {_exact(model.exclude_signature)}"
@@ -147,6 +144,11 @@ def _geoms(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int], tou
 def _range(model: mujoco.MjModel, prefix: str, kind: str, i: int) -> str:
     limited = getattr(model, f"{prefix}_{kind}limited")[i]
     return f"{kind} {_exact(getattr(model, f'{prefix}_{kind}range')[i]) if limited else 'free'}"
+
+
+def _fields(model: mujoco.MjModel, kind: str, names: tuple[str, ...], i: int) -> str:
+    """Return fields of element i of a kind; an array that this version of MuJoCo lacks counts as zeros."""
+    return " ".join(f"{name} {_exact(_row(model, f'{kind}_{name}', i))}" for name in names)
 
 
 def _row(model: mujoco.MjModel, name: str, i: int) -> Array:

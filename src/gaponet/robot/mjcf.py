@@ -32,18 +32,10 @@ PLAIN_TAGS = {
 MAX_PLAIN_ELEMENTS = 2000
 EXPANDING_ATTRIBUTES = {"nsample", "resolution", "builtin", "file", "num", "dim"}  # create more than the file shows
 USER_SIZES = [f"nuser_{kind}" for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")]
-SOLVER_ITERATIONS = (
-    "iterations",
-    "ls_iterations",
-    "noslip_iterations",
-    "ccd_iterations",
-    "sdf_iterations",
-    "sdf_initpoints",
-)
-MAX_ATTRIBUTES = {
-    "size": dict.fromkeys(("nuserdata", "nkey", *USER_SIZES), 1000),
-    "option": dict.fromkeys(SOLVER_ITERATIONS, 1000),
-}
+SOLVER_ITERATIONS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations",
+                     "sdf_initpoints")  # fmt: skip
+LIMITED_ATTRIBUTES = {"size": {"nuserdata", "nkey", *USER_SIZES}, "option": {*SOLVER_ITERATIONS}}
+MAX_ATTRIBUTE = 1000
 _ACCEPTED: set[frozenset[tuple[str, int, int]]] = set()
 
 
@@ -146,20 +138,18 @@ def _count(path: Path, folder: Path, seen: set[Path], inspection: _Inspection, t
         times *= _copies(tag)
         inspection.count += times
         inspection.plain = inspection.plain and tag.tag in PLAIN_TAGS and not EXPANDING_ATTRIBUTES & tag.attrib.keys()
-        if (
-            inspection.count > MAX_ELEMENTS
-            or _extent(tag, "width", "height") > MAX_CELLS
-            or _extent(tag, "nrow", "ncol") > MAX_CELLS
-        ):
+        cells = max(_extent(tag, "width", "height"), _extent(tag, "nrow", "ncol"))
+        if inspection.count > MAX_ELEMENTS or cells > MAX_CELLS:
             raise RobotError(f"{path}: <{tag.tag}> makes a model far larger than a robot; gaponet does not load it")
         if tag.tag == "size" and _bytes(tag.get("memory", "0")) > MAX_BYTES:
             raise RobotError(
                 f"{path}: <size memory> is above {MAX_BYTES >> 20} MiB; delete it, MuJoCo chooses the size"
             )
-        for name in MAX_ATTRIBUTES.get(tag.tag, {}).keys() & tag.attrib.keys():
-            if not _extent(tag, name) <= MAX_ATTRIBUTES[tag.tag][name]:
-                most = MAX_ATTRIBUTES[tag.tag][name]
-                raise RobotError(f"{path}: <{tag.tag} {name}> is above {most}, more than a robot needs; delete it")
+        for name in LIMITED_ATTRIBUTES.get(tag.tag, set()) & tag.attrib.keys():
+            if not _extent(tag, name) <= MAX_ATTRIBUTE:
+                raise RobotError(
+                    f"{path}: <{tag.tag} {name}> is above {MAX_ATTRIBUTE}, more than a robot needs; delete it"
+                )
         if tag.tag == "include":
             other = folder / tag.get("file", "")
             if other.resolve() in seen:

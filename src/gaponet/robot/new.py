@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -32,9 +31,7 @@ class RobotOptions:
 
     Attributes:
         joints: Logged joints; all others are fixed. Default: those with an actuator, or all hinges if none has one.
-        operated: Logged joints that the operator corrects; default: all.
         kp, kd, effort_limit: "100" or "*wrist*=20", N·m/rad, N·m·s/rad, N·m; a later value overrides earlier ones.
-        mounts: Payload mounts, "hand=BODY" or "hand=BODY:x,y,z", m; default: found by name.
         packages: "NAME=FOLDER" of package://NAME.
         rate: Rate of commands, Hz.
         keyframe: Home position, also of fixed joints; default: the first keyframe.
@@ -42,11 +39,9 @@ class RobotOptions:
     """
 
     joints: tuple[str, ...] = ()
-    operated: tuple[str, ...] = ()
     kp: tuple[str, ...] = ()
     kd: tuple[str, ...] = ()
     effort_limit: tuple[str, ...] = ()
-    mounts: tuple[str, ...] = ()
     packages: tuple[str, ...] = ()
     rate: float = 50.0
     keyframe: str = ""
@@ -98,19 +93,6 @@ def new_robot(path: Path, out: Path, options: RobotOptions) -> NewRobot:
     return NewRobot(load_robot(out), joint_drives, model, pose, notes)
 
 
-def matching(names: Iterable[str], patterns: Iterable[str], option: str) -> list[str]:
-    """Return the names that match any pattern, in their order.
-
-    Raises:
-        UsageError: A pattern matches no name.
-    """
-    names = list(names)
-    for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in names):
-            raise UsageError(f"{option} {pattern}: no such joint; there are: {', '.join(names)}")
-    return [name for name in names if any(fnmatchcase(name, p) for p in patterns)]
-
-
 def _pair(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not equals or not name or not value:
@@ -129,11 +111,13 @@ def _logged_joints(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path)
         kind = kinds[name].name.removeprefix("mjJNT_").lower()
         raise UsageError(
             f"--joints {name}: is a {kind} joint, and gaponet supports angles only (rad, N·m); leave it out, then it "
-            "is "
-            "fixed at home"
+            "is fixed at home"
         )
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in hinges):
+            raise UsageError(f"--joints {pattern}: no such joint; there are: {', '.join(hinges)}")
     if patterns:
-        return matching(hinges, patterns, "--joints")
+        return [name for name in hinges if any(fnmatchcase(name, p) for p in patterns)]
     actuated = {model.joint(j).name for j in model.actuator_trnid[np.isin(model.actuator_trntype, ON_JOINT), 0]}
     return [name for name in hinges if name in actuated] or hinges
 
@@ -238,7 +222,6 @@ def _robot_toml(
     if not (0 < options.rate <= 1000):
         raise UsageError(f"--rate {options.rate}: give the rate of the commands in Hz, up to 1000")
     names = [d.name for d in joint_drives]
-    operated = matching(names, options.operated, "--operated") if options.operated else names
     dt = 1 / options.rate
     steps = max(1, math.ceil(dt / model.opt.timestep - 1e-6))
     stem = path.resolve().parent.name if path.stem in ("robot", "model", "scene") else path.stem
@@ -256,21 +239,18 @@ def _robot_toml(
             *([f"aliases = [{json.dumps(d.actuator)}]  # its actuator"] if d.actuator not in ("", *names) else []),
             f"kp = {d.kp!r}  # N·m/rad: {d.kp_source}", f"kd = {d.kd!r}  # N·m·s/rad: {d.kd_source}",
             f"effort_limit = {d.limit!r}  # N·m: {d.limit_source}",
-            f"home = {float(d.home)!r}  # rad: {source}", f"operated = {str(d.name in operated).lower()}",
+            f"home = {float(d.home)!r}  # rad: {source}", "operated = true",
         ]  # fmt: skip
-    for side, body, pos, why in _mounts(model, operated, options.mounts):
+    for side, body, pos, why in _mounts(model, names):
         lines += ["", f"[[payload_mount]]  # {why}", f"side = {json.dumps(side)}",
                   f"body = {json.dumps(body)}", f"pos = {[round(float(x), 6) for x in pos]}"]  # fmt: skip
     return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines) + "\n"
 
 
-def _mounts(
-    model: mujoco.MjModel, operated: list[str], mounts: tuple[str, ...]
-) -> list[tuple[str, str, np.ndarray, str]]:
-    """Return payload mounts: side, body, position in it (m), and source."""
-    if mounts:
-        return [_mount(model, *_pair(word)) for word in mounts]
-    ends = tips = _last_bodies(model, operated)
+def _mounts(model: mujoco.MjModel, joints: list[str]) -> list[tuple[str, str, np.ndarray, str]]:
+    """Guess payload mounts: side, body, position in it (m), and source."""
+    moved = {int(model.jnt_bodyid[model.joint(name).id]) for name in joints}
+    ends = tips = [b for b in sorted(moved) if not moved & set(_beyond(model, b)[1:])]  # nothing moves beyond them
     if len(ends) > 1:
         ends = _palms(model, [e for e in ends if any(_hand(model.body(b).name) for b in _beyond(model, e))])
     result: list[tuple[str, str, np.ndarray, str]] = []
@@ -286,26 +266,8 @@ def _mounts(
             body, pos, why = end, model.body_ipos[end], "the last link's centre of mass"
         name = model.body(end).name.lower()
         side = next((word for word in ("left", "right") if word in name), f"hand{len(result) or ''}")
-        result.append((side, model.body(body).name, pos, f"a guess: {why}; --mounts SIDE=BODY:x,y,z sets it"))
+        result.append((side, model.body(body).name, pos, f"a guess: {why}; correct side, body and pos"))
     return result
-
-
-def _mount(model: mujoco.MjModel, side: str, where: str) -> tuple[str, str, np.ndarray, str]:
-    body, _, place = where.partition(":")
-    try:
-        pos = np.array([float(x) for x in place.split(",")] if place else [0.0, 0.0, 0.0])
-    except ValueError:
-        pos = np.zeros(0)
-    bodies = [model.body(b).name for b in range(1, model.nbody)]
-    if body not in bodies or pos.shape != (3,) or not np.isfinite(pos).all():
-        raise UsageError(f"--mounts {side}={where}: write SIDE=BODY or SIDE=BODY:x,y,z; bodies: {', '.join(bodies)}")
-    return side, body, pos, "--mounts"
-
-
-def _last_bodies(model: mujoco.MjModel, operated: list[str]) -> list[int]:
-    """Return the bodies with an operated joint but none beyond it."""
-    moved = {int(model.jnt_bodyid[model.joint(name).id]) for name in operated}
-    return [b for b in sorted(moved) if not moved & set(_beyond(model, b)[1:])]
 
 
 def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:

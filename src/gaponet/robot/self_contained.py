@@ -24,7 +24,6 @@ Counters = dict[str, Iterator[int]]  # tag → index of the next element in the 
 DROPPED_SECTIONS = ("actuator", "sensor", "keyframe", "asset", "visual", "statistic", "custom", "size")
 COMPILER_ATTRIBUTES = {"angle": "radian", "autolimits": "true", "inertiafromgeom": "auto"}
 DROPPED_GEOM_ATTRIBUTES = ("class", "childclass", "material", "mesh", "density", "shellinertia", "fitscale", "fromto")
-JOINT_ATTRIBUTES = ("armature", "frictionloss", "margin")
 
 
 def self_contained_mjcf(path: Path) -> str:
@@ -52,9 +51,8 @@ def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
     ET.indent(root)
     text = ET.tostring(root, encoding="unicode") + "\n"
     if _fingerprint(model) != _fingerprint(compile_spec(mujoco.MjSpec.from_string(text), path)):
-        raise RobotError(
-            f"{path}: does not fit into one file that moves the same; write it without <include> and files"
-        )
+        what = "does not fit into one file that moves the same; write it without <include> and files"
+        raise RobotError(f"{path}: {what}")
     return text
 
 
@@ -99,12 +97,9 @@ def _unwrap(element: ET.Element) -> None:
 def _joint(element: ET.Element, model: mujoco.MjModel, j: int) -> None:
     dof, at = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
     set_attributes(
-        element, pos=model.jnt_pos[j], axis=model.jnt_axis[j], ref=model.qpos0[at], springref=model.qpos_spring[at]
-    )
-    set_attributes(
-        element,
-        **{name: getattr(model, f"{'jnt' if name == 'margin' else 'dof'}_{name}")[dof] for name in JOINT_ATTRIBUTES},
-    )
+        element, pos=model.jnt_pos[j], axis=model.jnt_axis[j], ref=model.qpos0[at], springref=model.qpos_spring[at],
+        armature=model.dof_armature[dof], frictionloss=model.dof_frictionloss[dof], margin=model.jnt_margin[dof],
+    )  # fmt: skip
     for name, kind, i in (("stiffness", "jnt", j), ("damping", "dof", dof)):
         higher = getattr(model, f"{kind}_{name}poly", np.zeros((model.nv, 0)))[i]
         first = getattr(model, f"{kind}_{name}")[i]

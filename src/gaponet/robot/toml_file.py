@@ -37,9 +37,7 @@ class ServoType:
     armature: Gain | None = None  # kg·m²
     frictionloss: Gain | None = None  # N·m
     gain: Gain | None = None  # N·m/rad for a firmware kp of 1
-    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = (
-        None  # V, supply of that measurement; gain is proportional to it
-    )
+    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = None  # V, of its supply; gain is in proportion
 
     @property
     def published(self) -> dict[str, float]:

@@ -120,13 +120,12 @@ def _correct_inertias(root: ET.Element) -> list[str]:
         impossible.append(link.get("name", ""))
     moved = {j.find("child").get("link", "") for j in root.iter("joint")  # type: ignore[union-attr]
              if j.get("type") != "fixed" and j.find("child") is not None}  # fmt: skip
-    notes = (
-        [f"inertia that no body has, taken as a ball's of the link's mass: {abbreviate(impossible)}"]
-        if impossible
-        else []
-    )
-    light = [name for name in light if name in moved]
-    return notes + ([f"links without mass behind a joint, taken as 1 mg: {abbreviate(light)}"] if light else [])
+    notes = []
+    if impossible:
+        notes.append(f"inertia that no body has, taken as a ball's of the link's mass: {abbreviate(impossible)}")
+    if light := [name for name in light if name in moved]:
+        notes.append(f"links without mass behind a joint, taken as 1 mg: {abbreviate(light)}")
+    return notes
 
 
 def _number(element: ET.Element | None, name: str) -> float:

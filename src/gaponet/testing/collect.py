@@ -56,11 +56,6 @@ class Collection:
     hours: float
     wall_s: float
 
-    @property
-    def times_real_time(self) -> float:
-        """Recorded time over wall time."""
-        return self.hours * 3600 / self.wall_s if self.wall_s > 0 else 0.0
-
 
 def collect(
     robot: RobotSpec,

@@ -1,20 +1,13 @@
-"""Fleets: virtual units sampled once from documented distributions, and stored.
+"""Fleets: virtual units sampled from documented distributions.
 
-A fleet file (fleets/*.toml) holds a seed, one [[distribution]] with its source per hidden parameter, and the sampled
-units. All units of a type share the deviations of the type (type_spread, per joint). They differ by production
-tolerances (unit_spread for the whole unit, joint_spread per joint). For a robot without units in the file they are
-sampled when the fleet is loaded, by the same rule.
-
-python -m gaponet.testing.fleet FLEET ROBOT     # samples the units again and writes them into the fleet's file
-
-Do that once after a distribution or the seed was changed; earlier results then belong to another fleet.
+A fleet file (fleets/*.toml) holds a seed and one [[distribution]] with its source per hidden parameter. All units of a
+type share the deviations of the type (type_spread, per joint). They differ by production tolerances (unit_spread for
+the whole unit, joint_spread per joint). Another distribution or seed makes another fleet.
 """
 
 from __future__ import annotations
 
 import hashlib
-import sys
-import tomllib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal, NotRequired
@@ -24,23 +17,18 @@ from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import write_text
 from gaponet.base.structure import Extended, Name, load_toml, validated
-from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec
 from gaponet.testing.physics import Physics, neutral
-
-Array = np.ndarray
 
 FLEETS = Path(__file__).parent / "fleets"
 UNITS = 4
-UNITS_MARKER = "\n# ---- drawn units ----\n"  # line of a fleet file before its units
-SIGNIFICANT_DIGITS = 6  # of a stored number
+SIGNIFICANT_DIGITS = 6  # of a sampled number, so that it does not depend on the machine
 MAX_DELAY_S = 1.0  # also the limit of the share of lost commands
 MAX_PARAMETER = 1e6  # of any other parameter, unless infinity means "no effect"
 SIGNED = ("friction_asymmetry", "drag_angle", "grip_x", "grip_z", "cable_angle", "cogging_phase", "tilt_roll",
           "tilt_pitch", "com_x", "com_y", "com_z", "zero_offset", "current_offset")  # fmt: skip
 Spread = Annotated[float, Interval(ge=0, le=MAX_PARAMETER)]
-UnitTable = dict[str, Extended | dict[str, dict[str, Extended]]]
 
 
 @dataclass(frozen=True)
@@ -63,17 +51,12 @@ class Distribution:
 
 
 class FleetTable(TypedDict):
-    """Content of a fleet file.
-
-    Attributes:
-        robot: Robot → unit → parameter of the unit, or joint → parameters of the joint.
-    """
+    """Content of a fleet file."""
 
     seed: Annotated[int, Interval(ge=0, le=2**63)]
     distribution: Annotated[tuple[Distribution, ...], Len(1, 1000)]
     name: NotRequired[Name]
     virtual: NotRequired[bool]
-    robot: NotRequired[dict[str, Annotated[dict[Name, UnitTable], Len(1, 1000)]]]
 
 
 class RescaledFleetTable(TypedDict):
@@ -95,7 +78,6 @@ class Fleet:
     """
 
     name: str
-    robot: str
     seed: int
     distributions: tuple[Distribution, ...]
     units: dict[str, Physics]
@@ -129,30 +111,15 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
         name = file.get("name", path.stem)
         return replace(load_fleet(FLEETS / f"{file['like']}.toml", robot), name=name, gain_scale=file["gain_scale"])
     table = validated(FleetTable, loaded, path, UsageError)
-    seed, distributions = table["seed"], _require_parameters(table["distribution"], path)
-    saved = table.get("robot", {}).get(robot.name)
-    if saved is None:
-        units = sample_fleet(robot, distributions, seed)
-        for unit_id, unit in units.items():
-            _require_possible(unit, f"{path}: unit '{unit_id}', sampled from the distributions")
-    else:
-        names = {d.name for d in distributions}
-        units = {unit_id: _physics(unit_id, unit, names, robot, path) for unit_id, unit in saved.items()}
-    return Fleet(table.get("name", path.stem), robot.name, seed, distributions, units)
-
-
-def _require_parameters(distributions: tuple[Distribution, ...], path: Path) -> tuple[Distribution, ...]:
-    """Return the distributions; refuse a parameter that does not exist or appears twice in the file `path`."""
+    seed, distributions = table["seed"], table["distribution"]
     parameters, names = [f.name for f in fields(Physics)], [d.name for d in distributions]
     for name in names:
         if name not in parameters or names.count(name) > 1:
             raise UsageError(f"{path}: [[distribution]] names '{name}' twice, or not one of {', '.join(parameters)}")
-    return distributions
-
-
-def sample_fleet(robot: RobotSpec, distributions: tuple[Distribution, ...], seed: int) -> dict[str, Physics]:
-    """Sample the units of a fleet, by id."""
-    return {f"virtual-{k}": sample_unit(robot, distributions, seed, k) for k in range(1, UNITS + 1)}
+    units = {f"virtual-{k}": sample_unit(robot, distributions, seed, k) for k in range(1, UNITS + 1)}
+    for unit_id, unit in units.items():
+        _require_possible(unit, f"{path}: unit '{unit_id}'")
+    return Fleet(table.get("name", path.stem), seed, distributions, units)
 
 
 def sample_unit(robot: RobotSpec, distributions: tuple[Distribution, ...], seed: int, unit: int) -> Physics:
@@ -180,23 +147,6 @@ def sample_unit(robot: RobotSpec, distributions: tuple[Distribution, ...], seed:
     return replace(neutral(n), **values)
 
 
-def _physics(unit_id: str, unit: UnitTable, names: set[str], robot: RobotSpec, path: Path) -> Physics:
-    """Return a stored unit with the parameters `names`."""
-    joints = unit.get("joint", {})
-    values = {}
-    for f in (f for f in fields(Physics) if f.name in names):
-        try:
-            if f.metadata["scope"] == "unit":
-                values[f.name] = np.array([float(unit[f.name])])  # type: ignore[arg-type]
-            else:
-                values[f.name] = np.array([joints[name][f.name] for name in robot.joint_names])  # type: ignore[index]
-        except (KeyError, TypeError) as error:
-            raise UsageError(f"{path}: unit '{unit_id}': {f.name}: {error} is missing; draw the fleet again") from None
-    physics = replace(neutral(len(robot.joint_names)), **values)
-    _require_possible(physics, f"{path}: unit '{unit_id}'")
-    return physics
-
-
 def _require_possible(unit: Physics, where: str) -> None:
     """Refuse parameters that no robot can have."""
     for f in fields(Physics):
@@ -206,33 +156,4 @@ def _require_possible(unit: Physics, where: str) -> None:
         if f.name == "corner":
             good &= value < 1.0
         if not (good | ((value == np.inf) & (f.metadata["neutral"] == np.inf))).all():
-            raise UsageError(f"{where}: {f.name} is {value.tolist()}; draw the fleet again")
-
-
-def to_toml(robot: RobotSpec, units: dict[str, Physics], distributions: tuple[Distribution, ...]) -> str:
-    """Return sampled units as the part of a fleet file after its distributions."""
-    scope = {f.name: f.metadata["scope"] for f in fields(Physics)}
-    scopes = {d.name: scope[d.name] for d in distributions}
-    lines = []
-    for unit_id, unit in units.items():
-        lines.append(f"\n[robot.{robot.name}.{unit_id}]")
-        lines += [f"{name} = {float(getattr(unit, name)[0])!r}" for name, s in scopes.items() if s == "unit"]
-        lines.append(f"[robot.{robot.name}.{unit_id}.joint]")
-        for i, joint in enumerate(robot.joint_names):
-            pairs = [f"{name} = {float(getattr(unit, name)[i])!r}" for name, s in scopes.items() if s == "joint"]
-            lines.append(f"{joint} = {{ {', '.join(pairs)} }}")
-    return "\n".join(lines) + "\n"
-
-
-def main(fleet: str, robot_name: str) -> None:
-    """Sample the units of a fleet of the package again; everything above UNITS_MARKER in its file stays."""
-    path = FLEETS / f"{fleet}.toml"
-    head = path.read_text(encoding="utf-8").split(UNITS_MARKER)[0]
-    table = validated(FleetTable, tomllib.loads(head), path, UsageError)
-    distributions, robot = _require_parameters(table["distribution"], path), load_robot(robot_name)
-    units = sample_fleet(robot, distributions, table["seed"])
-    write_text(path, head + UNITS_MARKER + to_toml(robot, units, distributions))
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+            raise UsageError(f"{where}: {f.name} is {value.tolist()}; correct its [[distribution]]")

@@ -9,10 +9,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.sim.batch import Batch
 from gaponet.testing.physics import Physics
-
-Array = np.ndarray
 
 DERATING_TEMPERATURE = 40.0  # °C above which a drive reduces its gain
 STUCK_SPEED = 1e-3  # rad/s below which a joint counts as stuck
@@ -103,7 +102,6 @@ class Couplings:
         self.neighbour = np.where(parent >= 0, parent, after)
         chain = np.cumsum(parent != np.arange(model.nv) - 1) - 1  # a chain starts at each branch
         self.same_chain = (chain[:, None] == chain).astype(float)
-        self.drags, self.limits = bool((physics.drag > 0).any()), bool((physics.limb_loss > 0).any())
         self.flexes = bool((physics.flex > 0).any())
         if self.flexes:
             self._gravity, self._com = batch.expand("opt.gravity"), batch.bind("subtree_com")

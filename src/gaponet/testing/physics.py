@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-
-Array = np.ndarray
 
 
 def _joint(effect: str, neutral: float, unit: str) -> dict[str, Any]:
@@ -129,11 +128,6 @@ class Physics:
             if f.metadata["effect"] not in effects
         }
         return replace(self, **off)
-
-    def without(self, *effects: str) -> Physics:
-        """Return the unit with these effects switched off."""
-        self.only(effects)  # raises an error for an unknown effect
-        return self.only([e for e in EFFECTS if e not in effects])
 
 
 EFFECTS: tuple[str, ...] = tuple(dict.fromkeys(f.metadata["effect"] for f in fields(Physics)))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.spec import RobotSpec
@@ -18,9 +19,7 @@ from gaponet.sysid.motion.motion import Motion
 from gaponet.sysid.motion.recipe import Recipe, Take
 from gaponet.testing.fleet import Fleet
 from gaponet.testing.physics import Physics
-from gaponet.testing.virtual_robot import UnitEvent, VirtualRobot
-
-Array = np.ndarray
+from gaponet.testing.virtual_robot import VirtualRobot
 
 
 @dataclass(frozen=True)
@@ -93,12 +92,7 @@ def _record(job: Job, group: list[Take], motions: dict[str, Motion], locked: tup
     for i, (take, c) in enumerate(zip(group, ctrl, strict=True)):
         qpos, qvel, tau, temperature = readings[:, : len(c), i]
         torque, qacc = equivalent_torque(models[payloads[i]], qpos, dt)
-        notes = {
-            "rate_hz": take.rate,
-            "warmth_K": round(float(warmth[i]), 2),
-            "seed": job.seed,
-            "events": _events(robots.events[i], len(c) * dt),
-        }
+        notes = {"rate_hz": take.rate, "warmth_K": round(float(warmth[i]), 2), "seed": job.seed}
         meta = _meta(job, take, motions[take.motion].level, notes)
         sequences.append(Sequence(meta, job.robot.joint_names, dt, c, qpos, qvel, qacc, tau, torque, temperature))
     return sequences
@@ -108,12 +102,6 @@ def _warmth(unit: Physics, seed: int) -> float:
     """Return the temperature above ambient at the start of a recording, K."""
     deviation = np.random.default_rng([seed, 1]).standard_normal()
     return max(0.0, float(unit.warmth[0] + unit.warmth_spread[0] * deviation))
-
-
-def _events(reported: list[UnitEvent], end: float) -> list[dict[str, Any]]:
-    """Return start, reported events and end, each with its time in the recording, s."""
-    middle = [{k: v for k, v in asdict(e).items() if v != ""} for e in reported if e.time < end]
-    return [{"time": 0.0, "kind": "motion_start"}, *middle, {"time": round(end, 4), "kind": "motion_end"}]
 
 
 def _meta(job: Job, take: Take, level: str, notes: dict[str, Any]) -> SequenceMeta:

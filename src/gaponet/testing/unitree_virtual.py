@@ -8,9 +8,8 @@ case. It can also simulate faults, to test the reaction of a controller.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,28 +32,13 @@ CLOCK_STEP_S = 10.0  # by which the robot's clock is ahead in the fault "clock"
 FIRST_ARM_MOTOR = 12  # rt/arm_sdk commands this motor and all after it
 
 
-@dataclass
-class CommandLog:
-    """Received commands: time (s), topic, targets, gains, weight, and joint states then; (n) in motor order."""
-
-    time: list[float] = field(default_factory=list)
-    topic: list[str] = field(default_factory=list)
-    ctrl: list[Array] = field(default_factory=list)
-    kp: list[Array] = field(default_factory=list)
-    kd: list[Array] = field(default_factory=list)
-    mode: list[Array] = field(default_factory=list)
-    weight: list[float] = field(default_factory=list)
-    qpos: list[Array] = field(default_factory=list)
-    qvel: list[Array] = field(default_factory=list)
-
-    def save(self, path: Path) -> None:
-        """Write the log as npz."""
-        with atomic_write(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **{name: np.array(values) for name, values in vars(self).items()})  # type: ignore[arg-type]
-
-
 class VirtualH12:
-    """The robot on the bus."""
+    """The robot on the bus.
+
+    Attributes:
+        heard: Received commands: time (s), topic, weight, and targets, gains, modes and joint states then, (n) in motor
+            order.
+    """
 
     def __init__(
         self,
@@ -83,7 +67,7 @@ class VirtualH12:
         self._writer = bus.writer("rt/lowstate", dds.LowState)
         self._readers = {name: bus.reader(f"rt/{name}", dds.LowCmd) for name in ("arm_sdk", "lowcmd")}
         self.live = LiveUnit(robot, physics, payload, seed=seed, period=1.0 / rate)
-        self.clock, self.heard = MonotonicClock(), CommandLog()
+        self.clock, self.heard = MonotonicClock(), list[dict[str, Any]]()
         self.first_command: float | None = None
         self.refused = self.missed = 0
         self._message = hg.LowState.new()
@@ -121,8 +105,12 @@ class VirtualH12:
             self.refused += 1
             return
         weight = 1.0 if topic == "lowcmd" else float(np.clip(q[WEIGHT_MOTOR], 0.0, 1.0))
-        self._log(topic, q, kp, kd, mode, weight, now)
         robot, motors = self.robot, len(MOTOR_NAMES)
+        qpos, qvel, *_ = self.live.read()
+        self.heard.append({
+            "time": now, "topic": topic, "ctrl": q[:motors], "kp": kp[:motors], "kd": kd[:motors],
+            "mode": mode[:motors], "weight": weight, "qpos": qpos[self._order], "qvel": qvel[self._order],
+        })  # fmt: skip
         share = np.zeros(motors)
         share[0 if topic == "lowcmd" else FIRST_ARM_MOTOR :] = weight
         enabled = (mode[:motors] == 1) | (topic == "arm_sdk")
@@ -137,16 +125,11 @@ class VirtualH12:
             out[self._order] = (1 - share) * mine[self._order] + share * theirs
         self.live.set_gains(gains, dampers, torque=torque)
 
-    def _log(self, topic: str, q: Array, kp: Array, kd: Array, mode: Array, weight: float, now: float) -> None:
-        qpos, qvel, *_ = self.live.read()
-        log, motors = self.heard, len(MOTOR_NAMES)
-        log.time.append(now)
-        log.topic.append(topic)
-        log.weight.append(weight)
-        for column, values in ((log.ctrl, q), (log.kp, kp), (log.kd, kd), (log.mode, mode)):
-            column.append(values[:motors])
-        log.qpos.append(qpos[self._order])
-        log.qvel.append(qvel[self._order])
+    def save_heard(self, path: Path) -> None:
+        """Write the received commands as npz, an array per field."""
+        columns = {name: np.array([row[name] for row in self.heard]) for name in next(iter(self.heard), {})}
+        with atomic_write(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **columns)
 
     def _send_state(self, k: int, now: float) -> None:
         wrong = self.first_command is not None and now - self.first_command >= self.fault_at

@@ -37,7 +37,7 @@ class LiveUnit:
             period: Time between two states, s.
         """
         self.robot, self.period = robot, period
-        locked = idle_joints(robot, robot.operated) if len(robot.operated) < len(robot.joint_names) else ()
+        locked = idle_joints(robot, robot.operated)
         self.unit = VirtualRobot(robot, [physics], [payload], dt=period, locked=locked)
         self.ctrl = robot.qpos_home.copy()
         self.unit.reset(self.ctrl[None], [seed])
@@ -102,7 +102,7 @@ class VirtualDriver:
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
         self.clock, self.period, self._given = clock, period, (robot, physics, payload, seed, period)
-        locked = idle_joints(robot, robot.operated) if len(robot.operated) < len(robot.joint_names) else ()
+        locked = idle_joints(robot, robot.operated)
         self.commanded = tuple(joint for joint in robot.joint_names if joint not in locked)
         self._at = robot.index(self.commanded)
 

@@ -5,48 +5,23 @@ It is used like a robot: send targets for one control period, then read encoders
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, expand_differences
 from gaponet.sim.model import build_model, qpos_range, stiffen_friction
-from gaponet.testing.motor import (
-    Backlash,
-    Bristles,
-    CommandLink,
-    Couplings,
-    Firmware,
-    Thermal,
-    cogging_torque,
-    derating_factor,
-    friction_limit,
-    quantised,
-    speed_factor,
-    supply_factor,
-)
+from gaponet.testing import motor
 from gaponet.testing.physics import Physics, stack
-
-Array = np.ndarray
 
 MAX_PHYSICS_STEP_S = 0.001
 MAX_EFFECT_PERIOD_S = 0.002  # of the hidden effects; bristles and current loops are evaluated at every physics step
 NOISE_PERIODS = 50  # control periods of noise that are sampled at a time
-HOT_WINDING = 80.0  # °C above which a unit reports "hot"
 REST_STD = 0.1  # of the friction band: a joint that always arrives in the same way stops in nearly the same place
 SETTLING_STEPS = 40  # each reduces the error by gravity stiffness / kp, 0.4 at worst on H1-2
-
-
-@dataclass(frozen=True)
-class UnitEvent:
-    """Event that a unit reports beside its readings: kind is packet_lost, torque_limit or hot."""
-
-    time: float  # s since reset
-    kind: str
-    joint: str = ""
 
 
 @dataclass(frozen=True)
@@ -104,9 +79,6 @@ class VirtualRobot:
         self._gain, self._bias = b.expand("actuator_gainprm"), b.expand("actuator_biasprm")
         self._range, self._frictionloss = b.expand("actuator_forcerange"), b.expand("dof_frictionloss")
         self._applied, self._force = b.bind("qfrc_applied"), b.bind("actuator_force")
-        self._cogs, self._fast = bool((p.cogging != 0).any()), bool(np.isfinite(p.no_load_speed).any())
-        self._thins, self._lags = bool((p.thinning != 0).any()), bool((p.current_time > 0).any())
-        self._churns = bool((p.churning > 0).any())
         self._damping = b.expand("dof_damping")
         self._cold_damping, self._thinning = self._damping.copy(), np.ones((1, 1))
         self._nominal_friction = model.dof_frictionloss.copy()
@@ -114,20 +86,21 @@ class VirtualRobot:
         self._kd = robot.kd[self.active] * p.kd_scale
         self._added = np.zeros_like(self._kp)
         self._effort = robot.effort_limit[self.active]
-        self._compliance, self._twists = p.windup / self._effort, bool((p.windup > 0).any())  # rad per N·m
+        self._compliance = p.windup / self._effort  # rad per N·m
+        # Effects that most fleets lack cost a tenth of the time each step.
+        self._fast, self._lags = bool(np.isfinite(p.no_load_speed).any()), bool((p.current_time > 0).any())
+        self._twists = bool((p.windup > 0).any())
         self._limits = qpos_range(model)
-        self.backlash = Backlash(p, model.dof_armature)
-        self.bristles = Bristles(p, self._nominal_friction)
-        self.thermal = Thermal(p)
-        self.link, self.firmware = CommandLink(p, self.dt), Firmware(p)
-        self.couplings = Couplings(p, model, b, self._effort)
+        self.backlash = motor.Backlash(p, model.dof_armature)
+        self.bristles = motor.Bristles(p, self._nominal_friction)
+        self.thermal = motor.Thermal(p)
+        self.link, self.firmware = motor.CommandLink(p, self.dt), motor.Firmware(p)
+        self.couplings = motor.Couplings(p, model, b, self._effort)
         self._supply = np.ones((self.num_envs, 1))
         self._chain_gain = self._push = self._passed = self._twist = self._squares = self._max_torque = self._kp * 0.0
         self._idle_temperature = np.zeros((self.num_envs, self.n))
         self._noise, self._chance, self._row, self._now = np.zeros(0), np.zeros(0), NOISE_PERIODS, 0.0
         self._rng: list[np.random.Generator] = []
-        self.events: list[list[UnitEvent]] = []
-        self._reported = np.zeros((2, *self._kp.shape), bool)
 
     def reset(self, ctrl: Array, seeds: list[int], warmth: Array | float = 0.0, start: Array | None = None) -> None:
         """Put the robots at rest under a command, as before a recording.
@@ -161,8 +134,6 @@ class VirtualRobot:
         self.bristles.reset(self._passed - load, self._friction_limit(self._passed))
         self.backlash.reset(self._motor_torque())
         self._squares = np.zeros_like(target)
-        self.events = [[] for _ in seeds]
-        self._reported = np.zeros((2, *target.shape), bool)
 
     def set_gains(self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0) -> None:
         """Set the drives to other gains than the robot's, (n) or (N, n); each drive delivers its kp_scale and kd_scale.
@@ -183,7 +154,7 @@ class VirtualRobot:
 
     def _settle(self, target: Array) -> None:
         """Move to the balance of PD and gravity, with a small offset: friction holds a joint where it stopped."""
-        full = self._kp * self.thermal.kt() * derating_factor(self.physics, self.thermal.winding)
+        full = self._kp * self.thermal.kt() * motor.derating_factor(self.physics, self.thermal.winding)
         self._qpos[:] = target
         for _ in range(SETTLING_STEPS):
             load = self._load()
@@ -202,8 +173,8 @@ class VirtualRobot:
 
     def _friction_limit(self, torque: Array) -> Array:
         """Return the present friction limit under a motor torque at the joint, (N, active), N·m."""
-        dry = self._nominal_friction + (self.couplings.drag(self._qpos) if self.couplings.drags else 0.0)
-        return friction_limit(self.physics, dry, self._qvel, torque, self._push, self._thinning)
+        dry = self._nominal_friction + self.couplings.drag(self._qpos)
+        return motor.friction_limit(self.physics, dry, self._qvel, torque, self._push, self._thinning)
 
     def _motor_torque(self) -> Array:
         """Return the torque that the drive sets, at the rated torque constant, (N, active), N·m."""
@@ -213,7 +184,7 @@ class VirtualRobot:
     def _gain_factor(self) -> Array:
         """Return the factor of the drives' gain by supply, temperature and load of the chain, (N, active)."""
         supply = 1.0 + self.physics.supply_gain * (self._supply - 1.0)
-        return supply * derating_factor(self.physics, self.thermal.winding) * self._chain_gain
+        return supply * motor.derating_factor(self.physics, self.thermal.winding) * self._chain_gain
 
     def step(self, ctrl: Array, rows: Array | None = None) -> None:
         """Send targets (N, n) rad and simulate one control period, only for `rows` (k,) if given."""
@@ -228,9 +199,8 @@ class VirtualRobot:
         factor = kt * self._gain_factor()
         self._max_torque = self._effort * kt * np.minimum(self._supply, 1.0)
         self._range[:, :, 1], self._range[:, :, 0] = self._max_torque, -self._max_torque
-        if self._thins:
-            self._thinning = self.thermal.thinning_factor()
-            self._damping[:] = self._cold_damping * self._thinning
+        self._thinning = self.thermal.thinning_factor()
+        self._damping[:] = self._cold_damping * self._thinning
         kp, kd, added = self._kp * factor, self._kd * factor, self._added * factor
         for k in range(count):
             target = self.link.read(self._now + k * period)
@@ -248,7 +218,6 @@ class VirtualRobot:
                 self._passed = self._force.copy()
                 self._twist = self._compliance * (self._passed - self._push)
         self._end_period(count)
-        self._report(range(self.num_envs) if rows is None else rows.tolist())
         self._now += self.dt
         self._row += 1
 
@@ -268,46 +237,23 @@ class VirtualRobot:
         self._bias[:, :, 1] = -kp
         self._bias[:, :, 2] = -kd
         if self._fast:
-            self._range[:, :, 1] = self._max_torque * speed_factor(self.physics, self._qvel)
-            self._range[:, :, 0] = -self._max_torque * speed_factor(self.physics, -self._qvel)
-        self._friction(joint_torque, period)
-
-    def _friction(self, joint_torque: Array, period: float) -> None:
-        """Set friction limits and applied torques."""
+            self._range[:, :, 1] = self._max_torque * motor.speed_factor(self.physics, self._qvel)
+            self._range[:, :, 0] = -self._max_torque * motor.speed_factor(self.physics, -self._qvel)
         limit = self._friction_limit(joint_torque)
-        ripple = cogging_torque(self.physics, self._qpos) if self._cogs else 0.0
-        if self._churns:
-            ripple = ripple - self.physics.churning * self._qvel * np.abs(self._qvel)
+        self._applied[:] = -self.physics.churning * self._qvel * np.abs(self._qvel)
+        self._applied += motor.cogging_torque(self.physics, self._qpos)
         if self.bristles.any:
-            self._applied[:] = ripple - self.bristles.step(limit, self._qvel, period)
-            self._frictionloss[:] = np.where(self.bristles.soft, 0.0, limit)
-            return
+            self._applied -= self.bristles.step(limit, self._qvel, period)
+            limit = np.where(self.bristles.soft, 0.0, limit)
         self._frictionloss[:] = limit
-        if self._cogs or self._churns:
-            self._applied[:] = ripple
 
     def _end_period(self, count: int) -> None:
         """Advance temperatures and supply by a control period with `count` effect periods."""
         squares = self._squares / count
         self.thermal.step(squares, self.dt)
         work = np.maximum(self._motor_torque() * self._qvel, 0.0)
-        if self.couplings.limits:
-            self._chain_gain = self.couplings.gain_factor(self._motor_torque())
-        self._supply = supply_factor(self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True))
-
-    def _report(self, rows: Iterable[int]) -> None:
-        """Add events: lost packets, and joints that reach their torque limit or get hot (once until they leave it)."""
-        lost = self._chance[:, self._row, 1] < self.physics.drop[:, 0]
-        now = np.stack([np.abs(self._motor_torque()) >= self._effort, self.thermal.winding > HOT_WINDING])
-        new, self._reported = now & ~self._reported, now
-        if not (lost.any() or new.any()):
-            return
-        for i in rows:
-            if lost[i]:
-                self.events[i].append(UnitEvent(round(self._now, 4), "packet_lost"))
-            for kind, column in zip(*np.nonzero(new[:, i]), strict=True):
-                joint = self.robot.joint_names[self.active[column]]
-                self.events[i].append(UnitEvent(round(self._now, 4), ("torque_limit", "hot")[kind], joint))
+        self._chain_gain = self.couplings.gain_factor(self._motor_torque())
+        self._supply = motor.supply_factor(self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True))
 
     def _sample_noise(self) -> None:
         """Sample noise (N, periods, 3, n) and chances of jitter and loss (N, periods, 2)."""
@@ -321,7 +267,7 @@ class VirtualRobot:
             self._sample_noise()
         p, noise = self.all_joints, self._noise[:, self._row]
         true = self._full(self._qpos + self._twist, self.robot.qpos_home)  # the encoder is on the motor's side
-        qpos = quantised(true + p.zero_offset + p.encoder_noise * noise[:, 0], p.encoder_step)
+        qpos = motor.quantised(true + p.zero_offset + p.encoder_noise * noise[:, 0], p.encoder_step)
         qvel = self._full(self._qvel, 0.0) + p.velocity_noise * noise[:, 1]
         tau = self._full(self._motor_torque(), 0.0) + p.current_offset + p.current_noise * noise[:, 2]
         temperature = self._idle_temperature.copy()

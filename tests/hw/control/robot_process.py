@@ -42,7 +42,7 @@ class RobotProcess:
 def main(domain: int) -> None:
     from gaponet.robot.spec import load_robot
     from gaponet.testing.fleet import load_fleet
-    from gaponet.testing.unitree_virtual import CommandLog, VirtualH12
+    from gaponet.testing.unitree_virtual import VirtualH12
 
     robot = load_robot("h1_2")
     served = VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE)
@@ -56,12 +56,11 @@ def main(domain: int) -> None:
             served.machine = int(rest)
         if word == "clear":
             time.sleep(0.2)  # what the last controller sent is still on its way
-            served.fault, served.machine, served.heard, served.refused = "none", 6, CommandLog(), 0
+            served.fault, served.machine, served.heard, served.refused = "none", 6, [], 0
         if word == "heard":
-            heard = served.heard
-            k = len(heard.time)
-            answer = {n: [v.tolist() for v in getattr(heard, n)[:k]] for n in ("ctrl", "kp", "kd", "qvel")}
-            answer |= {"weight": heard.weight[:k], "time": heard.time[:k], "refused": served.refused}
+            heard = list(served.heard)
+            answer = {n: [row[n].tolist() for row in heard] for n in ("ctrl", "kp", "kd", "qvel")}
+            answer |= {n: [row[n] for row in heard] for n in ("weight", "time")} | {"refused": served.refused}
         print(json.dumps(answer), flush=True)
 
 

@@ -27,7 +27,7 @@ desired = plant.get_desired_state_input_port(joints[0].model_instance())
 forces = plant.get_applied_generalized_force_input_port()
 weights = delay_weights([robot_cfg.DELAYS[name] for name in names], check.step)
 offset = np.array([robot_cfg.OFFSETS[name] for name in names])
-errors, columns = [], [names.index(name) for name in check.facts["corrected"]]
+paths = []
 for motion in check.motions:
     q, v = np.zeros(plant.num_positions()), np.zeros(plant.num_velocities())
     q[at], v[dof] = motion["qpos"][0], motion["qvel"][0]
@@ -44,5 +44,5 @@ for motion in check.motions:
             forces.FixValue(context, robot_cfg.friction(plant, context, target))
             simulator.AdvanceTo((k * decimation + i + 0.5) * check.step)  # one discrete step, despite rounding
         path.append(plant.GetPositions(context)[at])
-    errors.append(np.abs(np.array(path) - motion["qpos"][1:])[:, columns].mean())
-print(f"Drake: {1e3 * np.mean(errors):.2f} mrad; in gaponet {check.facts['error_mrad']['plain']:.2f}")
+    paths.append(np.array(path))
+check.report_motions("Drake", paths)

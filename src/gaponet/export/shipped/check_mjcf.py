@@ -3,17 +3,13 @@
 from pathlib import Path
 
 import mujoco
-import numpy as np
 
 from gaponet.export.shipped.mujoco_servos import Check, play
 
 HERE = Path(__file__).parent
 check = Check(HERE)
-columns = [check.names.index(name) for name in check.facts["corrected"]]
+file = str(HERE / check.facts["file"])
 for form, what in (("plain", "the MJCF alone"), ("joints", "the MJCF with servo_law.py")):
-    errors = []
-    for motion in check.motions:
-        model = mujoco.MjModel.from_xml_path(str(HERE / check.facts["file"]))
-        path = play(model, check.facts, motion, check.facts["prefix"], form)
-        errors.append(np.abs(path - motion["qpos"])[1:, columns].mean())
-    print(f"{what}: {1e3 * np.mean(errors):.2f} mrad; in gaponet {check.facts['error_mrad'][form]:.2f}")
+    models = [mujoco.MjModel.from_xml_path(file) for _ in check.motions]
+    paths = [play(m, check.facts, x, check.facts["prefix"], form) for m, x in zip(models, check.motions, strict=True)]
+    check.report_motions(what, [path[1:] for path in paths], form)

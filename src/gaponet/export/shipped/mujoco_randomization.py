@@ -1,12 +1,8 @@
-"""Set a MuJoCo model to one of the sampled units of a robot. This file is copied into exports; it needs no gaponet.
-
-python mujoco_randomization.py MODEL.xml     # tries three units
-"""
+"""Set a MuJoCo model to one of the sampled units of a robot. This file is copied into exports; it needs no gaponet."""
 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +51,3 @@ def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[s
     for i, name in enumerate(drawn["joints"]):
         joints[name] |= {field: float(values[row][i]) for field, values in drawn["units"].items()}
     return facts | {"joints": joints}
-
-
-if __name__ == "__main__":
-    model, drawn = mujoco.MjModel.from_xml_path(sys.argv[1]), units()
-    for row in range(3):
-        apply(model, drawn, row)
-        print(row, {name: model.dof_frictionloss[model.joint(name).dofadr[0]] for name in drawn["joints"]})

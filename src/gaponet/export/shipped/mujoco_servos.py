@@ -30,15 +30,14 @@ def read(path: str | Path) -> dict[str, Any]:
 class Servos:
     """Servos of a compiled model: sets the identified numbers once, and the servo model before each step."""
 
-    def __init__(self, model: Any, facts: dict[str, Any], prefix: str = "", form: str = "joints") -> None:
+    def __init__(self, model: Any, facts: dict[str, Any], prefix: str = "") -> None:
         """
         Args:
             prefix: Text before each joint's name in the model.
-            form: "joints", or "plain" for the numbers that were fitted without the servo model.
         """
         import mujoco
 
-        joints = facts[form]
+        joints = facts["joints"]
         numbers = [f for f, value in next(iter(joints.values())).items() if isinstance(value, int | float)]
         column = {f: np.array([j.get(f, 0.0) for j in joints.values()]) for f in numbers}
         self.model = model
@@ -183,10 +182,14 @@ class Check:
             path: Positions after each period, (T, worlds, n) rad.
             form: Form of the robot that was played, a key of error_mrad in facts.json.
         """
+        places = zip(self._places, self.motions, strict=True)
+        paths = [np.asarray(path)[row : row + len(motion["qpos"]) - 1, world] for (row, world), motion in places]
+        self.report_motions(f"{engine}, {self.worlds} worlds", paths, form)
+
+    def report_motions(self, engine: str, paths: list[Any], form: str = "plain") -> None:
+        """Print the same for motions played one by one; paths: positions after each period, (T, n) rad each."""
         columns = [self.names.index(name) for name in self.facts["corrected"]]
-        errors = []
-        for (row, world), motion in zip(self._places, self.motions, strict=True):
-            qpos = motion["qpos"][1:]
-            errors.append(np.abs(np.asarray(path)[row : row + len(qpos), world] - qpos)[:, columns].mean())
+        pairs = zip(paths, self.motions, strict=True)
+        errors = [np.abs(path - motion["qpos"][1:])[:, columns].mean() for path, motion in pairs]
         expected = self.facts["error_mrad"][form]
-        print(f"{engine}, {self.worlds} worlds: {1e3 * np.mean(errors):.2f} mrad; in gaponet {expected:.2f}")
+        print(f"{engine}: {1e3 * np.mean(errors):.2f} mrad; in gaponet {expected:.2f}")
