@@ -39,9 +39,9 @@ slow: setup
 faults: setup
 	$(BIN)/python -m pytest -m faults -rP tests/hw
 
-# Live targets for ten minutes, from a sender that stalls, floods and dies. LIVE=--realtime, as root, on a busy machine.
+# Live targets for ten minutes, from a sender that stalls, floods and dies.
 live: setup
-	$(BIN)/python tests/hw/control/live.py --minutes 10 $(LIVE)
+	$(BIN)/python tests/hw/control/live.py --minutes 10
 
 # At the other end, in environments of their own in ~/.cache/gaponet: programs on the DDS version of Unitree's SDK (Python
 # 3.10), rclpy of ROS 2 Jazzy and Kilted (Python 3.12): five minutes.

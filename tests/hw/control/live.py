@@ -28,7 +28,6 @@ import numpy as np
 
 GAPONET = [sys.executable, "-m", "gaponet"]
 RATE, HOLD = 50.0, 0.5  # Hz, s
-REALTIME, PATIENT = "--realtime", "--patient"
 JOINTS = ("left_shoulder_pitch_joint", "left_elbow_joint", "right_shoulder_pitch_joint", "right_elbow_joint")
 SHORT = 0.3  # s of a way to go wrong that a run survives; a flood goes on longer
 WAYS = ("stall", "flood", "nan", "joints", "jump", "range", "again", "backwards", "large", "garbage")
@@ -75,14 +74,8 @@ def send(address: str) -> None:
         time.sleep(max(0.0, began + k / RATE - time.monotonic()))
 
 
-def started(command: list[str], first: int, **how: Any) -> subprocess.Popen[str]:
-    """A process; with --realtime of SCHED_FIFO with a priority of its own, so that other work stops nobody."""
-    realtime = ["chrt", "-f", str(first)] if REALTIME in sys.argv else []
-    return subprocess.Popen([*realtime, *command], text=True, **how)
-
-
-def sender(address: str) -> subprocess.Popen[str]:
-    return started([sys.executable, __file__, "--send", address], 5, stdin=subprocess.PIPE)
+def started(command: list[str], **pipes: Any) -> subprocess.Popen[str]:
+    return subprocess.Popen(command, text=True, **pipes)
 
 
 def tell(process: subprocess.Popen[str], way: str) -> None:
@@ -97,16 +90,13 @@ def stream(seconds: float, domain: int, model: str | None = None) -> dict[str, A
         heard, address = Path(folder) / "heard.npz", f"ipc://{folder}/targets"
         bus, payload = ["--domain", str(domain)], ["--payload-mass", "1"]
         robot = started([*GAPONET, "virtual", "serve", "--robot", "h1_2", *bus, *payload, "--rate", "100", "--fleet",
-                         "easy", "--heard", str(heard)], 15, stdout=subprocess.PIPE)  # fmt: skip
+                         "easy", "--heard", str(heard)], stdout=subprocess.PIPE)  # fmt: skip
         assert robot.stdout
         robot.stdout.readline()
         options = ["--targets", "zmq", "--live.address", address, "--live.hold", str(HOLD), "--yes", "--json"]
         options += ["--model", model] if model else []
-        options += ["--safety.stale", "6", "--safety.overrun", "5"] if PATIENT in sys.argv else []
-        control = started(
-            [*GAPONET, "run", "--driver", "unitree", *bus, *payload, *options], 20, stdout=subprocess.PIPE
-        )
-        from_whom = sender(address)
+        control = started([*GAPONET, "run", "--driver", "unitree", *bus, *payload, *options], stdout=subprocess.PIPE)
+        from_whom = started([sys.executable, __file__, "--send", address], stdin=subprocess.PIPE)
         try:
             wait_for_run(address, control, from_whom)
             done, survived = time.monotonic() + seconds, 0
@@ -163,11 +153,6 @@ def judged(path: Path, result: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def steal() -> float:
-    """s for which this machine's host has given its processors to others, since boot; Linux."""
-    return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
-
-
 def wrongs(result: dict[str, Any]) -> list[str]:
     """Return what docs/deploy-safety.md does not say."""
     kind, text = result["events"][-2][2:] if len(result["events"]) > 1 else ("", "")
@@ -183,9 +168,8 @@ def wrongs(result: dict[str, Any]) -> list[str]:
 
 def play(minutes: float, domain: int, model: str | None = None) -> dict[str, Any]:
     """Stream; the result, and what is wrong with it."""
-    stolen = steal()
     result = stream(60 * minutes, domain, model)
-    return result | {"realtime": REALTIME in sys.argv, "stolen_s": steal() - stolen, "wrong": wrongs(result)}
+    return result | {"wrong": wrongs(result)}
 
 
 def main() -> None:
@@ -193,10 +177,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--domain", type=int, default=44)
     parser.add_argument("--model")
-    parser.add_argument(REALTIME, action="store_true", help="SCHED_FIFO for all of them, the controller first; as root")
-    parser.add_argument(
-        PATIENT, action="store_true", help="a machine that stalls for 0.1 s stops nothing; for other load"
-    )
     parser.add_argument("--send")
     asked = parser.parse_args()
     if asked.send:
