@@ -309,10 +309,8 @@ def test_a_port_that_is_lost_while_damping_is_opened_again(driver, servos, wire)
 def test_the_watchdog_says_nothing_until_it_damps_and_then_asks_nothing(so101, wire, servos, driver):
     from gaponet.hw.drivers.open import open_driver
 
-    spec = driver.watchdog()
-    early, other = spec.pop("early"), open_driver(**spec)
+    other = open_driver(**driver.watchdog())
     del servos.heard[:]
-    assert early
     other.connect()
     assert not servos.heard
     other.damp()

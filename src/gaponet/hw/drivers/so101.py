@@ -396,7 +396,7 @@ class SO101Driver:
         """Return the options of a driver that opens the port before it is exclusive, and is silent until it damps."""
         calibration = str(self.calibration) if self.calibration else None
         return {
-            "kind": "so101", "robot": str(self.robot.folder.resolve()), "early": True, "port": self.port,
+            "kind": "so101", "robot": str(self.robot.folder.resolve()), "port": self.port,
             "calibration": calibration, "silent": True, "torque_limit": self._torque_limit,
         }  # fmt: skip
 

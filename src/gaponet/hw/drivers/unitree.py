@@ -305,7 +305,7 @@ class UnitreeDriver:
     def watchdog(self) -> dict[str, object] | None:
         """Return the options of a second participant: connected from the start, and silent until it damps."""
         return {
-            "kind": "unitree", "robot": str(self.robot.folder.resolve()), "early": True, "topic": self.topic,
+            "kind": "unitree", "robot": str(self.robot.folder.resolve()), "topic": self.topic,
             "joints": self.joints, "domain": self.domain, "interface": self.interface, "sole": False,
         }  # fmt: skip
 
