@@ -5,6 +5,7 @@ test_obedience.py has the faults of the robots themselves, in simulated time.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -99,31 +100,32 @@ def served() -> Iterator[RobotProcess]:
     robot.kill()
 
 
+def arms(heard: dict[str, list]) -> np.ndarray:
+    """Stiffness that the robot heard, (commands, joints) without the torso, which is held while the arms damp."""
+    return np.delete(np.array(heard["kp"]).reshape(-1, len(ROBOT.joint_names)), TORSO, axis=1)
+
+
 @ENDS
 def test_a_controller_that_dies_or_hangs_leaves_a_damped_robot(served, how, periods):
-    def arms() -> np.ndarray:
-        """Stiffness that the robot heard, (commands, joints) without the torso, which is held while the arms damp."""
-        kp = np.array(served.ask("heard")["kp"]).reshape(-1, len(ROBOT.joint_names))
-        return np.delete(kp, TORSO, axis=1)
-
+    heard = lambda: served.ask("heard")  # noqa: E731
     for _ in range(8):
         driver = UnitreeDriver(ROBOT, domain=DOMAIN)
         wait(lambda driver=driver: is_free(driver.address))
         served.ask("clear")
         process = started(H1_2, DOMAIN)
         try:
-            wait(lambda process=process: len(arms()) > 10 or process.poll() is not None)
+            wait(lambda process=process: len(arms(heard())) > 10 or process.poll() is not None)
             if process.poll() is None:
                 with pytest.raises(UsageError, match="another process commands this robot"):
                     Controller(driver, ROBOT, config=slow(10), watchdog=False).run(lambda k, state: None)
-            if process.poll() is not None or not arms()[-1].any():
+            if process.poll() is not None or not arms(heard())[-1].any():
                 continue  # a late period has ended it
             ended = time.monotonic()
             process.send_signal(how)
-            wait(lambda: not arms()[-1].any())
-            wait(lambda: served.ask("heard")["weight"][-1] < 0.05)  # in the end the arms are handed back
-            stiff, heard = arms().any(axis=1), served.ask("heard")
-            at, weight = (np.array(heard[name])[: len(stiff)] for name in ("time", "weight"))
+            wait(lambda: not arms(heard())[-1].any())
+            wait(lambda: heard()["weight"][-1] < 0.05)  # in the end the arms are handed back
+            said = heard()
+            stiff, at, weight = arms(said).any(axis=1), np.array(said["time"]), np.array(said["weight"])
             assert (np.diff(stiff.astype(int)) <= 0).all()
             damped = int(stiff.sum())
             assert at[damped] - ended < periods / 10 + BUSY_S
@@ -133,7 +135,7 @@ def test_a_controller_that_dies_or_hangs_leaves_a_damped_robot(served, how, peri
             process.send_signal(signal.SIGCONT)  # who comes back from standing still has nothing more to say
             process.wait(20)
             time.sleep(0.3)
-            assert not arms()[-1].any()
+            assert not arms(heard())[-1].any()
             return
         finally:
             process.kill()
@@ -156,6 +158,33 @@ def test_the_watchdog_switches_the_torque_off_when_the_controller_is_no_more(how
             process.kill()
             process.wait()
             wait(lambda: is_free(port), 30)
+
+
+def test_live_targets_are_followed_until_their_sender_dies_and_then_the_robot_damps(served, tmp_path):
+    pytest.importorskip("zmq", reason="pip install 'gaponet[zmq]'")
+    from gaponet.hw.targets.client import RemoteRobot
+
+    address, hold = f"ipc://{tmp_path}/targets", 0.5
+    bus = ["--driver", "unitree", "--domain", str(DOMAIN), "--rate", "10", "--safety.acceleration", "2"]
+    words = ["run", *bus, "--targets", "zmq", "--live.address", address, "--live.hold", str(hold), "--yes", "--json"]
+    for _ in range(8):
+        wait(lambda: is_free(UnitreeDriver(ROBOT, domain=DOMAIN).address))
+        served.ask("clear")
+        control = subprocess.Popen([sys.executable, "-m", "gaponet", *words], stdout=subprocess.PIPE, text=True)
+        sender = RemoteRobot(address, patience=60.0)
+        for k, _ in zip(range(80), sender, strict=False):
+            sender.send({"left_elbow_joint": 0.2 * np.sin(0.1 * k)})
+        sender.close(end=False)
+        died = time.monotonic()
+        result = json.loads(control.communicate(timeout=60)[0])
+        if result["events"][-2][2] not in ("stale", "overrun"):
+            break
+    assert result["events"][-2][2] == "silence", result["events"]
+    assert (control.returncode, result["targets"]["taken"] > 30) == (3, True)
+    heard = served.ask("heard")
+    stiff = arms(heard).any(axis=1)
+    assert (np.diff(stiff.astype(int)) <= 0).all(), "a position command after damping"
+    assert 0 < heard["time"][int(stiff.sum())] - died < hold + 0.1 + BUSY_S
 
 
 def test_two_publishers_on_the_bus_are_refused(served):
