@@ -337,30 +337,27 @@ def test_time_that_the_computer_was_suspended_is_the_difference_of_two_clocks(mo
 # ---- watchdog
 
 
-def test_a_watchdog_that_cannot_damp_the_robot_any_more_ends_the_run_damped(arm):
+@pytest.mark.parametrize(
+    ("part", "text"),
+    [
+        ("problem", "asked to stop: it hangs"),
+        ("beat", "the watchdog ended"),
+        ("fired", "the watchdog has damped the robot"),
+    ],
+)
+def test_no_command_leaves_that_the_watchdog_does_not_guard(arm, part, text):
     driver = NotedArm(arm)
+    late = lambda: driver.clock.now() >= 0.9  # noqa: E731
+    parts = {"problem": lambda: "it hangs" * late(), "beat": lambda weight: not late(), "fired": late}
     controller = control(driver)
-    controller.output.watchdog = fake_watchdog(problem=lambda: "it ended" if driver.clock.now() >= 0.9 else "")
-    assert controller.run(motion_policy(MOTION, DT)).fault.text == "asked to stop: it ended"
-    assert 0.9 <= driver.damped <= 0.92
-
-
-def test_no_command_leaves_whose_heartbeat_the_watchdog_did_not_get(arm):
-    driver = NotedArm(arm)
-    controller = control(driver)
-    controller.output.watchdog = fake_watchdog(beat=lambda weight: driver.clock.now() < 0.9)
-    assert controller.run(motion_policy(MOTION, DT)).fault.text == "the watchdog ended"
+    controller.output.watchdog = fake_watchdog(**{part: parts[part]})
+    recording = controller.run(motion_policy(MOTION, DT))
+    assert recording.fault.text.endswith(text)
     assert driver.commands[-1][0] < 0.9
-
-
-def test_no_command_leaves_once_the_watchdog_has_damped_the_robot(arm):
-    fired: list[float] = []
-    driver = NotedArm(arm)
-    controller = control(driver)
-    controller.output.watchdog = fake_watchdog(fired=lambda: bool(fired))
-    recording = controller.run(acting(lambda: fired.append(driver.clock.now())))
-    assert recording.fault.text.endswith("the watchdog has damped the robot")
-    assert driver.sent[-1][0] < fired[0], "neither a command nor a message that damps with another weight"
+    if part == "fired":
+        assert driver.sent[-1][0] < 0.9, "nor a message that damps with another weight"
+    else:
+        assert 0.9 <= driver.damped <= 0.92
 
 
 def test_a_watchdog_damps_after_five_periods_for_as_long_as_the_controller_would(arm, monkeypatch):

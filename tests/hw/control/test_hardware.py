@@ -150,7 +150,7 @@ def test_the_plan_judges_the_commands_that_a_compensator_makes(so101):
 
 def test_a_run_with_compensation_says_how_far_commands_lead_and_whose_limits_hold(so101, tmp_path, capsys):
     save_robot(so101.with_servos({"elbow_flex": {"kp": 12.0}}), tmp_path / "identified")
-    words = ["run", "--robot", str(tmp_path / "identified"), "--motion", "tour-all-0", "--fast", "--compensate"]
+    words = ["run", "--robot", str(tmp_path / "identified"), "--motion", "sweep-elbow_flex", "--fast", "--compensate"]
     assert main([*words, "--payload-mass", "0", "--blend-speed", "4", "--blend", "0.2"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     lead = re.search(r"commands lead their targets by at most (\d\.\d\d) rad \((\w+)\)", said)

@@ -107,7 +107,7 @@ def virtual(robot: RobotSpec, found: np.ndarray) -> tuple[Controller, list[np.nd
             super().write(ctrl, weight)
 
     stands = dataclasses.replace(robot, qpos_home=found)
-    driver = Driver(stands, load_fleet("easy", robot).unit("virtual-1"), clock)
+    driver = Driver(stands, load_fleet("easy", robot).unit("virtual-1"), clock, period=0.01)
     return Controller(driver, robot, config=QUICK, clock=clock), sent
 
 

@@ -17,8 +17,6 @@ from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig
 from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, LiveConfig, LiveTargets, Message, decode, next_step
 from gaponet.sysid.motion.motion import Motion
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_driver import VirtualDriver
 
 FAULT, HOLD = 1.5, 0.5  # s; from FAULT on a sender goes wrong; HOLD is the default
 NAN = float("nan")
@@ -267,8 +265,7 @@ def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
     transport = Answering(clock, None)
     config = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
     targets = LiveTargets(transport, so101, so101.joint_names, clock, DT, 5.0)
-    driver = VirtualDriver(so101, load_fleet("easy", so101).unit("virtual-1"), clock)
-    controller = Controller(driver, so101, config=config, clock=clock)
+    controller = Controller(NotedArm(so101, clock), so101, config=config, clock=clock)
     begin = controller.readiness.context.planner.begin
 
     def slow(first, found):

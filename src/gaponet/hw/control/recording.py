@@ -123,22 +123,14 @@ class Recording:
         late = np.array(self.late or [0.0])
         ages = table["time"] - table["state_time"] if len(table) else np.zeros(1)
         incomplete = {"not_whole": self.rows.error.strerror} if self.rows.error else {}
-        return (
-            incomplete
-            | self.meta
-            | {
-                "robot": self.robot,
-                "virtual": self.virtual,
-                "obeyed": not self.disobedience,
-                "rate_hz": 1 / self.dt,
-                "periods": len(table),
-                "missed": self.missed,
-                "late_ms": {q: round(float(np.quantile(late, p)) * 1e3, 3) for q, p in QUANTILES.items()},
-                "state_age_ms": {q: round(float(np.quantile(ages, p)) * 1e3, 3) for q, p in QUANTILES.items()},
-                "refused_messages": int(table["refused"][-1]) if len(table) else 0,
-                "events": [[round(e.time - start, 4), e.phase, e.kind, e.text] for e in self.events],
-            }
-        )
+        return incomplete | self.meta | {
+            "robot": self.robot, "virtual": self.virtual, "obeyed": not self.disobedience, "rate_hz": 1 / self.dt,
+            "periods": len(table), "missed": self.missed,
+            "late_ms": {q: round(float(np.quantile(late, p)) * 1e3, 3) for q, p in QUANTILES.items()},
+            "state_age_ms": {q: round(float(np.quantile(ages, p)) * 1e3, 3) for q, p in QUANTILES.items()},
+            "refused_messages": int(table["refused"][-1]) if len(table) else 0,
+            "events": [[round(e.time - start, 4), e.phase, e.kind, e.text] for e in self.events],
+        }  # fmt: skip
 
     def save(self, folder: Path, name: str) -> Path:
         """Write NAME.parquet for gaponet import, all periods as NAME.cycles.npy, and NAME.json.

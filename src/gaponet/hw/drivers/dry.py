@@ -23,10 +23,7 @@ class DryRun(Driver):
     reads_back = True  # what was not sent cannot be checked
 
     def __init__(self, driver: Driver) -> None:
-        """
-        Args:
-            driver: The robot; it must publish nothing when it connects.
-        """
+        """Take the driver of the robot, which must publish nothing when it connects."""
         self.driver = driver
         self._at = np.array([driver.joint_names.index(name) for name in driver.commanded])
         self._measured: Array | None = None  # qpos of the last state, rad

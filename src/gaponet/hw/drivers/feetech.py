@@ -108,19 +108,14 @@ class ServoBus:
         errors: Servo → error bits of all its replies so far.
     """
 
-    def __init__(self, stream: Stream, timeout: float = 0.01, retries: int = RETRIES) -> None:
-        """
-        Args:
-            stream: The port.
-            timeout: Silence after which missing replies are given up, s.
-            retries: How often these are requested again.
-        """
-        self.stream, self.timeout, self.retries = stream, timeout, retries
+    def __init__(self, stream: Stream, timeout: float = 0.01) -> None:
+        """Send over a port; missing replies are given up after `timeout` s of silence."""
+        self.stream, self.timeout = stream, timeout
         self.refused = 0
         self.errors: dict[int, int] = {}
         self._tag = 0
 
-    def sync_read(self, servos: Iterable[int], block: Register, retries: int | None = None) -> dict[int, bytes]:
+    def sync_read(self, servos: Iterable[int], block: Register, retries: int = RETRIES) -> dict[int, bytes]:
         """Return a block of each of several servos; servos without an intact reply are missing.
 
         What is missing after a silence is requested again. A reply does not name its request. So successive requests
@@ -128,7 +123,7 @@ class ServoBus:
         an earlier call is not taken for it.
         """
         missing, replies, sizes = list(servos), dict[int, bytes](), set[int]()
-        for _ in range(1 + (self.retries if retries is None else retries)):
+        for _ in range(1 + retries):
             self._tag = (self._tag + 1) % REQUEST_TAGS
             size = block.size + self._tag
             sizes.add(size)

@@ -318,11 +318,7 @@ class TickClock:
     """
 
     def __init__(self, arrivals: list[float], ticks: list[int]) -> None:
-        """
-        Args:
-            arrivals: Times of the first messages, s of the monotonic clock.
-            ticks: Their ticks.
-        """
+        """Take the arrival times, s of the monotonic clock, and the ticks of the first messages."""
         period = (arrivals[-1] - arrivals[0]) / max((ticks[-1] - ticks[0]) % 2**32, 1)
         # s; None: the tick is no clock, and arrival times are used
         self.period = next((p for p in TICK_PERIODS_S if 0.7 < period / p < 1.4), None)
