@@ -55,13 +55,13 @@ class Watchdog:
         self._fired, self._timeout = False, timeout
         self._answer_time: float | None = None  # monotonic s of the last answer, or of the first heartbeat before it
 
-    def wait_ready(self, timeout: float = READY_TIMEOUT_S) -> None:
+    def wait_ready(self) -> None:
         """Return when it could damp the robot.
 
         Raises:
             DriverError: It could not reach the robot.
         """
-        ready, _, _ = select.select([self._out], [], [], timeout)
+        ready, _, _ = select.select([self._out], [], [], READY_TIMEOUT_S)
         if not ready or self._out.read(1) != READY:
             self._process.kill()
             raise DriverError("the watchdog could not reach the robot; see its message above")

@@ -13,35 +13,34 @@ from gaponet.hw.control.recording import Recording
 from gaponet.hw.control.safety import Limits
 
 
-class DryRun(Driver):
+class DryRun:
     """A `Driver` around another one, of which only the readings are used.
 
     Its states are the robot's, moved on by the way of the commands, as if the robot followed at once. Without this the
     first motion would count as a joint that does not follow.
     """
 
-    reads_back = True  # what was not sent cannot be checked
-
     def __init__(self, driver: Driver) -> None:
         """Take the driver of the robot, which must publish nothing when it connects."""
         self.driver = driver
+        self.address = driver.address  # the same lock: a serial bus has one master, also one that only reads
+        self.joint_names, self.commanded = driver.joint_names, driver.commanded
+        self.noisy, self.at_end, self.at_stop = driver.noisy, driver.at_end, driver.at_stop
+        self.reads_back = True  # what was not sent cannot be checked
+        self.virtual, self.kp, self.kd, self.qpos_range, self.facts = self._known_once_connected()
         self._at = np.array([driver.joint_names.index(name) for name in driver.commanded])
         self._measured: Array | None = None  # qpos of the last state, rad
         self._start: Array | None = None  # qpos at the first command, rad
         self._moved: Array | float = 0.0  # way of the commands since then, rad
 
-    def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the robot, its address included: a bus has one master, also one that only reads."""
-        return getattr(self.driver, name)
-
-    @property
-    def facts(self) -> dict[str, Any]:  # type: ignore[override]
-        """Facts of the robot, and that the run is dry."""
-        return self.driver.facts | {"dry_run": True}
-
     def connect(self) -> None:
         """Connect the robot's driver."""
         self.driver.connect()
+        self.virtual, self.kp, self.kd, self.qpos_range, self.facts = self._known_once_connected()
+
+    def _known_once_connected(self) -> tuple[bool, Array, Array, Array | None, dict[str, Any]]:
+        inner = self.driver
+        return inner.virtual, inner.kp, inner.kd, inner.qpos_range, inner.facts | {"dry_run": True}
 
     def read(self) -> State:
         """Return the robot's state, moved on."""
