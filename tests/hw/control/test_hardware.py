@@ -129,7 +129,7 @@ def test_a_driver_writes_no_command_outside_its_robots_range(h1_2):
 
 def shifted(robot: RobotSpec, joint: str, by: float) -> SimpleNamespace:
     """A compensator that commands a joint away from its target."""
-    shift = by * (np.array(robot.joint_names) == joint)
+    shift = np.where(np.array(robot.joint_names) == joint, by, 0.0)
     return SimpleNamespace(reset=lambda target, mass: None, step=lambda target, qpos: target + shift)
 
 

@@ -35,6 +35,7 @@ serial = pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 
 QUICK = ControlConfig(blend=0.5, blend_speed=2.0, settle=0.1, damp=2.0)
 ELBOW, ROLL = 3, 5  # servos
+FAULT_S = 2.2 - 1e-6  # after the first command; just before a state and a period
 WHOLE = reg.Register(0, 128)
 
 RNG = random.Random(1)
@@ -296,12 +297,12 @@ def swing(
     ],
 )  # fmt: skip
 def test_a_fault_of_an_h1_2_ends_in_damp(monkeypatch, fault, kind, periods):
-    recording, robot = swing(monkeypatch, fault=fault, at=2.205, size=0.25)
+    recording, robot = swing(monkeypatch, fault=fault, at=FAULT_S, size=0.25)
     assert recording.fault.kind == kind, recording.fault
     assert phases(recording)[-3:] == ["run", "damp", "stopped"]
     damped = next(time for time, kp in zip(robot.heard.time, robot.heard.kp, strict=True) if kp[16] == 0)
     state_age = 1 / RATE  # a fault is in the next state, which the controller reads in the next period
-    assert 0 < damped - (robot.first_command + 2.205) <= periods * 0.02 + state_age + 1e-6
+    assert 0 < damped - (robot.first_command + FAULT_S) <= periods * 0.02 + state_age + 1e-6
     judge(recording, vars(robot.heard), robot.robot, SafetyConfig())
     silent = fault in ("stop", "repeat", "checksum")
     text = "could NOT be damped: switch the supply off (nothing was heard" if silent else "damped and let go"
