@@ -281,7 +281,7 @@ def swing(
         target[[left, right]] += size * (1 + np.array([1, -1]) * np.sin(0.06 * k))
         return target if k < 150 else None
 
-    config = ControlConfig(blend=1.5, settle=0.1, blend_out=False, damp=1.0)
+    config = ControlConfig(blend=1.5, settle=0.1, blend_out=bool(way), damp=1.0)
     driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
     recording = Controller(driver, robot, config=config, clock=clock, watchdog=False, payload_mass=told).run(policy)
     return recording, clock.robot
