@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test slow faults live peers engines buckets browser adversary tournament fuzz hostile kills lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test slow faults peers engines buckets browser adversary tournament fuzz hostile kills lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -38,10 +38,6 @@ slow: setup
 # Faults injected over a real bus between processes: minutes, on a machine that is otherwise idle.
 faults: setup
 	$(BIN)/python -m pytest -m faults -rP tests/hw
-
-# Live targets for ten minutes, from a sender that stalls, floods and dies. LIVE=--realtime, as root, on a busy machine.
-live: setup
-	$(BIN)/python tests/hw/control/live.py --minutes 10 $(LIVE)
 
 # At the other end, in environments of their own in ~/.cache/gaponet: programs on the DDS version of Unitree's SDK (Python
 # 3.10), rclpy of ROS 2 Jazzy and Kilted (Python 3.12): five minutes.

@@ -45,6 +45,10 @@ class Servos:
         at, size = REGISTERS[name]
         self.table[servo - 1][at : at + size] = value.to_bytes(size, "little")
 
+    def silence(self, *numbers: int) -> None:
+        """Let these servos answer no more."""
+        self.adversary = lambda servo, reply: b"" if servo in numbers else reply
+
     def answer(self, data: bytes) -> bytes:
         """What the servos say to these bytes."""
         self._pending += data

@@ -1,14 +1,20 @@
-"""A virtual two-joint arm in simulated time that notes all it is sent, and a watchdog without a process."""
+"""A virtual two-joint arm in simulated time that notes all it is sent, its controller, and a watchdog in name only."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from arm import commands
 
 from gaponet.hw.control.clock import SimulatedClock
+from gaponet.hw.control.controller import Controller
+from gaponet.hw.control.driver import State
 from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.recording import Recording
+from gaponet.hw.targets.policy import Policy, motion_policy
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.motion import Motion
 from gaponet.testing.fleet import load_fleet
@@ -20,9 +26,15 @@ MOTION = Motion("sway", "whole_body", DT, commands(40, seed=1))
 
 
 class NotedArm(VirtualDriver):
-    """Notes commands (None: damping), weights, and how it is closed."""
+    """Notes commands (None: damping), weights, and how it is closed; `change` may replace each state that is read."""
 
-    def __init__(self, robot: RobotSpec, clock: SimulatedClock | None = None) -> None:
+    def __init__(
+        self,
+        robot: RobotSpec,
+        clock: SimulatedClock | None = None,
+        change: Callable[[State], State] = lambda state: state,
+    ) -> None:
+        self.change = change
         unit = load_fleet("easy", robot).unit("virtual-1")
         super().__init__(robot, unit, clock or SimulatedClock(), period=0.01)
         self.sent: list[tuple[float, np.ndarray | None]] = []
@@ -40,6 +52,9 @@ class NotedArm(VirtualDriver):
         """Times and position commands."""
         return [(time, ctrl) for time, ctrl in self.sent if ctrl is not None]
 
+    def read(self) -> State:
+        return self.change(super().read())
+
     def write(self, ctrl: np.ndarray, weight: float = 1.0) -> None:
         self.sent.append((self.clock.now(), ctrl.copy()))
         self.weights.append((self.clock.now(), weight))
@@ -53,6 +68,27 @@ class NotedArm(VirtualDriver):
 
     def close(self, hold: bool = False) -> None:
         self.closed.append(hold)
+
+
+def control(driver: NotedArm, **options: Any) -> Controller:
+    """A controller of the arm, quick and in simulated time."""
+    return Controller(driver, driver._given[0], config=options.pop("config", QUICK), clock=driver.clock, **options)
+
+
+def run(driver: NotedArm, motion: Motion = MOTION, **options: Any) -> Recording:
+    """Play a motion."""
+    return control(driver, **options).run(motion_policy(motion, DT))
+
+
+def acting(act: Callable[[], object], period: int = 20) -> Policy:
+    """A policy that plays MOTION and acts in one period of the run."""
+    play = motion_policy(MOTION, DT)
+    return lambda k, state: [act() if k == period else None, play(k, state)][1]
+
+
+def phases(recording: Recording) -> list[str]:
+    """Names of the phases in turn."""
+    return [event.phase for event in recording.events]
 
 
 def fake_watchdog(**changes: object) -> SimpleNamespace:

@@ -242,12 +242,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--states", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
+    args = parser.parse_args()
     robot, began = load_robot("h1_2"), time.monotonic()
-    count = attack(robot, asked.states, asked.seed)
-    told = vars(count) | {"ends": dict(count.ends), "wrong": dict(count.wrong)}
-    told["seconds"] = round(time.monotonic() - began)
-    print(json.dumps(told, indent=1))
+    count = attack(robot, args.states, args.seed)
+    result = vars(count) | {"ends": dict(count.ends), "wrong": dict(count.wrong)}
+    result["seconds"] = round(time.monotonic() - began)
+    print(json.dumps(result, indent=1))
     sys.exit(bool(count.wrong))
 
 

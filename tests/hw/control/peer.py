@@ -13,7 +13,7 @@ import random
 import struct
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct
@@ -113,21 +113,18 @@ def entry(byte: int) -> int:
 TABLE = [entry(byte) for byte in range(256)]
 
 
-def packed_state(s: LowState) -> bytes:
-    i = s.imu_state
-    out = struct.pack("<2IBB2xI", *s.version, s.mode_pr, s.mode_machine, s.tick)
-    out += struct.pack("<13fh2x", *i.quaternion, *i.gyroscope, *i.accelerometer, *i.rpy, i.temperature)
-    for m in s.motor_state:
-        out += struct.pack("<B3x4f2hf", m.mode, m.q, m.dq, m.ddq, m.tau_est, *m.temperature, m.vol)
-        out += struct.pack("<7I", *m.sensor, m.motorstate, *m.reserve)
-    return out + bytes(s.wireless_remote) + struct.pack("<4I", *s.reserve)
+def numbers(value: object) -> list:
+    """All numbers of a message in turn."""
+    if isinstance(value, (list, tuple)):
+        return [n for part in value for n in numbers(part)]
+    return numbers([getattr(value, f.name) for f in fields(value)]) if is_dataclass(value) else [value]
 
 
-def packed_command(c: LowCmd) -> bytes:
-    out = struct.pack("<BB2x", c.mode_pr, c.mode_machine)
-    for m in c.motor_cmd:
-        out += struct.pack("<B3x5fI", m.mode, m.q, m.dq, m.tau, m.kp, m.kd, m.reserve)
-    return out + struct.pack("<4I", *c.reserve)
+def packed(message: LowState | LowCmd) -> bytes:
+    """The C struct of a message without its checksum."""
+    state = "<2IBB2xI13fh2x" + 35 * "B3x4f2hf7I" + "40B4I"
+    layout = state if isinstance(message, LowState) else "<BB2x" + 35 * "B3x5fI" + "4I"
+    return struct.pack(layout, *numbers(message)[:-1])
 
 
 def robot(part: DomainParticipant, seconds: float) -> dict:
@@ -145,7 +142,7 @@ def robot(part: DomainParticipant, seconds: float) -> dict:
             if not isinstance(command, LowCmd):
                 continue
             heard, last = heard + 1, command.motor_cmd[WEIGHT].q
-            wrong += command.crc != crc(packed_command(command))
+            wrong += command.crc != crc(packed(command))
             stiff = max(stiff, max(m.kp for m in command.motor_cmd))
             for k in range(13, MOTORS):
                 if command.motor_cmd[k].kp > 0:
@@ -154,7 +151,7 @@ def robot(part: DomainParticipant, seconds: float) -> dict:
         for k in range(MOTORS):
             m, noise = state.motor_state[k], random.gauss(0, 1)
             m.mode, m.q, m.dq, m.tau_est, m.temperature = 1, q[k] + 1e-5 * noise, 1e-3 * noise, 0.1 * noise, [35, 36]
-        state.crc = crc(packed_state(state))
+        state.crc = crc(packed(state))
         writer.write(state)
         time.sleep(max(0.0, 0.01 - (time.monotonic() - start - now)))
     return {"commands": heard, "wrong_crc": wrong, "last_weight": last, "largest_kp": stiff}
@@ -171,7 +168,7 @@ def client(part: DomainParticipant, seconds: float) -> dict:
             if isinstance(state, LowState):
                 heard, newest = heard + 1, state
         if newest is not None:
-            wrong += newest.crc != crc(packed_state(newest))
+            wrong += newest.crc != crc(packed(newest))
             home = home or ([m.q for m in newest.motor_state], now)
             moved = max(moved, abs(newest.motor_state[ELBOW].q - home[0][ELBOW]))
             command = LowCmd(0, newest.mode_machine, [MotorCmd(0, 0, 0, 0, 0, 0, 0) for _ in range(35)], [0] * 4, 0)
@@ -179,7 +176,7 @@ def client(part: DomainParticipant, seconds: float) -> dict:
                 command.motor_cmd[k] = MotorCmd(1, home[0][k], 0.0, 0.0, 60.0, 2.0, 0)
             command.motor_cmd[ELBOW].q += 0.3 * math.sin(now - home[1])
             command.motor_cmd[WEIGHT].q = min(1.0, (now - home[1]) / 2)
-            command.crc = crc(packed_command(command))
+            command.crc = crc(packed(command))
             writer.write(command)
         time.sleep(0.02)
     return {"states": heard, "wrong_crc": wrong, "moved": moved}

@@ -138,14 +138,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robot", choices=list(ROBOTS), nargs="+", default=list(ROBOTS))
-    asked, bad = parser.parse_args(), 0
-    for name in asked.robot:
+    args, bad = parser.parse_args(), 0
+    for name in args.robot:
         robot, began = load_robot(name), time.monotonic()
-        told = {"robot": name, "plans": plans(robot, asked.poses, asked.seed)}
-        told["live"] = live(robot, asked.seconds, asked.seed)
-        told["minutes"] = round((time.monotonic() - began) / 60, 1)
-        bad += told["plans"]["touching"] + told["live"]["commands that touch"] + told["live"]["states that touch"]
-        print(json.dumps(told, indent=1), flush=True)
+        result = {"robot": name, "plans": plans(robot, args.poses, args.seed)}
+        result["live"] = live(robot, args.seconds, args.seed)
+        result["minutes"] = round((time.monotonic() - began) / 60, 1)
+        bad += result["plans"]["touching"] + result["live"]["commands that touch"] + result["live"]["states that touch"]
+        print(json.dumps(result, indent=1), flush=True)
     sys.exit(bool(bad))
 
 

@@ -1,7 +1,6 @@
 """A virtual H1-2 on the bus in a process of its own, told what to do by lines on stdin, one JSON answer each.
 
-fault KIND: go wrong from now on. machine N: be another robot. clear: be well, forget what was heard. heard: the
-commands since.
+clear: forget what was heard. heard: the commands since.
 """
 
 from __future__ import annotations
@@ -48,19 +47,14 @@ def main(domain: int) -> None:
     served = VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE)
     threading.Thread(target=served.run, daemon=True).start()
     for line in sys.stdin:
-        word, _, rest = line.strip().partition(" ")
         answer: Any = "ok"
-        if word == "fault":
-            served.fault_at, served.fault = 0.0, rest  # type: ignore[assignment]
-        if word == "machine":
-            served.machine = int(rest)
-        if word == "clear":
+        if line.strip() == "clear":
             time.sleep(0.2)  # what the last controller sent is still on its way
-            served.fault, served.machine, served.heard, served.refused = "none", 6, [], 0
-        if word == "heard":
+            served.heard = []
+        else:
             heard = list(served.heard)
-            answer = {n: [row[n].tolist() for row in heard] for n in ("ctrl", "kp", "kd", "qvel")}
-            answer |= {n: [row[n] for row in heard] for n in ("weight", "time")} | {"refused": served.refused}
+            answer = {"kp": [row["kp"].tolist() for row in heard]}
+            answer |= {name: [row[name] for row in heard] for name in ("weight", "time")}
         print(json.dumps(answer), flush=True)
 
 

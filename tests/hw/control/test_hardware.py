@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.motion.motion import Motion
 
 JOINT = "left_shoulder_pitch_joint"
+RUN = ["run", "--driver", "unitree", "--motion", "sweep-left_elbow", "--yes"]
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +55,7 @@ def test_a_folder_that_differs_from_the_known_robot_is_refused_with_the_value(
     h1_2, tmp_path, capsys, file, pattern, new, said
 ):
     folder = tampered(h1_2, tmp_path / "sent", file, pattern, new)
-    words = ["run", "--driver", "unitree", "--motion", "sweep-left_elbow", "--yes", "--robot", str(folder)]
-    assert main(words) == 2
+    assert main([*RUN, "--robot", str(folder)]) == 2
     assert re.search(said, " ".join(capsys.readouterr().err.split()))
     sent = load_robot(folder)
     assert robot_hash(sent) != robot_hash(h1_2)
@@ -65,30 +66,23 @@ def test_a_folder_that_differs_from_the_known_robot_is_refused_with_the_value(
 def test_a_run_that_differs_from_the_known_robot_is_refused(h1_2, tmp_path, capsys):
     stiff = load_robot(tampered(h1_2, tmp_path / "sent", "robot.toml", r"kp = (\d+)\.0", r"kp = \g<1>0.0"))
     run = untrained(tmp_path / "run", stiff, Dataset.create(tmp_path / "set", stiff))
-    words = ["run", "--driver", "unitree", "--motion", "sweep-left_elbow", "--yes", "--model", str(run)]
-    assert main(words) == 2
+    assert main([*RUN, "--model", str(run)]) == 2
     assert "the known robot has 200 " in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_folder_supplies_identified_values_and_the_known_robot_its_limits(h1_2, tmp_path):
+def test_a_folder_supplies_identified_values_and_the_known_robot_all_else(h1_2, tmp_path):
     save_robot(h1_2.with_servos({JOINT: {"kp": 90.0, "stop_low": -0.5, "stop_high": 0.5}}), tmp_path / "identified")
-    robot = hardware_robot(load_robot(tmp_path / "identified"), reference_robot("unitree", None))
-    assert robot.folder == h1_2.folder
-    assert robot.kp[robot.index([JOINT])] == 90.0
-    limits = Limits.from_robot(robot, (JOINT,), SafetyConfig(margin=0.0))
-    assert (limits.kp, limits.low, limits.high) == (100.0, -0.5, 0.5)
-
-
-def test_all_but_identified_values_is_the_known_robots(h1_2, tmp_path):
-    save_robot(h1_2.with_servos({JOINT: {"kp": 90.0}}), tmp_path / "identified")
     file = tmp_path / "identified" / "robot.toml"
     file.write_text(re.sub(r"home = [-\d.]+", "home = 0.3", file.read_text()))
-    sent = load_robot(tmp_path / "identified")
-    known = reference_robot("unitree", None)
+    sent, known = load_robot(tmp_path / "identified"), reference_robot("unitree", None)
     robot = hardware_robot(sent, known)
+    assert robot.folder == h1_2.folder
+    assert robot.nominal is known
+    assert robot.kp[robot.index([JOINT])] == 90.0
     assert not np.array_equal(sent.qpos_home, h1_2.qpos_home)
     np.testing.assert_array_equal(robot.qpos_home, h1_2.qpos_home)
-    assert robot.nominal is known
+    limits = Limits.from_robot(robot, (JOINT,), SafetyConfig(margin=0.0))
+    assert (limits.kp, limits.low, limits.high) == (100.0, -0.5, 0.5)
 
 
 def test_an_identified_stop_does_not_widen_a_range(h1_2):
@@ -133,18 +127,10 @@ def test_a_driver_writes_no_command_outside_its_robots_range(h1_2):
             driver.write(ctrl)
 
 
-class Shifted:
+def shifted(robot: RobotSpec, joint: str, by: float) -> SimpleNamespace:
     """A compensator that commands a joint away from its target."""
-
-    def __init__(self, robot: RobotSpec, joint: str, by: float) -> None:
-        self.shift = np.zeros(len(robot.joint_names))
-        self.shift[robot.joint_names.index(joint)] = by
-
-    def reset(self, target, payload_mass=None):
-        pass
-
-    def step(self, target, qpos, qvel=None):
-        return target + self.shift
+    shift = np.where(np.array(robot.joint_names) == joint, by, 0.0)
+    return SimpleNamespace(reset=lambda target, mass: None, step=lambda target, qpos: target + shift)
 
 
 def test_the_plan_judges_the_commands_that_a_compensator_makes(so101):
@@ -153,18 +139,18 @@ def test_the_plan_judges_the_commands_that_a_compensator_makes(so101):
     ctrl = np.repeat(low[None], 60, axis=0)
     ctrl[:, 0] += 0.1 * np.sin(np.linspace(0, 2 * np.pi, 60))
     plan = planner.plan(Motion("pan", "joint", 0.02, ctrl), low)
-    judged = planner.judge_commands(plan, Shifted(so101, "wrist_flex", 0.01), (0.0,))
+    judged = planner.judge_commands(plan, shifted(so101, "wrist_flex", 0.01), (0.0,))
     assert judged.correction == pytest.approx(0.01)
     assert judged.corrected_joint == "wrist_flex"
     with pytest.raises(UsageError, match=r"compensation with 0 kg brings .* and the plane at 0 m"):
-        planner.judge_commands(plan, Shifted(so101, "shoulder_lift", 0.5), (0.0,))
+        planner.judge_commands(plan, shifted(so101, "shoulder_lift", 0.5), (0.0,))
     with pytest.raises(UsageError, match="compensation commands no number to elbow_flex"):
-        planner.judge_commands(plan, Shifted(so101, "elbow_flex", np.nan), (0.0,))
+        planner.judge_commands(plan, shifted(so101, "elbow_flex", np.nan), (0.0,))
 
 
 def test_a_run_with_compensation_says_how_far_commands_lead_and_whose_limits_hold(so101, tmp_path, capsys):
     save_robot(so101.with_servos({"elbow_flex": {"kp": 12.0}}), tmp_path / "identified")
-    words = ["run", "--robot", str(tmp_path / "identified"), "--motion", "tour-all-0", "--fast", "--compensate"]
+    words = ["run", "--robot", str(tmp_path / "identified"), "--motion", "sweep-elbow_flex", "--fast", "--compensate"]
     assert main([*words, "--payload-mass", "0", "--blend-speed", "4", "--blend", "0.2"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     lead = re.search(r"commands lead their targets by at most (\d\.\d\d) rad \((\w+)\)", said)

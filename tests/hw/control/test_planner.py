@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 
 import numpy as np
 import pytest
 from contacts import Contacts
+from hw.noted_arm import phases
 
 from gaponet.base.errors import UsageError
 from gaponet.cli.main import main
@@ -27,6 +29,7 @@ from gaponet.testing.virtual_driver import VirtualDriver
 
 FOLDED = np.array([0.2, -1.70, 1.65, 0.9, 0.4, 1.2])  # pan, lift, elbow, wrist flex and roll, gripper
 OVER = np.array([0.0, -1.2, 0.0, 1.4, 0.0, 0.0])
+DOWN = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0])  # in the table
 QUICK = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
 
 
@@ -104,26 +107,38 @@ def virtual(robot: RobotSpec, found: np.ndarray) -> tuple[Controller, list[np.nd
             super().write(ctrl, weight)
 
     stands = dataclasses.replace(robot, qpos_home=found)
-    driver = Driver(stands, load_fleet("easy", robot).unit("virtual-1"), clock)
+    driver = Driver(stands, load_fleet("easy", robot).unit("virtual-1"), clock, period=0.01)
     return Controller(driver, robot, config=QUICK, clock=clock), sent
 
 
+def push_down(planner: Planner, sag: np.ndarray | float = 0.0) -> tuple[CollisionGuard, list[np.ndarray]]:
+    """Live targets go into the table: the guard, and what it makes of them."""
+    home = planner.robot.qpos_home
+    guard = CollisionGuard(planner, home)
+    targets = (home + min(1.0, k / 60) * (DOWN - home) for k in range(200))
+    return guard, [guard.step(target, guard.qpos + sag, 0.02) for target in targets]
+
+
 def test_live_targets_that_go_for_the_table_are_cut(so101, planner, judge):
-    down = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0])
-    assert judge.deepest(down)[0] > 0.1
-    guard, at = CollisionGuard(planner, so101.qpos_home), []
-    for k in range(200):
-        asked = so101.qpos_home + min(1.0, k / 60) * (down - so101.qpos_home)
-        at.append(guard.step(asked, guard.qpos, 0.02))
+    assert judge.deepest(DOWN)[0] > 0.1
+    guard, at = push_down(planner)
     assert max(judge.deepest(q)[0] for q in at) == 0
     assert "the plane at 0 m" in guard.obstacle
-    assert abs(at[-1][0] - down[0]) < 0.05, "what does not lead into it goes on"
-    for _ in range(300):
-        at.append(guard.step(so101.qpos_home, guard.qpos, 0.02))
-    np.testing.assert_allclose(at[-1], so101.qpos_home, atol=1e-6)
+    assert abs(at[-1][0] - DOWN[0]) < 0.05, "what does not lead into it goes on"
+    back = [guard.step(so101.qpos_home, guard.qpos, 0.02) for _ in range(300)]
+    np.testing.assert_allclose(back[-1], so101.qpos_home, atol=1e-6)
     assert not guard.obstacle
     slow = planner.config.blend_speed * 0.02  # away from an obstacle
-    assert np.abs(np.diff(at[199:], axis=0)).max() <= slow + 1e-9
+    assert np.abs(np.diff([at[-1], *back], axis=0)).max() <= slow + 1e-9
+
+
+def test_of_an_arm_that_sags_the_arm_itself_is_kept_clear(planner):
+    sag = np.array([0.0, 0.08, 0.0, 0.0, 0.0, 0.0])
+    guard, at = push_down(planner, sag)
+    clearance = planner.collision.clearance
+    assert "the plane at 0 m" in guard.obstacle
+    assert planner.collision.along(np.array(at) + sag).min() > clearance - 0.002
+    assert planner.collision.along(at[-1][None]).min() > clearance + 0.005, "the sag matters here"
 
 
 @pytest.fixture(scope="module")
@@ -135,20 +150,18 @@ def low(so101: RobotSpec, planner: Planner) -> np.ndarray:
     return posture
 
 
-def test_an_arm_that_started_below_the_clearance_is_brought_back_there(so101, low):
-    controller, _ = virtual(so101, low)
-    recording = controller.run(lambda k, state: so101.qpos_home if k < 100 else None)
-    assert recording.fault is None
-    assert any("back where it was found" in e.text for e in recording.events), [e.text for e in recording.events]
-
-
-def test_a_way_back_that_is_cut_ends_where_the_arm_is_and_says_so(so101, low, monkeypatch):
-    monkeypatch.setattr(CollisionGuard, "allow_start_clearance", lambda guard: None)
+@pytest.mark.parametrize("cut", [False, True])
+def test_an_arm_that_started_below_the_clearance_is_brought_back_there_or_as_far_as_it_may(
+    so101, low, monkeypatch, cut
+):
+    if cut:
+        monkeypatch.setattr(CollisionGuard, "allow_start_clearance", lambda guard: None)
     controller, sent = virtual(so101, low)
-    recording = controller.run(lambda k, state: so101.qpos_home if k < 100 else None)
+    recording = controller.run(lambda k, state: so101.qpos_home if k < 50 else None)
     assert recording.fault is None
-    assert "where it is: gripper and the plane at 0 m would come too near" in recording.events[-1].text
-    assert np.abs(sent[-1] - low).max() > 0.02
+    where = "where it is: gripper and the plane at 0 m would come too near" if cut else "back where it was found"
+    assert where in recording.events[-1].text
+    assert not cut or np.abs(sent[-1] - low).max() > 0.02
 
 
 @pytest.mark.parametrize("allowed", [True, False])
@@ -166,23 +179,9 @@ def test_live_targets_reach_a_start_below_the_clearance_only_on_the_way_back(so1
     assert free < 0.6 * clearance if allowed else free > clearance - 1e-3
 
 
-def test_of_an_arm_that_sags_the_arm_itself_is_kept_clear(so101, planner):
-    down, sag = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0]), np.array([0.0, 0.08, 0.0, 0.0, 0.0, 0.0])
-    guard, least = CollisionGuard(planner, so101.qpos_home), np.inf
-    for k in range(200):
-        asked = so101.qpos_home + min(1.0, k / 60) * (down - so101.qpos_home)
-        at = guard.step(asked, guard.qpos + sag, 0.02)
-        least = min(least, planner.collision.along((at + sag)[None]).min())
-    told = planner.collision.along(at[None]).min()
-    assert "the plane at 0 m" in guard.obstacle
-    assert least > planner.collision.clearance - 0.002
-    assert told > planner.collision.clearance + 0.005, "the sag matters here"
-
-
 def test_a_controller_cuts_them_and_says_what_for(so101, judge):
     controller, sent = virtual(so101, so101.qpos_home)
-    down = np.array([0.0, 1.7, 0.3, 0.5, 0.0, 0.0])
-    way = down - so101.qpos_home
+    way = DOWN - so101.qpos_home
     recording = controller.run(lambda k, state: so101.qpos_home + min(1, k / 50) * way if k < 90 else None)
     assert recording.fault is None
     assert max(judge.deepest(q)[0] for q in sent) == 0
@@ -211,32 +210,32 @@ def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkey
         Planner(so101, so101.joint_names, *hasty).plan(motion(so101, OVER), so101.qpos_home)
 
 
-@pytest.mark.parametrize("way", ["by way of home", "none", "none for a robot that does not obey"])
-def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_there(way, monkeypatch):
+@pytest.mark.parametrize(
+    ("found_way", "obeys"), [(True, True), (False, True), (False, False)], ids=["by way of home", "none", "ignores"]
+)
+def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_there(monkeypatch, found_way, obeys):
     robot = load_robot("h1_2")
     judge, found, far = Contacts(robot), robot.qpos_home.copy(), robot.qpos_home.copy()
     at = robot.index(robot.operated)
     found[at], far[at] = HERE, ACROSS
     controller, sent = virtual(robot, found)
-    driver, hears = controller.driver, way in ("by way of home", "none")
-    driver.at_end = "hold" if hears else "hand_over"
+    driver = controller.driver
+    driver.at_end = "hold" if obeys else "hand_over"
 
     def read():
-        fault = None if hears or controller.phase != "blend_out" else Fault("obedience", "it ignores goals")
+        fault = None if obeys or controller.phase != "blend_out" else Fault("obedience", "it ignores goals")
         return State(driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))), fault=fault)
 
     driver.read, controller.monitor.noisy = read, False
     assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
-    legs = [found, robot.qpos_home, far]
-    rows = np.concatenate(
-        [Trajectory.minimum_jerk(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in itertools.pairwise(legs)]
-    )
+    legs = itertools.pairwise([found, robot.qpos_home, far])
+    rows = np.concatenate([Trajectory.minimum_jerk(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in legs])
 
     def search(*given):  # each step takes a millisecond, and where there is no way it takes a few to find that out
-        for _ in find_points(*given) if way == "by way of home" else range(50):
+        for _ in find_points(*given) if found_way else range(50):
             controller.clock._now += 0.001
             yield
-        return finish_search(find_points(*given)) if way == "by way of home" else None
+        return finish_search(find_points(*given)) if found_way else None
 
     def policy(k, state):
         if k:
@@ -245,22 +244,21 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
 
     recording = controller.run(policy)
     last = recording.events[-1].text
-    assert (recording.fault is None) == hears, recording.fault
-    if not hears:
-        assert [e.phase for e in recording.events][-3:] == ["blend_out", "release", "stopped"]
+    assert (recording.fault is None) == obeys, recording.fault
+    if not obeys:
+        assert phases(recording)[-3:] == ["blend_out", "release", "stopped"]
         assert last == "let go; the robot did not obey"
         return
     assert judge.along(np.array([row.ctrl for row in recording.rows if row.ctrl is not None]), 0.02)[0] == 0
-    back = np.array([row.target for row in recording.rows if row.phase == "blend_out" and row.target is not None])
-    if way == "none":
-        assert last.startswith("where it is: no clear way was found back to where it was found: the straight one ")
-        assert last.endswith("; hold")
-        np.testing.assert_allclose(sent[-1][at], ACROSS, atol=0.02)
+    np.testing.assert_allclose(sent[-1][at], HERE if found_way else ACROSS, atol=0.02)
+    if not found_way:
+        text = "where it is: no clear way was found back to where it was found: the straight one brings .*; hold"
+        assert re.fullmatch(text, last)
         return
     assert last == "back where it was found; hold"
-    np.testing.assert_allclose(sent[-1][at], HERE, atol=0.02)
-    still = int(np.argmax(np.abs(back - back[0]).max(axis=1) > 0))
-    assert 2 < still < 100, "it looks for a share of each period"
+    back = np.array([row.target for row in recording.rows if row.phase == "blend_out" and row.target is not None])
+    standing = int(np.argmax(np.abs(back - back[0]).max(axis=1) > 0))
+    assert 2 < standing < 100, "it looks for a share of each period"
 
 
 @pytest.mark.parametrize(
@@ -288,6 +286,5 @@ def test_an_arm_without_shapes_and_a_robot_that_may_fall_are_asked_for(so101, tm
     assert main([*words, "--robot", str(tmp_path / "mine"), "--limits-from", str(tmp_path / "mine")]) == 2
     assert "so101 has no collision.toml" in " ".join(capsys.readouterr().err.split())
     assert main(["run", "--driver", "unitree", "--topic", "lowcmd", "--motion", "sweep-left_elbow", "--yes"]) == 2
-    assert "legs and torso go off, and a robot that stands falls; say --hangs" in " ".join(
-        capsys.readouterr().err.split()
-    )
+    said = " ".join(capsys.readouterr().err.split())
+    assert "legs and torso go off, and a robot that stands falls; say --hangs" in said

@@ -44,17 +44,15 @@ def test_the_lock_works_for_the_next_user_of_the_computer(mask):
         path.unlink()
 
 
-def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path, monkeypatch):
+def test_a_link_or_a_pipe_in_place_of_the_lock_is_refused_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(publisher, "LOCK_FOLDER", tmp_path)
-    (tmp_path / "gaponet-arm.lock").symlink_to(tmp_path / "elsewhere")
+    lock = tmp_path / "gaponet-arm.lock"
+    lock.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(UsageError, match="cannot be opened"), sole_publisher("arm"):
         pass
     assert not (tmp_path / "elsewhere").exists()
-
-
-def test_a_pipe_in_place_of_the_lock_is_refused_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(publisher, "LOCK_FOLDER", tmp_path)
-    os.mkfifo(tmp_path / "gaponet-arm.lock")
+    lock.unlink()
+    os.mkfifo(lock)
     with pytest.raises(UsageError, match="not a regular file"), sole_publisher("arm"):
         pass
 

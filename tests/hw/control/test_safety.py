@@ -76,9 +76,8 @@ def drawn(rng: np.random.Generator, scale: float, rows: int) -> np.ndarray:
 
 def test_no_command_ever_leaves_range_rate_or_torque(arm):
     rng = np.random.default_rng(0)
-    limits = Limits.from_robot(
-        arm, arm.joint_names, SafetyConfig(), gains=(np.array([20.0, 3.0]), np.array([0.0, 1.5]))
-    )
+    gains = np.array([20.0, 3.0]), np.array([0.0, 1.5])
+    limits = Limits.from_robot(arm, arm.joint_names, SafetyConfig(), gains=gains)
     for _ in range(4):
         rows = MILLION // 4
         target, previous, qpos, qvel = (drawn(rng, s, rows) for s in (2.0, 1.5, 1.5, 3.0))
@@ -149,17 +148,14 @@ def test_damping_never_asks_for_more_than_the_effort_limit():
     np.testing.assert_allclose(kd, [8.0, 0.2, 8.0])
 
 
-def test_a_share_above_the_effort_limit_is_refused():
+def test_limits_that_leave_nothing_or_more_than_there_is_are_refused(arm):
     with pytest.raises(UsageError, match=r"torque_share is 1\.5; give at most 1"):
         SafetyConfig(torque_share=1.5)
-
-
-def test_a_margin_wider_than_the_range_is_refused(arm):
     with pytest.raises(UsageError, match="leaves nothing of the range of shoulder"):
         Limits.from_robot(arm, arm.joint_names, SafetyConfig(margin=2.0))
 
 
-def watched(change: dict[str, object], noisy: bool = True, periods: int = 40) -> tuple[str, int]:
+def watched(change: dict[str, object], noisy: bool = True, periods: int = 80) -> tuple[str, int]:
     """Kind of the first fault and its period, of a state that moves gently until period 10 and is then changed."""
     rng = np.random.default_rng(0)
     watch = StateMonitor(("shoulder", "elbow"), np.arange(2), DT, SafetyConfig(), noisy)
@@ -189,20 +185,21 @@ def keep(name):
 @pytest.mark.parametrize(
     ("change", "kind", "period"),
     [
-        ({}, "none", 40),
+        ({}, "none", 80),
         ({name: keep(name) for name in ("time", "qpos", "qvel", "tau")}, "stale", 12),
         ({"time": lambda k, *_: k * DT - 0.05}, "stale", 10),  # late packets: they come, but old
         ({name: keep(name) for name in ("qpos", "qvel", "tau")}, "frozen", 11),
         ({"qvel": np.array([np.nan, 0.0])}, "nan", 10),
         ({"qpos": lambda k, f, _: f["qpos"] + [0.4, 0.0]}, "jump", 10),
         ({"temperature": np.array([40.0, 90.0])}, "temperature", 10),
-        ({"temperature": np.full(2, np.nan)}, "none", 40),
+        ({"temperature": np.full(2, np.nan)}, "none", 80),
         ({"qpos": lambda k, f, _: f["qpos"] - 0.051 * np.minimum(k - 9, 16)}, "tracking", 33),
         ({"refused": lambda k, *_: 3 * (k - 9)}, "checksum", 16),
+        ({"refused": lambda k, *_: (k - 9) // 3}, "none", 80),  # seventeen a second
         ({"late": 0.041}, "overrun", 10),
-        ({"late": 0.039}, "none", 40),
+        ({"late": 0.039}, "none", 80),
         ({"tilt": 0.71}, "tilt", 10),
-        ({"tilt": 0.69}, "none", 40),
+        ({"tilt": 0.69}, "none", 80),
         ({"tilt": np.nan}, "tilt", 10),  # an IMU that gives no attitude
     ],
 )
@@ -210,21 +207,16 @@ def test_each_watchdog_speaks_in_time(change, kind, period):
     assert watched(change) == (kind, period)
 
 
-def test_seventeen_wrong_checksums_in_each_second_are_ignored():
-    assert watched({"refused": lambda k, *_: (k - 9) // 3}, periods=200) == ("none", 200)
-
-
 def test_a_coarse_encoder_may_rest_but_not_while_the_command_moves_on():
     change = {name: keep(name) for name in ("qpos", "qvel", "tau")}
-    kind, period = watched(change, noisy=False, periods=60)
+    kind, period = watched(change, noisy=False)
     assert kind == "frozen"
     assert period in (39, 40)  # 0.3 rad at 0.01 rad a period
 
 
 def test_where_the_real_joints_end_earlier_commands_do(arm):
-    limits = Limits.from_robot(
-        arm, arm.joint_names, SafetyConfig(margin=0.1), qpos_range=np.array([[-0.5, 9.0], [-9.0, 0.4]])
-    )
+    real = np.array([[-0.5, 9.0], [-9.0, 0.4]])
+    limits = Limits.from_robot(arm, arm.joint_names, SafetyConfig(margin=0.1), qpos_range=real)
     mjcf = arm.qpos_range
     np.testing.assert_allclose(limits.low, [-0.4, mjcf[1, 0] + 0.1])
     np.testing.assert_allclose(limits.high, [mjcf[0, 1] - 0.1, 0.3])

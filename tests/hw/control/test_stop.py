@@ -9,10 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hw.noted_arm import DT, MOTION, QUICK, NotedArm
+from hw.noted_arm import DT, MOTION, NotedArm, acting, control
 
 from gaponet.base.errors import UsageError
-from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.stop import StopKeys, StopRequest
 from gaponet.hw.targets.policy import motion_policy
 
@@ -43,20 +42,9 @@ def terminal(monkeypatch) -> Iterator[Terminal]:
     os.close(made.master)
 
 
-def controller(driver: NotedArm, **how: object) -> Controller:
-    return Controller(driver, driver._given[0], config=QUICK, clock=driver.clock, **how)
-
-
 @pytest.mark.parametrize("key", KEYS.values(), ids=KEYS)
 def test_every_key_stops_a_motion_in_the_next_period_and_the_terminal_is_as_before(arm, terminal, key):
-    motion = motion_policy(MOTION, DT)
-
-    def policy(k, state):
-        if k == 20:
-            terminal.type(key)
-        return motion(k, state)
-
-    recording = controller(NotedArm(arm)).run(policy, keys=True)
+    recording = control(NotedArm(arm)).run(acting(lambda: terminal.type(key)), keys=True)
     assert recording.fault is not None
     assert "asked to stop: key " in recording.fault.text
     assert sum(row.phase == "run" for row in recording.rows) == 21
@@ -73,9 +61,8 @@ def test_all_keys_are_read_so_that_none_reaches_the_shell(terminal):
 
 def test_a_key_between_consent_and_first_command_leaves_the_robot_uncommanded(arm, terminal):
     driver = NotedArm(arm)
-    recording = controller(driver, on_connect=lambda _: os.write(terminal.master, b"x")).run(
-        motion_policy(MOTION, DT), keys=True
-    )
+    controller = control(driver, on_connect=lambda _: os.write(terminal.master, b"x"))
+    recording = controller.run(motion_policy(MOTION, DT), keys=True)
     assert "key 'x'; nothing was commanded" in recording.fault.text
     assert (driver.sent, driver.closed) == ([], [True])
 
@@ -86,7 +73,7 @@ def test_a_refusal_of_the_connected_robot_leaves_it_uncommanded_and_held(arm, te
 
     driver = NotedArm(arm)
     with pytest.raises(UsageError, match="no"):
-        controller(driver, on_connect=refuse).run(motion_policy(MOTION, DT), keys=True)
+        control(driver, on_connect=refuse).run(motion_policy(MOTION, DT), keys=True)
     assert (driver.sent, driver.closed) == ([], [True])
     assert termios.tcgetattr(terminal.slave) == terminal.before
 
@@ -103,5 +90,5 @@ def test_a_terminal_that_ends_stops(terminal):
 
 def test_a_policy_that_raises_leaves_the_terminal_as_before(arm, terminal):
     with pytest.raises(ZeroDivisionError):
-        controller(NotedArm(arm)).run(lambda k, state: np.zeros(2) / (k // k), keys=True)
+        control(NotedArm(arm)).run(lambda k, state: np.zeros(2) / (k // k), keys=True)
     assert termios.tcgetattr(terminal.slave) == terminal.before

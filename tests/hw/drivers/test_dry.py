@@ -1,29 +1,27 @@
 """A dry run computes all commands and sends none."""
 
+import itertools
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from arm import TOML, XML, commands
+from arm import TOML, XML
+from hw.noted_arm import DT, MOTION, QUICK, NotedArm, acting
 from motion_files import write_motion
 
 from gaponet.base.errors import UsageError
 from gaponet.cli.main import main
 from gaponet.hw.control import publisher
-from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
-from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.driver import State
 from gaponet.hw.drivers.dry import DryRun, summarize_commands
 from gaponet.hw.drivers.link import measure_link
 from gaponet.hw.drivers.open import open_driver
 from gaponet.hw.targets.policy import motion_policy
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.motion.motion import Motion
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_driver import VirtualDriver
-
-MOTION = Motion("sway", "whole_body", 0.02, commands(100, seed=1))
 
 
-class Deaf(VirtualDriver):
+class Deaf(NotedArm):
     def write(self, ctrl, weight=1.0):
         raise AssertionError("a command was sent")
 
@@ -31,11 +29,10 @@ class Deaf(VirtualDriver):
 
 
 def test_a_dry_run_goes_through_the_motion_and_sends_nothing(arm):
-    clock = SimulatedClock()
-    driver = DryRun(Deaf(arm, load_fleet("easy", arm).unit("virtual-1"), clock))
-    config = ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1, damp=0.1)
-    controller = Controller(driver, arm, config=config, clock=clock)
-    recording = controller.run(motion_policy(MOTION, 0.02))
+    inner = Deaf(arm)
+    driver = DryRun(inner)
+    controller = Controller(driver, arm, config=QUICK, clock=inner.clock)
+    recording = controller.run(motion_policy(MOTION, DT))
     assert recording.fault is None
     sent = summarize_commands(recording, controller.limits)
     assert sent["shoulder"]["lowest_rad"] <= MOTION.ctrl[:, 0].min() + 1e-9
@@ -44,44 +41,37 @@ def test_a_dry_run_goes_through_the_motion_and_sends_nothing(arm):
 
 
 def test_a_dry_run_that_is_stopped_damps_nothing_and_needs_no_watchdog(arm):
-    inner = Deaf(arm, load_fleet("easy", arm).unit("virtual-1"), SimulatedClock())
+    inner = Deaf(arm)
     inner.watchdog = dict
-    driver, play = DryRun(inner), motion_policy(MOTION, 0.02)
-    controller = Controller(driver, arm, config=ControlConfig(blend=0.3, damp=0.1), clock=inner.clock)
-    recording = controller.run(lambda k, state: controller.stop("no more") if k == 9 else play(k, state))
+    driver = DryRun(inner)
+    controller = Controller(driver, arm, config=QUICK, clock=inner.clock)
+    recording = controller.run(acting(lambda: controller.stop("no more"), 9))
     assert recording.events[-1].text == "nothing was sent"
     assert driver.watchdog() is None
 
 
 def test_a_dry_run_beside_a_run_of_the_same_robot_is_refused(arm, tmp_path, monkeypatch):
     monkeypatch.setattr(publisher, "LOCK_FOLDER", tmp_path)
-    inner = Deaf(arm, load_fleet("easy", arm).unit("virtual-1"), SimulatedClock())
+    inner = Deaf(arm)
     inner.address = "a port"
     with publisher.sole_publisher("a port"), pytest.raises(UsageError, match="another process commands"):
-        Controller(DryRun(inner), arm, clock=SimulatedClock()).run(motion_policy(MOTION, 0.02))
+        Controller(DryRun(inner), arm, clock=inner.clock).run(motion_policy(MOTION, DT))
 
 
 def test_a_dry_run_on_the_command_line_says_what_would_be_sent(arm, tmp_path, capsys):
     write_motion(tmp_path / "sway.npz", MOTION, arm)
     command = ["run", "--motion", str(tmp_path / "sway.npz"), "--robot", str(arm.folder), "--payload-side", "hand"]
-    assert main([*command, "--fast", "--dry-run"]) == 0
+    command += ["--fast", "--dry-run", "--blend", "0.2", "--blend-speed", "4", "--settle", "0.1", "--damp", "0.1"]
+    assert main(command) == 0
     assert "nothing was sent" in " ".join(capsys.readouterr().out.split())
-    assert main([*command, "--fast", "--dry-run", "--out", str(tmp_path / "out")]) == 2
+    assert main([*command, "--out", str(tmp_path / "out")]) == 2
 
 
 def test_a_link_that_loses_every_fifth_state_says_so():
-    class Lossy:
-        k = 0
-
-        def read(self):
-            from gaponet.hw.control.driver import State
-
-            self.k += 1 + (self.k % 5 == 3)
-            none = np.zeros(1)
-            return State(1e-3 * self.k, none, none, none, none)
-
-    found = measure_link(Lossy(), 0.2)
-    assert found["lost"] == pytest.approx(found["states"] / 4, rel=0.1)
+    numbers = (k for k in itertools.count(1) if k % 5 != 4)
+    state = lambda: State(1e-3 * next(numbers), *np.zeros((4, 1)))  # noqa: E731
+    link = measure_link(SimpleNamespace(read=state), 0.2)
+    assert link["lost"] == pytest.approx(link["states"] / 4, rel=0.1)
 
 
 def test_a_robot_whose_mjcf_lies_in_a_subfolder_can_be_opened_by_a_watchdog(tmp_path):
@@ -98,6 +88,4 @@ def test_a_robot_whose_mjcf_lies_in_a_subfolder_can_be_opened_by_a_watchdog(tmp_
     text = (h1_2.folder / "robot.toml").read_text()
     (own / "robot.toml").write_text('mjcf = "model/robot.xml"\n' + text)
     (own / "model" / "robot.xml").write_text(h1_2.mjcf.read_text())
-    spec = UnitreeDriver(load_robot(own)).watchdog()
-    spec.pop("early")
-    assert open_driver(**spec).joint_names == h1_2.joint_names
+    assert open_driver(**UnitreeDriver(load_robot(own)).watchdog()).joint_names == h1_2.joint_names

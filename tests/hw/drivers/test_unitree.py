@@ -67,15 +67,18 @@ def decoded(robot, data):
     return driver._state, driver
 
 
-def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(robot):
+@pytest.mark.parametrize(
+    ("quaternion", "tilt"),
+    [
+        ((1.0, 0.0, 0.0, 0.0), 0.0), ((np.cos(0.4), 0.0, np.sin(0.4), 0.0), 0.8),
+        ((np.cos(0.4), 0.0, 0.0, np.sin(0.4)), 0.0), ((0.0, 0.0, 0.0, 0.0), np.nan),
+    ],
+    ids=["upright", "leaning", "turned", "none"],
+)  # fmt: skip
+def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(robot, quaternion, tilt):
     data = message()
-    assert decoded(robot, data)[0].tilt == pytest.approx(0.0, abs=1e-3)
-    hg.LowState.view(data, "imu_state.quaternion")[:] = (np.cos(0.4), 0.0, np.sin(0.4), 0.0)
-    assert decoded(robot, data)[0].tilt == pytest.approx(0.8, abs=1e-5)
-    hg.LowState.view(data, "imu_state.quaternion")[:] = (np.cos(0.4), 0.0, 0.0, np.sin(0.4))  # turned, not leaning
-    assert decoded(robot, data)[0].tilt == pytest.approx(0.0, abs=1e-3)
-    hg.LowState.view(data, "imu_state.quaternion")[:] = 0.0
-    assert np.isnan(decoded(robot, data)[0].tilt)
+    hg.LowState.view(data, "imu_state.quaternion")[:] = quaternion
+    assert decoded(robot, data)[0].tilt == pytest.approx(tilt, abs=1e-3, nan_ok=True)
 
 
 def test_only_the_stop_keys_of_the_remote_stop(robot):

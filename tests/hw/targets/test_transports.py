@@ -74,45 +74,42 @@ def test_a_policy_that_leaves_ends_the_run_and_one_that_crashes_does_not(listeni
     assert len({m.sender for m in said}) == 2
 
 
-def test_a_stranger_who_says_too_much_is_cut_off_and_nobody_else(listening):
+@pytest.fixture
+def dealer(listening):
+    """A function that returns a socket which is connected to the transport."""
     import zmq
 
     context = zmq.Context()
-    try:
-        stranger, sender = (context.socket(zmq.DEALER) for _ in range(2))
-        for socket in (stranger, sender):
-            socket.linger = 0
-            socket.connect(listening.address)
-        stranger.send(b"x" * (MAX_MESSAGE_BYTES + 1))
-        stranger.send_multipart([b"", b"\x80\x04pickle"])
-        sender.send(json.dumps({"time": 1.0, "target": {"a": 0.5}}).encode())
-        found = received(listening, 1)
-        found += received(listening, 1, 0.5)
-        assert [m.target for m in found if not m.error] == [{"a": 0.5}]
-        assert len(listening.receive()) == 0
-        listening.publish(b"nobody", STATE)
-    finally:
-        context.destroy(linger=0)
+
+    def connect():
+        socket = context.socket(zmq.DEALER)
+        socket.connect(listening.address)
+        return socket
+
+    yield connect
+    context.destroy(linger=0)
 
 
-def test_no_more_messages_are_taken_at_a_look_than_a_period_can_bear(listening):
-    import zmq
+def test_a_stranger_who_says_too_much_is_cut_off_and_nobody_else(listening, dealer):
+    stranger, sender = dealer(), dealer()
+    stranger.send(b"x" * (MAX_MESSAGE_BYTES + 1))
+    stranger.send_multipart([b"", b"\x80\x04pickle"])
+    sender.send(json.dumps({"time": 1.0, "target": {"a": 0.5}}).encode())
+    found = received(listening, 1) + received(listening, 1, 0.5)
+    assert [m.target for m in found if not m.error] == [{"a": 0.5}]
+    assert len(listening.receive()) == 0
+    listening.publish(b"nobody", STATE)
 
-    context = zmq.Context()
-    try:
-        sender = context.socket(zmq.DEALER)
-        sender.connect(listening.address)
-        for k in range(300):
-            sender.send(json.dumps({"time": k}).encode())
-        most = found = 0
-        deadline = time.monotonic() + 20
-        while found < 300 and time.monotonic() < deadline:
-            now = len(listening.receive())
-            most, found = max(most, now), found + now
-        assert found == 300
-        assert most <= 64
-    finally:
-        context.destroy(linger=0)
+
+def test_no_more_messages_are_taken_at_a_look_than_a_period_can_bear(listening, dealer):
+    sender, counts = dealer(), [0]
+    for k in range(300):
+        sender.send(json.dumps({"time": k}).encode())
+    deadline = time.monotonic() + 20
+    while sum(counts) < 300 and time.monotonic() < deadline:
+        counts.append(len(listening.receive()))
+    assert sum(counts) == 300
+    assert max(counts) <= 64
 
 
 def test_two_cannot_listen_at_one_address(listening):
@@ -178,12 +175,15 @@ def test_ros_messages_are_on_the_wire_as_another_library_has_them(ros2):
 
 
 def test_plans_and_what_is_no_trajectory_are_refused(ros2):
-    assert "a plan" in ros2.to_message("a", trajectory("ab", [1, 2], points=2)[4:]).error
-    assert "a plan" in ros2.to_message("a", trajectory("ab", [1, 2], due=900_000_000)[4:]).error
-    assert "1 positions for 2 joints" in ros2.to_message("a", trajectory("ab", [1])[4:]).error
-    assert "2 positions for 1 joints" in ros2.to_message("a", trajectory("aa", [1, 2])[4:]).error
-    assert ros2.to_message("a", trajectory("ab", [1, 2], stamp=(0, 0))[4:]).time is None
-    assert ros2.to_message("a", trajectory("ab", [], points=0)[4:]).end
+    def said(*given, **options):
+        return ros2.to_message("a", trajectory(*given, **options)[4:])
+
+    assert "a plan" in said("ab", [1, 2], points=2).error
+    assert "a plan" in said("ab", [1, 2], due=900_000_000).error
+    assert "1 positions for 2 joints" in said("ab", [1]).error
+    assert "2 positions for 1 joints" in said("aa", [1, 2]).error
+    assert said("ab", [1, 2], stamp=(0, 0)).time is None
+    assert said("ab", [], points=0).end
     whole = trajectory("ab", [1, 2])[4:]
     assert "has more than" in ros2.to_message("a", whole + bytes(MAX_MESSAGE_BYTES)).error
     rng = np.random.default_rng(0)

@@ -131,4 +131,7 @@ class Driver(Protocol):
         """
 
     def watchdog(self) -> dict[str, object] | None:
-        """Return how another process opens this robot to damp it (control.watchdog); None if it cannot."""
+        """Return the arguments of open_driver with which another process connects to this robot to damp it.
+
+        That driver must send nothing before it damps (control.watchdog). None: no other process can damp the robot.
+        """

@@ -114,8 +114,6 @@ class Planner:
     ) -> None:
         """
         Args:
-            robot: The robot.
-            commanded: Its commanded joints.
             config: Speed and duration of the moves to the first target and back.
             safety: Speed and acceleration of commands.
             limits: Range, torque and shapes; default without payload.
@@ -303,11 +301,7 @@ class CollisionGuard:
     """
 
     def __init__(self, planner: Planner, qpos: Array) -> None:
-        """
-        Args:
-            planner: Its shapes and speeds hold.
-            qpos: Posture at which it begins, (n,) rad.
-        """
+        """Begin at a posture (n,) rad, with the shapes and speeds of a planner."""
         self.collision, self.config, self.safety = planner.collision, planner.config, planner.safety
         self.qpos, self.obstacle = np.array(qpos, float), ""
         # Free space now and at the start, to be kept, and its reduction by sagging, (pairs + shells,) m.

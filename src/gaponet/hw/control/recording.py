@@ -79,8 +79,8 @@ class Recording:
         """Return the fault that ended the run, or None."""
         return next((e for e in self.events if e.kind in FAULT_KINDS), None)
 
-    def log(self, source: str = "controller", phase: str = "run") -> Log:
-        """Return the periods of a phase as a Log of the commanded joints; its time begins with them, s.
+    def log(self, source: str = "controller") -> Log:
+        """Return the periods of the phase `run` as a Log of the commanded joints; its time begins with them, s.
 
         A row has the state read at the start of a period and the command sent in it, as to_sequence requires.
 
@@ -91,14 +91,14 @@ class Recording:
             raise LogError(f"{source}: no data, the robot did not do what it was told: {self.disobedience}")
         if self.rows.error:
             raise LogError(f"{source}: not whole, {self.rows.error.strerror}; make room and record again")
-        return self._log(source, phase)
+        return self._log(source)
 
-    def _log(self, source: str, phase: str = "run") -> Log:
-        rows = self.phase_rows(phase)
+    def _log(self, source: str) -> Log:
+        rows = self.phase_rows("run")
         if len(rows) < 2:
             last = self.events[-1] if self.events else None
             why = f"; it ended with: {last.text}" if last else ""
-            raise LogError(f"{source}: {len(rows)} periods of phase '{phase}', nothing to learn from{why}")
+            raise LogError(f"{source}: {len(rows)} periods of phase 'run', nothing to learn from{why}")
         at = [self.joint_names.index(name) for name in self.commanded]
         time, values = np.array(rows["time"]), {"ctrl": rows["ctrl"][:, at]}
         for name in READINGS:
@@ -123,22 +123,14 @@ class Recording:
         late = np.array(self.late or [0.0])
         ages = table["time"] - table["state_time"] if len(table) else np.zeros(1)
         incomplete = {"not_whole": self.rows.error.strerror} if self.rows.error else {}
-        return (
-            incomplete
-            | self.meta
-            | {
-                "robot": self.robot,
-                "virtual": self.virtual,
-                "obeyed": not self.disobedience,
-                "rate_hz": 1 / self.dt,
-                "periods": len(table),
-                "missed": self.missed,
-                "late_ms": {q: round(float(np.quantile(late, p)) * 1e3, 3) for q, p in QUANTILES.items()},
-                "state_age_ms": {q: round(float(np.quantile(ages, p)) * 1e3, 3) for q, p in QUANTILES.items()},
-                "refused_messages": int(table["refused"][-1]) if len(table) else 0,
-                "events": [[round(e.time - start, 4), e.phase, e.kind, e.text] for e in self.events],
-            }
-        )
+        return incomplete | self.meta | {
+            "robot": self.robot, "virtual": self.virtual, "obeyed": not self.disobedience, "rate_hz": 1 / self.dt,
+            "periods": len(table), "missed": self.missed,
+            "late_ms": {q: round(float(np.quantile(late, p)) * 1e3, 3) for q, p in QUANTILES.items()},
+            "state_age_ms": {q: round(float(np.quantile(ages, p)) * 1e3, 3) for q, p in QUANTILES.items()},
+            "refused_messages": int(table["refused"][-1]) if len(table) else 0,
+            "events": [[round(e.time - start, 4), e.phase, e.kind, e.text] for e in self.events],
+        }  # fmt: skip
 
     def save(self, folder: Path, name: str) -> Path:
         """Write NAME.parquet for gaponet import, all periods as NAME.cycles.npy, and NAME.json.
@@ -151,28 +143,25 @@ class Recording:
         Raises:
             OSError: A file could not be written; the periods written so far stay in the folder.
         """
-        with lock_folder(folder, FOLDER_KIND):
-            return self._save(folder, name)
-
-    def _save(self, folder: Path, name: str) -> Path:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        taken = {file.name.removesuffix(end) for end in (".json", ROWS_SUFFIX) for file in folder.glob(f"*{end}")}
-        name = next(n for k in itertools.count(1) if (n := f"{name}-{k}" if k > 1 else name) not in taken)
-        self.rows.save(folder / f"{name}{ROWS_SUFFIX}")
-        path = folder / f"{name}.parquet"
-        try:
-            if len(self.phase_rows("run")) >= 2:
-                log = self._log(str(path))
-                columns = {"time": log.channels["ctrl"].time}
-                for channel, (_, values) in log.channels.items():
-                    columns |= {f"{channel}.{j}": values[:, i] for i, j in enumerate(log.joint_names)}
-                table = pa.table(columns, metadata={NOT_OBEYED: self.disobedience} if self.disobedience else None)
-                with atomic_write(path) as temporary:
-                    pq.write_table(table, temporary)
-            write_text(folder / f"{name}.json", json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n")
-        except OSError as error:
-            kept = f"{error.strerror or error}; all periods that were written are in {name}{ROWS_SUFFIX}"
-            raise OSError(error.errno, kept, error.filename) from error
-        return path
+        with lock_folder(folder, FOLDER_KIND):
+            taken = {file.name.removesuffix(end) for end in (".json", ROWS_SUFFIX) for file in folder.glob(f"*{end}")}
+            name = next(n for k in itertools.count(1) if (n := f"{name}-{k}" if k > 1 else name) not in taken)
+            self.rows.save(folder / f"{name}{ROWS_SUFFIX}")
+            path = folder / f"{name}.parquet"
+            try:
+                if len(self.phase_rows("run")) >= 2:
+                    log = self._log(str(path))
+                    columns = {"time": log.channels["ctrl"].time}
+                    for channel, (_, values) in log.channels.items():
+                        columns |= {f"{channel}.{j}": values[:, i] for i, j in enumerate(log.joint_names)}
+                    table = pa.table(columns, metadata={NOT_OBEYED: self.disobedience} if self.disobedience else None)
+                    with atomic_write(path) as temporary:
+                        pq.write_table(table, temporary)
+                write_text(folder / f"{name}.json", json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n")
+            except OSError as error:
+                kept = f"{error.strerror or error}; all periods that were written are in {name}{ROWS_SUFFIX}"
+                raise OSError(error.errno, kept, error.filename) from error
+            return path

@@ -213,8 +213,7 @@ class StateMonitor:
     ) -> None:
         """
         Args:
-            joint_names: Names of all joints, (n).
-            commanded: Index of the commanded ones.
+            commanded: Indices of the commanded joints.
             dt: Control period, s.
             noisy: Equal readings count as frozen at once; else only after the command has moved by frozen_travel.
         """

@@ -55,13 +55,13 @@ class Watchdog:
         self._fired, self._timeout = False, timeout
         self._answer_time: float | None = None  # monotonic s of the last answer, or of the first heartbeat before it
 
-    def wait_ready(self, timeout: float = READY_TIMEOUT_S) -> None:
+    def wait_ready(self) -> None:
         """Return when it could damp the robot.
 
         Raises:
             DriverError: It could not reach the robot.
         """
-        ready, _, _ = select.select([self._out], [], [], timeout)
+        ready, _, _ = select.select([self._out], [], [], READY_TIMEOUT_S)
         if not ready or self._out.read(1) != READY:
             self._process.kill()
             raise DriverError("the watchdog could not reach the robot; see its message above")
@@ -122,10 +122,9 @@ def main(spec: dict[str, Any]) -> None:
 
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    timeout, damp, early = spec.pop("timeout"), spec.pop("damp"), spec.pop("early")
+    timeout, damp = spec.pop("timeout"), spec.pop("damp")
     driver = open_driver(**spec)
-    if early:
-        driver.connect()
+    driver.connect()
     _send(READY)
     weight = None  # of the controller's last command; None: nothing was commanded
     while True:
@@ -141,7 +140,7 @@ def main(spec: dict[str, Any]) -> None:
     _send(FIRED)
     why = "ended" if readable else f"was silent for {timeout * 1e3:.0f} ms"
     print(f"watchdog: the controller {why}; damping {driver.address}", file=sys.stderr, flush=True)
-    _damp(driver, damp, weight, connected=early)
+    _damp(driver, damp, weight)
 
 
 def _send(word: bytes) -> None:
@@ -149,7 +148,7 @@ def _send(word: bytes) -> None:
         os.write(1, word)
 
 
-def _damp(driver: Driver, seconds: float, weight: float, connected: bool) -> None:
+def _damp(driver: Driver, seconds: float, weight: float) -> None:
     """Damp for some seconds from the first success on, and until the robot confirms it; retry what fails."""
     start, damping_since, last_error = time.monotonic(), None, ""
     report = lambda text: print(f"watchdog: {driver.address} {text}", file=sys.stderr, flush=True)  # noqa: E731
@@ -157,9 +156,6 @@ def _damp(driver: Driver, seconds: float, weight: float, connected: bool) -> Non
         now, wait = time.monotonic(), DAMP_INTERVAL_S
         left = 1.0 if damping_since is None else max(1.0 - (now - damping_since) / seconds, 0.0)
         try:
-            if not connected:
-                driver.connect()
-                connected = True
             driver.damp(weight * left, left)
             damping_since = damping_since or now
             if not left:

@@ -38,6 +38,7 @@ except ImportError:
 
 QUEUE_LENGTH = 64  # messages buffered between two reads: 128 ms at 500 Hz
 MAX_SAMPLE_KIB = 64  # of a message that is put together from fragments
+DISCOVERY_S = 0.5  # in which other participants are heard
 MAX_ENTRIES = 500  # of discovery that are read
 SHUTDOWN_S = 3.0  # longest wait for the deletion of the domains at the end of a process
 SCALARS = {"<f4": float32, "<i2": int16, "<u4": uint32, "u1": byte}
@@ -158,13 +159,13 @@ class Bus:
             self._topics[name] = Topic(self._participant, name, as_bytes(kind))
         return self._topics[name]
 
-    def publishers(self, wait: float = 0.5) -> defaultdict[str, list[str]]:
-        """Return the other publishers after listening for `wait` s: topic → programs, as they call themselves."""
+    def publishers(self) -> defaultdict[str, list[str]]:
+        """Return the other publishers, which takes DISCOVERY_S: topic → programs, as they call themselves."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication
 
         programs = BuiltinDataReader(self._participant, BuiltinTopicDcpsParticipant)
         publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-        time.sleep(wait)
+        time.sleep(DISCOVERY_S)
         names = {e.key: _program(e.qos) for e in programs.read(N=MAX_ENTRIES) if hasattr(e, "key")}
         publishers: defaultdict[str, list[str]] = defaultdict(list)
         for entry in publications.read(N=MAX_ENTRIES):

@@ -21,10 +21,7 @@ class DryRun:
     """
 
     def __init__(self, driver: Driver) -> None:
-        """
-        Args:
-            driver: The robot; it must publish nothing when it connects.
-        """
+        """Take the driver of the robot, which must publish nothing when it connects."""
         self.driver = driver
         self.address = driver.address  # the same lock: a serial bus has one master, also one that only reads
         self.joint_names, self.commanded = driver.joint_names, driver.commanded

@@ -10,7 +10,10 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from serial import Serial
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST = 0xFE
@@ -76,19 +79,6 @@ RUNNING = Register(40, 31)  # block from TORQUE_ENABLE to PRESENT_CURRENT
 STS3215 = 777  # model number
 
 
-class Stream(Protocol):
-    """Byte stream with the methods that are used of pyserial's Serial."""
-
-    def read(self, size: int = 1) -> bytes:
-        """Return up to `size` bytes, after the port's time-out at the latest."""
-
-    def write(self, data: bytes, /) -> int | None:
-        """Send bytes."""
-
-    def reset_input_buffer(self) -> None:
-        """Drop received bytes that were not read."""
-
-
 def checksum(body: bytes) -> int:
     """Return the inverted sum of all bytes between FF FF and the checksum."""
     return ~sum(body) & 0xFF
@@ -108,19 +98,14 @@ class ServoBus:
         errors: Servo → error bits of all its replies so far.
     """
 
-    def __init__(self, stream: Stream, timeout: float = 0.01, retries: int = RETRIES) -> None:
-        """
-        Args:
-            stream: The port.
-            timeout: Silence after which missing replies are given up, s.
-            retries: How often these are requested again.
-        """
-        self.stream, self.timeout, self.retries = stream, timeout, retries
+    def __init__(self, stream: Serial, timeout: float = 0.01) -> None:
+        """Send over a port; missing replies are given up after `timeout` s of silence."""
+        self.stream, self.timeout = stream, timeout
         self.refused = 0
         self.errors: dict[int, int] = {}
         self._tag = 0
 
-    def sync_read(self, servos: Iterable[int], block: Register, retries: int | None = None) -> dict[int, bytes]:
+    def sync_read(self, servos: Iterable[int], block: Register, retries: int = RETRIES) -> dict[int, bytes]:
         """Return a block of each of several servos; servos without an intact reply are missing.
 
         What is missing after a silence is requested again. A reply does not name its request. So successive requests
@@ -128,7 +113,7 @@ class ServoBus:
         an earlier call is not taken for it.
         """
         missing, replies, sizes = list(servos), dict[int, bytes](), set[int]()
-        for _ in range(1 + (self.retries if retries is None else retries)):
+        for _ in range(1 + retries):
             self._tag = (self._tag + 1) % REQUEST_TAGS
             size = block.size + self._tag
             sizes.add(size)

@@ -287,7 +287,7 @@ class SO101Driver:
         self._settings_index, self._settings_time = (self._settings_index + 1) % len(servos), now
         return self._check_settings(bus, [servos[self._settings_index]], retries=0)
 
-    def _check_settings(self, bus: reg.ServoBus, servos: list[int], retries: int | None = None) -> Fault | None:
+    def _check_settings(self, bus: reg.ServoBus, servos: list[int], retries: int = reg.RETRIES) -> Fault | None:
         """Return a fault if gains, ranges or zeros have changed; a servo that does not answer has changed none."""
         settings = bus.sync_read(servos, reg.SETTINGS, retries)
         return self._disobedience_fault([
@@ -396,7 +396,7 @@ class SO101Driver:
         """Return the options of a driver that opens the port before it is exclusive, and is silent until it damps."""
         calibration = str(self.calibration) if self.calibration else None
         return {
-            "kind": "so101", "robot": str(self.robot.folder.resolve()), "early": True, "port": self.port,
+            "kind": "so101", "robot": str(self.robot.folder.resolve()), "port": self.port,
             "calibration": calibration, "silent": True, "torque_limit": self._torque_limit,
         }  # fmt: skip
 

@@ -50,11 +50,7 @@ class ArmCalibration:
     """
 
     def __init__(self, rows: dict[str, ServoRow], robot: RobotSpec) -> None:
-        """
-        Args:
-            rows: Calibration of each joint, by its name.
-            robot: Order of the joints, and the gripper's lower limit.
-        """
+        """Take the order of the joints and the gripper's lower limit from the robot."""
         ordered = [rows[joint] for joint in robot.joint_names]
         self.rows, self.servos = rows, [row.id for row in ordered]
         self.low, self.high = (np.array([getattr(row, end) for row in ordered]) for end in ("range_min", "range_max"))
@@ -106,23 +102,14 @@ def uncalibrated(robot: RobotSpec) -> ArmCalibration:
 def resolve_calibration(
     file: ArmCalibration | None, stored: dict[str, ServoRow], robot: RobotSpec, port: str
 ) -> ArmCalibration:
-    """Return the calibration of the file if the servos store the same, or the servos' own without a file.
-
-    Args:
-        file: From the file; None without one.
-        stored: In the servos, by joint.
-        robot: Order of the joints.
-        port: For messages.
+    """Return the calibration of the file if the servos store the same, by joint, or the servos' own without a file.
 
     Raises:
         DriverError: The two differ, or neither has the ends of the joints.
     """
     if file is None:
-        blank = [
-            j
-            for j in JOINTS
-            if j != CONTINUOUS_JOINT and stored[j].range_max - stored[j].range_min >= STEPS_PER_TURN - 1
-        ]
+        whole = {j for j in JOINTS if stored[j].range_max - stored[j].range_min >= STEPS_PER_TURN - 1}
+        blank = [j for j in JOINTS if j in whole and j != CONTINUOUS_JOINT]
         if blank:
             raise DriverError(
                 f"{port}: the servos hold no calibration (no limits in {', '.join(blank)}); run lerobot-calibrate, "

@@ -305,7 +305,7 @@ class UnitreeDriver:
     def watchdog(self) -> dict[str, object] | None:
         """Return the options of a second participant: connected from the start, and silent until it damps."""
         return {
-            "kind": "unitree", "robot": str(self.robot.folder.resolve()), "early": True, "topic": self.topic,
+            "kind": "unitree", "robot": str(self.robot.folder.resolve()), "topic": self.topic,
             "joints": self.joints, "domain": self.domain, "interface": self.interface, "sole": False,
         }  # fmt: skip
 
@@ -318,11 +318,7 @@ class TickClock:
     """
 
     def __init__(self, arrivals: list[float], ticks: list[int]) -> None:
-        """
-        Args:
-            arrivals: Times of the first messages, s of the monotonic clock.
-            ticks: Their ticks.
-        """
+        """Take the arrival times, s of the monotonic clock, and the ticks of the first messages."""
         period = (arrivals[-1] - arrivals[0]) / max((ticks[-1] - ticks[0]) % 2**32, 1)
         # s; None: the tick is no clock, and arrival times are used
         self.period = next((p for p in TICK_PERIODS_S if 0.7 < period / p < 1.4), None)

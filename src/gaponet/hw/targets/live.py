@@ -136,13 +136,10 @@ class LiveTargets:
     ) -> None:
         """
         Args:
-            transport: Where targets come from.
-            robot: Its joints and ranges.
             commanded: Joints that the driver commands.
             clock: The controller's.
             dt: Control period, s.
             speed: Fastest joint, rad/s (SafetyConfig.speed).
-            config: Which targets are accepted.
         """
         # Decoding the first message of a process takes 20 ms or more, which no control period has.
         decode("", b'{"time": 0.0, "target": {"joint": 0.0}, "end": false}')

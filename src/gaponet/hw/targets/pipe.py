@@ -18,9 +18,7 @@ class PipeTransport:
     """A `Transport` that reads lines and sends nothing."""
 
     def __init__(self, descriptor: int | None = None) -> None:
-        """
-        Args:
-            descriptor: The pipe; default standard input.
+        """Read a pipe, by default standard input.
 
         Raises:
             UsageError: Standard input is a terminal, where any key stops a run.

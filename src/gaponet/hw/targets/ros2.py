@@ -71,13 +71,7 @@ class ROS2Transport:
     """A `Transport` on a DDS domain."""
 
     def __init__(self, domain: int = 0, interface: str = "lo", topic: str = TOPIC, states: str = STATES_TOPIC) -> None:
-        """
-        Args:
-            domain: ROS_DOMAIN_ID.
-            interface: Network interface.
-            topic: Topic of JointTrajectory, with the prefix rt/.
-            states: Topic of JointState, with the prefix rt/.
-        """
+        """Join the domain ROS_DOMAIN_ID. Topics, of JointTrajectory and of JointState, have the prefix rt/."""
         self.address = f"{topic}, domain {domain}, interface {interface}"
         self._bus = dds.Bus(domain, interface)
         self._reader = self._bus.reader(topic, JointTrajectory, QUEUE_LENGTH)
