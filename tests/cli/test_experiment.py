@@ -51,7 +51,5 @@ def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(place, 
 
 def test_what_cannot_be_asked_of_a_dataset_is_one_line(place, capsys):
     where = [str(place / "data"), "--out", str(place / "out"), "--robot", str(place / "arm")]
-    assert main(["experiment", "unit", *where]) == 2
-    assert "use gaponet experiment compare --holdout-units" in capsys.readouterr().err
     assert main(["experiment", "compare", *where, "--seeds", "0"]) == 2
     assert "--seeds is at least 1" in capsys.readouterr().err

@@ -233,11 +233,6 @@ def test_prune_deletes_what_neither_this_push_nor_the_last_names_once_it_is_a_da
     same(dataset, Dataset(tmp_path / "back"))
 
 
-def test_the_command_prune_names_the_one_that_replaces_it(capsys):
-    assert main(["prune", "s3://robots/arm"]) == 2
-    assert capsys.readouterr().err == "Usage: gaponet prune was removed; use gaponet push --prune\n"
-
-
 @pytest.mark.parametrize(
     ("remote", "step"), [(Bucket, "store"), (Bucket, "_replace_index"), (Hub, "store")], ids=lambda x: str(x)
 )

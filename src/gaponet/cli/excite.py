@@ -16,8 +16,6 @@ from gaponet.cli.out import Out, writes
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import load_robot
 
-MAX_COLUMNS = 4  # of a table
-
 
 @writes("motions")
 def excite(
@@ -68,13 +66,12 @@ def _show_prediction(screen: Out, name: str, prediction: Prediction) -> None:
     """Print standard errors before and after the motions, and how much more playing is useful."""
     before, after = prediction.before, prediction.after
     fields = [f for f in next(iter(before.values())) if any(by[f] > 0 for by in before.values())]
-    for start in range(0, len(fields), MAX_COLUMNS):
-        chosen = fields[start : start + MAX_COLUMNS]
-        title = f"{name}: standard errors, now → at best" if start == 0 else "Further parameters"
-        screen.table(title, ["joint", *(SERVO_FIELDS[f].heading for f in chosen)], [
-            [j, *(" → ".join(_two_digits(by[j][f] * SERVO_FIELDS[f].factor) for by in (before, after)) for f in chosen)]
-            for j in before
-        ])  # fmt: skip
+    screen.wide_table(
+        f"{name}: standard errors, now → at best",
+        ["joint", *(SERVO_FIELDS[f].heading for f in fields)],
+        [[j, *(" → ".join(_two_digits(by[j][f] * SERVO_FIELDS[f].factor) for by in (before, after)) for f in fields)]
+         for j in before],
+    )  # fmt: skip
     seconds = prediction.useful_seconds
     screen.say(
         f"{seconds:.0f} s are worth playing: after them half a minute more makes the errors less than 5 % smaller"

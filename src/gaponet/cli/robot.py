@@ -12,7 +12,7 @@ import tyro
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.cli.options import Flag, Folder, Json, Model
-from gaponet.cli.out import MAX_COLUMNS, Out
+from gaponet.cli.out import Out
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
 from gaponet.share.reading import open_dataset
 
@@ -53,10 +53,27 @@ def link(
         port: so101: serial port.
         seconds: How long to listen.
     """
-    from gaponet.cli.link import listen
+    from gaponet.hw.drivers.link import measure_link
+    from gaponet.hw.drivers.open import open_driver
 
+    out, name = Out(json), robot or ("h1_2" if driver == "unitree" else "so101")
     options = {"domain": domain, "interface": interface, "silent": True} if driver == "unitree" else {"port": port}
-    listen(Out(json), driver, robot or ("h1_2" if driver == "unitree" else "so101"), options, seconds)
+    bus = open_driver(driver, name, **options)
+    try:
+        bus.connect()
+        measured = measure_link(bus, seconds)
+        publishers = bus.publishers() if hasattr(bus, "publishers") else {}
+    finally:
+        bus.close(hold=True)
+    three = lambda what: ", ".join(f"{value:.2f}" for value in measured[what])  # noqa: E731
+    out.table(f"{'VIRTUAL ' * bus.virtual}{name} at {bus.address}, {seconds:g} s", ["what", "value"], [
+        ["states, a second", f"{measured['states']}, {measured['rate_hz']:.1f}"],
+        ["age when it comes, ms: p50, p99, max", three("age_ms")],
+        ["between two, ms: p50, p99, max", three("interval_ms")],
+        ["lost, refused", f"{measured['lost']}, {measured['refused']}"],
+        *([f"publish {topic}", "; ".join(programs) or "nobody"] for topic, programs in publishers.items()),
+    ])  # fmt: skip
+    out.result(measured | {"publishers": publishers, "virtual": bus.virtual} | bus.facts)
 
 
 def check(
@@ -225,15 +242,11 @@ def show(
     known = ParameterUncertainty.require(spec)
     sure = {j: summarize(known, j) for j in known.joints}
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
-    for start in range(0, len(fields), MAX_COLUMNS):
-        part = fields[start : start + MAX_COLUMNS]
-        title = f"{spec.name}, ± standard error" if start == 0 else "Further parameters"
-        screen.table(title, ["joint", *(SERVO_FIELDS[f].heading for f in part)], table_rows(known, part))
+    columns = ["joint", *(SERVO_FIELDS[f].heading for f in fields)]
+    screen.wide_table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
     for line in sentences(known):
         screen.say(line)
     if out is not None:
-        from gaponet.base.files import atomic_write
-
         if out.suffix not in (".png", ".svg"):
             raise UsageError(f"--out {out}: a picture is a .png or an .svg")
         with atomic_write(out) as temporary:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Data, Flag, Json, Robot
+from gaponet.cli.options import Data, Json, Robot
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
 from gaponet.share.reading import open_dataset
@@ -27,7 +27,6 @@ def view(
     payload_mass: float | None = None,
     show: tuple[str, ...] = ("target", "nominal", "aligned", "recorded"),
     render: Path | None = None,
-    web: Flag = False,
     port: int = 8080,
     start: float | None = None,
     duration: float = 8.0,
@@ -51,8 +50,7 @@ def view(
         unit: Which unit's recording, where there are several.
         payload_mass: Which payload's recording, kg.
         show: Copies from left to right; aligned stands for the identified robot and every --model.
-        render: Write a .gif, .mp4 or .png instead (.png: the moment of the largest nominal error).
-        web: The default without --render; accepted as before.
+        render: Write a .gif, .mp4 or .png, and open no browser (.png: the moment of the largest nominal error).
         port: Port of the browser's page, on this machine.
         start: s into the recording; default: where most happens.
         duration: s of the recording.
