@@ -309,6 +309,11 @@ def test_no_error_shows_keys_or_the_signature_of_a_link():
         raise OSError(f"403 for {link}")
 
 
+def test_a_mistake_in_the_program_is_not_reported_as_an_error_of_the_network():
+    with pytest.raises(AttributeError), network_errors("me/arm"):
+        None.nothing  # noqa: B018
+
+
 def test_a_hub_that_does_not_answer_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
     assert main(["pull", "me/arm", str(tmp_path / "back")]) == 2
