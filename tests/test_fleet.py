@@ -1,6 +1,7 @@
 """gaponet check --fleet: a night of many robots, those that drifted adapted, and who since when."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from arm import commands, record, write_arm
 
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.fleet import changed_since, load_nights
+from gaponet.fleet import changed_since, check_fleet, load_nights
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.evidence import estimate_uncertainty
@@ -45,21 +46,17 @@ def site(tmp_path_factory):
     return place
 
 
-def check_fleet(site, name, capsys):
-    code = 0
-    words = [site / "robots", site / name, "--out", site / "out", "--night", name, "--workers", "2", "--json"]
-    try:
-        code = main(["check", "--fleet", *map(str, words)])
-    except SystemExit as end:
-        code = end.code
-    return code, json.loads(capsys.readouterr().out)["robots"]
+def check(site, night):
+    """Check all robots in this process: workers of their own only take longer."""
+    with ThreadPoolExecutor(1) as pool:
+        nights = check_fleet(site / "robots", site / night, site / "out", night, executor=pool)
+        return {robot: result for robot, result, _ in nights}
 
 
 def test_two_nights_of_three_arms(site, capsys):
-    code, first = check_fleet(site, "night1", capsys)
-    assert (code, {r: n["verdict"] for r, n in first.items()}) == (0, dict.fromkeys(("a1", "a2", "a3"), "same"))
-    code, second = check_fleet(site, "night2", capsys)
-    assert code == 1
+    first = check(site, "night1")
+    assert {r: n["verdict"] for r, n in first.items()} == dict.fromkeys(("a1", "a2", "a3"), "same")
+    second = check(site, "night2")
     assert {r: n["verdict"] for r, n in second.items()} == {"a1": "same", "a2": "drifted", "a3": "not checked"}
     assert {tuple(number) for number in second["a2"]["numbers"]} == {("shoulder", "kp"), ("elbow", "kp")}
     before, after = second["a2"]["adapted"]
@@ -72,11 +69,14 @@ def test_two_nights_of_three_arms(site, capsys):
     assert "shoulder, kp" in page
 
     # The same command goes on: a robot that was checked is not checked again, one that could not be read is.
-    kept = (site / "out" / "a2.json").stat().st_mtime_ns
+    stored = (site / "out" / "a2.json").stat().st_mtime_ns
     logs(load_robot(site / "arm"), site / "night2", "a3", 2500)
-    code, again = check_fleet(site, "night2", capsys)
+    words = [site / "robots", site / "night2", "--out", site / "out", "--night", "night2", "--workers", "1", "--json"]
+    with pytest.raises(SystemExit, match="1"):
+        main(["check", "--fleet", *map(str, words)])
+    again = json.loads(capsys.readouterr().out)["robots"]
     assert {r: n["verdict"] for r, n in again.items()} == {"a1": "same", "a2": "drifted", "a3": "same"}
-    assert (site / "out" / "a2.json").stat().st_mtime_ns == kept
+    assert (site / "out" / "a2.json").stat().st_mtime_ns == stored
     assert [n["night"] for n in load_nights(site / "out" / "a3.json")] == ["night1", "night2"]
 
 
