@@ -1,6 +1,7 @@
 """The house: what is loaded when, and which way imports go."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -46,6 +47,7 @@ def top_level_imports(tree: ast.Module) -> list[str]:
     return [n.module for n in tree.body if isinstance(n, ast.ImportFrom) and n.module]
 
 
+@functools.cache
 def imported(file: Path) -> set[str]:
     """Modules of gaponet that a file imports anywhere, in functions and for types too."""
     found = set()
