@@ -39,15 +39,15 @@ def adapt(
     mixed_gains: Flag = False,
     json: Json = False,
 ) -> None:
-    """Bring an identified robot to another unit or day: short logs.
+    """Adapt an identified robot to another unit or day with short logs.
 
-    A robot folder in, a robot folder out: gaponet adapt ./my_robot LOGS --out ./my_robot_today. Of a run the
-    trained model stays as it is; gaponet eval then shows the unit without and with its adaptation.
+    For a robot folder, a new robot folder is written: gaponet adapt ./my_robot LOGS --out ./my_robot_today. For a run,
+    the trained model stays unchanged, and gaponet eval then shows the unit without and with its adaptation.
 
     Args:
-        out: Robot folder to write, where a robot folder is adapted.
-        payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same. A
-            number: kg in each hand, of logs whose format does not state it.
+        out: Robot folder to write; required for a robot folder.
+        payload_mass: recorded: as the recordings state. unknown: estimate it; all recordings must have the same. A
+            number: kg in each hand, for logs whose format does not state it.
     """
     screen = Out(json)
     unknown = payload_mass == "unknown"

@@ -51,16 +51,17 @@ def check(
 ) -> None:
     """Is this still the robot that was identified? What changed?
 
-    The exit code is 0 where it is, 1 where it is not, 2 where that cannot be decided. With --fleet many robots are
-    checked, those that drifted are adapted, and one page shows them; the same command again continues.
+    The exit code is 0 if the robot is unchanged, 1 if it changed, and 2 if that cannot be decided. With --fleet many
+    robots are checked, robots that drifted are adapted, and one page shows all. The same command again continues.
 
     Args:
-        fleet: Check a folder of robots: who drifted, by what, since when. The options below are for this.
-        out: Folder for fleet.html, adapted/ROBOT, and ROBOT.json with its nights.
-        night: Name of the night; default today.
+        fleet: Check a folder of robots and show which drifted, in which parameters, and since when. The options below
+            are for this.
+        out: Folder for fleet.html, adapted/ROBOT, and ROBOT.json with all its checks.
+        night: Name of this check; default today's date.
         adapt: Adapt robots that drifted.
-        executor: Local, ray or ray:ADDRESS (docs/scale.md); all machines see the folders.
-        workers: Robots at a time; 0 for one per core.
+        executor: local, ray or ray:ADDRESS (docs/scale.md); all machines must see the folders.
+        workers: Number of robots at a time; 0 for one per core.
     """
     screen = Out(json)
     if fleet:

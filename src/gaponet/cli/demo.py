@@ -36,14 +36,14 @@ def demo(
     network: str = "40s",
     json: Json = False,
 ) -> None:
-    """See all of it in minutes, on VIRTUAL robots or on your logs.
+    """Run all steps in minutes, on VIRTUAL robots or on your logs.
 
     Args:
         data: Folder of real logs; default: logs collected from virtual H1-2 robots here and now.
         robot: Robot name or folder.
-        out: Folder for dataset, robot, run and report; a demo that was interrupted there is finished.
+        out: Folder for dataset, robot, run and report; an interrupted demo continues there.
         budget: Time of identification.
-        network: Training time of a network on top of it, which is asked whether it adds anything.
+        network: Training time of a network on top of the identified robot.
     """
     if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")):
         raise UsageError("the demo trains and draws: pip install 'gaponet[train,report]'")

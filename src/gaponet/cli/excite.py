@@ -31,19 +31,19 @@ def excite(
 ) -> None:
     """Write the motions to play on a robot: first, or next.
 
-    No data yet: --robot NAME. A robot that was identified: --for FOLDER chooses what tells most beside its logs, and
-    says how much more is worth playing.
+    Without data, give --robot NAME. For an identified robot, --for FOLDER chooses the motions that add most information
+    to its logs, and says how much more is worth playing.
 
     Args:
         robot: Robot name or folder; its range, torque and payload limits bound the motions.
         known: Robot folder of gaponet identify or adapt.
         out: Folder for the motion files and sheet.md.
-        minutes: How long all motions are together. 10 (the default) identify gains, friction and delay, 40 make a good
-            model. With --for half a minute.
-        payloads: kg in each hand; every motion is played with each. With --for what they may be.
-        rate: How many commands a second, Hz.
+        minutes: Total duration of the motions. 10 (default) suffice to identify gains, friction and delay, 40 to train
+            a good model. With --for the default is half a minute.
+        payloads: kg in each hand; every motion is played with each payload. With --for: payloads to choose from.
+        rate: Commands per second, Hz.
         format: txt (SAGE, 50 Hz), csv (with time) or npz; gaponet run and record play each.
-        seed: What the drawing of motions starts from.
+        seed: Seed of the random choice of motions.
     """
     screen = Out(json)
     if bool(robot) == (known is not None):

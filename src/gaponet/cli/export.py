@@ -57,18 +57,18 @@ def export(
     """Write an identified robot or a network for another program.
 
     Args:
-        to: For a robot or a run's simulator: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a
-            check.py that needs no gaponet; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a
+        to: Simulator of a robot or a run: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py
+            that needs no gaponet; urdf (or SDF: damping, friction, effort limits); json (the numbers). Network of a
             run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac
-            Lab), actuator-net (one network per joint: past of target − position and speed in, torque out). Of a robot,
-            randomization: what to randomise in training. lerobot: put the correction behind the LeRobot policy in
-            --into; LeRobot's commands find the step through the plug-in lerobot_robot_gaponet.
+            Lab), actuator-net (one network per joint; its inputs are past target − position and speed, its output is
+            the torque). randomization: ranges of a robot's parameters for training. lerobot: add the correction to the
+            LeRobot policy in --into; LeRobot finds it through the plug-in lerobot_robot_gaponet.
         into: For mjcf and urdf: a file of your own; an edited copy is written (mjcf: default the robot's). For lerobot:
             folder of a policy (pretrained_model) that holds policy_postprocessor.json.
         engine: The engine whose terms the ranges are written in, beside sampled units (randomization.json).
-        scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot: over its type.
+        scope: today: this robot as last fitted. any-day: sessions on several days. any-robot: all robots of its type.
         units: For any-robot: robot folders of the type.
-        dynamics: For lerobot: feed forward inertia and damping too; for smooth targets only.
+        dynamics: For lerobot: feed forward inertia and damping too; use it for smooth targets only.
         remove: For lerobot: remove the correction.
     """
     screen = Out(json)

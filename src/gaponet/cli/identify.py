@@ -43,19 +43,19 @@ def identify(
     holdout_units: tuple[str, ...] = (),
     json: Json = False,
 ) -> None:
-    """Fit the simulator's servos to logs: a robot folder.
+    """Fit the simulator's servos to logs and write a robot folder.
 
-    Gains, damping, friction, armature, zero offsets and delays are fitted to the training motions. Of a robot that is
-    driven by torque (no position was commanded) armature, damping, friction and delay are fitted.
+    Gains, damping, friction, armature, zero offsets and delays are fitted to the training motions. For a robot that is
+    driven by torque (no position was commanded), armature, damping, friction and delay are fitted.
 
-    The result is a robot folder: use it with --robot, with a slash: gaponet gap DATASET --robot ./OUT. Gains of the
-    robot's file are the start of the fit; gains that recordings state are taken as given. Where nothing does better
-    than the robot as it is, nothing is written and the exit status is 2.
+    Use the robot folder with --robot and a slash: gaponet gap DATASET --robot ./OUT. The fit starts from the gains in
+    the robot's file; gains that recordings state are not changed. If no fit is better than the robot as it is, nothing
+    is written and the exit status is 2.
 
     Args:
-        current: Torque-driven robots: the recorded torque is a current, or its constant is unknown; fit N·m per
-            unit too.
-        details: List for every joint what these logs do not determine.
+        current: Torque-driven robots: fit the torque constant too, where the recorded torque is a current or its
+            unit is unknown.
+        details: List the parameters of every joint that these logs do not determine.
     """
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)

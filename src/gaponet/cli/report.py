@@ -26,8 +26,8 @@ def report(
     """Write one offline HTML page about an identified robot or a run.
 
     Args:
-        list_runs: List the training runs in this folder and below it, best first, instead.
-        dataset: Dataset folder to evaluate on; default the one of the last evaluation, where it still is.
+        list_runs: Instead, list the training runs in this folder and below, best first.
+        dataset: Dataset folder to evaluate on. Default: the dataset of the last evaluation.
         also: Further runs to compare, e.g. the MLP's.
     """
     if list_runs:

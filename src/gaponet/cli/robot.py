@@ -43,7 +43,7 @@ def link(
     seconds: float = 5.0,
     json: Json = False,
 ) -> None:
-    """Listen to a robot without moving it: how its states arrive, and who publishes what.
+    """Listen to a robot without moving it: rate and age of its states, and the programs that publish commands.
 
     Args:
         robot: Name, or a folder with robot.toml and robot.xml.
@@ -51,7 +51,7 @@ def link(
         domain: unitree: DDS domain.
         interface: unitree: network interface to the robot.
         port: so101: serial port.
-        seconds: How long to listen.
+        seconds: Duration, s.
     """
     from gaponet.hw.drivers.link import measure_link
     from gaponet.hw.drivers.open import open_driver
@@ -82,12 +82,12 @@ def check(
     payloads: tuple[float, ...] = (),
     json: Json = False,
 ) -> None:
-    """Step a robot's simulator and say what is wrong with its folder.
+    """Step a robot's simulator and list the faults of its folder.
 
     Args:
         robot: Name, or a folder with robot.toml and robot.xml.
-        data: Dataset of this robot, whose postures and payloads are looked at.
-        payloads: kg in every mount, each held for a minute; default those of the data, or 0.
+        data: Dataset of this robot whose postures and payloads are checked too.
+        payloads: kg in every mount; each is held for a minute. Default: those of the data, or 0.
     """
     if not robot:
         raise UsageError(f"gaponet robot check needs a robot name ({', '.join(packaged_robots())}) or a folder")
@@ -114,21 +114,21 @@ def new(
     """Make a robot folder from a vendor's MJCF or URDF, with the source of every number, and check it.
 
     Args:
-        model: MJCF or URDF file, as it lies in its repository.
+        model: MJCF or URDF file with the files that it names.
         out: New robot folder.
-        joints: Those in the logs, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with
-            an actuator, or all hinges.
-        operated: Those of them that are to be corrected; default all.
-        kp: The gain of the controller that recorded the logs, N·m/rad: 100 for all, '*wrist*=20' for some, the later
-            wins. Default: the model's actuators.
-        kd: Likewise, N·m·s/rad.
-        effort_limit: Likewise, N·m.
-        mounts: Where payloads go: SIDE=BODY, or SIDE=BODY:x,y,z in m. Default: found by name.
-        packages: NAME=FOLDER of package://NAME in a URDF. Default: looked for around it.
-        rate: How many commands a second, Hz.
-        keyframe: At which frozen joints stand, and home. Default: the first, or the model's zero.
-        contacts: Let links touch as the model says.
-        name: What the robot is called. Default: the file's name.
+        joints: Recorded joints, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with an
+            actuator, or all hinges.
+        operated: Joints among them that are corrected; default all.
+        kp: Position gain of the controller while recording, N·m/rad: 100 for all joints, '*wrist*=20' for some; a later
+            value replaces an earlier one. Default: the model's actuators.
+        kd: Damping gain, likewise, N·m·s/rad.
+        effort_limit: Torque limit, likewise, N·m.
+        mounts: Payload mounts: SIDE=BODY, or SIDE=BODY:x,y,z in m. Default: chosen by body name.
+        packages: NAME=FOLDER for package://NAME in a URDF. Default: searched around the file.
+        rate: Commands per second, Hz.
+        keyframe: Keyframe that gives the home position and the angles of frozen joints. Default: the first, or zero.
+        contacts: Keep the contacts between links that the model has.
+        name: Name of the robot. Default: the file's name.
     """
     from gaponet.report.view.portrait import prepare
 

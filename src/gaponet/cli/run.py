@@ -43,12 +43,12 @@ DriverName = Annotated[
 
 @dataclass(frozen=True)
 class Connection:
-    """How to reach the robot."""
+    """How the robot is connected."""
 
     topic: Literal["arm_sdk", "lowcmd"] = "arm_sdk"
-    """unitree: arm_sdk leaves legs and balance to the robot; lowcmd is for a robot that hangs."""
+    """unitree: arm_sdk leaves legs and balance to the robot's own controller; lowcmd requires that the robot hangs."""
     joints: Literal["arms", "upper_body", "all"] = "arms"
-    """unitree: what is commanded; the legs only with all, on lowcmd."""
+    """unitree: joints that are commanded. The legs are commanded with all on lowcmd only."""
     domain: int = 0
     """unitree, and targets over DDS: DDS domain."""
     interface: str = "lo"
@@ -56,16 +56,16 @@ class Connection:
     port: str = "/dev/ttyACM0"
     """so101: serial port."""
     calibration: Path | None = None
-    """so101: the file that lerobot-calibrate wrote for this arm. It is compared with what the servos hold of it, which
-    counts where no file is given."""
+    """so101: calibration file of lerobot-calibrate for this arm. It must agree with the calibration in the servos.
+    Default: the calibration in the servos."""
     unit: str = "4"
-    """virtual: number or name in the fleet."""
+    """virtual: number or name of the robot in the fleet."""
     fleet: str = "hard"
     """virtual: hard, easy, shifted, unnamed, or a .toml file."""
     hangs: Flag = False
-    """unitree: the robot hangs. lowcmd demands it: all motors that are not commanded, legs too, go off."""
+    """unitree: state that the robot hangs. lowcmd switches off all motors that are not commanded, legs too."""
     fast: Flag = False
-    """virtual: as fast as this machine can, not in real time."""
+    """virtual: run as fast as this machine can instead of in real time."""
 
 
 @dataclass(frozen=True)
@@ -73,44 +73,44 @@ class ControlArgs:
     """Options about robot and control loop. The docstrings are the command-line help."""
 
     driver: DriverName = "virtual"
-    """virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial), or the driver of
-    an installed extension."""
+    """virtual (a simulated robot in this process), unitree (DDS: a real H1-2 or gaponet virtual serve), so101 (serial),
+    or the driver of an installed extension."""
     robot: str | None = None
-    """Name or folder, identified ones too; default the one that the model's run keeps; without a model h1_2, or so101
-    with so101."""
+    """Robot name or folder; it may be identified. Default: the robot of the model's run; without a model h1_2, or so101
+    for the so101 driver."""
     limits_from: str | None = None
     """Robot folder whose gains, joint ranges, effort limits and collision shapes are used on hardware instead of the
-    package's robot; an extension's driver requires it. Read its values before you name it. Identified values come from
-    --robot or --model."""
+    packaged robot. Check its values first. The driver of an extension requires it. Identified values come from --robot
+    or --model."""
     payload_side: str = "both"
-    """both, or one hand."""
+    """Hand that carries the payload: both, or the side of one payload mount."""
     max_payload: float | None = None
-    """kg in each hand that the motion must be possible with; default payload_mass, 0 without one. A motion of the
-    library that several payloads shall play alike needs the heaviest of them here."""
+    """Payload for which the motion must be feasible, kg in each hand. Default: payload_mass, or 0. To play one library
+    motion with several payloads, give the heaviest."""
     connection: tyro.conf.OmitArgPrefixes[Connection] = Connection()
-    """How to reach the robot."""
+    """Connection to the robot."""
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
     """Timing."""
     safety: SafetyConfig = SafetyConfig()  # noqa: RUF009
     """Limits and checks of states."""
     plane: float | None = None
-    """Height of the floor or table in the robot's frame, m; default what its collision.toml says."""
+    """Height of the floor or table in the robot's frame, m. Default: the height in its collision.toml."""
     unchecked: Flag = False
-    """Go without looking whether the robot meets itself, or what it stands on."""
+    """Skip the check for collisions of the robot with itself and with the floor or table."""
     yes: Flag = False
-    """Do not ask before a robot moves."""
+    """Move a real robot without asking first."""
 
 
 @dataclass(frozen=True)
 class Live(LiveConfig):
-    """Targets that come while the robot moves."""
+    """Targets that arrive while the robot moves."""
 
     address: str = "tcp://127.0.0.1:5555"
-    """zmq: where to listen; 127.0.0.1 is heard from this machine alone."""
+    """zmq: address to listen on. 127.0.0.1 accepts programs of this machine only."""
     topic: str = "rt/joint_trajectory_controller/joint_trajectory"
-    """dds: of trajectory_msgs/JointTrajectory, as ROS 2 has it on the bus."""
+    """dds: topic of trajectory_msgs/JointTrajectory, by its name on the bus of ROS 2."""
     states: str = "rt/joint_states"
-    """dds: of sensor_msgs/JointState, to which states go."""
+    """dds: topic of sensor_msgs/JointState on which states are published."""
 
 
 @dataclass(frozen=True)
@@ -118,26 +118,26 @@ class RunArgs(ControlArgs):
     """Options of a run: those of ControlArgs, compensation and live targets."""
 
     targets: Literal["zmq", "dds", "stdin"] | None = None
-    """Instead of a motion, targets that come while the robot moves: JSON over ZeroMQ or in lines on standard input, or
-    ROS 2's JointTrajectory over DDS. docs/deploy.md has the messages."""
+    """Follow targets that arrive while the robot moves, instead of a motion: JSON over ZeroMQ, JSON lines on standard
+    input, or ROS 2's JointTrajectory over DDS. docs/deploy.md describes the messages."""
     live: Live = Live()
-    """Live targets: where they come from, and which are taken."""
+    """Source and limits of live targets."""
     payload_mass: float | None = None
-    """kg in each hand; with compensation, None estimates it."""
+    """Payload, kg in each hand. Compensation estimates it if it is not given."""
     compensate: Flag = False
-    """Command what gets the robot to where the motion says by what is known of it: the feed-forward of --robot, best
-    the folder that gaponet identify wrote. A motion's velocity and acceleration are fed forward too, live targets'
-    only with --compensation.dynamics."""
+    """Correct the commands so that the robot follows the motion: feed-forward by --robot, best a folder of gaponet
+    identify. Velocity and acceleration of a motion are fed forward; those of live targets only with
+    --compensation.dynamics."""
     model: Path | None = None
-    """Run or artifact folder: compensate with its model on top."""
+    """Run or artifact folder whose network corrects the commands in addition."""
     compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
-    """How commands are found, with compensation."""
+    """Settings of the compensation."""
     unit_id: str = ""
-    """Which unit this is, with a model; what gaponet adapt found out about it is used."""
+    """Name of this robot. With a model, the adaptation that gaponet adapt stored for this name is used."""
     extrapolate: Flag = False
-    """Take payloads, with a model, and servo gains other than those that the data were recorded with."""
+    """Accept payloads (with a model) and servo gains outside those of the recorded data."""
     dry_run: Flag = False
-    """Connect, read and compute, send nothing, and say what would be sent."""
+    """Connect, read and compute, but send nothing; print the commands instead."""
 
 
 @writes("recordings")
@@ -149,12 +149,12 @@ def run(
 ) -> None:
     """Play a motion or live targets on a robot; any key stops it.
 
-    Ctrl-C, Ctrl-Z and SIGTERM do as well, within one control period. A real robot moves only after the word yes.
+    Ctrl-C, Ctrl-Z and SIGTERM also stop it, within one control period. A real robot moves only after you typed yes.
 
     Args:
-        motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz); or --targets.
-        out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npy.
-        args: Robot, loop and model.
+        motion: Motion name (gaponet collect lists the forms) or motion file (.txt, .csv, .npz). Or give --targets.
+        out: Folder for the recording: MOTION.parquet (gaponet import reads it), MOTION.json and MOTION.cycles.npy.
+        args: Robot, control loop and model.
     """
     screen = Out(json)
     if args.dry_run and out:

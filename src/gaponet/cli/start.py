@@ -89,7 +89,7 @@ def start(
     anyway: Flag = False,
     json: Json = False,
 ) -> None:
-    """All of it in one command: model file and logs in, report out.
+    """All steps in one command: from model file and logs to a report.
 
     OUT/commands.sh lists the commands that ran. The same command again continues after an interruption or a question.
     Logs that were added to the folder are imported, and later commands run again. Other logs need another OUT.
@@ -100,10 +100,10 @@ def start(
         out: Folder for all results.
         unit_id: Name of the recorded robot.
         payload_mass: kg in each hand while recording.
-        joints: Those of the model's joints that were recorded, by name or pattern; default those that the logs name.
-        kp: The gain of the controller while recording, N·m/rad: a number, or PATTERN=NUMBER; default the model's.
-        kd: Likewise, N·m·s/rad.
-        effort_limit: Likewise, N·m.
+        joints: Recorded joints of the model, by name or pattern. Default: those that the logs name.
+        kp: Position gain of the controller while recording, N·m/rad: NUMBER or PATTERN=NUMBER. Default: the model's.
+        kd: Damping gain, likewise, N·m·s/rad.
+        effort_limit: Torque limit, likewise, N·m.
         map: A joint's name in the log and the robot's, as a=b; may be repeated.
         format: Format of the logs; gaponet import --formats lists them.
         position_unit: Unit of positions, where the format leaves it open.
