@@ -58,7 +58,7 @@ buckets: setup
 	$(BIN)/pip install -q -e ".[dev,s3,gs]"
 	$(BIN)/python -m pytest -m peers -s tests/share
 
-# Chromium looks at gaponet view --web and at a report (Debian: apt-get install chromium libegl1): two minutes.
+# Chromium looks at gaponet view and at a report (Debian: apt-get install chromium libegl1): two minutes.
 browser: setup
 	$(BIN)/pip install -q -e ".[dev,view]"
 	$(BIN)/python -m pytest -m browser -s tests/report/view

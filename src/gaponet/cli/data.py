@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Data, Json, Logs, Robot, Source
+from gaponet.cli.options import Data, Json, Logs, Robot, Source, actions
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import abbreviate
@@ -188,18 +188,8 @@ def _labels(
     screen.result({"cells": found.groups, "agreement": found.agreement, "recordings": found.recordings})
 
 
-# Each is run while the command line is parsed; what is left to call is nothing.
-Action = (
-    Annotated[None, tyro.conf.subcommand("card", constructor=_card)]
-    | Annotated[None, tyro.conf.subcommand("split", constructor=_split)]
-    | Annotated[None, tyro.conf.subcommand("figures", constructor=_figures)]
-    | Annotated[None, tyro.conf.subcommand("export", constructor=_export)]
-    | Annotated[None, tyro.conf.subcommand("remove", constructor=_remove)]
-    | Annotated[None, tyro.conf.subcommand("labels", constructor=_labels)]
-)
-
-
-def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
+@actions(card=_card, split=_split, figures=_figures, export=_export, remove=_remove, labels=_labels)
+def data(action: None) -> None:
     """A dataset's card, splits, pictures, export and removal."""
 
 

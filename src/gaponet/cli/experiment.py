@@ -6,13 +6,13 @@ import inspect
 import signal
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.progress import progress_bar, progress_bars
-from gaponet.cli.options import Json
+from gaponet.cli.options import Json, actions
 from gaponet.cli.out import Out, writes
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.compare import Compare, with_identified
@@ -115,7 +115,7 @@ def _command(kind: type[Any]) -> Any:
         "out: Folder of the results; its report.html shows all experiments in it.", "experiment: Its options.",
         "options: Shared.",
     ))  # fmt: skip
-    return Annotated[None, tyro.conf.subcommand(kind.__name__.lower(), constructor=writes("experiments")(run))]
+    return writes("experiments")(run)
 
 
 def _show_result(result: Result, out: Path, screen: Out) -> None:
@@ -173,10 +173,6 @@ def real(
     screen.result(result)
 
 
+@actions(**{kind.__name__.lower(): _command(kind) for kind in EXPERIMENTS}, real=real)
 def experiment(action: None) -> None:
     """Run an experiment: the paper, comparisons, real recordings."""
-
-
-# Each is run while the command line is parsed; the function that remains to be called does nothing.
-ACTION: Any = Union[(*map(_command, EXPERIMENTS), Annotated[None, tyro.conf.subcommand("real", constructor=real)])]
-experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

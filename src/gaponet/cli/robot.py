@@ -11,7 +11,7 @@ import tyro
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
-from gaponet.cli.options import Flag, Folder, Json, Model
+from gaponet.cli.options import Flag, Folder, Json, Model, actions
 from gaponet.cli.out import Out
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
 from gaponet.share.reading import open_dataset
@@ -269,15 +269,6 @@ def show(
     })  # fmt: skip
 
 
-# Each is run while the command line is parsed; what is left to call is nothing.
-Action = (
-    Annotated[None, tyro.conf.subcommand("new", constructor=new)]
-    | Annotated[None, tyro.conf.subcommand("check", constructor=check)]
-    | Annotated[None, tyro.conf.subcommand("list", constructor=list_robots)]
-    | Annotated[None, tyro.conf.subcommand("link", constructor=link)]
-    | Annotated[None, tyro.conf.subcommand("show", constructor=show)]
-)
-
-
-def robot(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
+@actions(new=new, check=check, list=list_robots, link=link, show=show)
+def robot(action: None) -> None:
     """Make, check or show a robot folder; listen to a robot."""

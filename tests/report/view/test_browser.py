@@ -1,4 +1,4 @@
-"""What a browser shows: gaponet view --web, and the report on a desk and on a phone. make browser."""
+"""What a browser shows: gaponet view, and the report on a desk and on a phone. make browser."""
 
 import threading
 import time
@@ -16,7 +16,7 @@ OFF = 60  # |difference| of one channel, of 255, by which a pixel is another
 
 @pytest.fixture
 def web(arm):
-    """Three copies of a moving arm, served and played as gaponet view --web does."""
+    """Three copies of a moving arm, served and played as gaponet view does."""
     from gaponet.report.view.film import Clip
     from gaponet.report.view.scene import Scene
     from gaponet.report.view.side_by_side import Copy, SideBySide
