@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import isfinite
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -34,7 +34,7 @@ def adapt(
     unit: Unit = "",
     motions: tuple[str, ...] = (),
     seconds: float = 30.0,
-    payload_mass: str = "recorded",
+    payload_mass: float | Literal["recorded", "unknown"] = "recorded",
     robot: Robot = None,
     mixed_gains: Flag = False,
     json: Json = False,
@@ -56,11 +56,11 @@ def adapt(
             raise UsageError(f"{run}: is a robot folder; give --out FOLDER for the adapted one")
         if robot is not None or mixed_gains:
             raise UsageError("--robot and --mixed-gains are for the adaptation of a run")
-        told = None if unknown or payload_mass == "recorded" else _mass(payload_mass)
+        mass = None if isinstance(payload_mass, str) else payload_mass
         with progress_bar("adapting") as update:
             made = api.adapt_robot(
                 run, dataset, out=out, unit=unit, motions=motions, seconds=seconds, unknown_payload=unknown,
-                payload_mass=told, progress=update,
+                payload_mass=mass, progress=update,
             )  # fmt: skip
         screen.say(
             f"{mrad(made.before)} → {mrad(made.after)} mrad over {made.recordings} recording(s) of unit {made.unit_id} "
@@ -72,7 +72,7 @@ def adapt(
         return
     if out is not None:
         raise UsageError(f"{run}: is no robot folder (no robot.toml); --out is for those, a run keeps its adaptations")
-    if not unknown and payload_mass != "recorded":
+    if not isinstance(payload_mass, str):
         raise UsageError(f"--payload-mass {payload_mass}: a run takes recorded or unknown")
     with progress_bar("adapting") as update:
         made = api.adapt_model(
@@ -97,10 +97,3 @@ def _show(screen: Out, made: AdaptResult) -> None:
         std = made.payload_std
         deviation = f" ± {std:.2f}" if std is not None and isfinite(std) else ""  # it needs two windows
         screen.say(f"payload {made.payload_mass:.2f}{deviation} kg in each hand that carries")
-
-
-def _mass(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise UsageError(f"--payload-mass {text}: give recorded, unknown, or a number of kg") from None

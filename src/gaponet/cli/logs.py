@@ -75,8 +75,8 @@ def import_logs(
         from gaponet.data.describe.guess import guess_logs
         from gaponet.data.formats import look
 
-        kind, told, recordings = look(src, format, logs, allow_pickle)
-        print(guess_logs(recordings, spec, kind, dict(told)), end="")
+        kind, facts, recordings = look(src, format, logs, allow_pickle)
+        print(guess_logs(recordings, spec, kind, dict(facts)), end="")
         return
     if out is None:
         raise UsageError("say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)")
@@ -110,8 +110,8 @@ def doctor(
         diagnosis = api.doctor(data, robot=spec, progress=update)
     out.say(f", {Diagnosis.inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
-    mended = Finding.proposal(list(diagnosis.findings)) if fix else ""
-    for line in mended.splitlines():
+    proposal = Finding.proposal(list(diagnosis.findings)) if fix else ""
+    for line in proposal.splitlines():
         out.say(line)
     drawn: list[Path] = []
     if figures is not None:
@@ -121,7 +121,7 @@ def doctor(
             drawn = draw_findings(data, spec, list(diagnosis.findings), figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")
     out.say(f"next: gaponet doctor {dataset} --fix" if diagnosis.count("error") else f"next: gaponet gap {dataset}")
-    out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": mended,
+    out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": proposal,
                 "figures": [str(path) for path in drawn]} | diagnosis.to_dict())  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def _show_formats(out: Out) -> None:
 
 
 def _cuts(entries: ListOf[Entry]) -> dict[str, list[str]]:
-    """Why recordings were cut → which."""
+    """Return reason → motions of recordings that were cut."""
     found: dict[str, list[str]] = {}
     for entry in entries:
         if cut := entry.meta.notes.get("cut"):
@@ -149,20 +149,20 @@ def _cuts(entries: ListOf[Entry]) -> dict[str, list[str]]:
 
 def _nonsense(entries: ListOf[Entry]) -> list[str]:
     """Return a line for each channel with implausible rows (data.describe.plausibility)."""
-    told: dict[str, list[tuple[Entry, dict[str, Any]]]] = {}
+    by_channel: dict[str, list[tuple[Entry, dict[str, Any]]]] = {}
     for entry in entries:
         for channel, found in entry.meta.notes.get("nonsense", {}).items():
-            told.setdefault(channel, []).append((entry, found))
+            by_channel.setdefault(channel, []).append((entry, found))
     return [
         f"{channel} is nonsense in {sum(f['rows'] for _, f in found)} rows of {len(found)} recordings (first "
         f"{found[0][1]['worst']:.4g} of {found[0][1]['joints'][0]} in {found[0][0].meta.motion}): "
         f"{', '.join(dict.fromkeys(f['done'] for _, f in found))}; --strict refuses them"
-        for channel, found in told.items()
+        for channel, found in by_channel.items()
     ]
 
 
 def _unrecorded(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
-    """A line about operated joints that the logs do not hold."""
+    """Return a line about operated joints that the logs lack, if any."""
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
     if not lacking:
         return []

@@ -41,12 +41,12 @@ def record(
     from gaponet.robot.folder import MOVE_STORED_ROBOT
     from gaponet.sim.model import require_stored_robot
 
-    connection, side = args.connection, args.payload_side
+    side = args.payload_side
     if args.driver != "virtual" and not unit_id:
         raise UsageError("say which unit is recorded: --unit-id NAME")
     screen = Out(json)
     if args.driver == "virtual":
-        unit_id = f"virtual-{connection.unit}" if connection.unit.isdigit() else connection.unit
+        unit_id = args.connection.unit_name
     request = RunArgs(**vars(args), payload_mass=payload_mass)
     spec = resolve_robot(request)
     known = Dataset.open_existing(out, spec)

@@ -31,7 +31,7 @@ class WebScene:
         try:
             import viser
         except ImportError:
-            raise UsageError("--web needs viser; run: pip install 'gaponet[view]'") from None
+            raise UsageError("the page in the browser needs viser; run: pip install 'gaponet[view]'") from None
         self.scene, self.clip = scene, clip
         self.server = viser.ViserServer(HOST, port, label="gaponet view", verbose=False)
         self.url = f"http://{HOST}:{self.server.get_port()}"
