@@ -1,28 +1,16 @@
-"""Files of a few bytes that demand gigabytes or endless time, and the commands that open them.
-
-    PYTHONPATH=src:tests python -m base.hostile [--only WORDS] [--json FILE]
-
-Each command must end with one line, within MAX_PROCESSOR_S of computing and MAX_MEMORY of all its processes. Exit code
-1 if one does not. Some of the files are used by test_sandbox.py.
-"""
+"""Files of a few bytes that demand gigabytes or endless time, and the commands that open them (make hostile)."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import resource
 import shutil
 import signal
 import sqlite3
 import struct
-import subprocess
-import sys
-import tempfile
-import time
 import zlib
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +21,6 @@ from gaponet.base import sandbox
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 
-MAX_PROCESSOR_S, MAX_MEMORY = 10.0, 1 << 30
-KILL_AFTER_S, KILL_ABOVE = 60.0, 12 << 30  # bytes
 IMPORT = ("import", "{}/logs", "--robot", "{}/arm", "--unit-id", "a", "--payload-mass", "0", "--out", "{}/set")
 IMPORT = (*IMPORT, "--position-unit", "rad", "--time-unit", "s")
 CHECK = ("robot", "check", "{}/arm")
@@ -342,79 +328,3 @@ CASES = {
     "pickle repr": Case(pickled(DOUBLED + b"cnumpy\ndtype\nh\x3c\x85R."), PICKLE),
     "csv sparse": Case(sparse("a.csv"), IMPORT),
 }
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of a command.
-
-    Attributes:
-        code: Exit code; None if the command was killed.
-        seconds, computing: Wall and processor time, s.
-        memory: Peak, bytes.
-    """
-
-    code: int | None
-    message: str
-    seconds: float
-    computing: float
-    memory: int
-
-    @property
-    def good(self) -> bool:
-        """True if the command ended with a one-line error or silently, within the limits."""
-        lines = self.message.splitlines()
-        lines = [line for line in lines if not line.startswith(("reading", "checking", "downloading"))]
-        clear = (self.code == 2 and len(lines) == 1) or (self.code == 0 and not lines)
-        return clear and self.computing < MAX_PROCESSOR_S and self.memory < MAX_MEMORY
-
-
-def run_case(name: str, folder: Path) -> Outcome:
-    """Write a case into a folder and run its command, killed beyond KILL_AFTER_S."""
-    case = CASES[name]
-    case.make(folder)
-
-    def limit() -> None:
-        os.setsid()
-        resource.setrlimit(resource.RLIMIT_AS, (KILL_ABOVE, KILL_ABOVE))
-
-    command = [sys.executable, "-m", "gaponet", *(word.format(folder) for word in case.words)]
-    with tempfile.TemporaryFile() as messages:
-        start = time.monotonic()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=messages, preexec_fn=limit)
-        pid = code = None
-        while not pid and time.monotonic() - start < KILL_AFTER_S:
-            time.sleep(0.02)
-            pid, status, used = os.wait4(process.pid, os.WNOHANG)
-            code = os.waitstatus_to_exitcode(status) if pid else None
-        if not pid:
-            os.killpg(process.pid, signal.SIGKILL)
-            _, _, used = os.wait4(process.pid, 0)
-        process.returncode = -9 if code is None else code
-        seconds = time.monotonic() - start
-        messages.seek(0)
-        text = messages.read().decode("utf-8", "replace")
-        return Outcome(code, text, seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024)
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", help="prefixes of names, separated by commas")
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    outcomes: dict[str, Outcome] = {}
-    for name in filter(lambda name: name.startswith(tuple(args.only.split(","))), CASES):
-        with tempfile.TemporaryDirectory(prefix="hostile-") as folder:
-            outcomes[name] = one = run_case(name, Path(folder))
-        last = one.message.replace(folder, "").strip().splitlines()[-1:] or [""]
-        times = f"{one.seconds:6.1f} s, computing {one.computing:5.1f} s, {one.memory / 1e6:6.0f} MB"
-        print(f"{'ok' if one.good else 'NOT':4}{name:22}{times}, code {one.code}: {last[0][:150]}", flush=True)
-    if args.json:
-        args.json.write_text(json.dumps({n: asdict(o) | {"good": o.good} for n, o in outcomes.items()}, indent=1))
-    bad = [name for name, one in outcomes.items() if not one.good]
-    print(f"{len(outcomes)} hostile files; outside of the limits: {', '.join(bad) or 'none'}")
-    return 1 if bad else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

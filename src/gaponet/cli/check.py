@@ -69,8 +69,6 @@ def check(
             raise UsageError("--fleet: give a folder for the page and the results, --out FOLDER")
         _check_fleet(screen, robot, logs, out, night, adapt, payload_mass, executor, workers)
         return
-    if not (robot / "robot.toml").is_file():
-        raise UsageError(f"{robot}: is no robot folder (no robot.toml); give what gaponet identify wrote")
     made = api.check(robot, logs, unit=unit, motions=motions, payload_mass=payload_mass, threads=threads)
     drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
     named = {m.joint for m in drift.moved}

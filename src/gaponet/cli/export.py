@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from gaponet import api
+from gaponet.api.files import NetworkTarget, RobotTarget
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.base.progress import progress_bar
@@ -28,20 +29,7 @@ Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of ga
 @like(api.export_robot)
 def export(
     robot: Holder,
-    to: Literal[
-        "onnx",
-        "torch",
-        "mjcf",
-        "urdf",
-        "mjlab",
-        "isaaclab",
-        "newton",
-        "drake",
-        "json",
-        "randomization",
-        "actuator-net",
-        "lerobot",
-    ] = "onnx",
+    to: RobotTarget | NetworkTarget | Literal["randomization", "lerobot"] = "onnx",
     out: Path | None = None,
     data: str | None = None,
     into: Path | None = None,

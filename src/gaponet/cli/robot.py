@@ -236,8 +236,6 @@ def show(
     from gaponet.sysid.uncertainty import ParameterUncertainty, sentences, summarize, table_rows
 
     screen = Out(json)
-    if not (robot / "robot.toml").is_file():
-        raise UsageError(f"{robot}: is no robot folder (no robot.toml); give what gaponet identify wrote")
     spec = load_robot(robot)
     known = ParameterUncertainty.require(spec)
     sure = {j: summarize(known, j) for j in known.joints}

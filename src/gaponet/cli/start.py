@@ -28,6 +28,7 @@ from gaponet.cli.out import Out
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
+from gaponet.share.remote import FileRecord
 
 if TYPE_CHECKING:
     from gaponet.data.log import Log
@@ -310,7 +311,7 @@ class StartRecord:
         self.fields["options"] = options
         logs_toml = self.out / "logs.toml"
         if logs_toml.is_file():
-            self.fields["files"][f"{self.out.name}/logs.toml"] = _sha256(logs_toml)
+            self.fields["files"][f"{self.out.name}/logs.toml"] = FileRecord.of(logs_toml).sha256
         if not self.data.exists():  # an interrupted import leaves data of these logs
             write_json(self.out / RECORD_FILE, self.fields)
 
@@ -332,18 +333,10 @@ class StartRecord:
 def hash_logs(logs: Path, out: Path) -> dict[str, str]:
     """Return file → SHA-256 of all logs, and of the logs.toml in `out`, which may lie among the logs."""
     paths, root = (logs.rglob("*"), logs) if logs.is_dir() else ([logs], logs.parent)
-    files = {}
-    for file in paths:
-        name = file.relative_to(root)
-        if out.resolve() not in file.resolve().parents and not any(part.startswith(".") for part in name.parts):
-            files[name.as_posix()] = file
+    files = {file.relative_to(root).as_posix(): file for file in paths if out.resolve() not in file.resolve().parents}
+    files = {name: file for name, file in files.items() if not any(part.startswith(".") for part in name.split("/"))}
     files[f"{out.name}/logs.toml"] = out / "logs.toml"
-    return {name: _sha256(file) for name, file in sorted(files.items()) if file.is_file()}
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
+    return {name: FileRecord.of(file).sha256 for name, file in sorted(files.items()) if file.is_file()}
 
 
 def _run(screen: Out, commands: list[list[str]], lines: list[str], record: StartRecord, anyway: bool) -> None:
