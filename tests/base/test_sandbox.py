@@ -125,7 +125,7 @@ def test_a_command_ends_with_one_line_within_the_limits(tmp_path, name):
     words = [sys.executable, "-m", "gaponet", *(word.format(tmp_path) for word in hostile.CASES[name].words)]
     limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESSES, MAX_ADDRESSES))  # noqa: E731
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(words, capture_output=True, text=True, errors="replace", preexec_fn=limit, timeout=60)
+    done = subprocess.run(words, capture_output=True, text=True, errors="replace", preexec_fn=limit, timeout=300)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     lines = [x for x in done.stderr.splitlines() if not x.startswith(("reading", "checking", "downloading"))]
     assert (done.returncode, len(lines)) in ((2, 1), (0, 0)), done.stderr

@@ -24,7 +24,7 @@ def replay(
     figure: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Will a policy transfer? Predict what the robot would do in its rollout.
+    """Will a policy transfer? Predict the robot in its rollout.
 
     The rollout is a log of your simulator (targets as commands, and states) in any format that gaponet import reads.
     Its targets are played unchanged, although a policy would react to a different state. The band contains nine tenths
