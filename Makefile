@@ -77,7 +77,7 @@ fuzz: setup
 
 # Files of some bytes that ask for gigabytes or for ever, each opened by its command: five minutes, on Linux.
 hostile: setup
-	OMP_NUM_THREADS=1 PYTHONPATH=src:tests $(BIN)/python -m base.hostile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow tests/base
 
 # Every command that writes, killed, on full and read-only disks, twice at once: half an hour; disks need root. Then ranks
 # of torchrun killed and frozen: five minutes.

@@ -106,13 +106,3 @@ def test_the_navigation_of_the_site_has_every_page():
     site = (ROOT / "zensical.toml").read_text(encoding="utf-8")
     for page in PAGES:
         assert f'"{page.name}"' in site, page.name
-
-
-HALF_SENTENCE = re.compile(r'(?:"""|^ +[a-z]\w*(?:, \w+)*: )(?:Of|As|By|With) ', re.M)
-
-
-def test_no_docstring_says_only_whose_a_thing_is():
-    found = [
-        f"{p.name}: {m[0].strip()}" for p in SOURCE.rglob("*.py") for m in HALF_SENTENCE.finditer(p.read_text("utf-8"))
-    ]
-    assert found == []

@@ -1,6 +1,7 @@
 """An untrusted file that exceeds a limit gives a one-line error, and the next file is read."""
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,8 @@ from gaponet.data.formats import parquet, read_logs
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import load_robot
 
+MAX_PROCESSOR_S, MAX_MEMORY = 10.0, 1 << 30  # of a command that opens a hostile file, with all its processes
+MAX_ADDRESSES = 12 << 30  # bytes, so that a failure does not take the machine with it
 limited = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
 
 
@@ -112,3 +115,19 @@ def test_rows_are_counted_before_reading(tmp_path):
     assert (tmp_path / "a.parquet").stat().st_size < 1e6
     with pytest.raises(LogError, match="70,000,000 rows of 1 columns are 70,000,000 values, more than 512 MiB"):
         parquet.read(tmp_path / "a.parquet", ["time"])
+
+
+@pytest.mark.slow
+@limited
+@pytest.mark.parametrize("name", hostile.CASES)
+def test_a_command_ends_with_one_line_within_the_limits(tmp_path, name):
+    hostile.CASES[name].make(tmp_path)
+    words = [sys.executable, "-m", "gaponet", *(word.format(tmp_path) for word in hostile.CASES[name].words)]
+    limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESSES, MAX_ADDRESSES))  # noqa: E731
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(words, capture_output=True, text=True, errors="replace", preexec_fn=limit, timeout=300)
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    lines = [x for x in done.stderr.splitlines() if not x.startswith(("reading", "checking", "downloading"))]
+    assert (done.returncode, len(lines)) in ((2, 1), (0, 0)), done.stderr
+    assert used.ru_utime + used.ru_stime - before.ru_utime - before.ru_stime < MAX_PROCESSOR_S
+    assert used.ru_maxrss << 10 < MAX_MEMORY

@@ -1,11 +1,9 @@
 """gaponet import and doctor as a user runs them: one line for what is wrong, and nothing half-written."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -36,22 +34,22 @@ def logs(tmp_path):
     return tmp_path / "logs"
 
 
-def test_import_says_what_came_in_and_that_nothing_was_applied(logs, tmp_path, capsys):
+def test_import_says_what_came_in_and_that_nothing_was_applied_and_the_same_again_adds_nothing(logs, tmp_path, capsys):
     assert import_so101(logs, tmp_path / "data") == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "1 sequences, 0.1 min at 49.85 Hz, robot so101, unit lab, payload 0 kg" in told
     assert "nothing was applied to the data" in told
     assert "Next: gaponet doctor" in told
-    assert len(Dataset(tmp_path / "data")) == 1
     assert (tmp_path / "data" / "offsets.json").is_file()
+    assert import_so101(logs, tmp_path / "data") == 0
+    assert "1 there already, 0 added" in capsys.readouterr().out
+    assert len(Dataset(tmp_path / "data")) == 1
 
 
 def test_import_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
     assert import_so101(logs, tmp_path / "data", "--json") == 0
     result = json.loads(capsys.readouterr().out)
-    assert result["sequences"] == 1
-    assert result["rate_hz"] == [49.85]
-    assert result["offsets_applied"] is False
+    assert (result["sequences"], result["rate_hz"], result["offsets_applied"]) == (1, [49.85], False)
     assert result["offsets"]["elbow_flex"]["rests_up"] == 0
     (delays,) = result["delay_s"].values()
     assert delays["elbow_flex"] == pytest.approx(0.04, abs=0.003)
@@ -78,51 +76,16 @@ def test_a_map_that_is_none_says_how_to_write_it(logs, tmp_path, capsys):
     assert capsys.readouterr().err.strip().endswith("Usage: --map Elbow: write NAME_IN_LOG=NAME_OF_ROBOT")
 
 
-def test_the_same_command_again_says_what_was_there(logs, tmp_path, capsys):
-    assert import_so101(logs, tmp_path / "data") == 0
-    assert import_so101(logs, tmp_path / "data") == 0
-    assert "1 there already, 0 added" in capsys.readouterr().out
-    assert len(Dataset(tmp_path / "data")) == 1
+def sage_with(old: str, new: str, name: str) -> Callable[[Path], Path]:
+    """Write SAGE logs of which one file has other text; a good motion comes first."""
 
-
-def sage_with(change: Callable[[Path], object]) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        change(write_so101(folder / "real" / "so101" / "custom" / "wave"))
-        write_so101(folder / "real" / "so101" / "custom" / "before", rows=50)  # a good one, read first
+        file = write_so101(folder / "real" / "so101" / "custom" / "wave") / name
+        file.write_text(file.read_text().replace(old, new, 1))
+        write_so101(folder / "real" / "so101" / "custom" / "before", rows=50)
         return folder
 
     return make
-
-
-def rewrite(name: str, old: str, new: str) -> Callable[[Path], object]:
-    def change(motion: Path) -> None:
-        text = (motion / name).read_text()
-        assert old in text
-        (motion / name).write_text(text.replace(old, new, 1))
-
-    return change
-
-
-def rewritten(**values: np.ndarray) -> Callable[[Path], object]:
-    ctrl = wave(60, 6)
-    return lambda motion: write_sage(motion, **({"ctrl": ctrl, "qpos": ctrl} | values))
-
-
-def with_nan(motion: Path) -> None:
-    qpos = wave(60, 6)
-    qpos[9, 2] = np.nan
-    write_sage(motion, wave(60, 6), qpos)
-
-
-def going_back(motion: Path) -> None:
-    time = 20060.0 * np.arange(60)
-    time[30] = time[10]
-    write_sage(motion, wave(60, 6), wave(60, 6), time=time)
-
-
-def cut_short(motion: Path) -> None:
-    state = motion / "state_motor.csv"
-    state.write_text(state.read_text()[:-40])
 
 
 def half_a_parquet(folder: Path) -> Path:
@@ -135,40 +98,28 @@ def half_a_parquet(folder: Path) -> Path:
 
 BROKEN = {
     "missing column": (
-        sage_with(rewrite("state_motor.csv", "positions", "angles")),
+        sage_with("positions", "angles", "state_motor.csv"),
         r"state_motor.csv:1: column 'positions' is missing; the header has: type, timestamp, angles",
     ),
-    "NaN": (sage_with(with_nan), "state_motor.csv:11: qpos of elbow_flex is not finite; repair or cut the row"),
-    "time going back": (sage_with(going_back), ".csv:32: time does not increase in channel"),
     "wrong joint name": (
-        sage_with(rewrite("joint_list.txt", "Elbow", "Ellbow")),
+        sage_with("Elbow", "Ellbow", "joint_list.txt"),
         "joint_list.txt names joint 'Ellbow', which robot 'so101' does not have; nearest: elbow_flex, wrist_roll, "
         "wrist_flex. Map it with --map Ellbow=elbow_flex",
     ),
-    "degrees": (
-        sage_with(rewritten(ctrl=wave(60, 6, amplitude=40.0))),
-        "positions must be in radians: these look like degrees",
-    ),
-    "empty file": (
-        sage_with(lambda motion: (motion / "control.csv").write_text("")),
-        "control.csv:1: header is '', expected type,timestamp,positions",
-    ),
-    "truncated CSV": (sage_with(cut_short), "state_motor.csv:61: expected TYPE,timestamp and 3 list(s) of 6 numbers"),
     "half-written Parquet": (half_a_parquet, "b.parquet: not a readable Parquet file"),
 }
 
 
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_broken_input_is_one_line_that_says_what_where_and_what_to_do(what, arm, tmp_path, capsys):
+    """And leaves no dataset; the readers' own tests have every message."""
     make, message = BROKEN[what]
     logs, out = make(tmp_path / "logs"), tmp_path / "data"
     code = import_arm(logs, arm, out, *SI) if what == "half-written Parquet" else import_so101(logs, out)
     assert code == 2
-    printed = capsys.readouterr()
-    error = printed.err.strip().split("\n")[-1]
+    error = capsys.readouterr().err.strip().split("\n")[-1]
     assert message in error
     assert error.split(": ")[0] in ("Log", "JointMismatch")
-    assert "Traceback" not in printed.err
     assert not out.exists()
 
 
@@ -192,14 +143,6 @@ def test_a_note_about_joints_begins_a_word_of_its_own(arm, tmp_path, capsys):
     assert "note  elbow: not in every recording" in capsys.readouterr().out
 
 
-def test_a_broken_file_leaves_an_existing_dataset_as_it_was(logs, tmp_path):
-    assert import_so101(logs, tmp_path / "data") == 0
-    before = {f: f.read_bytes() for f in (tmp_path / "data").rglob("*") if f.is_file()}
-    broken = sage_with(cut_short)(tmp_path / "broken")
-    assert import_so101(broken, tmp_path / "data") == 2
-    assert {f: f.read_bytes() for f in (tmp_path / "data").rglob("*") if f.is_file()} == before
-
-
 def test_a_table_asks_for_its_units(arm, tmp_path, capsys):
     table = tmp_path / "wave.csv"
     table.write_text(table_text(arm_columns()))
@@ -209,39 +152,22 @@ def test_a_table_asks_for_its_units(arm, tmp_path, capsys):
     )
 
 
-def test_doctor_speaks_and_ends_with_a_verdict_and_what_comes_next(logs, tmp_path, capsys):
+def test_doctor_ends_with_a_verdict_and_what_comes_next_or_prints_one_json_object(logs, tmp_path, capsys):
     import_so101(logs, tmp_path / "data")
     capsys.readouterr()
     assert main(["doctor", str(tmp_path / "data")]) == 0
     told = capsys.readouterr().out
     assert "so101, 1 sequences, 1 motions" in told
-    assert "49.85" in told
     verdict, next_ = told.strip().split("\n")[-2:]
     assert verdict.startswith("Usable. Read the")
     assert next_ == f"next: gaponet gap {tmp_path / 'data'}"
-
-
-def test_doctor_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
-    import_so101(logs, tmp_path / "data")
-    capsys.readouterr()
     assert main(["doctor", str(tmp_path / "data"), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["sequences"][0]["rate_hz"] == 49.85
     assert {f["level"] for f in result["findings"]} <= {"ok", "note", "warning", "error"}
     assert [j["joint"] for j in result["joints"]][-1] == "gripper"
-
-
-def test_doctor_refuses_another_robot_and_a_damaged_file(logs, tmp_path, capsys):
-    import_so101(logs, tmp_path / "data")
     assert main(["doctor", str(tmp_path / "data"), "--robot", "h1_2"]) == 2
     assert "holds robot 'so101'" in capsys.readouterr().err
-    file = next((tmp_path / "data" / "sequences").iterdir())
-    file.write_bytes(file.read_bytes()[:100])
-    assert main(["doctor", str(tmp_path / "data")]) == 2
-    assert "not a readable Parquet file" in capsys.readouterr().err
-    shutil.rmtree(tmp_path / "data")
-    assert main(["doctor", str(tmp_path / "data")]) == 2
-    assert "not a dataset" in capsys.readouterr().err
 
 
 def test_logs_are_found_again_in_a_dataset_whose_journal_holds_no_lags(arm, tmp_path, capsys):

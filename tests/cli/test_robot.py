@@ -9,21 +9,10 @@ from vendors import write_mjcf
 from gaponet.cli.main import main
 
 
-def test_list_names_the_packages_robots(capsys):
-    assert main(["robot", "list", "--json"]) == 0
-    assert [r["name"] for r in json.loads(capsys.readouterr().out)["robots"]] == [
-        "fr3",
-        "g1_23",
-        "g1_29",
-        "h1_2",
-        "so101",
-        "ur10e",
-        "xl330_bench",
-    ]
-
-
 @pytest.mark.parametrize("name", ["so101", "h1_2", "g1_29", "g1_23", "fr3", "ur10e"])
-def test_the_packages_robots_are_right(name, capsys):
+def test_the_packages_robots_are_listed_and_right(name, capsys):
+    assert main(["robot", "list", "--json"]) == 0
+    assert name in [r["name"] for r in json.loads(capsys.readouterr().out)["robots"]]
     assert main(["robot", "check", name, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["warnings"] == []
@@ -45,11 +34,6 @@ def test_a_users_folder_is_checked_and_shown(tmp_path, capsys):
     [
         (TOML.replace("kp = 20.0", "kp = 20.0\nhome = 2.0", 1), XML, "home 2 lies outside its range [-1.50, 1.50]"),
         (TOML.replace("kp = 20.0", "kp = 0.0", 1), XML, "shoulder: kp is 0; a position-controlled joint needs kp > 0"),
-        (
-            TOML.replace("effort_limit = 5.0", "effort_limit = 0.5", 1),
-            XML,
-            "needs 0.883 N·m to hold its home, its limit is",
-        ),
         (TOML, XML.replace(' range="-1.5 1.5"', "", 1), "shoulder: has no range in the MJCF"),
         (TOML.split("[[payload_mount]]")[0], XML, "no [[payload_mount]]: payloads other than 0 will be refused"),
     ],
@@ -59,19 +43,6 @@ def test_what_compiles_and_is_doubtful_is_a_warning(tmp_path, capsys, toml, xml,
     assert main(["robot", "check", str(tmp_path / "arm"), "--json"]) == 0
     warnings = json.loads(capsys.readouterr().out)["warnings"]
     assert any(warning in text for text in warnings)
-
-
-@pytest.mark.parametrize(
-    ("toml", "message"),
-    [
-        (TOML.replace('"elbow"', '"knee"'), "robot.toml names joint 'knee', the MJCF has: elbow, shoulder"),
-        (TOML.replace('"fore"', '"hand"'), "payload mount 'hand' names body 'hand', which is missing"),
-    ],
-)
-def test_a_broken_folder_is_one_line_and_exit_code_2(tmp_path, capsys, toml, message):
-    write_arm(tmp_path / "arm", toml=toml)
-    assert main(["robot", "check", str(tmp_path / "arm")]) == 2
-    assert message in capsys.readouterr().err
 
 
 def test_check_without_a_name_says_which_there_are(capsys):

@@ -75,6 +75,12 @@ def bucket(tmp_path):
 
 
 @pytest.fixture
+def disk(bucket):
+    """The address of a disk as object storage, for what is the same on the Hub."""
+    return f"file://{bucket}"
+
+
+@pytest.fixture
 def forge(bucket):
     """Change what was pushed as somebody does who knows how an index is made: hashes and sizes are right.
 

@@ -52,14 +52,14 @@ def test_a_run_comes_back_with_the_same_network_and_without_what_a_browser_would
     push(tmp_path / "back", place)
 
 
-def test_what_would_be_lost_is_replaced_only_when_asked(dataset, arm, run, place, tmp_path):
+def test_what_would_be_lost_is_replaced_only_when_asked(dataset, arm, run, disk, tmp_path):
     shutil.copytree(dataset.path, tmp_path / "small")
     add(dataset, arm, ["new"])
-    push(dataset.path, place)
+    push(dataset.path, disk)
     with pytest.raises(RemoteError, match="holds 1 sequences that would be lost"):
-        push(tmp_path / "small", place)
-    push(tmp_path / "small", place, replace=True)
-    pull(place, tmp_path / "back")
+        push(tmp_path / "small", disk)
+    push(tmp_path / "small", disk, replace=True)
+    pull(disk, tmp_path / "back")
     same(Dataset(tmp_path / "small"), Dataset(tmp_path / "back"))
 
 
@@ -233,11 +233,6 @@ def test_prune_deletes_what_neither_this_push_nor_the_last_names_once_it_is_a_da
     same(dataset, Dataset(tmp_path / "back"))
 
 
-def test_the_command_prune_names_the_one_that_replaces_it(capsys):
-    assert main(["prune", "s3://robots/arm"]) == 2
-    assert capsys.readouterr().err == "Usage: gaponet prune was removed; use gaponet push --prune\n"
-
-
 @pytest.mark.parametrize(
     ("remote", "step"), [(Bucket, "store"), (Bucket, "_replace_index"), (Hub, "store")], ids=lambda x: str(x)
 )
@@ -274,15 +269,15 @@ def test_of_two_first_pushes_to_the_hub_the_slower_one_gets_the_error_too(hub, d
         remote.store(tmp_path, Index(1, "dataset", "arm", ("a",), {"x": FileRecord(1, "0" * 64)}), ["x"], False)
 
 
-def test_the_same_recording_under_another_name_is_the_one_that_is_there(dataset, arm, place, tmp_path):
+def test_the_same_recording_under_another_name_is_the_one_that_is_there(dataset, arm, disk, tmp_path):
     renamed = Dataset.create(tmp_path / "renamed", arm)
     for entry in dataset.entries:
         sequence = dataset.read(entry)
         renamed.append(replace(sequence, meta=replace(sequence.meta, motion=f"my {entry.meta.motion}")))
-    push(dataset.path, place)
-    pull(place, tmp_path / "theirs")
-    push(renamed.path, place)
-    assert pull(place, tmp_path / "theirs").files == 0
+    push(dataset.path, disk)
+    pull(disk, tmp_path / "theirs")
+    push(renamed.path, disk)
+    assert pull(disk, tmp_path / "theirs").files == 0
 
 
 @pytest.mark.parametrize(
@@ -312,6 +307,11 @@ def test_no_error_shows_keys_or_the_signature_of_a_link():
     link = "https://KEY:SECRET@host/file?X-Amz-Signature=SECRET"
     with pytest.raises(RemoteError, match=r"^me/arm: 403 for https://host/file\?…$"), network_errors("me/arm"):
         raise OSError(f"403 for {link}")
+
+
+def test_a_mistake_in_the_program_is_not_reported_as_an_error_of_the_network():
+    with pytest.raises(AttributeError), network_errors("me/arm"):
+        None.nothing  # noqa: B018
 
 
 def test_a_hub_that_does_not_answer_is_one_line(tmp_path, monkeypatch, capsys):

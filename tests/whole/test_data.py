@@ -28,7 +28,7 @@ def run(place, capsys, *words):
     return captured
 
 
-def test_the_card_says_virtual_first_and_asks_for_the_licence(place, capsys):
+def test_the_card_says_virtual_first_asks_for_the_licence_and_keeps_it(place, capsys):
     told = run(place, capsys, "data", "card", "{}/set").out.split("\n")
     assert told[0] == "set: 6 sequences, 0.00 h of arm, all on VIRTUAL robots"
     assert "licence: not stated; set it with gaponet data card DIR --licence …" in told
@@ -37,9 +37,6 @@ def test_the_card_says_virtual_first_and_asks_for_the_licence(place, capsys):
         .read_text(encoding="utf-8")
         .startswith("# set: 6 sequences, 0.00 h of arm, all on V")
     )
-
-
-def test_the_card_is_one_json_object_with_the_licence(place, capsys):
     out = run(place, capsys, "data", "card", "{}/set", "--licence", "CC-BY-4.0", "--source", "test", "--json").out
     card = json.loads(out)
     assert (card["licence"], card["source"], card["total"]["frames"]) == ("CC-BY-4.0", "test", 360)

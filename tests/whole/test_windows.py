@@ -53,7 +53,7 @@ work = Path(sys.argv[1])
 gp.import_logs(work / "logs", robot="so101", out=work / "data", unit_id="a", payload_mass=0.0)
 small = PretrainingConfig(rounds=1, num_envs=4, steps=20, gradient_steps=5, batch_size=64, sensor_states=16)
 gp.train(work / "data", out=work / "run", budget="120", config=TrainConfig(pretraining=small))
-for words in ("doctor data", "gap data", "eval run data", "report run", "report . --list"):
+for words in ("doctor data", "eval run data", "report run", "report . --list"):
     name, *rest = words.split()
     assert main([name, *(w if w.startswith("--") else str(work / w) for w in rest)]) == 0, words
 assert (work / "run" / "report.html").is_file()

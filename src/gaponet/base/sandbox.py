@@ -14,7 +14,6 @@ import os
 import pickle
 import select
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
@@ -50,7 +49,6 @@ CHILD_VARIABLES = {
     "MKL_NUM_THREADS": "1",
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
-SIZE = struct.Struct("<Q")
 
 
 def sandboxed(
@@ -143,8 +141,8 @@ class _Child:
         timeout.start()
         try:
             _write(self.process.stdin, request)
-            return _read(self.process.stdout)
-        except (EOFError, BrokenPipeError):
+            return pickle.load(self.process.stdout)
+        except (EOFError, BrokenPipeError, pickle.UnpicklingError):  # the last: the child ended within its answer
             code = self.process.wait()
             if code == 0:
                 return None, IDLE
@@ -172,34 +170,9 @@ def _close() -> None:
 
 
 def _write(stream: IO[bytes], value: Any) -> None:
-    """Write a pickle; large arrays follow it without a copy, which would count as the child's memory."""
-    buffers: list[pickle.PickleBuffer] = []
-    parts: list[Any] = [pickle.dumps(value, 5, buffer_callback=buffers.append), *(b.raw() for b in buffers)]
-    stream.write(b"".join(SIZE.pack(n) for n in (len(parts), *(memoryview(part).nbytes for part in parts))))
-    for part in parts:
-        stream.write(part)
+    """Write a pickle. Of protocol 5 arrays are written without a copy, which would count as the child's memory."""
+    pickle.dump(value, stream, 5)
     stream.flush()
-
-
-def _read(stream: IO[bytes]) -> Any:
-    sizes = [_read_size(stream) for _ in range(_read_size(stream))]
-    text, *buffers = (_read_exactly(stream, size) for size in sizes)
-    return pickle.loads(text, buffers=buffers)
-
-
-def _read_size(stream: IO[bytes]) -> int:
-    return int(SIZE.unpack(_read_exactly(stream, SIZE.size))[0])
-
-
-def _read_exactly(stream: IO[bytes], size: int) -> bytearray:
-    content = bytearray(size)
-    view, position = memoryview(content), 0
-    while position < size:
-        count = stream.readinto(view[position:])  # type: ignore[attr-defined]
-        if not count:
-            raise EOFError
-        position += count
-    return content
 
 
 def _serve() -> None:
@@ -209,7 +182,7 @@ def _serve() -> None:
     _Child.is_this_process = True
     while os.name == "nt" or select.select([0], [], [], IDLE_S)[0]:
         try:
-            module, name, path, file, arguments, seconds = _read(sys.stdin.buffer)
+            module, name, path, file, arguments, seconds = pickle.load(sys.stdin.buffer)
         except EOFError:
             return
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -38,14 +38,14 @@ def adapt(
     mixed_gains: Flag = False,
     json: Json = False,
 ) -> None:
-    """Bring an identified robot to another unit or day: short logs.
+    """Adapt an identified robot to another unit or day with short logs.
 
-    A robot folder in, a robot folder out: gaponet adapt ./my_robot LOGS --out ./my_robot_today. Of a run the
-    trained model stays as it is; gaponet eval then shows the unit without and with its adaptation.
+    For a robot folder, a new robot folder is written: gaponet adapt ./my_robot LOGS --out ./my_robot_today. For a run,
+    the trained model stays unchanged, and gaponet eval then shows the unit without and with its adaptation.
 
     Args:
-        out: Robot folder to write, where a robot folder is adapted.
-        payload_mass: kg in each hand, of logs whose format does not state it; of a robot folder.
+        out: Robot folder to write; required for a robot folder.
+        payload_mass: kg in each hand, for logs of a robot folder whose format does not state it.
     """
     screen = Out(json)
     if (run / "robot.toml").is_file():

@@ -51,16 +51,17 @@ def check(
 ) -> None:
     """Is this still the robot that was identified? What changed?
 
-    The exit code is 0 where it is, 1 where it is not, 2 where that cannot be decided. With --fleet many robots are
-    checked, those that drifted are adapted, and one page shows them; the same command again continues.
+    The exit code is 0 if the robot is unchanged, 1 if it changed, and 2 if that cannot be decided. With --fleet many
+    robots are checked, robots that drifted are adapted, and one page shows all. The same command again continues.
 
     Args:
-        fleet: Check a folder of robots: who drifted, by what, since when. The options below are for this.
-        out: Folder for fleet.html, adapted/ROBOT, and ROBOT.json with its nights.
-        night: Name of the night; default today.
+        fleet: Check a folder of robots and show which drifted, in which parameters, and since when. The options below
+            are for this.
+        out: Folder for fleet.html, adapted/ROBOT, and ROBOT.json with all its checks.
+        night: Name of this check; default today's date.
         adapt: Adapt robots that drifted.
-        executor: Local, ray or ray:ADDRESS (docs/scale.md); all machines see the folders.
-        workers: Robots at a time; 0 for one per core.
+        executor: local, ray or ray:ADDRESS (docs/scale.md); all machines must see the folders.
+        workers: Number of robots at a time; 0 for one per core.
     """
     screen = Out(json)
     if fleet:
@@ -68,8 +69,6 @@ def check(
             raise UsageError("--fleet: give a folder for the page and the results, --out FOLDER")
         _check_fleet(screen, robot, logs, out, night, adapt, payload_mass, executor, workers)
         return
-    if not (robot / "robot.toml").is_file():
-        raise UsageError(f"{robot}: is no robot folder (no robot.toml); give what gaponet identify wrote")
     made = api.check(robot, logs, unit=unit, motions=motions, payload_mass=payload_mass, threads=threads)
     drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
     named = {m.joint for m in drift.moved}

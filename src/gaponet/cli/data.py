@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Data, Json, Logs, Robot, Source
+from gaponet.cli.options import Data, Json, Logs, Robot, Source, actions
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import abbreviate
@@ -24,7 +24,7 @@ def _card(
     """Count and measure what a dataset holds; writes card.json and CARD.md into it.
 
     Args:
-        licence: Record this licence in dataset.json, e.g. CC-BY-4.0; "" takes it away.
+        licence: Record this licence in dataset.json, such as CC-BY-4.0; "" removes it.
         source: Record where the data come from: a paper, a laboratory, an address.
     """
     from gaponet.data.card import make_card, write_card
@@ -53,8 +53,8 @@ def _split(
     """Divide a dataset into training, validation and test parts that share no recording; writes splits/….json into it.
 
     Args:
-        by: What the test part has and the others have not; of repetitions and of time (logs imported with --cut) the
-            last.
+        by: Property whose values are divided among the parts. The last repetitions, or the last pieces in time (logs
+            imported with --cut), are the test part.
         holdout: Motions, units or payloads (kg) for the test part; default a quarter of them by a fixed rule.
     """
     from gaponet.data.card import count_entries
@@ -110,7 +110,7 @@ def _export(
     robot: Robot = None,
     json: Json = False,
 ) -> None:
-    """Write a dataset in a format of others; gaponet import reads back all that the format can hold.
+    """Write a dataset in another format; gaponet import reads it back as far as the format can hold it.
 
     Args:
         out: New folder.
@@ -134,10 +134,10 @@ def _export(
 
 
 def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Json = False) -> None:
-    """Take sequences out of a dataset, with their simulated replays; their logs can be imported again.
+    """Remove sequences from a dataset, with their simulated replays; their logs can be imported again.
 
     Args:
-        ids: Names or patterns of them, as sequences.jsonl lists them: '*-1kg-*' is all with a payload of 1 kg.
+        ids: Ids in sequences.jsonl, or patterns: '*-1kg-*' removes all with a payload of 1 kg.
     """
     out, data = Out(json), Dataset(dataset)
     gone = data.remove(ids)
@@ -160,8 +160,8 @@ def _labels(
         logs: File or folder of logs.
         robot: Robot name or folder.
         out: Folder for logs.toml and labels.csv, which gaponet import LOGS --logs OUT/logs.toml takes.
-        payloads: The masses that were in the room, kg.
-        units: How many robots there were.
+        payloads: Masses that may have been carried, kg.
+        units: Number of robots.
         rate: Hz, of logs without a clock.
     """
     from gaponet.data.formats import read_logs
@@ -186,18 +186,8 @@ def _labels(
     screen.result({"cells": found.groups, "agreement": found.agreement, "recordings": found.recordings})
 
 
-# Each is run while the command line is parsed; what is left to call is nothing.
-Action = (
-    Annotated[None, tyro.conf.subcommand("card", constructor=_card)]
-    | Annotated[None, tyro.conf.subcommand("split", constructor=_split)]
-    | Annotated[None, tyro.conf.subcommand("figures", constructor=_figures)]
-    | Annotated[None, tyro.conf.subcommand("export", constructor=_export)]
-    | Annotated[None, tyro.conf.subcommand("remove", constructor=_remove)]
-    | Annotated[None, tyro.conf.subcommand("labels", constructor=_labels)]
-)
-
-
-def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
+@actions(card=_card, split=_split, figures=_figures, export=_export, remove=_remove, labels=_labels)
+def data(action: None) -> None:
     """A dataset's card, splits, pictures, export and removal."""
 
 

@@ -11,11 +11,10 @@ from pathlib import Path
 from gaponet import api
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.progress import progress_bar
-from gaponet.cli.gap import show_methods
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
-from gaponet.report.verdict import verdict
+from gaponet.report.view.portrait import prepare
 from gaponet.robot.spec import load_robot, robot_argument
 
 # Many small rounds: minutes, not hours.
@@ -31,79 +30,63 @@ def demo(
     network: str = "40s",
     json: Json = False,
 ) -> None:
-    """See all of it in minutes, on VIRTUAL robots or on your logs.
+    """Run all steps in minutes, on VIRTUAL robots or on your logs.
 
     Args:
         data: Folder of real logs; default: logs collected from virtual H1-2 robots here and now.
         robot: Robot name or folder.
-        out: Folder for dataset, robot, run and report; a demo that was interrupted there is finished.
+        out: Folder for dataset, robot, run and report; an interrupted demo continues there.
         budget: Time of identification.
-        network: Training time of a network on top of it, which is asked whether it adds anything.
+        network: Training time of a network on top of the identified robot.
     """
-    require_extras()
-    from gaponet.data.store import Dataset
-    from gaponet.report.view.portrait import portrait, prepare
-
-    prepare()
-    from gaponet.cli.identify import identify  # imports mujoco
-    from gaponet.report.report import write_report
+    if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")):
+        raise UsageError("the demo trains and draws: pip install 'gaponet[train,report]'")
+    prepare()  # before mujoco is imported
+    from gaponet.cli.gap import gap
+    from gaponet.cli.identify import identify
+    from gaponet.cli.report import report
+    from gaponet.cli.train import evaluate
 
     screen, began = Out(json), time.monotonic()
-    dataset, known, run = out / "dataset", out / "robot", out / "network"
+    dataset, identified, run = out / "dataset", out / "robot", out / "network"
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
         screen.say(f": how far is the simulator from the robot?  (gaponet gap {dataset})", "1 Measure")
         holdout = _make_dataset(dataset, data, robot, screen)
-        with progress_bar("gap") as update:
-            gap = api.gap(str(dataset), robot=robot, progress=update)
-        show_methods(screen, gap.to_dict(), ("joint",))
-        for sentence in verdict(gap.methods):
-            screen.say(sentence)
-        screen.say(f": which causes explain that?  (gaponet identify {dataset} --out {known})", "2 Identify")
-        if not (known / "robot.toml").is_file():
-            identify(str(dataset), known, budget=budget, robot=robot, holdout_units=holdout)
-        words = f"gaponet train {dataset} --model gaponet --robot {robot_argument(known)} --out {run}"
+        gap(str(dataset), robot=robot)
+        screen.say(f": which causes explain that?  (gaponet identify {dataset} --out {identified})", "2 Identify")
+        if not (identified / "robot.toml").is_file():
+            identify(str(dataset), identified, budget=budget, robot=robot, holdout_units=holdout)
+        words = f"gaponet train {dataset} --model gaponet --robot {robot_argument(identified)} --out {run}"
         screen.say(f": does a network find more?  ({words})", "3 Use")
-        resume, config = (run / "checkpoint.pt").is_file(), TrainConfig(pretraining=QUICK)
         try:
             with progress_bar("training gaponet") as update:
                 api.train(
-                    Dataset(dataset), out=run, budget=network, config=config, robot=known, holdout_units=holdout,
-                    resume=resume, progress=update,
+                    str(dataset), out=run, budget=network, config=TrainConfig(pretraining=QUICK), robot=identified,
+                    holdout_units=holdout, resume=(run / "checkpoint.pt").is_file(), progress=update,
                 )  # fmt: skip
         except ModelError:  # a machine with much other work
             screen.say(
                 f"{network} were over before a network learned anything; --network 5m gives it more", "", "yellow"
             )
-            run = known
-    with progress_bar("evaluating") as update:
-        found = api.evaluate(run, str(dataset), progress=update).to_dict()
-    show_methods(screen, found, ("joint", "payload"))
-    with progress_bar("report") as update:
-        path = write_report(run, progress=update, picture=portrait)
-    for sentence in verdict(found["methods"]):
-        screen.say(sentence)
-    screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
-    screen.say(f"next: gaponet export {known} --to mjcf; gaponet view {dataset} --robot {robot_argument(known)}")
-    screen.result(found)
-
-
-def require_extras() -> None:
-    """Say at once, and together, what is not installed."""
-    if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")):
-        raise UsageError("the demo trains and draws: pip install 'gaponet[train,report]'")
+            run = identified
+    evaluate(run, str(dataset), json=json)
+    with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
+        report(run)
+        screen.say(f"{time.monotonic() - began:.0f} s in all")
+        view = f"gaponet view {dataset} --robot {robot_argument(identified)}"
+        screen.say(f"next: gaponet export {identified} --to mjcf; {view}")
 
 
 def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tuple[str, ...]:
     """Import logs or collect from the virtual fleet; returns the units to hold out of training."""
-    if data is not None:
-        from gaponet.cli.logs import import_logs
+    from gaponet.cli.collect import collect
+    from gaponet.cli.logs import import_logs
 
+    if data is not None:
         import_logs(data, robot, unit_id="lab", payload_mass=0.0, out=path)
         return ()
     if load_robot(robot).name != "h1_2":
         raise UsageError(f"the embedded virtual robots are H1-2; for {robot} give logs with --data DIR")
-    from gaponet.cli.collect import collect
-
     screen.say("No --data given: collecting from VIRTUAL H1-2 robots; nothing below says anything about real ones.")
     collect(robot=robot, fleet="easy", recipe="demo", out=path)
     return ("virtual-4",)

@@ -16,8 +16,6 @@ from gaponet.cli.out import Out, writes
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import load_robot
 
-MAX_COLUMNS = 4  # of a table
-
 
 @writes("motions")
 def excite(
@@ -33,19 +31,19 @@ def excite(
 ) -> None:
     """Write the motions to play on a robot: first, or next.
 
-    No data yet: --robot NAME. A robot that was identified: --for FOLDER chooses what tells most beside its logs, and
-    says how much more is worth playing.
+    Without data, give --robot NAME. For an identified robot, --for FOLDER chooses the motions that add most information
+    to its logs, and says how much more is worth playing.
 
     Args:
         robot: Robot name or folder; its range, torque and payload limits bound the motions.
         known: Robot folder of gaponet identify or adapt.
         out: Folder for the motion files and sheet.md.
-        minutes: How long all motions are together. 10 (the default) identify gains, friction and delay, 40 make a good
-            model. With --for half a minute.
-        payloads: kg in each hand; every motion is played with each. With --for what they may be.
-        rate: How many commands a second, Hz.
+        minutes: Total duration of the motions. 10 (default) suffice to identify gains, friction and delay, 40 to train
+            a good model. With --for the default is half a minute.
+        payloads: kg in each hand; every motion is played with each payload. With --for: payloads to choose from.
+        rate: Commands per second, Hz.
         format: txt (SAGE, 50 Hz), csv (with time) or npz; gaponet run and record play each.
-        seed: What the drawing of motions starts from.
+        seed: Seed of the random choice of motions.
     """
     screen = Out(json)
     if bool(robot) == (known is not None):
@@ -68,13 +66,12 @@ def _show_prediction(screen: Out, name: str, prediction: Prediction) -> None:
     """Print standard errors before and after the motions, and how much more playing is useful."""
     before, after = prediction.before, prediction.after
     fields = [f for f in next(iter(before.values())) if any(by[f] > 0 for by in before.values())]
-    for start in range(0, len(fields), MAX_COLUMNS):
-        chosen = fields[start : start + MAX_COLUMNS]
-        title = f"{name}: standard errors, now → at best" if start == 0 else "Further parameters"
-        screen.table(title, ["joint", *(SERVO_FIELDS[f].heading for f in chosen)], [
-            [j, *(" → ".join(_two_digits(by[j][f] * SERVO_FIELDS[f].factor) for by in (before, after)) for f in chosen)]
-            for j in before
-        ])  # fmt: skip
+    screen.wide_table(
+        f"{name}: standard errors, now → at best",
+        ["joint", *(SERVO_FIELDS[f].heading for f in fields)],
+        [[j, *(" → ".join(_two_digits(by[j][f] * SERVO_FIELDS[f].factor) for by in (before, after)) for f in fields)]
+         for j in before],
+    )  # fmt: skip
     seconds = prediction.useful_seconds
     screen.say(
         f"{seconds:.0f} s are worth playing: after them half a minute more makes the errors less than 5 % smaller"

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json as json_text
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from gaponet import api
+from gaponet.api.files import NetworkTarget, RobotTarget
 from gaponet.base.errors import UsageError
+from gaponet.base.files import write_text
 from gaponet.base.progress import progress_bar
-from gaponet.cli.attach import attach
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
+from gaponet.robot.spec import load_robot
 
 if TYPE_CHECKING:
     from gaponet.export.randomization import Engine, Scope
 
+POLICY_FILE, POLICY_STEP = "policy_postprocessor.json", "gaponet_correct"  # of a LeRobot policy
 CHECKED_IN = {"mjcf": "MuJoCo", "actuator-net": "mjlab"}
 Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.", metavar="ROBOT|RUN")]
 
@@ -25,20 +29,7 @@ Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of ga
 @like(api.export_robot)
 def export(
     robot: Holder,
-    to: Literal[
-        "onnx",
-        "torch",
-        "mjcf",
-        "urdf",
-        "mjlab",
-        "isaaclab",
-        "newton",
-        "drake",
-        "json",
-        "randomization",
-        "actuator-net",
-        "lerobot",
-    ] = "onnx",
+    to: RobotTarget | NetworkTarget | Literal["randomization", "lerobot"] = "onnx",
     out: Path | None = None,
     data: str | None = None,
     into: Path | None = None,
@@ -54,18 +45,18 @@ def export(
     """Write an identified robot or a network for another program.
 
     Args:
-        to: For a robot or a run's simulator: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a
-            check.py that needs no gaponet; urdf (damping, friction, effort limits); json (the numbers). Of a
+        to: Simulator of a robot or a run: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py
+            that needs no gaponet; urdf (or SDF: damping, friction, effort limits); json (the numbers). Network of a
             run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac
-            Lab), actuator-net (one network per joint: past of target − position and speed in, torque out). Of a robot,
-            randomization: what to randomise in training. lerobot: put the correction behind the LeRobot policy in
-            --into; LeRobot's commands find the step through the plug-in lerobot_robot_gaponet.
+            Lab), actuator-net (one network per joint; its inputs are past target − position and speed, its output is
+            the torque). randomization: ranges of a robot's parameters for training. lerobot: add the correction to the
+            LeRobot policy in --into; LeRobot finds it through the plug-in lerobot_robot_gaponet.
         into: For mjcf and urdf: a file of your own; an edited copy is written (mjcf: default the robot's). For lerobot:
             folder of a policy (pretrained_model) that holds policy_postprocessor.json.
         engine: The engine whose terms the ranges are written in, beside sampled units (randomization.json).
-        scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot: over its type.
+        scope: today: this robot as last fitted. any-day: sessions on several days. any-robot: all robots of its type.
         units: For any-robot: robot folders of the type.
-        dynamics: For lerobot: feed forward inertia and damping too; for smooth targets only.
+        dynamics: For lerobot: feed forward inertia and damping too; use it for smooth targets only.
         remove: For lerobot: remove the correction.
     """
     screen = Out(json)
@@ -75,7 +66,7 @@ def export(
     if to == "lerobot":
         if into is None:
             raise UsageError("--to lerobot: give the folder of a LeRobot policy with --into POLICY")
-        attach(screen, into, None if remove else robot, payload_mass, dynamics)
+        _attach(screen, into, None if remove else robot, payload_mass, dynamics)
         return
     if to == "onnx" or to == "torch" or to == "actuator-net":
         if (robot / "robot.toml").is_file():
@@ -127,3 +118,34 @@ def _show_ranges(
         screen.say(f"  no log determines these, drawn from the prior range: {names}", "warning", "yellow")
     screen.say(f"{file}: {len(next(iter(made.units.values())))} units in {file.parent / 'randomization.json'}")
     screen.result({"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown})
+
+
+def _attach(screen: Out, policy: Path, holder: Path | None, payload_mass: float, dynamics: bool) -> None:
+    """Put the correction of a robot or a run behind a LeRobot policy, in place of an earlier one; None removes it."""
+    file = policy / POLICY_FILE
+    if not file.is_file():
+        raise UsageError(
+            f"{policy}: has no {POLICY_FILE}; give the folder that holds a LeRobot policy and its processors"
+        )
+    try:
+        document = json_text.loads(file.read_text(encoding="utf-8"))
+        steps = [step for step in document["steps"] if step.get("registry_name") != POLICY_STEP]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise UsageError(f"{file}: is no processor of LeRobot") from None
+    config: dict[str, object] = {}
+    if holder is not None:
+        is_robot = (holder / "robot.toml").is_file()
+        if is_robot:
+            load_robot(holder)
+        elif not (holder / "model").is_dir():
+            raise UsageError(f"{holder}: is neither a robot folder of gaponet identify nor a run of gaponet train")
+        config = {
+            "known" if is_robot else "model": str(holder.resolve()),
+            "payload_mass": payload_mass,
+            "dynamics": dynamics,
+        }
+        steps.append({"registry_name": POLICY_STEP, "config": config})
+    write_text(file, json_text.dumps(document | {"steps": steps}, indent=2) + "\n")
+    names = [step.get("registry_name", step.get("class", "?")) for step in steps]
+    screen.say(f"{file}: {' → '.join(names) or 'no steps'}")
+    screen.result({"file": str(file), "steps": names, "config": config})

@@ -6,19 +6,19 @@ from pathlib import Path
 
 from gaponet import api
 from gaponet.api.opening import driven_by_torque
-from gaponet.api.results import IdentifyResult
+from gaponet.api.results import IdentifyResult, TorqueResult
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.base.text import format_uncertainty
 from gaponet.cli import options
 from gaponet.cli.options import Flag, Json, Robot, Source
-from gaponet.cli.out import MAX_COLUMNS, Out, writes
-from gaponet.cli.torque import show_torque
+from gaponet.cli.out import Out, writes
 from gaponet.report.tables import mrad
 from gaponet.robot.servo_fields import DEFAULT_TERMS, SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
+from gaponet.sysid.torque_motors import PASSIVE_FIELDS
 
 UNDETERMINED = "not determined by these logs"
 
@@ -42,19 +42,19 @@ def identify(
     holdout_units: tuple[str, ...] = (),
     json: Json = False,
 ) -> None:
-    """Fit the simulator's servos to logs: a robot folder.
+    """Fit the simulator's servos to logs and write a robot folder.
 
-    Gains, damping, friction, armature, zero offsets and delays are fitted to the training motions. Of a robot that is
-    driven by torque (no position was commanded) armature, damping, friction and delay are fitted.
+    Gains, damping, friction, armature, zero offsets and delays are fitted to the training motions. For a robot that is
+    driven by torque (no position was commanded), armature, damping, friction and delay are fitted.
 
-    The result is a robot folder: use it with --robot, with a slash: gaponet gap DATASET --robot ./OUT. Gains of the
-    robot's file are the start of the fit; gains that recordings state are taken as given. Where nothing does better
-    than the robot as it is, nothing is written and the exit status is 2.
+    Use the robot folder with --robot and a slash: gaponet gap DATASET --robot ./OUT. The fit starts from the gains in
+    the robot's file; gains that recordings state are not changed. If no fit is better than the robot as it is, nothing
+    is written and the exit status is 2.
 
     Args:
-        current: Torque-driven robots: the recorded torque is a current, or its constant is unknown; fit N·m per
-            unit too.
-        details: List for every joint what these logs do not determine.
+        current: Torque-driven robots: fit the torque constant too, where the recorded torque is a current or its
+            unit is unknown.
+        details: List the parameters of every joint that these logs do not determine.
     """
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
@@ -63,7 +63,7 @@ def identify(
             raise UsageError(f"--like {like}: {dataset} holds a robot that is driven by torque; leave --like out")
         with progress_bar("identifying"):
             driven = api.identify_torque(data, out=out, current=current, robot=spec)
-        show_torque(screen, driven, current)
+        _show_torque(screen, driven, current)
         screen.result(driven.to_dict())
         return
     with progress_bar("identifying") as update:
@@ -92,15 +92,13 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         end = "" if found.improved else " No fit was better, so these servos are written as they are."
         screen.say(f"Start and prior: {taken}.{end}")
     shown = [f for f in SERVO_FIELDS if any(v.get(f) for v in values.values())]
-    for start in range(0, len(shown), MAX_COLUMNS):
-        part = shown[start : start + MAX_COLUMNS]
-        rows = [[j, *(_cell(v.get(f), found.std[j].get(f), SERVO_FIELDS[f].factor) for f in part)]
-                for j, v in values.items()]  # fmt: skip
-        for servo in dict.fromkeys(filter(None, (found.robot.servos[i] for i in found.robot.operated_index))):
-            known = [_cell(servo.published.get(f), None, SERVO_FIELDS[f].factor) for f in part]
-            rows += [[f"published for {servo.name}, {servo.source}", *known]] * any(known)
-        title = "Identified servos" if start == 0 else "Further parameters"
-        screen.table(f"{title}, ± standard error", ["joint", *(SERVO_FIELDS[f].heading for f in part)], rows)
+    rows = [[j, *(_cell(v.get(f), found.std[j].get(f), SERVO_FIELDS[f].factor) for f in shown)]
+            for j, v in values.items()]  # fmt: skip
+    for servo in dict.fromkeys(filter(None, (found.robot.servos[i] for i in found.robot.operated_index))):
+        published = [_cell(servo.published.get(f), None, SERVO_FIELDS[f].factor) for f in shown]
+        rows.append([f"published for {servo.name}, {servo.source}", *published])
+    columns = ["joint", *(SERVO_FIELDS[f].heading for f in shown)]
+    screen.wide_table("Identified servos, ± standard error", columns, rows)
     for term in found.comparisons:
         fell, error = (mrad(x) for x in term.gain)
         judges = "motions" if term.name == "torque" else "recordings"
@@ -133,3 +131,32 @@ def _cell(value: float | None, std: float | None, factor: float) -> str:
     if value is None:
         return ""
     return format_uncertainty(value * factor, std * factor) if std else f"{value * factor:.3g}"
+
+
+def _show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
+    """Print the parameters of a torque-driven robot and its errors before and after."""
+    found, spec, virtual = made.fit, made.robot, "VIRTUAL " if made.virtual else ""
+    rows = []
+    for j, name in enumerate(spec.operated):
+        i = spec.operated_index[j]
+        values = {f: float(getattr(found.robot, f)[i]) for f in PASSIVE_FIELDS}
+        cells = [
+            format_uncertainty(SERVO_FIELDS[f].factor * v, SERVO_FIELDS[f].factor * found.std[name][f]) if v else "0"
+            for f, v in values.items()
+        ]
+        rows.append([name, *cells, f"{1e3 * found.robot.delay[i]:.0f}", f"{found.bias[j]:+.2g}",
+                     *([format_uncertainty(float(found.constant[j]), found.std[name]["constant"])] if current else []),
+                     *(f"{x[j]:.3g}" for x in found.torque)])  # fmt: skip
+    columns = ["joint", *(SERVO_FIELDS[f].heading for f in PASSIVE_FIELDS), "delay, ms", "bias, N·m"]
+    columns += ["N·m per unit"] * current + ["torque apart before, N·m", "after"]
+    screen.table("Torque-driven joints, ± standard error; medians on recordings that were not fitted", columns, rows)
+    ahead = (
+        f"Angle apart from the {virtual}robot, so long after its state, mrad: before → after, {found.windows} starts"
+    )
+    screen.table(ahead, ["joint", *(f"{h:g} s" for h in found.angle)], [
+        [name, *(f"{mrad(a[j])} → {mrad(b[j])}" for a, b in found.angle.values())]
+        for j, name in enumerate(spec.operated)
+    ])  # fmt: skip
+    screen.say(
+        f"robot folder {made.folder}: armature, damping, friction and delay; a servo's kp and kd are the file's still"
+    )

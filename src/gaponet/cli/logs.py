@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -74,8 +75,8 @@ def import_logs(
         from gaponet.data.describe.guess import guess_logs
         from gaponet.data.formats import look
 
-        kind, told, recordings = look(src, format, logs, allow_pickle)
-        print(guess_logs(recordings, spec, kind, dict(told)), end="")
+        kind, facts, recordings = look(src, format, logs, allow_pickle)
+        print(guess_logs(recordings, spec, kind, dict(facts)), end="")
         return
     if out is None:
         raise UsageError("say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)")
@@ -109,8 +110,8 @@ def doctor(
         diagnosis = api.doctor(data, robot=spec, progress=update)
     out.say(f", {Diagnosis.inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
-    mended = Finding.proposal(list(diagnosis.findings)) if fix else ""
-    for line in mended.splitlines():
+    proposal = Finding.proposal(list(diagnosis.findings)) if fix else ""
+    for line in proposal.splitlines():
         out.say(line)
     drawn: list[Path] = []
     if figures is not None:
@@ -120,7 +121,7 @@ def doctor(
             drawn = draw_findings(data, spec, list(diagnosis.findings), figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")
     out.say(f"next: gaponet doctor {dataset} --fix" if diagnosis.count("error") else f"next: gaponet gap {dataset}")
-    out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": mended,
+    out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": proposal,
                 "figures": [str(path) for path in drawn]} | diagnosis.to_dict())  # fmt: skip
 
 
@@ -135,38 +136,24 @@ def _show_formats(out: Out) -> None:
     out.result({fmt: {"about": what, "extra": extra} for fmt, (what, extra) in rows.items()})
 
 
-def _cuts(entries: ListOf[Entry]) -> dict[str, list[str]]:
-    """Why recordings were cut → which."""
-    found: dict[str, list[str]] = {}
+def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
+    """Return lines about recordings that were cut, implausible rows, and operated joints that the logs lack."""
+    cuts, implausible = defaultdict[str, list[str]](list), defaultdict[str, list[tuple[str, dict[str, Any]]]](list)
     for entry in entries:
         if cut := entry.meta.notes.get("cut"):
-            found.setdefault(cut, []).append(entry.meta.motion)
-    return found
-
-
-def _nonsense(entries: ListOf[Entry]) -> list[str]:
-    """Return a line for each channel with implausible rows (data.describe.plausibility)."""
-    told: dict[str, list[tuple[Entry, dict[str, Any]]]] = {}
-    for entry in entries:
-        for channel, found in entry.meta.notes.get("nonsense", {}).items():
-            told.setdefault(channel, []).append((entry, found))
-    return [
-        f"{channel} is nonsense in {sum(f['rows'] for _, f in found)} rows of {len(found)} recordings (first "
-        f"{found[0][1]['worst']:.4g} of {found[0][1]['joints'][0]} in {found[0][0].meta.motion}): "
-        f"{', '.join(dict.fromkeys(f['done'] for _, f in found))}; --strict refuses them"
-        for channel, found in told.items()
+            cuts[cut].append(entry.meta.motion)
+        for channel, rows in entry.meta.notes.get("nonsense", {}).items():
+            implausible[channel].append((entry.meta.motion, rows))
+    lines = [f"{', '.join(motions)}: {cut}; what follows was left out" for cut, motions in cuts.items()]
+    lines += [
+        f"{channel} is nonsense in {sum(rows['rows'] for _, rows in found)} rows of {len(found)} recordings (first "
+        f"{found[0][1]['worst']:.4g} of {found[0][1]['joints'][0]} in {found[0][0]}): "
+        f"{', '.join(dict.fromkeys(rows['done'] for _, rows in found))}; --strict refuses them"
+        for channel, found in implausible.items()
     ]
-
-
-def _unrecorded(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
-    """A line about operated joints that the logs do not hold."""
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
-    if not lacking:
-        return []
-    return [
-        f"{abbreviate(lacking)}: not in every recording, taken to stand at home there; [posture] in logs.toml says "
-        "where"
-    ]
+    where = "not in every recording, taken to stand at home there; [posture] in logs.toml says where"
+    return [*lines, f"{abbreviate(lacking)}: {where}"] if lacking else lines
 
 
 def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
@@ -190,9 +177,7 @@ def _show_import(out: Out, made: ImportResult) -> None:
         f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
         f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
     )
-    for cut, motions in _cuts(entries).items():
-        out.say(f"  {', '.join(motions)}: {cut}; what follows was left out", "note", "cyan")
-    for line in (*_nonsense(entries), *_unrecorded(entries, robot)):
+    for line in _notes(entries, robot):
         out.say(f"  {line}", "note", "cyan")
     for line in made.cut[:MAX_ROWS]:
         out.say(f"  {line}", "cut", "yellow")

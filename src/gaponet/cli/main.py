@@ -28,21 +28,13 @@ TASKS = {
     "On a robot, real or virtual": ("run", "record", "virtual"),
     "Share it": ("push", "pull"),
 }
-# Command → module:function. A module is imported when its command is run; help reads what it says of itself.
-COMMANDS = {
-    **{
-        name: f"gaponet.cli.{name}:{name}"
-        for name in (
-            "start", "demo", "data", "excite", "collect", "robot", "gap", "view", "identify", "adapt", "train",
-            "export", "check", "replay", "report", "experiment", "run", "record", "virtual",
-        )
-    },
-    **{name: f"gaponet.cli.share:{name}" for name in ("push", "pull")},
-    "import": "gaponet.cli.logs:import_logs",
-    "doctor": "gaponet.cli.logs:doctor",
-    "eval": "gaponet.cli.train:evaluate",
+# Functions that have another name or are in another module than their command.
+ELSEWHERE = {
+    "import": "logs:import_logs", "doctor": "logs:doctor", "eval": "train:evaluate", "push": "share:push",
+    "pull": "share:pull",
 }  # fmt: skip
-RENAMED_GROUPS = {"warm-start": "pretraining", "warm_start": "pretraining"}  # of options: earlier name → today's
+# Command → module:function. A module is imported when its command runs.
+COMMANDS = {name: f"gaponet.cli.{ELSEWHERE.get(name, f'{name}:{name}')}" for names in TASKS.values() for name in names}
 # Command, or command with its first argument → what replaces it.
 REMOVED = {
     "prune": "gaponet push --prune",
@@ -99,9 +91,6 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
     if not argv or argv[0] in ("-h", "--help"):
         print(_overview())
         return
-    for earlier, today in RENAMED_GROUPS.items():
-        prefix = f"--{earlier}."
-        argv = [f"--{today}.{word.removeprefix(prefix)}" if word.startswith(prefix) else word for word in argv]
     name, completing = argv[0], argv[0].startswith("--tyro-")
     for removed in (name, " ".join(argv[:2])):
         if removed in REMOVED:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, Union
 
 import tyro
 
@@ -43,6 +43,23 @@ def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
         own, theirs = (inspect.getdoc(f) or "" for f in (command, function))
         said = theirs.partition("Args:\n")[2].partition("\n\n")[0]
         command.__doc__ = own + ("\n" if "Args:\n" in own else "\n\nArgs:\n") + said
+        return command
+
+    return decorate
+
+
+def actions(**functions: Callable[..., Any]) -> Callable[[Command], Command]:
+    """Decorator of a command with actions, such as gaponet robot check: each runs while the command line is parsed.
+
+    Args:
+        functions: Name of the action → function.
+    """
+    kinds = [Annotated[None, tyro.conf.subcommand(name, constructor=f)] for name, f in functions.items()]
+
+    def decorate(command: Command) -> Command:
+        union: Any = Union[tuple(kinds)]  # noqa: UP007
+        flat = tyro.conf.arg(name="")
+        command.__annotations__["action"] = Annotated[union, tyro.conf.OmitSubcommandPrefixes, flat]
         return command
 
     return decorate

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
-MAX_COLUMNS = 4  # of a table of joints
+MAX_COLUMNS = 4  # beside the first, of a part of a wide table
 WIDTH = 120  # letters of a line in a file or a pipe
 LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
 
@@ -65,6 +65,13 @@ class Out:
         for line in lines:
             table.add_row(*map(Text, line))
         self.console.print(table)
+
+    def wide_table(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
+        """A table in parts of at most MAX_COLUMNS columns; rows that are blank in a part are left out."""
+        for start in range(1, len(columns), MAX_COLUMNS):
+            part = slice(start, start + MAX_COLUMNS)
+            cells = [[row[0], *row[part]] for row in rows if any(row[part])]
+            self.table(title if start == 1 else "Further parameters", [columns[0], *columns[part]], cells)
 
     def show(self, title: str, table: ResultTable) -> None:
         """A table of numbers, as `table`."""

@@ -24,16 +24,16 @@ def record(
     args: Annotated[ControlArgs, tyro.conf.arg(name="")] = ControlArgs(),  # noqa: B008
     json: Json = False,
 ) -> None:
-    """Play a motion uncorrected and keep what the robot did.
+    """Play a motion without correction and record it into a dataset.
 
     Args:
-        motion: Motions' names or files, played one after the other.
-        out: Dataset folder; made, or appended to. Every run's full recording goes to OUT/recordings.
-        unit_id: Which of its kind was recorded; the virtual driver knows it and sets it.
-        payload_mass: kg in each hand named by payload_side; 0 when empty.
-        repetitions: How often each motion is played.
-        seed: virtual: of the first recording's noise; later ones count on.
-        args: Robot and loop.
+        motion: Names or files of motions, played one after the other.
+        out: Dataset folder; created or appended to. The full recording of every run goes to OUT/recordings.
+        unit_id: Name of the recorded robot; the virtual driver sets it.
+        payload_mass: kg in each hand that payload_side names; 0 when empty.
+        repetitions: Number of times that each motion is played.
+        seed: virtual: seed of the noise in the first recording; it increases by one per recording.
+        args: Robot and control loop.
     """
     from gaponet.data.importer import measure_delays
     from gaponet.data.sequence import SequenceMeta, to_sequence
@@ -41,12 +41,12 @@ def record(
     from gaponet.robot.folder import MOVE_STORED_ROBOT
     from gaponet.sim.model import require_stored_robot
 
-    connection, side = args.connection, args.payload_side
+    side = args.payload_side
     if args.driver != "virtual" and not unit_id:
         raise UsageError("say which unit is recorded: --unit-id NAME")
     screen = Out(json)
     if args.driver == "virtual":
-        unit_id = f"virtual-{connection.unit}" if connection.unit.isdigit() else connection.unit
+        unit_id = args.connection.unit_name
     request = RunArgs(**vars(args), payload_mass=payload_mass)
     spec = resolve_robot(request)
     known = Dataset.open_existing(out, spec)

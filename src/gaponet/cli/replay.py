@@ -23,11 +23,11 @@ def replay(
     out: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Will a policy transfer? What the robot would do in its rollout.
+    """Will a policy transfer? Predict the robot in its rollout.
 
-    The rollout is a log of your simulator, targets as commands, and states, in any format that gaponet import reads.
-    Its targets are played as they stand; a policy that looks at the state would have answered what differs. The band
-    holds nine tenths of every validation motion of the robot, and what is not known of its servos does to this motion.
+    The rollout is a log of your simulator (targets as commands, and states) in any format that gaponet import reads.
+    Its targets are played unchanged, although a policy would react to a different state. The band contains nine tenths
+    of every validation motion of the robot, and the effect of uncertain servo parameters on this motion.
 
     Args:
         out: .npz to write: target, rollout, robot, low and high (T, joints), rad, and dt, s, of each rollout.

@@ -11,8 +11,8 @@ import tyro
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
-from gaponet.cli.options import Flag, Folder, Json, Model
-from gaponet.cli.out import MAX_COLUMNS, Out
+from gaponet.cli.options import Flag, Folder, Json, Model, actions
+from gaponet.cli.out import Out
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
 from gaponet.share.reading import open_dataset
 
@@ -43,7 +43,7 @@ def link(
     seconds: float = 5.0,
     json: Json = False,
 ) -> None:
-    """Listen to a robot without moving it: how its states arrive, and who publishes what.
+    """Listen to a robot without moving it: rate and age of its states, and the programs that publish commands.
 
     Args:
         robot: Name, or a folder with robot.toml and robot.xml.
@@ -51,12 +51,29 @@ def link(
         domain: unitree: DDS domain.
         interface: unitree: network interface to the robot.
         port: so101: serial port.
-        seconds: How long to listen.
+        seconds: Duration, s.
     """
-    from gaponet.cli.link import listen
+    from gaponet.hw.drivers.link import measure_link
+    from gaponet.hw.drivers.open import open_driver
 
+    out, name = Out(json), robot or ("h1_2" if driver == "unitree" else "so101")
     options = {"domain": domain, "interface": interface, "silent": True} if driver == "unitree" else {"port": port}
-    listen(Out(json), driver, robot or ("h1_2" if driver == "unitree" else "so101"), options, seconds)
+    bus = open_driver(driver, name, **options)
+    try:
+        bus.connect()
+        measured = measure_link(bus, seconds)
+        publishers = bus.publishers() if hasattr(bus, "publishers") else {}
+    finally:
+        bus.close(hold=True)
+    three = lambda what: ", ".join(f"{value:.2f}" for value in measured[what])  # noqa: E731
+    out.table(f"{'VIRTUAL ' * bus.virtual}{name} at {bus.address}, {seconds:g} s", ["what", "value"], [
+        ["states, a second", f"{measured['states']}, {measured['rate_hz']:.1f}"],
+        ["age when it comes, ms: p50, p99, max", three("age_ms")],
+        ["between two, ms: p50, p99, max", three("interval_ms")],
+        ["lost, refused", f"{measured['lost']}, {measured['refused']}"],
+        *([f"publish {topic}", "; ".join(programs) or "nobody"] for topic, programs in publishers.items()),
+    ])  # fmt: skip
+    out.result(measured | {"publishers": publishers, "virtual": bus.virtual} | bus.facts)
 
 
 def check(
@@ -65,12 +82,12 @@ def check(
     payloads: tuple[float, ...] = (),
     json: Json = False,
 ) -> None:
-    """Step a robot's simulator and say what is wrong with its folder.
+    """Step a robot's simulator and list the faults of its folder.
 
     Args:
         robot: Name, or a folder with robot.toml and robot.xml.
-        data: Dataset of this robot, whose postures and payloads are looked at.
-        payloads: kg in every mount, each held for a minute; default those of the data, or 0.
+        data: Dataset of this robot whose postures and payloads are checked too.
+        payloads: kg in every mount; each is held for a minute. Default: those of the data, or 0.
     """
     if not robot:
         raise UsageError(f"gaponet robot check needs a robot name ({', '.join(packaged_robots())}) or a folder")
@@ -95,19 +112,19 @@ def new(
     """Make a robot folder from a vendor's MJCF or URDF, with the source of every number, and check it.
 
     Args:
-        model: MJCF or URDF file, as it lies in its repository.
+        model: MJCF or URDF file with the files that it names.
         out: New robot folder.
-        joints: Those in the logs, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with
-            an actuator, or all hinges.
-        kp: The gain of the controller that recorded the logs, N·m/rad: 100 for all, '*wrist*=20' for some, the later
-            wins. Default: the model's actuators.
-        kd: Likewise, N·m·s/rad.
-        effort_limit: Likewise, N·m.
-        packages: NAME=FOLDER of package://NAME in a URDF. Default: looked for around it.
-        rate: How many commands a second, Hz.
-        keyframe: At which frozen joints stand, and home. Default: the first, or the model's zero.
-        contacts: Let links touch as the model says.
-        name: What the robot is called. Default: the file's name.
+        joints: Recorded joints, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with an
+            actuator, or all hinges.
+        kp: Position gain of the controller while recording, N·m/rad: 100 for all joints, '*wrist*=20' for some; a later
+            value replaces an earlier one. Default: the model's actuators.
+        kd: Damping gain, likewise, N·m·s/rad.
+        effort_limit: Torque limit, likewise, N·m.
+        packages: NAME=FOLDER for package://NAME in a URDF. Default: searched around the file.
+        rate: Commands per second, Hz.
+        keyframe: Keyframe that gives the home position and the angles of frozen joints. Default: the first, or zero.
+        contacts: Keep the contacts between links that the model has.
+        name: Name of the robot. Default: the file's name.
     """
     from gaponet.report.view.portrait import prepare
 
@@ -214,21 +231,15 @@ def show(
     from gaponet.sysid.uncertainty import ParameterUncertainty, sentences, summarize, table_rows
 
     screen = Out(json)
-    if not (robot / "robot.toml").is_file():
-        raise UsageError(f"{robot}: is no robot folder (no robot.toml); give what gaponet identify wrote")
     spec = load_robot(robot)
     known = ParameterUncertainty.require(spec)
     sure = {j: summarize(known, j) for j in known.joints}
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
-    for start in range(0, len(fields), MAX_COLUMNS):
-        part = fields[start : start + MAX_COLUMNS]
-        title = f"{spec.name}, ± standard error" if start == 0 else "Further parameters"
-        screen.table(title, ["joint", *(SERVO_FIELDS[f].heading for f in part)], table_rows(known, part))
+    columns = ["joint", *(SERVO_FIELDS[f].heading for f in fields)]
+    screen.wide_table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
     for line in sentences(known):
         screen.say(line)
     if out is not None:
-        from gaponet.base.files import atomic_write
-
         if out.suffix not in (".png", ".svg"):
             raise UsageError(f"--out {out}: a picture is a .png or an .svg")
         with atomic_write(out) as temporary:
@@ -251,15 +262,6 @@ def show(
     })  # fmt: skip
 
 
-# Each is run while the command line is parsed; what is left to call is nothing.
-Action = (
-    Annotated[None, tyro.conf.subcommand("new", constructor=new)]
-    | Annotated[None, tyro.conf.subcommand("check", constructor=check)]
-    | Annotated[None, tyro.conf.subcommand("list", constructor=list_robots)]
-    | Annotated[None, tyro.conf.subcommand("link", constructor=link)]
-    | Annotated[None, tyro.conf.subcommand("show", constructor=show)]
-)
-
-
-def robot(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
+@actions(new=new, check=check, list=list_robots, link=link, show=show)
+def robot(action: None) -> None:
     """Make, check or show a robot folder; listen to a robot."""

@@ -32,23 +32,20 @@ if TYPE_CHECKING:
     from gaponet.sysid.motion.motion import Motion
 
 DRIVERS = ("virtual", *driver_names())
-DriverName = Annotated[
-    str,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar=f"{{{','.join(DRIVERS)}}}", choices=DRIVERS, instance_from_str=lambda words: words[0],
-        is_instance=lambda value: isinstance(value, str), str_from_instance=lambda name: [name],
-    ),
-]  # fmt: skip
+DriverName = Annotated[str, tyro.constructors.PrimitiveConstructorSpec(
+    nargs=1, metavar=f"{{{','.join(DRIVERS)}}}", choices=DRIVERS, instance_from_str=lambda words: words[0],
+    is_instance=lambda value: isinstance(value, str), str_from_instance=lambda name: [name],
+)]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Connection:
-    """How to reach the robot."""
+    """How the robot is connected."""
 
     topic: Literal["arm_sdk", "lowcmd"] = "arm_sdk"
-    """unitree: arm_sdk leaves legs and balance to the robot; lowcmd is for a robot that hangs."""
+    """unitree: arm_sdk leaves legs and balance to the robot's own controller; lowcmd requires that the robot hangs."""
     joints: Literal["arms", "upper_body", "all"] = "arms"
-    """unitree: what is commanded; the legs only with all, on lowcmd."""
+    """unitree: joints that are commanded. The legs are commanded with all on lowcmd only."""
     domain: int = 0
     """unitree, and targets over DDS: DDS domain."""
     interface: str = "lo"
@@ -56,16 +53,21 @@ class Connection:
     port: str = "/dev/ttyACM0"
     """so101: serial port."""
     calibration: Path | None = None
-    """so101: the file that lerobot-calibrate wrote for this arm. It is compared with what the servos hold of it, which
-    counts where no file is given."""
+    """so101: calibration file of lerobot-calibrate for this arm. It must agree with the calibration in the servos.
+    Default: the calibration in the servos."""
     unit: str = "4"
-    """virtual: number or name in the fleet."""
+    """virtual: number or name of the robot in the fleet."""
     fleet: str = "hard"
     """virtual: hard, easy, shifted, unnamed, or a .toml file."""
     hangs: Flag = False
-    """unitree: the robot hangs. lowcmd demands it: all motors that are not commanded, legs too, go off."""
+    """unitree: state that the robot hangs. lowcmd switches off all motors that are not commanded, legs too."""
     fast: Flag = False
-    """virtual: as fast as this machine can, not in real time."""
+    """virtual: run as fast as this machine can instead of in real time."""
+
+    @property
+    def unit_name(self) -> str:
+        """Name in the fleet: a number stands for virtual-NUMBER."""
+        return f"virtual-{self.unit}" if self.unit.isdigit() else self.unit
 
 
 @dataclass(frozen=True)
@@ -73,44 +75,44 @@ class ControlArgs:
     """Options about robot and control loop. The docstrings are the command-line help."""
 
     driver: DriverName = "virtual"
-    """virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial), or the driver of
-    an installed extension."""
+    """virtual (a simulated robot in this process), unitree (DDS: a real H1-2 or gaponet virtual serve), so101 (serial),
+    or the driver of an installed extension."""
     robot: str | None = None
-    """Name or folder, identified ones too; default the one that the model's run keeps; without a model h1_2, or so101
-    with so101."""
+    """Robot name or folder; it may be identified. Default: the robot of the model's run; without a model h1_2, or so101
+    for the so101 driver."""
     limits_from: str | None = None
     """Robot folder whose gains, joint ranges, effort limits and collision shapes are used on hardware instead of the
-    package's robot; an extension's driver requires it. Read its values before you name it. Identified values come from
-    --robot or --model."""
+    packaged robot. Check its values first. The driver of an extension requires it. Identified values come from --robot
+    or --model."""
     payload_side: str = "both"
-    """both, or one hand."""
+    """Hand that carries the payload: both, or the side of one payload mount."""
     max_payload: float | None = None
-    """kg in each hand that the motion must be possible with; default payload_mass, 0 without one. A motion of the
-    library that several payloads shall play alike needs the heaviest of them here."""
+    """Payload for which the motion must be feasible, kg in each hand. Default: payload_mass, or 0. To play one library
+    motion with several payloads, give the heaviest."""
     connection: tyro.conf.OmitArgPrefixes[Connection] = Connection()
-    """How to reach the robot."""
+    """Connection to the robot."""
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
     """Timing."""
     safety: SafetyConfig = SafetyConfig()  # noqa: RUF009
     """Limits and checks of states."""
     plane: float | None = None
-    """Height of the floor or table in the robot's frame, m; default what its collision.toml says."""
+    """Height of the floor or table in the robot's frame, m. Default: the height in its collision.toml."""
     unchecked: Flag = False
-    """Go without looking whether the robot meets itself, or what it stands on."""
+    """Skip the check for collisions of the robot with itself and with the floor or table."""
     yes: Flag = False
-    """Do not ask before a robot moves."""
+    """Move a real robot without asking first."""
 
 
 @dataclass(frozen=True)
 class Live(LiveConfig):
-    """Targets that come while the robot moves."""
+    """Targets that arrive while the robot moves."""
 
     address: str = "tcp://127.0.0.1:5555"
-    """zmq: where to listen; 127.0.0.1 is heard from this machine alone."""
+    """zmq: address to listen on. 127.0.0.1 accepts programs of this machine only."""
     topic: str = "rt/joint_trajectory_controller/joint_trajectory"
-    """dds: of trajectory_msgs/JointTrajectory, as ROS 2 has it on the bus."""
+    """dds: topic of trajectory_msgs/JointTrajectory, by its name on the bus of ROS 2."""
     states: str = "rt/joint_states"
-    """dds: of sensor_msgs/JointState, to which states go."""
+    """dds: topic of sensor_msgs/JointState on which states are published."""
 
 
 @dataclass(frozen=True)
@@ -118,26 +120,26 @@ class RunArgs(ControlArgs):
     """Options of a run: those of ControlArgs, compensation and live targets."""
 
     targets: Literal["zmq", "dds", "stdin"] | None = None
-    """Instead of a motion, targets that come while the robot moves: JSON over ZeroMQ or in lines on standard input, or
-    ROS 2's JointTrajectory over DDS. docs/deploy.md has the messages."""
+    """Follow targets that arrive while the robot moves, instead of a motion: JSON over ZeroMQ, JSON lines on standard
+    input, or ROS 2's JointTrajectory over DDS. docs/deploy.md describes the messages."""
     live: Live = Live()
-    """Live targets: where they come from, and which are taken."""
+    """Source and limits of live targets."""
     payload_mass: float | None = None
-    """kg in each hand; with compensation, None estimates it."""
+    """Payload, kg in each hand. Compensation estimates it if it is not given."""
     compensate: Flag = False
-    """Command what gets the robot to where the motion says by what is known of it: the feed-forward of --robot, best
-    the folder that gaponet identify wrote. A motion's velocity and acceleration are fed forward too, live targets'
-    only with --compensation.dynamics."""
+    """Correct the commands so that the robot follows the motion: feed-forward by --robot, best a folder of gaponet
+    identify. Velocity and acceleration of a motion are fed forward; those of live targets only with
+    --compensation.dynamics."""
     model: Path | None = None
-    """Run or artifact folder: compensate with its model on top."""
+    """Run or artifact folder whose network corrects the commands in addition."""
     compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
-    """How commands are found, with compensation."""
+    """Settings of the compensation."""
     unit_id: str = ""
-    """Which unit this is, with a model; what gaponet adapt found out about it is used."""
+    """Name of this robot. With a model, the adaptation that gaponet adapt stored for this name is used."""
     extrapolate: Flag = False
-    """Take payloads, with a model, and servo gains other than those that the data were recorded with."""
+    """Accept payloads (with a model) and servo gains outside those of the recorded data."""
     dry_run: Flag = False
-    """Connect, read and compute, send nothing, and say what would be sent."""
+    """Connect, read and compute, but send nothing; print the commands instead."""
 
 
 @writes("recordings")
@@ -149,12 +151,12 @@ def run(
 ) -> None:
     """Play a motion or live targets on a robot; any key stops it.
 
-    Ctrl-C, Ctrl-Z and SIGTERM do as well, within one control period. A real robot moves only after the word yes.
+    Ctrl-C, Ctrl-Z and SIGTERM also stop it, within one control period. A real robot moves only after you typed yes.
 
     Args:
-        motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz); or --targets.
-        out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npy.
-        args: Robot, loop and model.
+        motion: Motion name (gaponet collect lists the forms) or motion file (.txt, .csv, .npz). Or give --targets.
+        out: Folder for the recording: MOTION.parquet (gaponet import reads it), MOTION.json and MOTION.cycles.npy.
+        args: Robot, control loop and model.
     """
     screen = Out(json)
     if args.dry_run and out:
@@ -186,8 +188,8 @@ def perform(
     if fast and args.targets:
         raise UsageError("live targets come in real time; leave out --fast")
     clock = SimulatedClock() if fast else MonotonicClock()
-    asks = args.driver != "virtual" and not args.yes and not args.dry_run
-    if asks:
+    needs_consent = args.driver != "virtual" and not args.yes and not args.dry_run
+    if needs_consent:
         require_terminal()
     _require_shapes(screen, args, spec)
     _require_hung(args)
@@ -203,8 +205,8 @@ def perform(
         require_plausible(compensator.robot)
     live = None if motion else listen(screen, args, spec, driver, clock)
 
-    def met(robot: Driver) -> None:
-        """The robot has answered and nothing was commanded: plan, show, ask."""
+    def plan_and_ask(robot: Driver) -> None:
+        """Plan, show and ask when the robot has answered and before anything is commanded."""
         if compensator:
             compensator.require_gains(robot.joint_names, robot.kp, robot.kd)
         if motion:
@@ -215,14 +217,14 @@ def perform(
                 plan = planner.judge_commands(plan, compensator, tuple(sorted(set(masses))))
             controller.plan = plan
             _show(screen, plan, spec, robot, limits.max_payload)
-        if asks:
+        if needs_consent:
             how = f"as {args.targets} says" if motion is None else "as planned"
             require_consent(f"{robot.address} will move {len(robot.commanded)} joints {how}.")
 
     controller = Controller(
         driver, spec, config=args.control, safety=args.safety, compensator=compensator, clock=clock,
-        payload_mass=args.payload_mass, folder=folder, on_event=lambda event: _tell(screen, event), on_connect=met,
-        planner=None if args.unchecked else planner, unchecked=args.unchecked,
+        payload_mass=args.payload_mass, folder=folder, on_event=lambda event: _show_event(screen, event),
+        on_connect=plan_and_ask, planner=None if args.unchecked else planner, unchecked=args.unchecked,
         metadata={
             "motion": motion.name if motion else "live", "payload_side": args.payload_side,
             "model": str(args.model) if args.model else None,
@@ -237,9 +239,9 @@ def perform(
             events = controller.recording.events
             live.close(events[-1].text if events else "nothing was commanded")
     if args.dry_run:
-        _report_dry(screen, recording, controller)
+        _show_dry_run(screen, recording, controller)
     else:
-        _report(screen, recording)
+        _show_summary(screen, recording)
     return recording, controller.plan.motion if controller.plan else None, identified
 
 
@@ -266,7 +268,7 @@ def listen(screen: Out, args: RunArgs, robot: RobotSpec, driver: Driver, clock: 
 
 
 def resolve_robot(args: RunArgs) -> RobotSpec:
-    """The robot that the model's run keeps, which one named must be; without a model the one named, or the driver's."""
+    """Return the robot of the model's run, which --robot must equal; without a model --robot, or the driver's."""
     from gaponet.base.errors import ModelError
     from gaponet.hw.control.hardware import ROBOT_OF_DRIVER
     from gaponet.robot.folder import has_stored_robot, load_stored_robot
@@ -293,7 +295,7 @@ def _require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None
 
 
 def _require_shapes(screen: Out, args: RunArgs, robot: RobotSpec) -> None:
-    """Refuse a real robot of which nobody knows where its limbs are."""
+    """Refuse a real robot without collision shapes."""
     if args.unchecked or (robot.folder / "collision.toml").is_file():
         return
     text = (
@@ -306,7 +308,7 @@ def _require_shapes(screen: Out, args: RunArgs, robot: RobotSpec) -> None:
 
 
 def _require_hung(args: RunArgs) -> None:
-    """Refuse lowcmd for a robot of which nobody said that it hangs."""
+    """Refuse lowcmd unless the user states that the robot hangs."""
     if args.driver != "unitree" or args.connection.topic != "lowcmd" or args.connection.hangs or args.dry_run:
         return
     words = {"arms": "legs and torso", "upper_body": "the legs", "all": "at the end of the run all motors"}
@@ -318,7 +320,7 @@ def _require_hung(args: RunArgs) -> None:
 
 
 def find_motion(name: str | None, args: RunArgs, robot: RobotSpec) -> tuple[Motion | None, Feasibility]:
-    """A motion file as it is, or a motion of the library, or None for live targets; and the limits it must keep."""
+    """Return a motion from a file or the library, or None for live targets; and the limits that it must keep."""
     from gaponet.sysid.motion.files import SUFFIXES, read_motion
     from gaponet.sysid.motion.library import Library
 
@@ -333,7 +335,7 @@ def find_motion(name: str | None, args: RunArgs, robot: RobotSpec) -> tuple[Moti
 
 
 def make_driver(args: RunArgs, robot: RobotSpec, clock: Any, seed: int) -> tuple[Driver, dict[str, Any]]:
-    """The driver, and what is known about the unit behind it."""
+    """Return the driver, and facts about a virtual robot for the recording."""
     from gaponet.hw.drivers.open import open_driver, supported_options
 
     connection = args.connection
@@ -346,15 +348,14 @@ def make_driver(args: RunArgs, robot: RobotSpec, clock: Any, seed: int) -> tuple
     from gaponet.testing.virtual_driver import VirtualDriver
 
     robot = robot.nominal or robot  # what identification found is the unit's, and that has its own
-    name = f"virtual-{connection.unit}" if connection.unit.isdigit() else connection.unit
-    side = args.payload_side
+    name, side = connection.unit_name, args.payload_side
     physics = load_fleet(connection.fleet, robot).unit(name)
     payload = (args.payload_mass or 0.0, side)
     return VirtualDriver(robot, physics, clock, payload, name, seed=seed), {"unit_id": name, "fleet": connection.fleet}
 
 
 def tracking(recording: Recording) -> dict[str, Any]:
-    """Mean |measured − asked| by joint over the run, rad: measured one period after the command, as everywhere."""
+    """Return the mean |measured − target| of each joint over the run, rad; measured one period after the command."""
     rows = recording.phase_rows("run")
     if len(rows) < 2:
         return {}
@@ -367,7 +368,7 @@ def tracking(recording: Recording) -> dict[str, Any]:
 
 
 def _compensator(screen: Out, args: RunArgs, robot: RobotSpec, unit: str) -> tuple[Any, str | None]:
-    """The compensator, or None; and the unit whose adaptation it uses."""
+    """Return the compensator, or None; and the unit whose adaptation it uses."""
     if args.model is None and not args.compensate:
         return None, None
     from gaponet.deploy.compensator import Compensator
@@ -402,7 +403,7 @@ def _compensator(screen: Out, args: RunArgs, robot: RobotSpec, unit: str) -> tup
 
 
 def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: float) -> None:
-    """From where to where, what moves and what is held, how near it comes to what, and how it ends."""
+    """Print the plan: what moves from where to where, what is held, clearances, and how it ends."""
     from gaponet.hw.control.plan import NO_MOVEMENT
 
     rows = plan.rows
@@ -435,12 +436,12 @@ def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: f
             screen.say(f"  {text}")
 
 
-def _tell(screen: Out, event: Event) -> None:
+def _show_event(screen: Out, event: Event) -> None:
     colour = "bold red" if event.kind not in ("", "end") else "cyan"
     screen.say(f"  {event.kind and event.kind + ': '}{event.text}", f"{event.phase:>9}", colour)
 
 
-def _report(screen: Out, recording: Recording) -> None:
+def _show_summary(screen: Out, recording: Recording) -> None:
     facts = recording.summary()
     three = lambda what: ", ".join(f"{facts[what][q]:.2f}" for q in ("p50", "p99", "max"))  # noqa: E731
     error = tracking(recording).get("tracking_error_rad", {}).get("mean")
@@ -453,7 +454,7 @@ def _report(screen: Out, recording: Recording) -> None:
     ])  # fmt: skip
 
 
-def _report_dry(screen: Out, recording: Recording, controller: Controller) -> None:
+def _show_dry_run(screen: Out, recording: Recording, controller: Controller) -> None:
     from gaponet.hw.drivers.dry import summarize_commands
 
     sent = summarize_commands(recording, controller.limits)

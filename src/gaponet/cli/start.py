@@ -28,6 +28,7 @@ from gaponet.cli.out import Out
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
+from gaponet.share.remote import FileRecord
 
 if TYPE_CHECKING:
     from gaponet.data.log import Log
@@ -89,7 +90,7 @@ def start(
     anyway: Flag = False,
     json: Json = False,
 ) -> None:
-    """All of it in one command: model file and logs in, report out.
+    """All steps in one command: from model file and logs to a report.
 
     OUT/commands.sh lists the commands that ran. The same command again continues after an interruption or a question.
     Logs that were added to the folder are imported, and later commands run again. Other logs need another OUT.
@@ -100,10 +101,10 @@ def start(
         out: Folder for all results.
         unit_id: Name of the recorded robot.
         payload_mass: kg in each hand while recording.
-        joints: Those of the model's joints that were recorded, by name or pattern; default those that the logs name.
-        kp: The gain of the controller while recording, N·m/rad: a number, or PATTERN=NUMBER; default the model's.
-        kd: Likewise, N·m·s/rad.
-        effort_limit: Likewise, N·m.
+        joints: Recorded joints of the model, by name or pattern. Default: those that the logs name.
+        kp: Position gain of the controller while recording, N·m/rad: NUMBER or PATTERN=NUMBER. Default: the model's.
+        kd: Damping gain, likewise, N·m·s/rad.
+        effort_limit: Torque limit, likewise, N·m.
         map: A joint's name in the log and the robot's, as a=b; may be repeated.
         format: Format of the logs; gaponet import --formats lists them.
         position_unit: Unit of positions, where the format leaves it open.
@@ -129,18 +130,23 @@ def start(
     import_options += [f"--{k.replace('_', '-')}={v}" for k, v in values.items() if v is not None]
     import_options += ["--skip-bad"] * skip_bad + ["--allow-pickle"] * allow_pickle
     read_options: dict[str, Any] = {
-        "fmt": format, "joint_map": joint_map(map), "skip_bad": skip_bad, "allow_pickle": allow_pickle
+        "fmt": format, "joint_map": joint_map(map), "skip_bad": skip_bad, "allow_pickle": allow_pickle,
+        **{name: values[name] for name in ("position_unit", "time_unit", "rate")},
     }  # fmt: skip
-    read_options |= {name: values[name] for name in ("position_unit", "time_unit", "rate")}
-    record = StartRecord.load(out, logs)
+    record = StartRecord(out, logs)
     robot_options = RobotOptions(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
         try:
-            inspection = inspect_inputs(model, logs, logs_toml, robot_options, read_options, write_guess=not dry_run)
-        except DescriptionNeededError as unread:
-            for line in unread.text.splitlines():
+            inspection = inspect_inputs(model, logs, logs_toml, robot_options, read_options, guess_joints=dry_run)
+        except DescriptionNeededError as error:
+            if not dry_run:
+                out.mkdir(parents=True, exist_ok=True)
+                write_text(logs_toml, error.text)
+                hint = f"{logs_toml} is a guess from these logs; check it, then give the same command again"
+                raise UsageError(f"{error}: {hint}") from None
+            for line in error.text.splitlines():
                 screen.say(f"  {line}")
-            raise UsageError(f"{unread}. The lines above are a guess from these logs; without --dry-run they are "
+            raise UsageError(f"{error}. The lines above are a guess from these logs; without --dry-run they are "
                              f"written to {logs_toml} for you to check") from None  # fmt: skip
         _print_inspection(screen, inspection, model, logs, unit_id, payload_mass)
         commands = make_commands(inspection, model, logs, out, robot_options, import_options, cut is None)
@@ -148,7 +154,6 @@ def start(
             words += ["--to", to] if words[0] == "export" else []
             words += ["--budget", budget] if words[0] == "identify" and budget else []
         lines = [shlex.join(["gaponet", *words]) for words in commands]
-        record.require_options(shlex.join(next(words for words in commands if words[0] == "import")[2:]))
         if dry_run:
             for line in lines:
                 screen.say(line, "  ")
@@ -156,7 +161,7 @@ def start(
             with lock_folder(out, "started"):
                 if inspection.logs_toml:
                     write_text(logs_toml, inspection.logs_toml)
-                record.begin(logs)
+                record.begin(shlex.join(next(words for words in commands if words[0] == "import")[2:]))
                 _run(screen, commands, lines, record, anyway)
             screen.say(f"commands that ran: {out / COMMANDS_FILE}")
     screen.result({
@@ -167,23 +172,22 @@ def start(
 
 def inspect_inputs(
     model: Path, logs: Path, logs_toml: Path, robot_options: RobotOptions, read_options: dict[str, Any],
-    write_guess: bool = True,
+    guess_joints: bool,
 ) -> Inspection:  # fmt: skip
     """Compile the model and read the first recording, with a guessed logs.toml where one is needed.
 
     Args:
         model: File, robot folder, or name of a packaged robot.
-        logs: Folder.
-        logs_toml: File for the guess. The user corrects it, and the next call reads it.
+        logs_toml: Description of the logs that a user checked, if the file exists.
         robot_options: Options for a robot that is made from a file.
         read_options: Options for the logs, as read_first_recording takes them.
-        write_guess: Write the guess if a person has to check it.
+        guess_joints: Accept a guess of which joint is which.
 
     Raises:
-        DescriptionNeededError: Without `write_guess`: a person has to check the guess.
+        DescriptionNeededError: A person has to check the guess.
         RobotError, UsageError, LogError: The model is broken, or the logs cannot be read; the message says what to do.
     """
-    from gaponet.data.describe.preview import DescriptionNeededError, read_first_recording
+    from gaponet.data.describe.preview import read_first_recording
     from gaponet.robot.new import new_robot
 
     with tempfile.TemporaryDirectory() as place:
@@ -193,19 +197,8 @@ def inspect_inputs(
             robot = load_robot(packaged := str(model))
         else:
             robot, packaged = new_robot(model, Path(place) / "robot", robot_options).robot, ""
-        try:
-            existing = logs_toml if logs_toml.is_file() else None
-            return Inspection(
-                robot, packaged, *read_first_recording(logs, robot, existing, not write_guess, **read_options)
-            )
-        except DescriptionNeededError as unread:
-            if not write_guess:
-                raise
-            logs_toml.parent.mkdir(parents=True, exist_ok=True)
-            write_text(logs_toml, unread.text)
-            raise UsageError(
-                f"{unread}: {logs_toml} is a guess from these logs; check it, then give the same command again"
-            ) from None
+        checked = logs_toml if logs_toml.is_file() else None
+        return Inspection(robot, packaged, *read_first_recording(logs, robot, checked, guess_joints, **read_options))
 
 
 def make_commands(
@@ -277,54 +270,49 @@ class _RecordFields(TypedDict):
 class StartRecord:
     """Logs, options and finished commands of a folder that `gaponet start` fills, in start.json."""
 
-    def __init__(self, out: Path, files: dict[str, str], fields: _RecordFields) -> None:
-        self.out, self.files, self.fields = out, files, fields
-        self.options = fields["options"]
-
-    @classmethod
-    def load(cls, out: Path, logs: Path) -> StartRecord:
+    def __init__(self, out: Path, logs: Path) -> None:
         """Read the record of a folder, or start one.
 
         Raises:
             UsageError: The folder holds data of other logs.
         """
-        files, data, path = hash_logs(logs, out), out / "data", out / RECORD_FILE
-        fields, source = _RecordFields(logs="", files={}, options="", done={}), "logs that no file names"
+        self.out, self.data, path = out, out / "data", out / RECORD_FILE
+        known, source = _RecordFields(logs="", files={}, options="", done={}), "logs that no file names"
         if path.is_file():
-            fields = read_json(_RecordFields, path, UsageError, f"delete it and {data}")
-            source = f"{fields['logs']}"
-        if not data.exists():  # only the robot is there
-            done = {line: inputs for line, inputs in fields["done"].items() if inputs == MODEL_INPUT}
-            return cls(out, files, _RecordFields(logs="", files={}, options="", done=done))
-        other = [name for name, digest in fields["files"].items() if files.get(name) != digest]
-        if fields["logs"] and not other:
-            return cls(out, files, fields)
+            known = read_json(_RecordFields, path, UsageError, f"delete it and {self.data}")
+            source = known["logs"]
+        self.fields = known | {"logs": str(logs.resolve()), "files": hash_logs(logs, out)}
+        if not self.data.exists():  # only the robot is there
+            done = {line: inputs for line, inputs in known["done"].items() if inputs == MODEL_INPUT}
+            self.fields |= {"options": "", "done": done}
+            return
+        other = [name for name, digest in known["files"].items() if self.fields["files"].get(name) != digest]
+        if known["logs"] and not other:
+            return
         if other:
             source += f", of which {abbreviate(other)} {'is' if len(other) == 1 else 'are'} missing or changed"
-            source += f" in {logs}" * (str(logs.resolve()) != fields["logs"])
+            source += f" in {logs}" * (self.fields["logs"] != known["logs"])
         raise UsageError(
-            f"{data} was made from {source}. Give another --out for these logs, or the same logs again; or delete "
-            f"{data}, and it is made anew"
+            f"{self.data} was made from {source}. Give another --out for these logs, or the same logs again; or delete "
+            f"{self.data}, and it is made anew"
         )
 
-    def require_options(self, options: str) -> None:
-        """Refuse other options of import than those of the data that are there."""
-        if self.options not in ("", options):
-            data = self.out / "data"
-            raise UsageError(
-                f"{data} was imported with {self.options}, not with {options}. Give another --out, or the same options "
-                f"again; or delete {data}, and it is made anew"
-            )
-        self.options = options
+    def begin(self, options: str) -> None:
+        """Take the present logs and these options of import as those of this run.
 
-    def begin(self, logs: Path) -> None:
-        """Take the present logs and options as those of this run."""
+        Raises:
+            UsageError: The data that are there were imported with other options.
+        """
+        if self.fields["options"] not in ("", options):
+            raise UsageError(
+                f"{self.data} was imported with {self.fields['options']}, not with {options}. Give another --out, or "
+                f"the same options again; or delete {self.data}, and it is made anew"
+            )
+        self.fields["options"] = options
         logs_toml = self.out / "logs.toml"
         if logs_toml.is_file():
-            self.files[f"{self.out.name}/logs.toml"] = _sha256(logs_toml)
-        done = self.fields["done"]
-        self.fields = _RecordFields(logs=str(logs.resolve()), files=self.files, options=self.options, done=done)
-        if not (self.out / "data").exists():  # an interrupted import leaves data of these logs
+            self.fields["files"][f"{self.out.name}/logs.toml"] = FileRecord.of(logs_toml).sha256
+        if not self.data.exists():  # an interrupted import leaves data of these logs
             write_json(self.out / RECORD_FILE, self.fields)
 
     def inputs(self, command: str) -> str:
@@ -332,8 +320,8 @@ class StartRecord:
         if command == "robot":
             return MODEL_INPUT
         if command == "import":
-            return hashlib.sha256(str(sorted(self.files.items())).encode()).hexdigest()
-        return dataset_hash(Dataset(self.out / "data").entries)
+            return hashlib.sha256(str(sorted(self.fields["files"].items())).encode()).hexdigest()
+        return dataset_hash(Dataset(self.data).entries)
 
     def finish(self, line: str, inputs: str) -> None:
         """Record a finished command."""
@@ -345,18 +333,10 @@ class StartRecord:
 def hash_logs(logs: Path, out: Path) -> dict[str, str]:
     """Return file → SHA-256 of all logs, and of the logs.toml in `out`, which may lie among the logs."""
     paths, root = (logs.rglob("*"), logs) if logs.is_dir() else ([logs], logs.parent)
-    files = {}
-    for file in paths:
-        name = file.relative_to(root)
-        if out.resolve() not in file.resolve().parents and not any(part.startswith(".") for part in name.parts):
-            files[name.as_posix()] = file
+    files = {file.relative_to(root).as_posix(): file for file in paths if out.resolve() not in file.resolve().parents}
+    files = {name: file for name, file in files.items() if not any(part.startswith(".") for part in name.split("/"))}
     files[f"{out.name}/logs.toml"] = out / "logs.toml"
-    return {name: _sha256(file) for name, file in sorted(files.items()) if file.is_file()}
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
+    return {name: FileRecord.of(file).sha256 for name, file in sorted(files.items()) if file.is_file()}
 
 
 def _run(screen: Out, commands: list[list[str]], lines: list[str], record: StartRecord, anyway: bool) -> None:

@@ -43,11 +43,11 @@ def train(
     Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model.
 
     Args:
-        recipe: labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with settings for that;
-            PPO options that are given keep their values.
-        fast: PPO with one pass over each batch and a smaller critic, whatever the fields below say.
+        recipe: labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with settings for that.
+            PPO options that you give keep their values.
+        fast: PPO with one pass over each batch and a smaller critic; it overrides the options below.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
-        config: Everything else.
+        config: Settings of the training.
     """
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.training.ranks import started

@@ -43,18 +43,18 @@ def view(
     """Watch a recording beside its simulations: browser, film.
 
     Args:
-        model: Robot folders of gaponet identify and run folders of gaponet train; each gives a copy of the robot.
-        motion: Which motion; default: one that the model was not trained on, where there is one.
-        unit: Which unit's recording, where there are several.
-        payload_mass: Which payload's recording, kg.
-        show: Copies from left to right; aligned stands for the identified robot and every --model.
-        render: Write a .gif, .mp4 or .png instead (.png: the moment of the largest nominal error).
+        model: Robot folders of gaponet identify and run folders of gaponet train; each adds a copy of the robot.
+        motion: Motion name. Default: one that the model was not trained on, if there is one.
+        unit: Unit, where several recorded the motion.
+        payload_mass: Payload of the recording, kg.
+        show: Copies of the robot from left to right; aligned means the identified robot and every --model.
+        render: Write a .gif, .mp4 or .png, and open no browser (.png: the moment of the largest nominal error).
         port: Port of the browser's page, on this machine.
-        start: s into the recording; default: where most happens.
-        duration: s of the recording.
+        start: Start within the recording, s. Default: the part with the most motion.
+        duration: Duration, s of the recording.
         speed: Below 1 is slow motion.
-        magnify: Differences from the recording times this, to make milliradians visible; said on the picture.
-        closeup: Limbs without an operated joint (a humanoid's legs) may be cut off.
+        magnify: Factor of the differences from the recording, to make milliradians visible; the picture states it.
+        closeup: Frame the operated limbs; others, such as a humanoid's legs, may be cut off.
         fps: Pictures a second of a film.
         width: Width of a picture, pixels; the height follows from the robots.
         azimuth: Camera, degrees; 180 looks at the robot's front.

@@ -40,25 +40,25 @@ def virtual(
     calibration: Path | None = None,
     frame: float | None = None,
 ) -> None:
-    """Be a VIRTUAL robot behind the real bus, for run and record.
+    """Serve a VIRTUAL robot on a real bus, for run and record.
 
     Args:
         action: serve.
         robot: h1_2 (DDS) or so101 (a serial bus on a pseudo-terminal).
-        unit: Unit of the fleet: its number or its name.
-        payload_mass: kg in each hand named by payload_side.
+        unit: Number or name of the robot in the fleet.
+        payload_mass: kg in each hand that payload_side names.
         payload_side: both, or one hand.
         fleet: Virtual units: hard, easy, shifted, unnamed, or a .toml file.
         domain: DDS domain.
         interface: Network interface; lo reaches this machine only.
         rate: States per second (DDS).
-        seconds: End by itself after this time.
-        fault: Go wrong on purpose, to rehearse what a controller does then.
-        fault_at: s after the first command.
-        heard: Write every command that arrived, and where the joints were, to this .npz at the end.
-        link: Serial: also give the pseudo-terminal this name, e.g. /tmp/so101.
-        calibration: Serial: write what the servos hold of a calibration to this file, as lerobot-calibrate does.
-        frame: Serial: instead of real time, this much time passes with every goal, s, for programs that keep none.
+        seconds: Stop after this time, s.
+        fault: Fault to inject, to test the controller.
+        fault_at: Time of the fault after the first command, s.
+        heard: .npz file for all received commands and the joint positions, written at the end.
+        link: Serial: additional name of the pseudo-terminal, such as /tmp/so101.
+        calibration: Serial: file for the calibration in the servos, in the format of lerobot-calibrate.
+        frame: Serial: simulated time per goal, s, instead of real time, for programs without a clock.
     """
     from gaponet.robot.spec import load_robot
     from gaponet.testing.fleet import load_fleet

@@ -39,7 +39,7 @@ class Hub:
         from huggingface_hub.errors import RepositoryNotFoundError
 
         for wanted in REPOSITORY_TYPES.values() if kind is None else (REPOSITORY_TYPES[kind],):
-            with suppress(RepositoryNotFoundError), network_errors(self.address, RepositoryNotFoundError):
+            with network_errors(self.address), suppress(RepositoryNotFoundError):
                 info = self.api.repo_info(self.repo, repo_type=wanted, revision=self.revision, files_metadata=True)
                 self.type, self.commit = wanted, str(info.sha)
                 self._sizes = {file.rfilename: file.size for file in getattr(info, "siblings", None) or ()}

@@ -40,14 +40,12 @@ class TransferResult:
 
     Attributes:
         kind: Dataset or run.
-        path: Its folder on this machine.
         files: Number of files: all of a push, the downloaded ones of a pull.
         size: Bytes of these files.
         pruned: Number of deleted files of earlier pushes.
     """
 
     kind: Kind
-    path: Path
     files: int
     size: int
     pruned: int = 0
@@ -77,7 +75,7 @@ def push(
     same = present and kind == present.kind == "dataset" and datasets.is_pushed(path, remote.address, present)
     if present and same and not remote.outdated(present):
         pruned = remote.prune(present) if prune else 0
-        return TransferResult(kind, path, len(present.files), present.size(present.files), pruned)
+        return TransferResult(kind, len(present.files), present.size(present.files), pruned)
     with _work_folder(path, "push") as folder:
         _clear(folder)  # files of a killed push
         files = folder / "files"
@@ -95,7 +93,7 @@ def push(
             pruned = remote.prune(index) if prune else 0
         finally:
             _clear(folder)
-    return TransferResult(kind, path, len(records), index.size(records), pruned)
+    return TransferResult(kind, len(records), index.size(records), pruned)
 
 
 def pull(address: str, out: str | Path) -> TransferResult:
@@ -121,7 +119,7 @@ def pull(address: str, out: str | Path) -> TransferResult:
     if present is not None and index.kind != "dataset":
         raise UsageError(f"{out}: is a dataset, and {remote.address} holds a run; choose a new folder")
     if present is not None and all(present.find(digest) for digest in index.contents):
-        return TransferResult(index.kind, out, 0, 0)
+        return TransferResult(index.kind, 0, 0)
     with _work_folder(out.absolute(), "pull") as folder:
         state = hashlib.sha256(index.text().encode()).hexdigest()[:16]
         _clear(folder, keep=state)  # files of a killed pull of another state
@@ -143,7 +141,7 @@ def pull(address: str, out: str | Path) -> TransferResult:
                 out.rmdir()
             new.rename(out)
         _clear(folder)
-    return TransferResult(index.kind, out, len(fetched), index.size(fetched))
+    return TransferResult(index.kind, len(fetched), index.size(fetched))
 
 
 def _kind(path: Path) -> Kind:

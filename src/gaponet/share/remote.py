@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 import shutil
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -24,7 +25,16 @@ MAX_INDEX_BYTES = 96 << 20  # 67 bytes per sequence
 MAX_FOLDER_DEPTH = 8
 MAX_PATH_LENGTH = 400  # characters
 MIN_FREE_BYTES = 1 << 28  # disk space that a download leaves free
-PROGRAMMING_ERRORS = (AssertionError, AttributeError, ModuleNotFoundError, NameError, TypeError)
+# Modules of the network libraries → base classes of their errors that are neither OSError nor ValueError.
+LIBRARY_ERRORS = {
+    "huggingface_hub.errors": (
+        "HTTPError", "EntryNotFoundError", "CorruptedCacheException", "RevisionResolutionError", "XetDownloadError",
+    ),
+    "botocore.exceptions": ("BotoCoreError", "ClientError"),
+    "gcsfs.retry": ("HttpError",),
+    "google.auth.exceptions": ("GoogleAuthError",),
+    "aiohttp": ("ClientError",),
+}  # fmt: skip
 
 
 class RemoteError(GAPONetError):
@@ -156,18 +166,19 @@ def download(remote: Remote, index: Index, paths: list[str], folder: Path) -> No
             raise RemoteError(wrong.format(remote.address, path))
 
 
-@contextmanager
-def network_errors(address: str, *unchanged: type[Exception]) -> Iterator[None]:
-    """Turn errors of the network libraries into a RemoteError with the address and without secrets.
+def _network_error_types() -> tuple[type[Exception], ...]:
+    """Return the errors that network libraries raise; a library that was not imported cannot have raised one."""
+    loaded = ((sys.modules[module], names) for module, names in LIBRARY_ERRORS.items() if module in sys.modules)
+    own = (getattr(module, name) for module, names in loaded for name in names if hasattr(module, name))
+    return (OSError, ValueError, RuntimeError, *own)  # Xet raises RuntimeError
 
-    Args:
-        unchanged: Errors that pass as they are.
-    """
+
+@contextmanager
+def network_errors(address: str) -> Iterator[None]:
+    """Turn errors of the network libraries into a RemoteError with the address and without secrets."""
     try:
         yield
-    except Exception as error:
-        if isinstance(error, (GAPONetError, *PROGRAMMING_ERRORS, *unchanged)):
-            raise
+    except _network_error_types() as error:
         text = re.sub(r"\?\S+", "?…", " ".join(str(error).split()))  # a query may hold a signature
         missing, refused = (isinstance(error, kind) for kind in (FileNotFoundError, PermissionError))
         reason = "not found: " * missing + "no permission: " * refused
