@@ -29,31 +29,13 @@ from gaponet.robot.spec import load_robot
 
 GAPONET = [sys.executable, "-m", "gaponet"]
 WAYS: dict[str, dict[str, bool] | None] = {"uncorrected": None, "corrected": {}, "dynamics": {"dynamics": True}}
+MOTIONS = ("tour-all-20", "tour-all-21", "limber-all-20", "limber-all-21")  # of the test; excitation has other ones
+MINUTES, FPS, UNIT = 8, 25, "1"  # excitation, LeRobot's rate, unit of the fleet `hard`
 LEAD = 5.0  # s of a test motion that are not judged: the way to its start, and the correction's blending in
 
 
-def main(
-    work: tyro.conf.Positional[Path],
-    motions: tuple[str, ...] = ("tour-all-20", "tour-all-21", "limber-all-20", "limber-all-21"),
-    minutes: float = 8.0,
-    fps: int = 25,
-    unit: str = "1",
-    windows: int = 12,
-    terms: tuple[str, ...] = (),
-    budget: str = "10m",
-) -> None:
-    """Print errors as JSON, rad.
-
-    Args:
-        work: Folder for everything that is made.
-        motions: For the test, by the names of gaponet's library; excitation has other ones.
-        minutes: Of excitation.
-        fps: LeRobot's rate, Hz.
-        unit: Of the fleet `hard`.
-        windows: Of identification.
-        terms: Of the servo's law that it tries beside gains, damping, friction, delay and offset.
-        budget: Of training.
-    """
+def main(work: tyro.conf.Positional[Path]) -> None:
+    """Print errors as JSON, rad; work is the folder for everything that is made."""
     work = work.resolve()
     work.mkdir(parents=True, exist_ok=True)
     os.environ |= {"HF_LEROBOT_HOME": str(work / "lerobot"), "HF_HUB_OFFLINE": "1"}
@@ -65,29 +47,29 @@ def main(
     tell_where_it_is()
     excitation, data, arm, run, out = (work / x for x in ("excitation", "data", "identified", "run", "exported"))
     if not excitation.is_dir():
-        call("excite", "--robot", "so101", "--minutes", f"{minutes:g}", "--out", excitation)
-    with served(unit, fps, work):
+        call("excite", "--robot", "so101", "--minutes", MINUTES, "--out", excitation)
+    with served(work):
         sets = work / "lerobot" / "me"
-        record(sets / "excitation", work, fps, str(excitation), round(2 * minutes), 30.0)
+        record(sets / "excitation", work, str(excitation), 2 * MINUTES, 30.0)
         if not (data / "dataset.json").is_file():
-            words = ["--position-unit", "deg", "--unit-id", f"virtual-{unit}", "--payload-mass", "0"]
+            words = ["--position-unit", "deg", "--unit-id", f"virtual-{UNIT}", "--payload-mass", "0"]
             call("import", sets / "excitation", "--robot", softer(work / "so101_p16"), *words, "--out", data)
         if not (arm / "robot.toml").is_file():
-            call("identify", data, "--out", arm, "--windows", windows, "--no-table", "--terms", *terms)
+            call("identify", data, "--out", arm, "--windows", 12, "--no-table", "--terms")
         if not (run / "model" / "card.json").is_file():
-            call("train", data, "--robot", arm, "--out", run, "--budget", budget)
+            call("train", data, "--robot", arm, "--out", run, "--budget", "10m")
         if not out.is_dir():
             call("data", "export", data, "--out", out, "--to", "lerobot")
         errors = {}
-        for motion in motions:
+        for motion in MOTIONS:
             for how, given in WAYS.items():
                 step = {"model": str(run), **given} if given is not None else None
-                record(sets / f"{motion}-{how}", work, fps, motion, 1, LEAD + 8.0, step)
-                errors[f"{motion} {how}"] = error(sets / f"{motion}-{how}", fps)
-    ratios = {how: [errors[f"{motion} {how}"] / errors[f"{motion} uncorrected"] for motion in motions] for how in WAYS}
+                record(sets / f"{motion}-{how}", work, motion, 1, LEAD + 8.0, step)
+                errors[f"{motion} {how}"] = error(sets / f"{motion}-{how}")
+    ratios = {how: [errors[f"{motion} {how}"] / errors[f"{motion} uncorrected"] for motion in MOTIONS] for how in WAYS}
     nominal = json.loads(call("gap", data, "--json"))["methods"]["nominal"]["mpjae"]
     print(json.dumps({
-        "virtual": True, "unit": unit, "fps": fps, "gap_rad": nominal, "opened_by_lerobot": opened(out),
+        "virtual": True, "unit": UNIT, "fps": FPS, "gap_rad": nominal, "opened_by_lerobot": opened(out),
         "error_rad": errors, "ratio": ratios, "mean": {how: float(np.mean(each)) for how, each in ratios.items()},
     }, indent=1))  # fmt: skip
 
@@ -149,11 +131,11 @@ def call(*words: object) -> str:
 
 
 @contextmanager
-def served(unit: str, fps: int, work: Path) -> Iterator[None]:
+def served(work: Path) -> Iterator[None]:
     """A VIRTUAL arm on the pseudo-terminal WORK/so101, its calibration in WORK/virtual.json."""
-    words = ["--robot", "so101", "--unit", unit, "--link", work / "so101", "--calibration", work / "virtual.json"]
+    words = ["--robot", "so101", "--unit", UNIT, "--link", work / "so101", "--calibration", work / "virtual.json"]
     (work / "virtual.json").unlink(missing_ok=True)
-    process = subprocess.Popen([*GAPONET, "virtual", "serve", *map(str, words), "--frame", str(1 / fps)])
+    process = subprocess.Popen([*GAPONET, "virtual", "serve", *map(str, words), "--frame", str(1 / FPS)])
     try:
         while not (work / "virtual.json").exists():
             if process.poll() is not None:
@@ -166,7 +148,7 @@ def served(unit: str, fps: int, work: Path) -> Iterator[None]:
 
 
 def record(
-    out: Path, work: Path, fps: int, motions: str, episodes: int, seconds: float, step: dict[str, object] | None = None
+    out: Path, work: Path, motions: str, episodes: int, seconds: float, step: dict[str, object] | None = None
 ) -> None:
     """LeRobot's record() with its own SO-101 and our motions, through the processor step where it is configured."""
     if (out / "meta" / "stats.json").is_file():
@@ -183,10 +165,10 @@ def record(
     processor = RobotProcessorPipeline(
         steps=steps, to_transition=robot_action_observation_to_transition, to_output=transition_to_robot_action
     )
-    teleop = TeleoperatorConfig.get_choice_class("gaponet_motion")(motions=motions, fps=fps)
+    teleop = TeleoperatorConfig.get_choice_class("gaponet_motion")(motions=motions, fps=FPS)
     robot = SO101FollowerConfig(port=str(work / "so101"), id="virtual", calibration_dir=work)
     dataset = DatasetRecordConfig(
-        repo_id=f"me/{out.name}", root=out, fps=fps, single_task=out.name, num_episodes=episodes, reset_time_s=0,
+        repo_id=f"me/{out.name}", root=out, fps=FPS, single_task=out.name, num_episodes=episodes, reset_time_s=0,
         episode_time_s=seconds, video=False, push_to_hub=False, no_stamp=True,
     )  # fmt: skip
     play(RecordConfig(robot, dataset, teleop, play_sounds=False), robot_action_processor=processor)
@@ -200,10 +182,10 @@ def opened(folder: Path) -> list[int]:
     return [found.num_episodes, found.num_frames, len(found[0]["action"])]
 
 
-def error(recorded: Path, fps: int) -> float:
+def error(recorded: Path) -> float:
     """Mean |observation − action of the frame before| over the joints that move, rad."""
     table = pq.read_table(recorded / "data", columns=["action", "observation.state"])
-    asked, seen = (np.array(table[name].to_pylist())[round(LEAD * fps) :, :5] for name in table.column_names)
+    asked, seen = (np.array(table[name].to_pylist())[round(LEAD * FPS) :, :5] for name in table.column_names)
     moves = np.ptp(asked, axis=0) > 1.0  # degrees
     return float(np.deg2rad(np.abs(seen[1:] - asked[:-1])[:, moves]).mean())
 

@@ -24,16 +24,8 @@ PUBLIC = {  # model → joints that are welded where it stands: slides, wheels, 
 }  # fmt: skip
 PACKAGED = Path(__file__).parents[1] / "src" / "gaponet" / "robot" / "robots"  # more names
 RATES = (25, 30, 50, 60, 100, 125, 200, 240, 250, 500, 1000)  # Hz
-EFFECTS = (
-    "stribeck",
-    "load",
-    "backlash",
-    "dead_band",
-    "speed",
-    "saturation",
-    "filter",
-    "creep",
-)  # not of the form that is fitted
+# Not of the form that is fitted.
+EFFECTS = ("stribeck", "load", "backlash", "dead_band", "speed", "saturation", "filter", "creep")
 NUMBERS = 3e6  # of a log in all: at most so much is recorded
 MOTIONS, SECONDS = 12, (120.0, 300.0)
 SMALL, SLOW = 4, 60.0

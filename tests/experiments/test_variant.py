@@ -45,7 +45,7 @@ def test_a_field_that_may_be_absent_reads_none():
         ("mlp:seed=3", "'seed=3' is not"),
         ("mlp:history=many", "history is 'many': Input should be a valid integer"),
         ("mlp:mlp_hidden=a,b", "mlp_hidden is 'a,b': Input should be a valid integer"),
-        ("gaponet:sensors=magic", "sensors is 'magic': Input should be 'off', 'predicted'"),
+        ("gaponet:sensors=magic", "sensors is 'magic': Input should be 'off' or 'predicted'"),
         ("gaponet:history=0", "it must be positive"),
     ],
 )

@@ -15,8 +15,8 @@ from gaponet.share.reading import open_dataset
 
 if TYPE_CHECKING:
     from gaponet.data.sequence import SequenceMeta
-    from gaponet.report.view.film import Clip
     from gaponet.report.view.scene import Scene
+    from gaponet.report.view.side_by_side import Clip
 
 
 def view(
@@ -61,9 +61,8 @@ def view(
         elevation: Camera, degrees; negative looks down.
     """
     _require_viewer(render)
-    from gaponet.report.view.film import Clip
     from gaponet.report.view.scene import Scene, View
-    from gaponet.report.view.side_by_side import select_entry, side_by_side
+    from gaponet.report.view.side_by_side import Clip, select_entry, side_by_side
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot, model[0] if model else None)

@@ -20,7 +20,6 @@ from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.progress import Running
 from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import Dataset
 from gaponet.experiments.cells import RESULT_FILE, SETUP_FILE, Cell, Report, read_record, run_cells
 from gaponet.experiments.result import Result, facts
 from gaponet.experiments.study import Study
@@ -50,8 +49,12 @@ def train_and_evaluate(cell: Cell, report: Report) -> None:
     """Train a cell and write its cell.json."""
     training = train_cell(cell, report)
     report(1.0, "evaluation")
-    outcome = evaluate_model(cell.folder, load_dataset(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
-    start = "identified" if cell.robot.nominal is not None else "nominal"
+    data, model, robot = load_dataset(cell.dataset), GapModel.load(cell.folder), cell.robot
+    sequences = data.sequences(select_entries([cell.folder], data)[0])
+    for dt in sorted({s.dt for s in sequences}):
+        model.require(robot, dt)
+    outcome = _by_group(sequences, robot, model.corrector(robot), cell.holdout_units, cell.threads)
+    start = "identified" if robot.nominal is not None else "nominal"
     training |= {"kind": cell.variant.kind, "changes": list(cell.variant.changes), "start": start}
     write_json(cell.folder / RESULT_FILE, training | outcome)
 
@@ -113,29 +116,6 @@ def _baseline_of_another_cell(folder: Path) -> DelayOffset | None:
 def _card(folder: Path) -> dict[str, Any]:
     file = folder / "model" / "card.json"
     return read_record(file) if file.is_file() else {}
-
-
-def evaluate_model(
-    run: Path, dataset: Dataset, robot: RobotSpec, holdout: tuple[str, ...], nthread: int = 0
-) -> Outcome:
-    """Evaluate a run's artifact on its test motions, by group of units."""
-    model = GapModel.load(run)
-    sequences = dataset.sequences(select_entries([run], dataset)[0])
-    for dt in sorted({s.dt for s in sequences}):
-        model.require(robot, dt)
-    return _by_group(sequences, robot, model.corrector(robot), holdout, nthread)
-
-
-def evaluate_baselines(
-    run: Path, dataset: Dataset, nominal: RobotSpec, identified: RobotSpec | None, holdout: tuple[str, ...]
-) -> Outcome:
-    """Evaluate the nominal simulator, the run's delay + offset and the identified simulator on its test motions."""
-    sequences = dataset.sequences(select_entries([run], dataset)[0])
-    outcomes = {
-        "nominal": _by_group(sequences, nominal, None, holdout),
-        "delay_offset": _by_group(sequences, nominal, DelayOffset.read(run).corrector(nominal), holdout),
-    }
-    return outcomes | ({} if identified is None else {"identified": _by_group(sequences, identified, None, holdout)})
 
 
 def _by_group(
@@ -233,7 +213,11 @@ def _baselines(cell: Cell, study: Study) -> Outcome:
     parts += [*cell.holdout_units, *([model_hash(identified)] if identified else [])]
     file = study.out / "baselines" / f"{hashlib.sha256(' '.join(parts).encode()).hexdigest()[:12]}.json"
     if not file.is_file():
-        outcome = evaluate_baselines(cell.folder, study.data, nominal, identified, cell.holdout_units)
+        sequences = study.data.sequences(select_entries([cell.folder], study.data)[0])
+        correctors = {"nominal": None, "delay_offset": DelayOffset.read(cell.folder).corrector(nominal)}
+        outcome = {k: _by_group(sequences, nominal, c, cell.holdout_units) for k, c in correctors.items()}
+        if identified is not None:
+            outcome["identified"] = _by_group(sequences, identified, None, cell.holdout_units)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, outcome)
     return read_record(file)

@@ -34,15 +34,8 @@ from gaponet.sim.replay import Corrector, replay
 
 T = TypeVar("T")
 STORED_TRAJECTORIES = 8  # for the report
-ORDER = (
-    "nominal",
-    "delay_offset",
-    "identified",
-    *LEARNED,
-    "adapted",
-    "uncorrected",
-    "transfer",
-)  # of tables and figures
+# Of tables and figures.
+ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "adapted", "uncorrected", "transfer")
 
 
 @dataclass(frozen=True)

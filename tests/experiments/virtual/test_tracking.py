@@ -16,8 +16,8 @@ def robot(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tracked(robot):
-    motions = [UnseenMotion(f"m{i}", commands(60 + 20 * i, i), ("m9", 0.3)) for i in range(2)]
-    return motions, track(robot, weak_unit(), "weak", motions, (0.0, 0.4), trained(robot))
+    motions = [UnseenMotion(f"m{i}", commands(60 + 20 * i, i)) for i in range(2)]
+    return track(robot, weak_unit(), "weak", motions, (0.0, 0.4), trained(robot))
 
 
 def mean(scores, part, method, payload):
@@ -25,20 +25,18 @@ def mean(scores, part, method, payload):
 
 
 def test_a_model_of_the_robot_reduces_both_alignment_and_compensation_errors(tracked):
-    _, scores = tracked
     for payload in (0.0, 0.4):
-        q = {m: mean(scores, "alignment", m, payload) for m in ("nominal", "mlp", "gaponet")}
+        q = {m: mean(tracked, "alignment", m, payload) for m in ("nominal", "mlp", "gaponet")}
         assert q["gaponet"] < q["mlp"] < q["nominal"]
-        q = {m: mean(scores, "compensation", m, payload) for m in ("raw", "feedforward", "mlp", "gaponet")}
+        q = {m: mean(tracked, "compensation", m, payload) for m in ("raw", "feedforward", "mlp", "gaponet")}
         assert q["gaponet"] < 0.25 * q["raw"]
         assert max(q["mlp"], q["feedforward"]) < 0.5 * q["raw"]
-    assert mean(scores, "compensation", "gaponet", 0.0) < mean(scores, "compensation", "mlp", 0.0)
+    assert mean(tracked, "compensation", "gaponet", 0.0) < mean(tracked, "compensation", "mlp", 0.0)
 
 
 def test_seeds_are_separate(tracked):
-    _, scores = tracked
-    assert {s.seed for s in scores if s.method == "gaponet"} == {0, 1}
-    assert {s.seed for s in scores if s.method in ("raw", "nominal")} == {None}
+    assert {s.seed for s in tracked if s.method == "gaponet"} == {0, 1}
+    assert {s.seed for s in tracked if s.method in ("raw", "nominal")} == {None}
 
 
 def score(method, seed, payload, value, part="alignment"):
@@ -63,8 +61,7 @@ def test_a_larger_error_is_reported(robot):
 
 
 def test_figures_show_every_method(robot, tracked):
-    motions, scores = tracked
-    made = result(session(robot), scores, motions, {})
+    made = result(session(robot), tracked, {})
     assert list(made.figures) == ["joints"]
     labels = {t.get_text() for t in made.figures["joints"].legends[0].get_texts()}
     assert labels == {
@@ -75,5 +72,5 @@ def test_figures_show_every_method(robot, tracked):
         "GAPONet",
     }
     assert [t.name for t in made.tables] == [
-        "alignment", "compensation", "alignment-joints", "compensation-joints", "motions",
+        "alignment", "compensation", "alignment-joints", "compensation-joints",
     ]  # fmt: skip

@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 from arm import commands, record
 from weak_arm import trained
@@ -33,11 +32,8 @@ def test_a_training_motion_under_another_name_is_refused(arm, used):
         require_unseen([chosen], used[0], arm, used[1])
 
 
-def test_a_test_motion_is_unseen_and_gets_its_nearest_training_motion(arm, used):
-    (motion,) = require_unseen([UnseenMotion("m2", commands(100, 2))], used[0], arm, used[1])
-    away = [np.sqrt(((commands(100, 2) - commands(100, i)) ** 2).mean()) for i in (0, 1)]
-    assert motion.nearest[0] == f"m{int(np.argmin(away))}"
-    assert motion.nearest[1] == pytest.approx(min(away), rel=1e-4)
+def test_a_test_motion_is_unseen(arm, used):
+    require_unseen([UnseenMotion("m2", commands(100, 2))], used[0], arm, used[1])
 
 
 def test_motions_are_generated(arm):

@@ -17,9 +17,8 @@ OFF = 60  # |difference| of one channel, of 255, by which a pixel is another
 @pytest.fixture
 def web(arm):
     """Two copies of a moving arm, served and played as gaponet view does."""
-    from gaponet.report.view.film import Clip
     from gaponet.report.view.scene import Scene
-    from gaponet.report.view.side_by_side import Copy, SideBySide
+    from gaponet.report.view.side_by_side import Clip, Copy, SideBySide
     from gaponet.report.view.web import WebScene
 
     real = recordings(arm, 1, rows=200, kp=0.5)[0]

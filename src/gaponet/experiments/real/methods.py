@@ -111,7 +111,7 @@ def adapted(question: Question) -> FittedSim:
     """The robot identified on other data, adapted on a few recordings of the test's unit or session."""
     if not question.few:
         raise UsageError(f"{question.name}: has no recordings for adaptation")
-    start, few = identified(question).robot if question.elsewhere is None else question.elsewhere(), question.few
+    start, few = (identified if question.elsewhere is None else elsewhere)(question).robot, question.few
     seconds = len(few) * WINDOW_S if few[0].duration < WINDOW_S else ADAPTATION_S  # all of the short windows
     fit = adapt(few, start, seconds, judge=True)
     return FittedSim(fit.robot if fit.accepted else start)
@@ -121,7 +121,7 @@ def elsewhere(question: Question) -> FittedSim:
     """The robot as it was identified on other data."""
     if question.elsewhere is None:
         raise UsageError(f"{question.name}: there is no other data set of this robot")
-    return FittedSim(question.elsewhere())
+    return FittedSim(question.once("elsewhere", question.elsewhere))
 
 
 METHODS: dict[str, tuple[str, Method]] = {

@@ -49,27 +49,6 @@ def result_table(rows: list[dict[str, Any]]) -> ResultTable:
     ))  # fmt: skip
 
 
-def joint_tables(rows: list[dict[str, Any]]) -> list[ResultTable]:
-    """One table by joint and payload for each data set in which joints were recorded one at a time."""
-    tables = []
-    for name in dict.fromkeys(r["set"] for r in rows if r.get("by_joint_mrad")):
-        of_set = [r for r in rows if r["set"] == name]
-        methods = list(dict.fromkeys(r["method"] for r in of_set))
-        heads = [m.partition(" by ")[0].removesuffix(" simulator") for m in methods]
-        cells: list[tuple[Any, ...]] = []
-        for question in dict.fromkeys(r["question"] for r in of_set):
-            errors = {r["method"]: r["by_joint_mrad"] for r in of_set if r["question"] == question}
-            first = next(iter(errors.values()))
-            for joint, kg, count in (
-                (j, kg, n) for j, by_payload in first.items() for kg, (_, n) in by_payload.items()
-            ):
-                values = [f"{errors[m][joint][kg][0]:.1f}" if m in errors else "–" for m in methods]
-                cells.append((question, joint, kg, count, *values))
-        caption = f"{name} by joint and payload, mrad: means over motions, too few for standard errors."
-        tables.append(ResultTable(name, ("question", "joint", "kg", "recordings", *heads), tuple(cells), caption))
-    return tables
-
-
 def _left_out(notes: tuple[str, ...]) -> str:
     """Say in how many folds validation rejected the network."""
     count = sum(note.startswith(LEFT_OUT) for note in notes)
@@ -86,7 +65,7 @@ def write_page(result: dict[str, Any], out: Path) -> list[Path]:
     rows = result["rows"]
     write_text(out / f"{STEM}.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     parts = [HEADING, f"![Error of each method as a share of the nominal error]({STEM}.png)"]
-    parts += [table.markdown() for table in (result_table(rows), *joint_tables(rows))]
+    parts.append(result_table(rows).markdown())
     seconds = ", ".join(f"{name} {value:,} s" for name, value in result["seconds"].items())
     parts.append(f"From file to table, on this machine: {seconds}.")
     for name, remarks in result["labels"].items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -152,13 +153,12 @@ def repeatability(question: Question) -> float:
 
 def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[tuple[float, float]]:
     """Yield the mean differences of the commands and of the responses of each pair of recordings, rad."""
-    for a, first in enumerate(group):
-        for second in group[a + 1 :]:
-            rows = min(len(first), len(second))
-            command = first.ctrl[:rows] - second.ctrl[:rows]
-            error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - command)[:, recorded_joints(first, robot)]
-            if np.abs(command).mean() < MAX_COMMAND_DIFFERENCE:
-                yield float(np.abs(command).mean()), float(error.mean())
+    for first, second in itertools.combinations(group, 2):
+        rows = min(len(first), len(second))
+        command = first.ctrl[:rows] - second.ctrl[:rows]
+        error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - command)[:, recorded_joints(first, robot)]
+        if np.abs(command).mean() < MAX_COMMAND_DIFFERENCE:
+            yield float(np.abs(command).mean()), float(error.mean())
 
 
 def recorded_joints(sequence: Sequence, robot: RobotSpec) -> list[int]:

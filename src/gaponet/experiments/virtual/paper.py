@@ -130,7 +130,7 @@ class Paper(UnitExperiment):
         assert session.study is not None
         study, data, robot = session.study, session.data, session.robot
         figures, _ = draw_figures(data, robot)
-        scores, _, _ = tracking.Tracking(count=self.count).measure(session, progress)
+        scores, _ = tracking.Tracking(count=self.count).measure(session, progress)
         virtual = any(e.meta.virtual for e in data.entries)
         errors, facts = list[HoldError](), dict[str, Any]()
         if virtual:

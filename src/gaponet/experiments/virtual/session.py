@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,7 +75,6 @@ class Session:
         data: Dataset that the models were trained on.
         trained: The models.
         study, cells: The trainings of this experiment, where no runs were given.
-        start: Time of the start, s of time.monotonic.
     """
 
     experiment: UnitExperiment
@@ -85,7 +83,6 @@ class Session:
     trained: list[TrainedModel]
     study: Study | None = None
     cells: tuple[Cell, ...] = ()
-    start: float = field(default_factory=time.monotonic)
 
     @property
     def fleet(self) -> str:
@@ -134,8 +131,6 @@ class Session:
             "compensator": ", ".join(f"{k} {v}" for k, v in asdict(config).items()),
         }  # fmt: skip
         runs = [f"{t.method} seed {t.seed} ({t.model.weights_hash()})" for t in self.trained]
-        minutes = round((time.monotonic() - self.start) / 60, 1)
-        repeat = facts(self.data, sorted({t.seed for t in self.trained}), **setup, runs=runs, **more, minutes=minutes)
+        repeat = facts(self.data, sorted({t.seed for t in self.trained}), **setup, runs=runs, **more)
         provenance = describe_provenance(self.data) + f" {QUICK_LABEL}." * (self.study is not None and self.study.quick)
-        return Result(name, title, provenance, repeat, tuple(tables), dict(figures),
-                      tuple(sentences))  # fmt: skip
+        return Result(name, title, provenance, repeat, tuple(tables), dict(figures), tuple(sentences))

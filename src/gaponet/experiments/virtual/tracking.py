@@ -140,41 +140,41 @@ class Tracking(UnitExperiment):
         """Return the experiment with few motions, for a quick run."""
         return replace(self, count=4)
 
-    def measure(self, session: Session, progress: Progress) -> tuple[list[Score], list[UnseenMotion], dict[str, Any]]:
+    def measure(self, session: Session, progress: Progress) -> tuple[list[Score], dict[str, Any]]:
         """Execute the motions on the unit; recordings of a real robot allow alignment alone.
 
         Returns:
-            Scores; the motions, of a virtual unit; further arguments of Session.result.
+            Scores; further arguments of Session.result.
         """
         robot, trained = session.robot, session.trained
         if not any(e.meta.virtual for e in session.data.entries):
             entries, unseen = select_entries([t.run for t in trained], session.data)
             scores = align(session.data.sequences(entries), robot, trained, progress)
-            return scores, [], {"test_motions": len({e.meta.motion for e in entries}), "unseen": unseen}
+            return scores, {"test_motions": len({e.meta.motion for e in entries}), "unseen": unseen}
         name, physics = session.unit
         progress("motions", 0.0)
         motions = generated(robot, self.count, max(session.payloads))
-        motions = require_unseen(motions, session.data, robot, trained)
+        require_unseen(motions, session.data, robot, trained)
         facts = {"unit_trained_on": True} if name in session.trained_units else {}
         scores = track(robot, physics, name, motions, session.payloads, trained, progress)
-        return scores, motions, facts | {"motions": len(motions), "config": PLANNED}
+        return scores, facts | {"motions": len(motions), "config": PLANNED}
 
     def run(self, session: Session, progress: Progress) -> Result:
         """Execute the motions and return tables, figures and sentences."""
         return result(session, *self.measure(session, progress))
 
 
-def result(session: Session, scores: list[Score], motions: list[UnseenMotion], facts: dict[str, Any]) -> Result:
+def result(session: Session, scores: list[Score], facts: dict[str, Any]) -> Result:
     """Return tables, figures and sentences."""
     robot, parts = session.robot, list(dict.fromkeys(s.part for s in scores))
-    sets, tag = joint_sets(robot), "VIRTUAL robot" if motions else "real robot"
+    virtual = "compensation" in parts
+    sets, tag = joint_sets(robot), "VIRTUAL robot" if virtual else "real robot"
     tables = [by_payload(scores, part, sets) for part in parts]
     tables += [by_joint(scores, part, robot) for part in parts]
-    tables += [_motion_table(motions, robot)] if motions else []
-    zero_shot = bool(motions) and not facts.get("unit_trained_on")
+    zero_shot = virtual and not facts.get("unit_trained_on")
     heading = f"Zero-shot tracking of motions never trained on{', unit never trained on' * zero_shot} ({tag})"
     return session.result(
-        "tracking" if motions else "tracking-real", heading, tables, {"joints": draw_joints(scores, robot, tag)},
+        "tracking" if virtual else "tracking-real", heading, tables, {"joints": draw_joints(scores, robot, tag)},
         [conclusion(scores, part, sets[0]) for part in parts], **facts,
     )  # fmt: skip
 
@@ -214,15 +214,6 @@ def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> ResultTable:
     ]  # fmt: skip
     head = ("Q_dis, rad·s", *(title(m) for m in names))
     return ResultTable(f"{part}-joints", head, tuple(rows), f"Q_dis {MEANING[part]}, joint by joint.", digits=4)
-
-
-def _motion_table(motions: ListOf[UnseenMotion], robot: RobotSpec) -> ResultTable:
-    rows = tuple((m.name, len(m.ctrl) * robot.dt, m.nearest[0], m.nearest[1] * 1e3) for m in motions)
-    caption = (
-        "No motion is in the training or validation set. Nearest: the most similar motion there, and the RMS "
-        "difference of the targets."
-    )
-    return ResultTable("motions", ("motion", "length, s", "nearest", "apart, mrad RMS"), rows, caption, 1)
 
 
 def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> MeanStd:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,12 +30,10 @@ class UnseenMotion:
 
     Attributes:
         ctrl: Targets, (T, n) rad; limbs without an operated joint stay at home.
-        nearest: The most similar training motion, and the RMS difference of the operated joints' targets, rad.
     """
 
     name: str
     ctrl: Array
-    nearest: tuple[str, float] = ("", float("inf"))
 
 
 def generated(robot: RobotSpec, count: int, max_payload: float) -> list[UnseenMotion]:
@@ -56,32 +54,24 @@ def generated(robot: RobotSpec, count: int, max_payload: float) -> list[UnseenMo
 
 
 def require_unseen(
-    motions: ListOf[UnseenMotion],
-    dataset: Dataset,
-    robot: RobotSpec,
-    trained: ListOf[TrainedModel],
-) -> list[UnseenMotion]:
-    """Return the motions with their nearest training or validation motion, over the time that both last.
+    motions: ListOf[UnseenMotion], dataset: Dataset, robot: RobotSpec, trained: ListOf[TrainedModel]
+) -> None:
+    """Refuse motions that were trained on, over the time that both last.
 
     Raises:
-        UsageError: One of them was trained on, by name or by its targets.
+        UsageError: One of them is in the training or validation set, by name or by its targets.
     """
-    used = training_motions(dataset, trained)
-    op = robot.operated_index
+    used, op = training_motions(dataset, trained), robot.operated_index
     first = {e.meta.motion: e for e in reversed(dataset.entries)}
     targets = {name: _at(dataset, first[name], robot.dt)[:, op] for name in used}
-    out = []
     for motion in motions:
         rms = {name: _rms(motion.ctrl[:, op], c) for name, c in targets.items()}
-        nearest = min(rms, key=lambda name: rms[name], default="")
-        if motion.name in used or (rms and rms[nearest] < MIN_RMS_DIFFERENCE):
-            near = motion.name if motion.name in used else nearest
+        near = motion.name if motion.name in used else min(rms, key=lambda name: rms[name])
+        if motion.name in used or rms[near] < MIN_RMS_DIFFERENCE:
             raise UsageError(
                 f"motion '{motion.name}' is motion '{near}' of training ({rms[near] * 1e3:.1f} mrad RMS apart); the "
                 "experiment needs motions that were never seen: leave it out"
             )
-        out.append(replace(motion, nearest=(nearest, rms.get(nearest, float("inf")))))
-    return out
 
 
 def training_motions(dataset: Dataset, trained: ListOf[TrainedModel]) -> set[str]:

@@ -12,9 +12,9 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.report.view.film import Clip
 from gaponet.report.view.gl import INSTALL_HINT
 from gaponet.report.view.scene import Scene
+from gaponet.report.view.side_by_side import Clip
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture

@@ -95,6 +95,49 @@ class SideBySide:
         return busiest_window(self.real.qpos[:, self.robot.operated_index], rows) * self.real.dt
 
 
+@dataclass(frozen=True)
+class Clip:
+    """A part of a recording.
+
+    Attributes:
+        start: s into the recording.
+        duration: s of the recording.
+        speed: Below 1 is slow motion.
+        fps: Pictures per second of the film.
+    """
+
+    start: float
+    duration: float
+    speed: float = 1.0
+    fps: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("duration", 0, 3600), ("speed", 0, 100), ("fps", 0, 120)):
+            if not low < (value := getattr(self, name)) <= high:
+                raise UsageError(f"--{name} is {value}; give more than {low} and at most {high}")
+
+    @classmethod
+    def from_start(
+        cls, shown: SideBySide, start: float | None, duration: float, speed: float = 1.0, fps: float = 20.0
+    ) -> Clip:
+        """Return the part from start on, or the part with the most motion, cut at the recording's end."""
+        recorded_s = (len(shown.real) - 1) * shown.real.dt
+        begin = shown.busiest(duration) if start is None else start
+        if not 0 <= begin < recorded_s:
+            raise UsageError(f"--start is {begin:g} s; the recording lasts {recorded_s:.1f} s")
+        return cls(begin, min(duration, recorded_s - begin), speed, fps)
+
+    @property
+    def stop(self) -> float:
+        """End of the clip, s into the recording."""
+        return self.start + self.duration
+
+    def times(self, period: float) -> np.ndarray:
+        """Return the times of the recording, s, with a picture every `period` s."""
+        count = max(round(self.duration / (period * self.speed)), 1)
+        return self.start + np.arange(count) * period * self.speed
+
+
 def select_entry(
     dataset: Dataset, runs: ListOf[Path], motion: str = "", unit: str = "", payload_mass: float | None = None
 ) -> Entry:

@@ -11,8 +11,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.text import escape_markdown
-from gaponet.report.view.film import Clip
 from gaponet.report.view.scene import Scene
+from gaponet.report.view.side_by_side import Clip
 
 FRAME_S = 1 / 30
 HOST = "127.0.0.1"  # private; forward the port for another machine
