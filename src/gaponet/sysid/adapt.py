@@ -93,8 +93,8 @@ def adapt(
     )  # fmt: skip
     before, after = (problem.rms(p) for p in (np.zeros_like(x[0, 0]), x[0, 0]))
     accepted = accepted and not (judge and after > (1 - MIN_RELATIVE_GAIN) * before)
-    values = {f: v[0] for f, v in problem.values(x[0]).items() if f in FIELDS}
-    return Adapted(with_values(robot, values), before, after, judged, accepted)
+    values = problem.values(x[0])
+    return Adapted(with_values(robot, {str(f): values[f][0] for f in FIELDS}), before, after, judged, accepted)
 
 
 def _motions_that_judge(parts: list[Sequence]) -> list[list[list[int]]]:

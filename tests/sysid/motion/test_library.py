@@ -94,3 +94,18 @@ def test_every_signal_stays_inside_and_starts_and_ends_at_rest(name, span):
 def test_a_creep_is_slow():
     y = SIGNALS["creep"](-1.0, 2.0, np.random.default_rng(0), DT)
     assert np.abs(np.diff(y) / DT).max() < 0.101
+
+
+def test_a_chirp_gets_faster():
+    y = SIGNALS["chirp"](-1.0, 1.0, np.random.default_rng(0), DT)
+    moving = y[50:-50] - y[0]
+    crossings = np.flatnonzero(np.diff(np.sign(moving)))
+    gaps = np.diff(crossings) * DT
+    assert gaps[0] > 3 * gaps[-1]
+
+
+def test_trapezoids_cruise_at_constant_speeds():
+    y = SIGNALS["trapezoids"](-2.0, 2.0, np.random.default_rng(3), DT)
+    speed = np.abs(np.diff(y)) / DT
+    cruising = sorted({round(float(v), 1) for v in speed if (np.abs(speed - v) < 0.01).sum() > 30 and v > 0.1})
+    assert cruising == [0.4, 0.7, 1.0, 1.4]

@@ -3,7 +3,7 @@ import pytest
 
 from gaponet.base.errors import UsageError
 from gaponet.sysid.motion.feasible import MAX_SPEED, TORQUE_SHARE, Feasibility
-from gaponet.sysid.motion.motion import GRID, PEAK_SPEED, Motion, blend, through
+from gaponet.sysid.motion.motion import GRID, PEAK_SPEED, Motion, blend, move_time, through
 
 
 def test_a_move_starts_and_ends_at_rest_and_passes_the_middle_in_the_middle():
@@ -26,6 +26,11 @@ def test_via_points_are_reached_and_held():
     assert (path[:2] == [0.0, 1.0]).all()
     assert np.allclose(path[11:15], [2.0, -1.0])
     assert np.allclose(path[-1], [0.5, 0.5])
+
+
+def test_move_time_keeps_peak_speed():
+    # 1 rad at 1.5 rad/s peak: 1.875 · 1 / 1.5 = 1.25 s
+    assert move_time(np.array([1.0, 0.01]), 1.5).tolist() == [1.25, 0.5]
 
 
 def still(robot, shoulder, elbow=0.0, rows=50):
