@@ -297,3 +297,10 @@ def test_joints_recorded_one_at_a_time_are_all_judged_and_asked(arm, tmp_path):
     for part in SPLITS:
         assert {e.meta.unrecorded for e in parts[part]} == {("shoulder",), ("elbow",)}
     assert sum(map(len, parts.values())) == 7
+
+
+def test_one_unit_cannot_be_split_by_unit(arm, tmp_path):
+    data = Dataset.create(tmp_path / "data", arm)
+    data.append(arm_sequence(arm, wave(60, 2), wave(60, 2)))
+    with pytest.raises(UsageError, match=r"one unit only \(a\); split it by another property"):
+        make_split(data, "unit")

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from arm import write_arm
 from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import DatasetError, FolderError
@@ -170,6 +171,8 @@ def test_a_replay_belongs_to_one_simulator(dataset, sequence):
     dataset.write_replay(entry, simulated)
     assert dataset.has_replay(entry, "abc")
     assert np.array_equal(dataset.pair(entry, "abc").sim.tau, sequence.tau)
+    (dataset.path / "replays").rename(dataset.path / "twins")  # their folder in older datasets
+    assert np.array_equal(dataset.pair(entry, "abc").sim.tau, sequence.tau)
     with pytest.raises(DatasetError, match="has no replay by simulator xyz; run gaponet gap"):
         dataset.pair(entry, "xyz")
 
@@ -282,3 +285,10 @@ def test_where_a_recording_came_from_is_words_and_is_never_opened(dataset, monke
     data.sequences()
     assert [name for name in opened if "secret" in name] == []
     assert any("sequences.jsonl" in name for name in opened)
+
+
+def test_a_robot_with_other_joints_and_the_same_name_is_another_robot(dataset, tmp_path):
+    swapped = write_arm(tmp_path / "swapped")
+    object.__setattr__(swapped, "joint_names", ("elbow", "shoulder"))
+    with pytest.raises(DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'arm' \(elbow, shoulder\)"):
+        dataset.require_robot(swapped)

@@ -361,3 +361,13 @@ def test_a_set_of_version_2_1_is_read_as_far_as_its_episodes_are_there(so101, tm
     assert list(found) == ["pick_up-0000", "pick_up-0003"]
     assert np.allclose(found["pick_up-0003"].channels["qpos"].values[:, 4], 0.34)
     assert "2 episodes that meta/episodes lists are missing" in caplog.text
+
+
+def test_a_unit_that_is_no_text_is_no_unit(dataset, arm, tmp_path):
+    export_lerobot(dataset, tmp_path / "out")
+    file = tmp_path / "out" / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    info["features"]["action"]["info"] = {"unit": {"x": 1}}
+    file.write_text(json.dumps(info))
+    with pytest.raises(UsageError, match="unit of positions is not written in the set"):
+        back(tmp_path / "out", arm, tmp_path / "again")

@@ -195,3 +195,10 @@ def test_a_cell_longer_than_the_csv_module_takes_is_refused_by_line(tmp_path, ar
     file.write_text("x" * 140_000 + "\n1\n2\n")
     with pytest.raises(LogError, match=r"wave\.csv:1: not a header of a table"):
         only(file, arm)
+
+
+def test_names_in_a_parquet_file_that_are_no_text_are_refused(tmp_path, arm):
+    file = write_parquet(tmp_path / "wave.parquet", arm_columns())
+    file.write_bytes(file.read_bytes().replace(b"ctrl.elbow", b"ctrl.\xff\xfebow"))
+    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file"):
+        only(file, arm)
