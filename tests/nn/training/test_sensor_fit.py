@@ -15,7 +15,7 @@ from gaponet.nn.training.sensor_fit import fit_inputs
 def test_the_predictor_explains_most_of_the_answers_on_held_out_states(tmp_path):
     torch.manual_seed(0)
     robot = write_arm(tmp_path)
-    config = ModelConfig(history=2, sensors="predicted", num_probes=4, sensor_hidden=(64, 64))
+    config = ModelConfig(kind="paper", history=2, num_probes=4)
     env = DeltaEnv(recordings(robot, 6), robot, config, 64, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
     report = fit_inputs(net, env, env.get_observations()["actor"], 2048, seed=0)

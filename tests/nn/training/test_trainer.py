@@ -21,7 +21,7 @@ from gaponet.report.methods import METHODS
 from gaponet.report.verdict import LEARNED
 
 SMALL = TrainConfig(
-    model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
+    model=ModelConfig(history=2, branch_hidden=(32,), trunk_hidden=(32,)),
     pretraining=PretrainingConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1, explained=-1e9),
     validate_every=4,
@@ -136,18 +136,17 @@ def test_a_held_out_payload_is_never_trained_on(robot, tmp_path):
         split_entries(data, holdout_payloads=(3.0,))
 
 
-@pytest.mark.parametrize("sensors", ["predicted", "off"])
-def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(sensors, robot, tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", ["paper", "gaponet"])
+def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(kind, robot, tmp_path, monkeypatch):
     monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
     data = dataset(tmp_path / "data", robot, kp=0.5)
-    config = replace(
-        SMALL, pretraining=replace(SMALL.pretraining, rounds=0), model=replace(SMALL.model, sensors=sensors)
-    )
+    model = replace(SMALL.model, kind=kind, num_probes=4)
+    config = replace(SMALL, pretraining=replace(SMALL.pretraining, rounds=0), model=model)
     trainer = Trainer.prepare(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
     model = trainer.run()
     assert trainer.net.features.standardise.std.min() < 0.9
-    assert (trainer.state.sensor_r2 is None) == (sensors == "off")
-    if sensors == "predicted":
+    assert (trainer.state.sensor_r2 is None) == (kind == "gaponet")
+    if kind == "paper":
         assert model.card["sensor_r2"]["mean"] > 0.3
 
 

@@ -72,7 +72,7 @@ def _fit_on_first_rank(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nth
 
 @dataclass(frozen=True)
 class _Samples:
-    """Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm), or (k, 2n) for learned probes."""
+    """Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm)."""
 
     inputs: Tensor
     answers: Tensor
@@ -117,7 +117,7 @@ def _answers(
     """Move states as their origin says, and return predictor inputs and the simulator's answers there.
 
     A random posture moves the whole frame, with history and action, within the joint limits. So the predictor also
-    learns gravity and inertia where no motion was recorded. Learned probes are random: each is one row of the inputs.
+    learns gravity and inertia where no motion was recorded.
 
     Args:
         x: Inputs of the network, (k, dim).
@@ -136,13 +136,7 @@ def _answers(
     x[far] += layout.shifted(shift)
     with torch.inference_mode():
         inputs = net.sensor_inputs(torch.from_numpy(x.astype(np.float32)))
-    offsets, m = None, net.config.num_probes
-    if net.config.sensor_source == "learned":
-        # Each probe moves a random subset of the joints.
-        probes = rng.uniform(-1, 1, (len(q), m, n)) * (rng.random((len(q), m, n)) < rng.random((len(q), m, 1)))
-        offsets = net.config.probe_limit * probes
-        inputs = torch.cat([inputs.repeat_interleave(m, 0), torch.from_numpy(probes).float().flatten(0, 1)], dim=1)
-    return _Samples(inputs.clone(), torch.from_numpy(oracle(q, v, offsets).reshape(len(inputs), -1)))
+    return _Samples(inputs.clone(), torch.from_numpy(oracle(q, v).reshape(len(inputs), -1)))
 
 
 def _fit_predictor(net: DeltaNet, samples: _Samples, joints: tuple[str, ...], seed: int, refit: bool) -> SensorReport:
