@@ -49,7 +49,8 @@ def artifact(robot, tmp_path_factory):
     "how",
     [
         {}, {"payload_input": False}, {"branch_hidden": ()}, {"kind": "mlp", "mlp_hidden": (16, 8)},
-        {"kind": "mlp", "mlp_match": True}, {"kind": "paper", "num_probes": 4}, {"kind": "shared_mlp", "payload_input": False},
+        {"kind": "mlp", "mlp_match": True}, {"kind": "paper", "num_probes": 4},
+        {"kind": "shared_mlp", "payload_input": False},
     ],
 )  # fmt: skip
 def test_the_onnx_file_equals_the_network(how):

@@ -81,12 +81,13 @@ class _FusedFeatures(nn.Module):
 def onnx_content(net: DeltaNet) -> bytes:
     """Return a network in evaluation mode as an ONNX file: x (batch, dim) → delta (batch, n), float32."""
     content, x = io.BytesIO(), torch.zeros(2, net.config.input_dim(net.n))
+    exported: Any = net if net.config.kind == "paper" else _FusedFeatures(net)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # dynamo=True writes the same function in 2 to 16 s instead of 0.1, and needs onnxscript; torch 2.14 has both.
         torch.onnx.export(
-            net if net.config.kind == "paper" else _FusedFeatures(net), (x,), content, input_names=["x"], output_names=["delta"],  # type: ignore[arg-type]
-            dynamo=False, dynamic_axes={name: {0: "batch"} for name in ("x", "delta")},
+            exported, (x,), content, input_names=["x"], output_names=["delta"], dynamo=False,  # type: ignore[arg-type]
+            dynamic_axes={name: {0: "batch"} for name in ("x", "delta")},
         )  # fmt: skip
     return content.getvalue()
 
