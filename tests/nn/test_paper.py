@@ -216,11 +216,11 @@ def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stoppe
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
     update = 8 * 8 * config.model.delta_hold
     run = tmp_path / "whole"
-    model = Trainer.prepare(*world, run, config, Budget(steps=4 * update)).run()
+    model = Trainer(*world, run, config, Budget(steps=4 * update)).run()
     assert GapModel.how_trained(model.card) == "4 updates of PPO from the untrained network, no supervised pre-training"
     assert model.card["steps"] == 4 * update
-    Trainer.prepare(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
-    Trainer.prepare(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
     whole, parts = (torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts"))
     assert all(torch.equal(x, parts[name]) for name, x in whole.items())
     untrained = build_network(config.model, 2)
@@ -229,7 +229,7 @@ def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stoppe
 
 def test_it_trains_by_labels_too_and_eval_says_how_many_corrections_are_at_the_limit(world, tmp_path, capsys):
     run = tmp_path / "run"
-    card = Trainer.prepare(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
+    card = Trainer(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
     assert GapModel.how_trained(card) == "supervised pre-training (1 rounds), 2 updates of PPO"
     result = evaluate([run], *world).result
     assert list(result["methods"]) == ["nominal", "delay_offset", "paper"]
@@ -246,7 +246,7 @@ def test_a_refitted_predictor_keeps_the_scale_of_the_sensor_values(world, tmp_pa
     for every in (0, 2):
         config = replace(TRAINING, ppo=replace(TRAINING.ppo, refit_sensors=every))
         config = replace(config, pretraining=replace(config.pretraining, rounds=0))
-        trainer = Trainer.prepare(*world, tmp_path / f"run{every}", config, Budget(steps=2 * 64))
+        trainer = Trainer(*world, tmp_path / f"run{every}", config, Budget(steps=2 * 64))
         trainer.run()
         fitted.append(trainer.net.predictor.state_dict())
     once, again = fitted

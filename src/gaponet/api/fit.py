@@ -249,7 +249,7 @@ def train(
             def show(status: Status) -> None:
                 progress(spent + share * status.fraction, 1.0, f"{kind}: {status.note}")
 
-            return Trainer.prepare(
+            return Trainer(
                 data, spec, run, replace(config, model=replace(config.model, kind=kind)), whole.part(share),
                 resume=resume, holdout_units=holdout_units, show=show, log=log,
             ).run()  # fmt: skip

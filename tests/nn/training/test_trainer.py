@@ -42,7 +42,7 @@ def robot(tmp_path_factory):
 def trained(robot, tmp_path_factory):
     place = tmp_path_factory.mktemp("trained")
     data = dataset(place / "data", robot, kp=0.5, delay=2)
-    return data, place / "run", Trainer.prepare(data, robot, place / "run", SMALL, STEPS).run()
+    return data, place / "run", Trainer(data, robot, place / "run", SMALL, STEPS).run()
 
 
 def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(trained, robot):
@@ -56,9 +56,9 @@ def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(traine
 def test_a_run_whose_budget_buys_no_step_fails_and_can_be_resumed(trained, robot, tmp_path):
     data, _, _ = trained
     with pytest.raises(ModelError, match=r"the budget ended .* before the first step of training: nothing was learned"):
-        Trainer.prepare(data, robot, tmp_path / "run", SMALL, Budget(seconds=1e-6)).run()
+        Trainer(data, robot, tmp_path / "run", SMALL, Budget(seconds=1e-6)).run()
     assert not (tmp_path / "run/model").exists()
-    card = Trainer.prepare(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
+    card = Trainer(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
     assert GapModel.how_trained(card) == "supervised pre-training (1 of 3 rounds), no PPO"
 
 
@@ -68,16 +68,16 @@ def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
     other = {"train": parts["train"], "val": parts["test"], "test": parts["val"]}
     path = write_split(data, other, "motion", ("swapped",))
     config = replace(SMALL, split=str(path))
-    assert Trainer.prepare(data, robot, tmp_path / "run", config, STEPS).data.splits == other
+    assert Trainer(data, robot, tmp_path / "run", config, STEPS).data.splits == other
     with pytest.raises(UsageError, match="leave out --holdout-units, --holdout-payloads, --rates and --train-share"):
-        Trainer.prepare(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
+        Trainer(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
 
 
 @pytest.mark.parametrize("kind", ["mlp", "inverse"])
 def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tmp_path):
     data, run, _ = trained
     config = replace(SMALL, model=replace(SMALL.model, kind=kind, mlp_hidden=(64,)))
-    model = Trainer.prepare(data, robot, tmp_path / "run", config, STEPS).run()
+    model = Trainer(data, robot, tmp_path / "run", config, STEPS).run()
     lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
     if kind == "inverse":  # one regression, no roll-outs of its own, no PPO
         assert [line["stage"] for line in lines][:2] == ["start", "pretraining"]
@@ -107,7 +107,7 @@ def test_card_and_progress_state_inputs_errors_and_label_fits(trained):
 
 def test_without_an_error_to_correct_the_network_hardly_corrects(robot, tmp_path):
     data = dataset(tmp_path / "data", robot)
-    Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS).run()
+    Trainer(data, robot, tmp_path / "run", SMALL, STEPS).run()
     assert evaluate([tmp_path / "run"], data, robot).result["delta"]["gaponet"]["max"] < 0.005
 
 
@@ -120,7 +120,7 @@ def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
 
     monkeypatch.setattr(gaponet.sim.batch, "Batch", note)
     data = dataset(tmp_path / "data", robot, rows=40)
-    Trainer.prepare(data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)).run()
+    Trainer(data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)).run()
     assert asked == {1}
 
 
@@ -142,7 +142,7 @@ def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(kind, rob
     data = dataset(tmp_path / "data", robot, kp=0.5)
     model = replace(SMALL.model, kind=kind, num_probes=4)
     config = replace(SMALL, pretraining=replace(SMALL.pretraining, rounds=0), model=model)
-    trainer = Trainer.prepare(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
+    trainer = Trainer(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
     model = trainer.run()
     assert trainer.net.features.standardise.std.min() < 0.9
     assert (trainer.state.sensor_r2 is None) == (kind == "gaponet")
@@ -153,7 +153,7 @@ def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(kind, rob
 def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(trained, robot, tmp_path):
     data = trained[0]
     fitted = robot.with_servos({j: {"kp": 11.0, "delay": 0.03} for j in robot.operated})
-    Trainer.prepare(data, fitted, tmp_path / "run", SMALL, Budget(steps=2 * 16 * 60)).run()
+    Trainer(data, fitted, tmp_path / "run", SMALL, Budget(steps=2 * 16 * 60)).run()
     result = evaluate([tmp_path / "run"], data, robot).result
     assert list(result["methods"]) == ["nominal", "delay_offset", "identified", "identified+gaponet"]
     assert result["methods"]["nominal"] == evaluate([trained[1]], data, robot).result["methods"]["nominal"]
@@ -168,7 +168,7 @@ def test_the_gain_is_halved_if_that_reduces_the_validation_error(tmp_path, robot
         return np.full(len(validator.sequences), mean)
 
     monkeypatch.setattr(Validator, "errors", error)
-    model = Trainer.prepare(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
+    model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
     assert model.card["gain"] == 0.5
     assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)
 
@@ -183,7 +183,7 @@ def test_ppo_starts_untrained_if_pretraining_increases_the_error(tmp_path, robot
     monkeypatch.setattr(Validator, "errors", error)
     config = replace(SMALL, pretraining=replace(SMALL.pretraining, rounds=2), validate_every=1,
                      ppo=replace(SMALL.ppo, critic_warmup=3))  # fmt: skip
-    trainer = Trainer.prepare(trained[0], robot, tmp_path / "run", config, STEPS)
+    trainer = Trainer(trained[0], robot, tmp_path / "run", config, STEPS)
     model = trainer.run()
     rounds, updates = [s for s in seen if s[0] == "pretraining"], [s for s in seen if s[0] == "ppo"]
     assert rounds == [("pretraining", True)] * 2
@@ -206,5 +206,5 @@ def test_recordings_with_several_gains_or_with_others_than_the_robots_need_an_op
     ]
     data = write_dataset(tmp_path / "data", robot, sequences)
     with pytest.raises(UsageError, match=message):
-        Trainer.prepare(data, robot, tmp_path / "run", SMALL, STEPS)
-    Trainer.prepare(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)
+        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
+    Trainer(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)
