@@ -70,7 +70,7 @@ def test_a_joint_observes_the_state_of_the_others_but_not_their_history():
 BASELINES = ("mlp", "shared_mlp")
 
 
-@pytest.mark.parametrize("kind", ["gaponet", *BASELINES, "inverse"])
+@pytest.mark.parametrize("kind", ["gaponet", *BASELINES])
 def test_an_untrained_network_corrects_nothing(kind):
     config = ModelConfig(kind=kind)
     assert build_network(config, 5)(x(config, 5)).abs().max() == 0

@@ -285,6 +285,8 @@ class GapModel:
         for field, value in REMOVED_OPTIONS.items():
             if (given := card["model"].pop(field, value)) != value:
                 raise ModelError(f"{file}: trained with {field} {given}, which is no more; train again without it")
+        if card["model"].get("kind") == "inverse":  # a removed recipe for the mlp
+            card["model"]["kind"] = "mlp"
         for field in TRAINING_OPTIONS:
             card["model"].pop(field, None)
         if stages := card.get("stages"):

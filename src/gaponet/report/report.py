@@ -282,7 +282,6 @@ def _training_facts(card: dict[str, Any], config: dict[str, Any]) -> list[list[s
         ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
         ["validated on", ", ".join(motions["val"][:MAX_LISTED_MOTIONS]) + more],
         ["observation", f"{shape['history']} past frames, payload {'in' if shape['payload_input'] else 'out'}"],
-        ["sensors", shape.get("sensors", "–") if shape["kind"] == "gaponet" else "–"],
         ["sensor predictor R²", _r2(card.get("sensor_r2"))],
         ["steps, time", f"{card['steps']:,} control steps in {card['seconds'] / 60:.1f} min"],
         ["PPO", f"{ppo['num_envs']} environments, {ppo['epochs']} epochs, σ {ppo['std']:g} rad"],

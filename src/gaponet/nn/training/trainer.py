@@ -32,9 +32,9 @@ from gaponet.nn.training.checkpoint import Checkpoint, StateDict
 from gaponet.nn.training.config import Budget, Status, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO, Update
-from gaponet.nn.training.pretraining import Pretraining, pretraining_config, trajectory_labels
+from gaponet.nn.training.pretraining import Pretraining, trajectory_labels
 from gaponet.nn.training.run_folder import Loggers, TrainingData, require_suitable, write_setup
-from gaponet.nn.training.sensor_fit import fit_inputs, refit_sensors
+from gaponet.nn.training.sensor_fit import fit_inputs, fit_sensors
 from gaponet.nn.training.validation import Validator, choose_gain
 from gaponet.robot.spec import RobotSpec
 
@@ -132,7 +132,7 @@ class Trainer:
     # ---- stages
 
     def _run_stages(self) -> None:
-        state, rounds = self.state, pretraining_config(self.config).rounds
+        state, rounds = self.state, self.config.pretraining.rounds
         if not np.isfinite(state.best_error):  # the untrained network corrects nothing: the error to improve on
             self.validator.set_errors(self.net, self.validator.errors(None))
             self._save_if_best(self.net, self.validator.errors(None).mean())
@@ -151,7 +151,7 @@ class Trainer:
 
     def _pretrain(self) -> None:
         """Supervised pre-training (nn/training/pretraining.py)."""
-        state, config, threads = self.state, pretraining_config(self.rank_config), self.rank_config.threads
+        state, config, threads = self.state, self.rank_config.pretraining, self.rank_config.threads
         self.stage = "labels"
         sequences = self.data.labelled_subset(config.rows)
         env = self._env(config.num_envs, UNLIMITED, self.config.seed, sequences=sequences)
@@ -184,7 +184,7 @@ class Trainer:
 
     def _ppo(self) -> None:
         config, state = self.rank_config.ppo, self.state
-        if self._spent() >= 1 or self.config.model.kind == "inverse":
+        if self._spent() >= 1:
             return
         self.stage = "ppo"
         episode_steps = round(self.config.episode_s / self.data.train[0].dt)
@@ -201,13 +201,9 @@ class Trainer:
             self.update = ppo.update()
             state.ppo_updates += 1
             state.steps += ranks.world() * config.num_envs * config.num_steps * self.config.model.delta_hold
-            if (
-                config.refit_sensors
-                and state.ppo_updates % config.refit_sensors == 0
-                and self.net.predictor is not None
-            ):
+            if config.refit_sensors and state.ppo_updates % config.refit_sensors == 0:
                 states, seed = self.rank_config.pretraining.sensor_states, self.config.seed + state.ppo_updates
-                state.sensor_r2 = refit_sensors(self.net, env, states, seed, self.rank_config.threads)
+                state.sensor_r2 = fit_sensors(self.net, env, states, seed, self.rank_config.threads, refit=True)
             self._tick()
             if state.ppo_updates % self.config.validate_every == 0:
                 state.ppo, state.env = ppo.state_dict(), env.state()
@@ -219,7 +215,7 @@ class Trainer:
         """Return the best pre-trained weights, or untrained ones if these have a larger error than no correction."""
         state = self.state
         too_large = state.best_trained_error > state.untrained_error
-        state.ppo_from_untrained = bool(pretraining_config(self.config).rounds) and too_large
+        state.ppo_from_untrained = bool(self.config.pretraining.rounds) and too_large
         if not state.ppo_from_untrained:
             return state.best_trained_state
         with torch.random.fork_rng():
@@ -334,7 +330,7 @@ class Trainer:
             seconds=round(self.seconds(), 1),
             interrupted=self.interrupted,
             stages={
-                "pretraining_rounds": [state.pretraining_rounds, pretraining_config(self.config).rounds],
+                "pretraining_rounds": [state.pretraining_rounds, self.config.pretraining.rounds],
                 "ppo_updates": state.ppo_updates,
                 "ppo_from_untrained": state.ppo_from_untrained,
             },
