@@ -15,7 +15,7 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export, sample_inputs
-from gaponet.nn.paper import RENAMED, released_inputs, released_network
+from gaponet.nn.paper import RENAMED
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
@@ -48,20 +48,22 @@ def test_inputs_have_the_dimensions_of_table_2(history, payload, trunk, seen, as
     assert build_network(net.config, 10)(torch.randn(3, net.config.input_dim(10))).abs().max() == 0
 
 
-def test_the_published_weights_give_the_published_outputs(paper_network):
-    net, pairs = released_network(dict(np.load(paper_network / "weights.npz"))), np.load(paper_network / "pairs.npz")
-    with torch.inference_mode():
-        delta = net(released_inputs(pairs["model_obs"], pairs["action"])).numpy()
-    assert np.abs(delta - pairs["delta"]).max() < 1e-6
-    assert np.abs(pairs["delta"]).max() > 0.1
-
-
-def test_the_published_predictor_answers_the_probes_in_one_order_of_joints(paper_network, monkeypatch):
+@pytest.fixture
+def benchmark(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    import released_network as benchmark
+    import released_network
 
+    return released_network
+
+
+def test_the_published_weights_give_the_published_outputs(paper_network, benchmark):
+    assert benchmark.difference(paper_network) < 1e-6
+    assert np.abs(np.load(paper_network / "pairs.npz")["delta"]).max() > 0.1
+
+
+def test_the_published_predictor_answers_the_probes_in_one_order_of_joints(paper_network, benchmark, monkeypatch):
     monkeypatch.setattr(benchmark, "STATES", 20)
-    net, robot = released_network(dict(np.load(paper_network / "weights.npz"))), load_robot("h1_2")
+    net, robot = benchmark.released_network(dict(np.load(paper_network / "weights.npz"))), load_robot("h1_2")
     order, _ = benchmark.inferred_order(net, *benchmark.random_states(net, robot, 0.02))
     left, right = (robot.operated[5 * arm :][:5] for arm in (0, 1))
     arms = [arm[i] for arm in (left, right) for i in (0, 2, 1, 3)]  # pitch, yaw, roll, elbow
@@ -113,23 +115,6 @@ def test_the_limit_changes_no_correction_within_it():
     assert 0.3 < within.float().mean() < 0.7
     assert torch.equal(limited[within], raw[within])
     assert torch.allclose(limited[~within].abs(), torch.tensor(small.config.delta_max))
-
-
-@pytest.mark.parametrize(
-    "how",
-    [{}, {"payload_input": False, "stride": 2}, {"payload_trunk": False, "delta_hold": 3},
-     {"branch_observation": True, "relative_action": True}],
-)  # fmt: skip
-def test_the_exported_paper_network_equals_the_network(tmp_path, how):
-    config, robot = replace(PAPER, **how), write_arm(tmp_path / "arm")
-    net = network(config)
-    assert export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), sample_inputs(net)) <= 1e-5
-    model = GapModel.load(tmp_path / "run")
-    assert model.config == config
-    x = torch.randn(7, config.input_dim(2))
-    with torch.inference_mode():
-        np.testing.assert_allclose(model.infer(x.numpy()), net(x).numpy(), atol=1e-6)
-    assert model.loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1).shape == (2,)
 
 
 def test_a_correction_is_held_for_its_duration_and_restarts_after_a_reset():

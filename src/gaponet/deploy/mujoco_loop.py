@@ -11,12 +11,9 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.deploy.transfer import Reference, Transfer, control_periods_of
 from gaponet.nn.artifact import GapModel
-from gaponet.robot.folder import has_stored_robot, stored_robot_holder
-from gaponet.robot.spec import RobotSpec
+from gaponet.nn.loop import DeltaLoop
 from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse
-
-GAIN_TOLERANCE = 1e-3  # relative, of kp and kd in a scene
 
 
 class MujocoAligner:
@@ -42,8 +39,7 @@ class MujocoAligner:
     ) -> None:
         """
         Args:
-            model: The identified robot that the scene is to move like, or a trained model. If the model's folder has no
-                simulator, the scene must have the gains of training.
+            model: The identified robot that the scene is to move like, or a trained model with its simulator.
             mj_model: The compiled scene.
             dt: Control period, s.
             payload_mass: kg in each hand of the robot that the scene is to move like.
@@ -53,27 +49,30 @@ class MujocoAligner:
         Raises:
             ModelError: The scene, the control period or the payload does not fit.
         """
-        operated = model.card["joint_names"] if isinstance(model, GapModel) else model.operated
-        source = model.path if isinstance(model, GapModel) else model.folder
-        self.payload_mass, self.loop = payload_mass, None
+        robot, source = (model.simulator(), model.path) if isinstance(model, GapModel) else (model, model.folder)
         scene_joints = [mj_model.joint(j).name for j in range(mj_model.njnt)]
-        for name in operated:
+        for name in robot.operated:
             if prefix + name not in scene_joints:
                 raise ModelError(
                     f"{source}: moves joint '{prefix + name}', the scene has {', '.join(scene_joints)}; give prefix"
                 )
-        self.transfer: Transfer | None = None
-        condition = Condition(payload_mass, "both", dt)
+        unchanged = not robot.has_servo_model
         if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
-        if isinstance(model, RobotSpec) or has_stored_robot(stored_robot_holder(model.path)):
-            self._prepare_transfer(model, mj_model, condition, prefix, extrapolate)
-        else:
-            _require_gains(model, mj_model, prefix)
-        if self.transfer is None and isinstance(model, GapModel):
-            model.require_rate(dt)
-            self.loop = model.loop()  # the scene equals the simulator of training
-        joints = operated if self.transfer is None else self.transfer.joint_names
+            unchanged = control_periods_of(model, dt) == 1
+        driven = {mj_model.joint(j).name for j in mj_model.actuator_trnid[:, 0]}
+        locked = tuple(name for name in robot.joint_names if prefix + name not in driven)
+        condition = Condition(payload_mass, "both", dt)
+        reference = BatchSim(robot, [condition], 1, locked)
+        joints = reference.joint_names
+        inverse = _of_scene(mj_model, tuple(prefix + name for name in joints), dt)
+        self.payload_mass = payload_mass
+        self.loop: DeltaLoop | None = None
+        self.transfer: Transfer | None = None
+        if not (unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range)):
+            self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
+        elif isinstance(model, GapModel):
+            self.loop, joints = model.loop(), robot.operated
         names = [prefix + name for name in joints]
         self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])
         self.qvel = np.array([mj_model.joint(name).dofadr[0] for name in names])
@@ -101,22 +100,6 @@ class MujocoAligner:
         self._fresh = False
         return out
 
-    def _prepare_transfer(
-        self, model: Reference, scene: mujoco.MjModel, condition: Condition, prefix: str, extrapolate: bool
-    ) -> None:
-        """Set self.transfer, unless the scene equals the robot or the simulator of training."""
-        robot = model.simulator() if isinstance(model, GapModel) else model
-        driven = {scene.joint(j).name for j in scene.actuator_trnid[:, 0]}
-        locked = tuple(name for name in robot.joint_names if prefix + name not in driven)
-        reference = BatchSim(robot, [condition], 1, locked)
-        joints = tuple(prefix + name for name in reference.joint_names)
-        inverse = _of_scene(scene, joints, condition.dt)
-        unchanged = (
-            control_periods_of(model, condition.dt) == 1 if isinstance(model, GapModel) else not robot.has_servo_model
-        )
-        if not (unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range)):
-            self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
-
 
 def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> AnalyticInverse:
     """Return the inverse dynamics of a robot in a scene, without contacts."""
@@ -130,17 +113,3 @@ def _actuator(scene: mujoco.MjModel, joint: str) -> int:
     if len(actuators) != 1:
         raise ModelError(f"joint '{joint}' has {len(actuators)} actuators in the scene; the model needs one, position")
     return int(actuators[0])
-
-
-def _require_gains(model: GapModel, scene: mujoco.MjModel, prefix: str) -> None:
-    for joint, *trained in zip(model.card["joint_names"], model.card["kp"], model.card["kd"], strict=True):
-        i = _actuator(scene, prefix + joint)
-        gains = scene.actuator_gainprm[i, 0], -scene.actuator_biasprm[i, 2]
-        for name, gain, trained_gain in zip(("kp", "kd"), gains, trained, strict=True):
-            if abs(gain - trained_gain) > GAIN_TOLERANCE * max(abs(trained_gain), 1.0):
-                raise ModelError(
-                    f"joint '{prefix + joint}': {name} is {gain:g} in the scene, the model was trained with "
-                    f"{trained_gain:g}; "
-                    "load the model with its run folder, so that commands can be transferred, or set the gains trained "
-                    "with (card.json)"
-                )

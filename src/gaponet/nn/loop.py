@@ -44,7 +44,7 @@ class DeltaLoop:
         """
         Args:
             qpos_range: Limits of the operated joints, (n, 2) rad.
-            network: The model. Without one, call `observe` and `push` only, as in training.
+            network: The model. Without one, call `observe` and `history.push` only, as in training.
             like: A float32 array or tensor. All buffers are of its kind and device; default numpy.
         """
         n = len(qpos_range)
@@ -91,10 +91,6 @@ class DeltaLoop:
         if self.any_fresh:
             self.fresh[ids] = False
             self.any_fresh = bool(self.fresh.any())
-
-    def push(self, qpos: Any, qvel: Any, u: Any) -> None:
-        """End a control period: append the state before it and its target, (num_envs, n) each, to the history."""
-        self.history.push(qpos, qvel, u)
 
     # ---- a control period
 

@@ -232,7 +232,7 @@ class DeltaEnv:
         operated, sim, target = self.operated, self.sim, self.target
         target[:] = _take(self.ctrl, self.row_on_device)
         target[:, operated] = (target[:, operated] + sim.array(delta)).clip(self.low, self.high)
-        self.loop.push(sim.qpos[:, operated], sim.qvel[:, operated], target[:, operated])
+        self.loop.history.push(sim.qpos[:, operated], sim.qvel[:, operated], target[:, operated])
         sim.step(target)
         self.row += 1
         self.elapsed += 1
