@@ -42,7 +42,7 @@ def stop(stage, at):
     return show
 
 
-@pytest.mark.parametrize(("stage", "at"), [("pretraining", 5), ("pretraining", 15), ("ppo", 1)])
+@pytest.mark.parametrize(("stage", "at"), [("pretraining", 5), ("pretraining", 15)])
 def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage, at):
     data, robot, whole = world
     begun = not (stage == "pretraining" and at < 10)

@@ -120,17 +120,6 @@ def test_ppo_alone_has_statistics_of_its_inputs(trained, robot, tmp_path):
     assert trainer.state.sensor_r2 is None
 
 
-def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(trained, robot, tmp_path):
-    data = trained[0]
-    fitted = robot.with_servos({j: {"kp": 11.0, "delay": 0.03} for j in robot.operated})
-    Trainer(data, fitted, tmp_path / "run", SMALL, Budget(steps=2 * 16 * 60)).run()
-    result = evaluate([tmp_path / "run"], data, robot).result
-    assert list(result["methods"]) == ["nominal", "delay_offset", "identified", "identified+gaponet"]
-    assert result["methods"]["nominal"] == evaluate([trained[1]], data, robot).result["methods"]["nominal"]
-    assert result["methods"]["identified"]["mpjae"] < 0.6 * result["methods"]["nominal"]["mpjae"]
-    assert result["methods"]["identified+gaponet"]["mpjae"] < 1.2 * result["methods"]["identified"]["mpjae"]
-
-
 def test_the_gain_is_halved_if_that_reduces_the_validation_error(tmp_path, robot, trained, monkeypatch):
     def error(validator, net, robot=None):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
         fitted = net is not None and bool(net.trunk[-1].weight.any())

@@ -134,7 +134,6 @@ class Trainer:
     def _run_stages(self) -> None:
         state, rounds = self.state, self.config.pretraining.rounds
         if not np.isfinite(state.best_error):  # the untrained network corrects nothing: the error to improve on
-            self.validator.set_errors(self.net, self.validator.errors(None))
             self._save_if_best(self.net, self.validator.errors(None).mean())
         if state.ppo is None and state.pretraining_rounds < rounds:
             self._pretrain()
