@@ -19,7 +19,7 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
 
 TINY_TRAINING = TrainConfig(
-    model=ModelConfig(history=2, branch_hidden=(16,), trunk_hidden=(16,)),
+    model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
     pretraining=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
     ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
     episode_s=0.5,
@@ -45,7 +45,7 @@ def differences(a: Any, b: Any, where: str = "") -> list[str]:
 
 def untrained(folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gaponet", **parts: tuple[str, ...]) -> Path:
     """A run that was trained, validated and tested on these motions of a dataset."""
-    config = ModelConfig(kind=kind, history=2)  # type: ignore[arg-type]
+    config = ModelConfig(kind=kind, history=2, num_probes=2)  # type: ignore[arg-type]
     net = build_network(config, len(robot.operated)).eval()
     motions = {part: sorted(parts.get(part, ())) for part in ("train", "val", "test")}
     card = make_card(config, robot, dt=[robot.dt], motions=motions, payload_seen=[0.0, 0.2], units=["a"], seed=0)
@@ -61,7 +61,7 @@ def untrained(folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gapone
 
 def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
     """A run whose operator adds the same to every target, rad: what it is told makes no difference."""
-    config = ModelConfig(history=2, branch_hidden=(8,), trunk_hidden=(8,))
+    config = ModelConfig(history=2, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,))
     net = build_network(config, len(robot.operated)).eval()
     torch.nn.init.zeros_(net.trunk[-1].weight)
     torch.nn.init.zeros_(net.trunk[-1].bias)
@@ -73,8 +73,8 @@ def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
 
 def random_run(folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] = (0.0, 0.2), **how: object) -> GapModel:
     """A run whose operator answers anything, up to some 0.1 rad: whatever it is told makes a difference."""
-    small = {"history": 2, "stride": 2}
-    small |= dict.fromkeys(("branch_hidden", "trunk_hidden"), (8,))
+    small = {"history": 2, "stride": 2, "num_probes": 4}
+    small |= dict.fromkeys(("branch_hidden", "trunk_hidden", "sensor_hidden"), (8,))
     torch.manual_seed(0)
     net = build_network(ModelConfig(**small | how), len(robot.operated)).eval()  # type: ignore[arg-type]
     with torch.no_grad():
@@ -88,7 +88,7 @@ def random_run(folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] =
     return GapModel.load(folder)
 
 
-SMALL = ModelConfig(history=2, branch_hidden=(16,), trunk_hidden=(16,))
+SMALL = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
 
 
 def small_model(robot: RobotSpec, folder: Path) -> GapModel:

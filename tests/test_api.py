@@ -40,7 +40,7 @@ def test_from_a_dataset_to_an_evaluated_model(tmp_path, capsys):
     nominal = gp.gap(data, robot=robot).mpjae["nominal"]
     assert gp.doctor(data, robot=robot).verdict
     small = TrainConfig(
-        ModelConfig(history=2, branch_hidden=(16,), trunk_hidden=(16,)),
+        ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
         pretraining=PretrainingConfig(rounds=2, num_envs=16, steps=60, gradient_steps=60, batch_size=256),
     )
     model = gp.train(data, out=tmp_path / "run", budget=str(2 * 16 * 60), config=small, robot=robot).model

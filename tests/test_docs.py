@@ -32,6 +32,7 @@ def widths(layers: tuple[int, ...]) -> str:
     ("page", "said"),
     [
         ("algorithm.md", f"Branch ({widths(MODEL.branch_hidden)}, ELU) and trunk ({widths(MODEL.trunk_hidden)})"),
+        ("algorithm.md", f"(hidden layers of {widths(MODEL.sensor_hidden)})"),
         ("algorithm.md", f"{widths(MODEL.mlp_hidden)} on the features"),
         ("algorithm.md", f"p = {MODEL.num_basis} features"),
         ("algorithm.md", f"m = {MODEL.num_probes} targets"),

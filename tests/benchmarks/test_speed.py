@@ -6,7 +6,7 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import PPOConfig, TrainConfig
 
 SMALL = TrainConfig(
-    ModelConfig(history=1, branch_hidden=(8,), trunk_hidden=(8,), mlp_hidden=(8,)),
+    ModelConfig(history=1, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,), mlp_hidden=(8,)),
     ppo=PPOConfig(num_steps=4, epochs=1, critic_hidden=(8,)),
     threads=1,
 )

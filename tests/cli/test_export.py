@@ -18,7 +18,7 @@ from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 
-CONFIG = ModelConfig(history=2, branch_hidden=(16,), trunk_hidden=(16,))
+CONFIG = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
 
 
 @pytest.fixture

@@ -45,7 +45,7 @@ def test_a_field_that_may_be_absent_reads_none():
         ("mlp:seed=3", "'seed=3' is not"),
         ("mlp:history=many", "history is 'many'; it must be a whole number"),
         ("mlp:mlp_hidden=a,b", "mlp_hidden is 'a'; it must be a whole number"),
-        ("paper:sensor_source=magic", "sensor_source is 'magic'; it is one of predicted, fixed"),
+        ("gaponet:sensors=magic", "sensors is 'magic'; it is one of off, predicted"),
         ("gaponet:history=0", "it must be positive"),
     ],
 )

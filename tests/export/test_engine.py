@@ -366,7 +366,8 @@ def test_every_kind_of_network_ships(tmp_path, kind):
     assert export_model(model, tmp_path / "run", tmp_path / "torch") <= 1e-5
 
 
-def test_a_model_with_memory_that_a_program_lacks_is_refused(tmp_path):
-    model = SimpleNamespace(config=ModelConfig(kind="paper", delta_hold=2), path=tmp_path)
+@pytest.mark.parametrize("how", [{"delta_hold": 2}, {"real_state": True}])
+def test_a_model_with_inputs_or_memory_that_a_program_lacks_is_refused(tmp_path, how):
+    model = SimpleNamespace(config=ModelConfig(kind="paper", **how), path=tmp_path)
     with pytest.raises(ModelError, match="train without"):
         delta_step(model, tmp_path)

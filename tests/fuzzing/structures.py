@@ -108,7 +108,7 @@ def _fitted() -> Files:
 
     def write(folder: Path) -> None:
         torch.manual_seed(0)
-        config = ModelConfig(history=2, branch_hidden=(8,), trunk_hidden=(8,))
+        config = ModelConfig(history=2, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,))
         net = build_network(config, 2).eval()
         torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
         card = make_card(

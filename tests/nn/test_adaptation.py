@@ -27,7 +27,7 @@ def robot(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def model(robot, tmp_path_factory):
-    config, folder = ModelConfig(history=2), tmp_path_factory.mktemp("run") / "model"
+    config, folder = ModelConfig(history=2, num_probes=2), tmp_path_factory.mktemp("run") / "model"
     net = build_network(config, 2).eval()
     export(net, folder, make_card(config, robot, dt=[0.02]), np.zeros((4, net.features.dim), np.float32))
     return GapModel.load(folder)

@@ -26,7 +26,7 @@ def robot(tmp_path_factory):
 @pytest.fixture(scope="module")
 def artifact(robot, tmp_path_factory):
     torch.manual_seed(0)
-    config = ModelConfig(history=2, branch_hidden=(16,), trunk_hidden=(16,))
+    config = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
     net = build_network(config, 2)
     torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
     folder = tmp_path_factory.mktemp("run") / "model"

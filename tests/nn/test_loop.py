@@ -20,12 +20,12 @@ LIMITS = np.array([[-10.0, 10.0]] * 2)
     [
         ModelConfig(),
         ModelConfig(payload_input=False),
-        ModelConfig(kind="paper", sensor_source="fixed"),
+        ModelConfig(kind="paper", sensor_source="fixed", real_state=True),
     ],
 )
 def test_the_parts_of_x_touch_and_fill_it(config):
     layout = Layout(config, 3)
-    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action, layout.sensors]
+    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action, layout.sensors, layout.real]
     assert np.concatenate([np.arange(layout.dim)[part] for part in parts]).tolist() == list(range(layout.dim))
 
 
@@ -39,10 +39,17 @@ class FirstRow:
         return low
 
 
-@pytest.mark.parametrize("how", [{"stride": 2}, {"kind": "paper", "sensor_source": "fixed", "num_probes": 3}])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"stride": 2}, {"kind": "paper", "sensor_hold": 3}, {"kind": "paper", "sensor_source": "fixed"},
+        {"kind": "paper", "sensor_source": "fixed", "sensor_hold": 2},
+    ],
+    ids=["stride", "held sensors", "fixed probes", "held probes"],
+)  # fmt: skip
 def test_training_and_rollout_give_the_network_the_same_inputs(tmp_path, how):
     robot = write_arm(tmp_path)
-    config = ModelConfig(history=2, **how)
+    config = ModelConfig(history=2, num_probes=3, **how)
     sequence = recordings(robot, 2, rows=14, kp=0.6)[1:]
     free: list = []
 

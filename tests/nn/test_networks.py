@@ -18,9 +18,10 @@ def x(config, n, batch=7, scale=1.0):
 
 @pytest.mark.parametrize(
     "config",
-    [ModelConfig(), ModelConfig(kind="mlp"), ModelConfig(payload_input=False, stride=2)],
-    ids=["gaponet", "mlp", "no-payload"],
-)
+    [ModelConfig(), ModelConfig(kind="mlp"), ModelConfig(sensors="predicted"),
+     ModelConfig(payload_input=False, stride=2)],
+    ids=["gaponet", "mlp", "sensors", "no-payload"],
+)  # fmt: skip
 def test_corrections_are_bounded_whatever_comes_in(config):
     net = build_network(config, 3)
     for p in net.parameters():
@@ -55,6 +56,17 @@ def test_a_joint_observes_the_state_of_the_others_but_not_their_history():
     b = a.clone()
     b[:, n + 1] += 0.5  # its speed
     assert (net(b) - net(a)).abs().max(dim=0).values.min() > 1e-4
+
+
+def test_a_joint_reads_its_own_sensors():
+    config, n = ModelConfig(sensors="predicted", num_probes=4), 3
+    net = build_network(config, n)
+    torch.nn.init.normal_(net.trunk[-1].weight)
+    sensors = torch.zeros(1, 4, 2, n)
+    net.sensors = lambda z: sensors.reshape(1, -1)
+    before = net.prepare(x(config, n, 1))
+    sensors[0, 2, 1, 2] = 1.0  # probe 2, velocity, joint 2
+    assert (net.prepare(x(config, n, 1)) - before).nonzero().tolist() == [[0, 2, n + 2 * 2 + 1]]
 
 
 BASELINES = ("mlp", "shared_mlp")

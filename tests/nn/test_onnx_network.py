@@ -16,7 +16,7 @@ from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, export, onnx_content, sample_inputs
 from gaponet.nn.onnx_network import OnnxNetwork
 
-SMALL = {"history": 2, "branch_hidden": (16, 8), "trunk_hidden": (16,)}
+SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
 
 
 def trained(n: int = 2, **how) -> torch.nn.Module:
@@ -48,10 +48,12 @@ def artifact(robot, tmp_path_factory):
 @pytest.mark.parametrize(
     "how",
     [
-        {}, {"payload_input": False}, {"branch_hidden": ()}, {"kind": "mlp", "mlp_hidden": (16, 8)},
-        {"kind": "mlp", "mlp_match": True}, {"kind": "paper", "num_probes": 4},
-        {"kind": "paper", "num_probes": 4, "branch_observation": True, "relative_action": True, "payload_trunk": False},
-        {"kind": "shared_mlp", "payload_input": False},
+        {}, {"sensors": "predicted"}, {"payload_input": False}, {"branch_hidden": ()},
+        {"kind": "mlp", "mlp_hidden": (16, 8)}, {"kind": "mlp", "mlp_match": True}, {"kind": "shared_mlp"},
+        {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False}, {"kind": "paper"},
+        {"kind": "paper", "branch_observation": True, "relative_action": True, "payload_trunk": False},
+        {"kind": "paper", "delta_hold": 3}, {"kind": "paper", "sensor_hold": 5}, {"kind": "paper", "stride": 2},
+        {"kind": "paper", "sensor_source": "learned"}, {"kind": "paper", "real_state": True},
     ],
 )  # fmt: skip
 def test_the_onnx_file_equals_the_network(how):
@@ -107,7 +109,7 @@ def test_removed_options_of_a_card_are_accepted_only_with_the_remaining_value(ar
         (artifact / "card.json").write_text(json.dumps(card))
         return GapModel.load(artifact)
 
-    known = {"context": "none", "branch": "unstacked", "coupling": "posture", "sensors": "predicted", "sensor_hold": 1}
+    known = {"context": "none", "branch": "unstacked", "coupling": "posture", "transformer_width": 64}
     assert written(**known).loop().n == 2
     with pytest.raises(ModelError, match="trained with branch stacked, which is no more; train again"):
         written(branch="stacked")

@@ -117,10 +117,14 @@ def test_the_limit_changes_no_correction_within_it():
     assert torch.allclose(limited[~within].abs(), torch.tensor(small.config.delta_max))
 
 
+def loop(infer, **how):
+    config = replace(PAPER, **how)
+    return DeltaLoop(config, np.array([[-9.0, 9.0]] * 2), 2, infer)
+
+
 def test_a_correction_is_held_for_its_duration_and_restarts_after_a_reset():
     count = iter(range(100))
-    infer = lambda x: np.full((2, 2), next(count), np.float32)  # noqa: E731
-    held = DeltaLoop(replace(PAPER, delta_hold=3), np.array([[-9.0, 9.0]] * 2), 2, infer)
+    held = loop(lambda x: np.full((2, 2), next(count), np.float32), delta_hold=3)
     zero = np.zeros((2, 2))
     seen = []
     for t in range(8):
@@ -128,6 +132,18 @@ def test_a_correction_is_held_for_its_duration_and_restarts_after_a_reset():
             held.reset(np.array([1]))
         seen.append(held.delta(zero, zero, zero, 0.0)[:, 0])
     assert np.array(seen).T.tolist() == [[0, 0, 0, 3, 3, 3, 6, 6], [0, 0, 0, 3, 4, 4, 4, 7]]
+
+
+def test_held_sensors_see_the_observation_of_the_last_refresh_and_the_trunk_the_present_action():
+    inputs = []
+    held = loop(lambda x: inputs.append(x.copy()) or np.zeros((2, 2), np.float32), sensor_hold=3)
+    for t in range(6):
+        held.delta(*np.full((3, 2, 2), float(t)), 0.0)
+    inputs = np.array(inputs)[:, 0]
+    at = held.layout
+    assert inputs[:, at.q.start].tolist() == [0, 0, 0, 3, 3, 3]
+    assert inputs[:, at.past.start].tolist() == [0, 0, 0, 2, 2, 2]
+    assert inputs[:, at.action.start].tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
@@ -155,6 +171,40 @@ def test_with_fixed_probes_the_branch_observes_the_simulator_and_control_loops_a
     assert np.isfinite(simulated.qpos).all()
 
 
+def test_learned_probes_start_at_the_fixed_ones_and_gradients_reach_them_alone():
+    config = replace(PAPER, sensor_source="learned")
+    net, x = network(config).train(), torch.randn(9, config.input_dim(2))
+    start = (config.probe_limit * net.probes.tanh()).detach()
+    np.testing.assert_allclose(start, ProbeOracle.probe_offsets(config, 2), atol=1e-6)
+    net.predictor.requires_grad_(False)
+    prepared = net.prepare(x)
+    assert not prepared.requires_grad
+    assert torch.equal(net.correct(prepared), net.correct(prepared))  # one sample per state
+    net.correct(prepared).sum().backward()
+    assert (net.probes.grad.abs().sum(1) > 0).all()
+
+
+def test_learned_sensors_are_the_predictor_s_answers_to_each_probe():
+    config = replace(PAPER, sensor_source="learned")
+    net, x = network(config), torch.randn(9, config.input_dim(2))
+    z = net.sensor_inputs(x)
+    each = [net.predictor.mean(torch.cat([z, probe.tanh().expand(9, 2)], dim=1)) for probe in net.probes]
+    assert torch.allclose(net.probed(net.sensors(x, z)), torch.cat(each, dim=1), atol=1e-5)
+
+
+def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
+    config, robot = replace(PAPER, sensor_source="learned"), write_arm(tmp_path)
+    env = DeltaEnv(recordings(robot, 2, rows=60, kp=0.5), robot, config, 64, 1000, RewardConfig(), nthread=1)
+    net = network(config)
+    start, learner = net.probes.clone(), PPO(env, net, TRAINING.ppo)
+    assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
+    fitted = copy.deepcopy(net.predictor.state_dict())
+    learner.update()
+    assert not torch.isclose(net.probes, start).any()
+    assert all(torch.equal(x, fitted[name]) for name, x in net.predictor.state_dict().items())
+
+
 def test_options_add_the_observation_to_the_branch_and_the_lag_to_the_trunk():
     net = network(replace(PAPER, branch_observation=True, relative_action=True))
     x = torch.randn(5, net.config.input_dim(2))
@@ -164,10 +214,56 @@ def test_options_add_the_observation_to_the_branch_and_the_lag_to_the_trunk():
     assert net.branch[0].in_features == net.config.observation_dim(2) + 16
 
 
+def test_a_hidden_recorded_state_has_no_effect_and_a_visible_one_has():
+    net, plain = network(replace(PAPER, real_state=True)), network()
+    state = net.state_dict()
+    state["branch.0.weight"] = state["branch.0.weight"][:, 5:]
+    plain.load_state_dict(state)
+    x = torch.randn(5, PAPER.input_dim(2))
+    hidden, known = (torch.cat([x, part], dim=1) for part in (torch.zeros(5, 5), torch.ones(5, 5)))
+    assert torch.allclose(net(hidden), plain(x), atol=1e-6)
+    assert not torch.allclose(net(known), net(hidden), atol=1e-4)
+
+
+def test_half_of_the_episodes_show_the_recorded_state(tmp_path):
+    config, robot = replace(PAPER, real_state=True), write_arm(tmp_path)
+    env = DeltaEnv(recordings(robot, 2, rows=30), robot, config, 200, 1000, RewardConfig(), nthread=1)
+    env.sim.qpos[:] -= 0.1
+    real = env.get_observations()["actor"][:, env.loop.layout.real]
+    shown = real[:, 4] == 1
+    assert 60 < shown.sum() < 140
+    assert not real[~shown].any()
+    assert torch.allclose(real[shown][:, :4], torch.tensor([0.1, 0.1, 0, 0]), atol=1e-6)
+    env.reset()
+    assert not torch.equal(env.get_observations()["actor"][:, -1] == 1, shown)
+
+
+def test_missing_extra_inputs_are_zero():
+    seen = []
+    given = loop(
+        lambda x: seen.append(x[0, -21:].copy()) or np.zeros((2, 2), np.float32), sensor_source="fixed", real_state=True
+    )
+    for width in (0, 16, 21):  # nothing, the simulator's answers, these and the recorded state
+        given.extra = (lambda: np.ones((2, width))) if width else None  # noqa: B023
+        given.delta(*np.zeros((3, 2, 2)), 0.0)
+    assert np.array(seen).tolist() == [[1] * width + [0] * (21 - width) for width in (0, 16, 21)]
+
+
 def test_other_networks_refuse_the_paper_s_switches():
-    for how in ({"delta_hold": 3}, {"payload_trunk": False}, {"sensor_source": "fixed"}):
+    for how in (
+        {"delta_hold": 3},
+        {"sensor_hold": 3},
+        {"sensor_target": "absolute"},
+        {"payload_trunk": False},
+        {"sensor_source": "learned"},
+        {"branch_observation": True},
+        {"relative_action": True},
+        {"real_state": True},
+    ):
         with pytest.raises(UsageError, match="use --model paper"):
             build_network(ModelConfig(**how), 2)
+    with pytest.raises(UsageError, match="hold one of them"):
+        replace(PAPER, delta_hold=3, sensor_hold=3)
 
 
 TRAINING = TrainConfig(
@@ -194,9 +290,10 @@ def world(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "how",
-    [{"delta_hold": 3, "branch_observation": True}, {"sensor_source": "fixed"}],
-    ids=["held correction and more inputs", "fixed probes"],
-)
+    [{"delta_hold": 3, "branch_observation": True, "real_state": True}, {"sensor_source": "fixed", "sensor_hold": 3},
+     {"sensor_source": "learned"}],
+    ids=["held correction and more inputs", "held fixed probes", "learned probes"],
+)  # fmt: skip
 def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(world, tmp_path, how):
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
     update = 8 * 8 * config.model.delta_hold

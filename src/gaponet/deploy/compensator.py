@@ -344,8 +344,8 @@ class Feedback:
 def _simulator_of(model: GapModel, robot: RobotSpec, dt: float, config: CompensatorConfig) -> RobotSpec:
     """Return the simulator that the model corrects: the given one or that of training."""
     model.require_rate(dt)
-    if model.config.delta_hold > 1:
-        raise ModelError(f"{model.path}: holds corrections; to be inverted it must be trained without")
+    if model.config.holds:
+        raise ModelError(f"{model.path}: holds corrections or sensors; to be inverted it must be trained without")
     if model.is_trained_in(robot):
         return robot
     if config.aim == "simulator":

@@ -41,7 +41,7 @@ class Compare:
     """
 
     models: tuple[str, ...] = DEFAULT_MODELS
-    """Kinds, each with changed settings where wanted: mlp:mlp_hidden=256,128 or gaponet:stride=2:history=8.
+    """Kinds, each with changed settings where wanted: mlp:mlp_hidden=256,128 or gaponet:sensors=predicted:history=8.
     gaponet:train_share=0.25 trains on a quarter of the motions. identified+KIND trains in the identified simulator
     (with --identify)."""
     holdout_units: tuple[str, ...] = ()

@@ -34,13 +34,15 @@ QUICK_PRETRAINING = PretrainingConfig(
     rounds=2, num_envs=16, steps=80, gradient_steps=40, batch_size=256, sensor_states=256
 )  # fmt: skip
 QUICK_PPO = PPOConfig(num_envs=32, num_steps=16, epochs=1, critic_warmup=1)
+QUICK_SENSOR_HIDDEN = (32,)  # hidden layers of the predictor, whose fit takes most of a short training
 QUICK_MOTIONS, QUICK_PAYLOADS, QUICK_UNITS = 6, 3, 2  # a split of six motions has 3 + 1 + 2
 QUICK_RECORDING_S = 2.0
 
 
 def quick_config(config: TrainConfig) -> TrainConfig:
-    """Return the settings with small rounds."""
-    return replace(config, pretraining=QUICK_PRETRAINING, ppo=QUICK_PPO)
+    """Return the settings with small networks and rounds."""
+    model = replace(config.model, sensor_hidden=QUICK_SENSOR_HIDDEN)
+    return replace(config, model=model, pretraining=QUICK_PRETRAINING, ppo=QUICK_PPO)
 
 
 def quick_dataset(data: Dataset, robot: RobotSpec, out: Path) -> Dataset:

@@ -1,4 +1,4 @@
-"""A model with some settings changed, as one word: mlp, mlp:mlp_hidden=256,128, identified+gaponet:history=8.
+"""A model with some settings changed, as one word: mlp, mlp:mlp_hidden=256,128, identified+gaponet:sensors=predicted.
 
 [identified+]KIND[:FIELD=VALUE]…        a field of ModelConfig or TrainConfig; pretraining.rounds for one inside another
 """

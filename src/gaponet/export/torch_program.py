@@ -78,10 +78,12 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
     """Load the step of a run's network from its checkpoint.
 
     Raises:
-        ModelError: There is no checkpoint, or the model holds corrections.
+        ModelError: There is no checkpoint, or the model holds corrections, has sensors or reads the recorded state.
     """
-    if model.config.delta_hold > 1:
-        raise ModelError(f"{model.path}: holds corrections, which torch exports do not; train without")
+    if model.config.holds:
+        raise ModelError(f"{model.path}: holds corrections or sensors, which torch exports do not; train without")
+    if model.config.real_state:
+        raise ModelError(f"{model.path}: real_state is an input that torch exports lack; train without")
     return DeltaStep(trained_network(run, model.config, len(model.card["joint_names"])), model)
 
 

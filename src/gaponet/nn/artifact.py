@@ -27,9 +27,8 @@ RATE_TOLERANCE = 0.02  # relative: a clock of 49.85 Hz counts as 50 Hz
 REMOVED_OPTIONS = {
     "payload_predictor": True, "context": "none", "branch": "unstacked", "branch_history": True, "fno_width": 32,
     "fno_layers": 3, "fno_modes": 4, "coupling": "posture", "transformer_width": 64, "transformer_layers": 2,
-    "transformer_heads": 4, "sensor_hold": 1, "real_state": False,
+    "transformer_heads": 4,
 }  # fmt: skip
-TRAINING_OPTIONS = ("sensors", "sensor_hidden")  # removed ones that do not change the inputs of model.onnx
 RENAMED_STAGES = {"warm_start_rounds": "pretraining_rounds", "ppo_anew": "ppo_from_untrained"}  # earlier → today
 
 
@@ -287,8 +286,6 @@ class GapModel:
                 raise ModelError(f"{file}: trained with {field} {given}, which is no more; train again without it")
         if card["model"].get("kind") == "inverse":  # a removed recipe for the mlp
             card["model"]["kind"] = "mlp"
-        for field in TRAINING_OPTIONS:
-            card["model"].pop(field, None)
         if stages := card.get("stages"):
             card["stages"] = {RENAMED_STAGES.get(name, name): value for name, value in stages.items()}
         config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)

@@ -14,7 +14,8 @@ Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 
 
 POSITIVE = ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max")
 PAPER_ONLY = (  # options of kind "paper" alone
-    "payload_trunk", "delta_hold", "sensor_source", "sensor_target", "branch_observation", "relative_action",
+    "payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target", "branch_observation",
+    "relative_action", "real_state",
 )  # fmt: skip
 
 
@@ -40,9 +41,12 @@ class ModelConfig:
     """Largest correction, rad."""
     delta_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """paper: number of control periods for which a correction is held (action duration)."""
-    sensor_source: Literal["predicted", "fixed"] = "predicted"
-    """paper: origin of the sensor values. predicted: the sensor predictor. fixed: the simulator, stepped once for each
-    probe; only in training and gaponet eval, because a robot has no simulator."""
+    sensor_source: Literal["predicted", "fixed", "learned"] = "predicted"
+    """paper: origin of the sensor values. predicted: the sensor predictor, for the num_probes fixed probes. fixed: the
+    simulator, stepped once for each fixed probe; only in training and gaponet eval, because a robot has no simulator.
+    learned: the sensor predictor, for probes that start at the fixed ones and are trained by PPO."""
+    sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
+    """paper: number of control periods for which the sensor values are held."""
     sensor_target: Literal["delta", "absolute"] = "delta"
     """paper: form of a sensor value. delta: the change of state, S(t+1) − S(t). absolute: the next state, S(t+1)."""
     branch_observation: bool = False
@@ -51,18 +55,26 @@ class ModelConfig:
     relative_action: bool = False
     """paper: the trunk input is the action minus the present position. This is not the paper's form: a lag of 10 mrad
     is hard to see in angles that span a radian."""
+    real_state: bool = False
+    """paper: the recorded state, relative to the simulated one, is an input of the branch too. Training hides it in
+    half of the episodes. gaponet eval never gives it; a control loop can (DeltaLoop.extra)."""
     num_probes: Annotated[int, Interval(ge=1, le=1000)] = 20
-    """paper: m, number of probes: targets for which the simulator gives its next state."""
+    """m, number of probes: targets for which the simulator gives its next state."""
     probe_small: Annotated[float, Interval(ge=0, le=10)] = 0.05
-    """paper: offset of a small probe, which depends on gains and friction, rad."""
+    """Offset of a small probe, which depends on gains and friction, rad."""
     probe_large: Annotated[float, Interval(ge=0, le=10)] = 0.4
-    """paper: offset of a large probe, which depends on inertia, payload and saturation, rad."""
+    """Offset of a large probe, which depends on inertia, payload and saturation, rad."""
+    sensors: Literal["off", "predicted"] = "off"
+    """off: the branch input is the observation. predicted: predicted sensor values too, as in the paper; they did not
+    reduce the error (docs/results/unnamed.md)."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
     branch_hidden: Layers = (64, 64)
     """Hidden layers of the branch net."""
     trunk_hidden: Layers = (32, 32)
     """Hidden layers of the trunk net."""
+    sensor_hidden: Layers = (128, 64)
+    """Hidden layers of the sensor predictor; 256 256 are not better."""
     mlp_hidden: Layers = (512, 256, 128)
     """Hidden layers of the MLP baseline (ASAP's size)."""
     mlp_match: bool = False
@@ -76,6 +88,8 @@ class ModelConfig:
             raise UsageError(
                 "mlp_match or shared_mlp without mlp_hidden: give the proportions of the hidden layers, e.g. 4 2 1"
             )
+        if self.delta_hold > 1 and self.sensor_hold > 1:
+            raise UsageError(f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them")
 
     def require_kind(self) -> None:
         """Refuse options of the paper's network in another one. The command line sets the kind after these options.
@@ -88,6 +102,11 @@ class ModelConfig:
                 raise UsageError(f"{name} {value}: model {self.kind} has no such switch; use --model paper")
 
     @property
+    def holds(self) -> bool:
+        """True if corrections or sensor values are held for several control periods."""
+        return self.delta_hold > 1 or self.sensor_hold > 1
+
+    @property
     def needs_simulator(self) -> bool:
         """True if the simulator gives the sensor values. They are then columns of x."""
         return self.sensor_source == "fixed"
@@ -96,10 +115,16 @@ class ModelConfig:
         """Return the length of o_t: 2n + 3nH, and 1 more with payload."""
         return 2 * n + 3 * n * self.history + int(self.payload_input)
 
+    @property
+    def probe_limit(self) -> float:
+        """Largest offset of a learned probe, rad: twice the largest fixed one."""
+        return 2 * max(self.probe_small, self.probe_large) or 1.0
+
     def sensor_dim(self, n: int) -> int:
         """Return the number of sensor values: n positions and n velocities for each of m probes."""
         return self.num_probes * 2 * n
 
     def input_dim(self, n: int) -> int:
-        """Return the length of x = [o_t | a_t | the simulator's answers] (nn/observation.py)."""
-        return self.observation_dim(n) + n + self.sensor_dim(n) * self.needs_simulator
+        """Return the length of x = [o_t | a_t | the simulator's answers | 2n + 1 of real_state] (nn/observation.py)."""
+        extra = self.sensor_dim(n) * self.needs_simulator + (2 * n + 1) * self.real_state
+        return self.observation_dim(n) + n + extra

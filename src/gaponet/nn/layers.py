@@ -146,6 +146,10 @@ class DeltaNet(nn.Module):
         """Set the statistics of the inputs from samples of x."""
         self.features.standardise.fit(self.features.relative(x))
 
+    def sensor_inputs(self, x: Tensor) -> Tensor:
+        """x → inputs of the sensor predictor, (B, …)."""
+        return self.features(x)[:, self.features.layout.observation]
+
     def prepare(self, x: Tensor) -> Tensor:
         """x → input of `correct`, (B, …)."""
         return self.arrange(self.features(x))

@@ -27,7 +27,8 @@ class DeltaLoop:
 
     Attributes:
         x: Input of the network, (num_envs, dim) float32; `observe` updates it.
-        sensors: Returns the columns of x after [o_t | a_t], (num_envs, …), with sensor_source "fixed"; else None.
+        extra: Returns the columns of x after [o_t | a_t], (num_envs, k): the simulator's answers, then real_state's
+            2n + 1 numbers (nn/observation.py). Missing columns stay zero; all do if extra is None.
         held: The correction that is held, (num_envs, n) rad, or (n,) for one robot.
         age: Control periods since the start, (num_envs,).
         fresh: Robots without a history, (num_envs,).
@@ -64,8 +65,9 @@ class DeltaLoop:
             np.array(side, float) if self._numpy else x.new_tensor(side) for side in np.transpose(qpos_range)
         )
         self._applied: Any = zeros_like(x, *shape)
-        self.age, self.held = zeros_like(x, num_envs), zeros_like(x, *shape)
-        self.sensors: Callable[[], Any] | None = None
+        self.holds, self.age = config.holds, zeros_like(x, num_envs)
+        self.held: Any = zeros_like(x, *shape)
+        self.extra: Callable[[], Any] | None = None
         self.fresh = np.ones(num_envs, bool)
         self.any_fresh = True
 
@@ -87,10 +89,17 @@ class DeltaLoop:
         u: Applied targets.
         """
         self.history.reset(ids, qpos, qvel, u)
-        self.age[ids] = 0
+        if self.holds:
+            self.age[ids] = 0
         if self.any_fresh:
             self.fresh[ids] = False
             self.any_fresh = bool(self.fresh.any())
+
+    def push(self, qpos: Any, qvel: Any, u: Any) -> None:
+        """End a control period: append the state before it and its target, (num_envs, n) each, to the history."""
+        self.history.push(qpos, qvel, u)
+        if self.holds:
+            self.age += 1
 
     # ---- a control period
 
@@ -105,12 +114,20 @@ class DeltaLoop:
         if self.any_fresh:
             frames = (x.reshape(-1, 1, self.n)[self.fresh] for x in (qpos, qvel, ctrl))
             self.begin(self.fresh.copy(), *frames)
-        self._q[...], self._v[...], self._action[...] = qpos, qvel, ctrl
-        self.history.write()
+        if self.config.sensor_hold == 1:
+            self._q[...], self._v[...] = qpos, qvel
+            self.history.write()
+        else:  # the sensor predictor's input is the observation of the last refresh
+            due, column = self._due(self.config.sensor_hold)
+            self._q[...] = self._xp.where(column, qpos, self._q)
+            self._v[...] = self._xp.where(column, qvel, self._v)
+            self.history.write(due)
+        self._action[...] = ctrl
         if self._payload is not None:
             self._payload[...] = payload_mass / self.config.payload_max
-        if self.sensors is not None:
-            self.x[:, self.layout.sensors] = self.sensors()
+        if self.extra is not None and (due := self._due(self.config.sensor_hold)[0]).any():
+            extra, start = self.extra(), self.layout.query.stop
+            self.x[due, start : start + extra.shape[1]] = extra[due]
         return self.x
 
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
@@ -143,11 +160,12 @@ class DeltaLoop:
         self.observe(qpos, qvel, ctrl, payload_mass)
         delta = self.answer()
         if self.config.delta_hold > 1:
-            due = self.age % self.config.delta_hold == 0
-            delta = self.held = self._xp.where(due if self.num_envs == 1 else due[:, None], delta, self.held)
-            self.age += 1
+            delta = self.held = self._xp.where(self._due(self.config.delta_hold)[1], delta, self.held)
         self._applied = applied = self._xp.minimum(self._xp.maximum(ctrl + delta, self.low), self.high)
-        self.history.push(None, None, applied)
+        if self.holds:
+            self.push(qpos, qvel, applied)
+        else:
+            self.history.push(None, None, applied)
         return applied - ctrl
 
     def solve(
@@ -168,7 +186,7 @@ class DeltaLoop:
         for _ in range(iterations):
             self._action[...] = wanted + offset
             offset -= gain * (offset + self.answer())
-        self.history.push(None, None, wanted)
+        self.push(qpos, qvel, wanted)
         return wanted + offset
 
     # ---- internals
@@ -190,6 +208,11 @@ class DeltaLoop:
         if self.any_fresh:
             last[self.fresh] = qpos.reshape(-1, self.n)[self.fresh]
         return self._xp.where(self._xp.isfinite(rows), rows, last).reshape(ctrl.shape)
+
+    def _due(self, hold: int) -> tuple[Any, Any]:
+        """Return the mask of robots at a multiple of `hold` control periods, (num_envs,), and the mask for joints."""
+        due = self.age % hold == 0
+        return due, due if self.num_envs == 1 else due[:, None]
 
 
 class DeltaCorrector:
@@ -216,7 +239,7 @@ class DeltaCorrector:
                 assert self._state is not None
                 return oracle(*self._state).reshape(len(start), -1)
 
-            loop.sensors = answers
+            loop.extra = answers
         self.loop = loop
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:

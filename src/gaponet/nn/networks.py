@@ -14,21 +14,24 @@ from gaponet.base.arrays import Array
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import DeltaNet, dense, num_parameters
 from gaponet.nn.observation import Layout
-from gaponet.nn.paper import PaperNet
+from gaponet.nn.paper import PaperNet, SensorPredictor
 
 
 class OperatorNet(DeltaNet):
     """DeepONet: Δa_j = bounded(⟨branch(inputs of joint j), trunk(a_j − q_j, P)⟩ + c_j).
 
-    All joints share one branch and one trunk net. The branch input of joint j is its one-hot index, its state and
-    history, the payload P, and q, q̇ and a − q of all joints. The trunk input is the one-hot index, a_j − q_j and the
-    payload.
+    All joints share one branch and one trunk net. The branch input of joint j is its one-hot index, its sensor values,
+    its state and history, the payload P, and q, q̇ and a − q of all joints. The trunk input is the one-hot index,
+    a_j − q_j and the payload.
     """
 
     columns: Tensor
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
+        if config.sensors == "predicted":
+            inputs = config.observation_dim(n)
+            self.predictor = SensorPredictor(inputs, config.sensor_hidden, config.sensor_dim(n))
         branch, trunk = self.joint_columns(config, n)
         self.register_buffer("columns", torch.from_numpy(np.hstack([branch, trunk]).ravel()), persistent=False)
         self.branch_inputs, self.trunk_inputs = branch.shape[1], trunk.shape[1]
@@ -38,9 +41,9 @@ class OperatorNet(DeltaNet):
 
     @staticmethod
     def joint_columns(config: ModelConfig, n: int) -> tuple[Array, Array]:
-        """Return the inputs of branch and trunk as columns of [features | 0 | 1], (n, inputs) each."""
-        layout = Layout(config, n)
-        columns = np.arange(layout.query.stop)
+        """Return the inputs of branch and trunk as columns of [features | sensors | 0 | 1], (n, inputs) each."""
+        layout, sensors = Layout(config, n), config.sensor_dim(n) * (config.sensors != "off")
+        columns = np.arange(layout.query.stop + sensors)
         joint_onehot = len(columns) + np.eye(n, dtype=int)
 
         def per_joint(part: slice) -> Array:
@@ -50,14 +53,16 @@ class OperatorNet(DeltaNet):
             return np.tile(columns[part], (n, 1))
 
         branch = [
-            joint_onehot, per_joint(slice(layout.past.stop)), all_joints(layout.payload), all_joints(layout.state),
-            all_joints(layout.action),
+            joint_onehot, per_joint(slice(layout.query.stop, None)), per_joint(slice(layout.past.stop)),
+            all_joints(layout.payload), all_joints(layout.state), all_joints(layout.action),
         ]  # fmt: skip
         trunk = [joint_onehot, per_joint(layout.action), all_joints(layout.payload)]
         return np.hstack(branch), np.hstack(trunk)
 
     def arrange(self, z: Tensor) -> Tensor:
         """Features of [o_t | a_t] → [branch inputs | trunk inputs] of each joint, (B, n, both)."""
+        if self.config.sensors != "off":
+            z = torch.cat([z, self.sensors(z)], dim=1)
         z = pad(pad(z, (0, 1)), (0, 1), value=1.0)
         return z.index_select(1, self.columns).reshape(-1, self.n, self.branch_inputs + self.trunk_inputs)
 
@@ -68,6 +73,10 @@ class OperatorNet(DeltaNet):
         shape = (-1, self.n, self.config.num_basis)
         branch, trunk = self.branch(branch_rows).reshape(shape), self.trunk(trunk_rows).reshape(shape)
         return self.bounded((branch * trunk).sum(-1) + self.bias)
+
+    def sensors(self, z: Tensor) -> Tensor:
+        """Features → predicted sensor values, standardised, (B, 2nm): n positions and n velocities per probe."""
+        return self.predictor.mean(z[:, self.features.layout.observation])
 
 
 class DeltaMLP(DeltaNet):
@@ -105,7 +114,7 @@ class DeltaMLP(DeltaNet):
 
 
 class SharedMLP(OperatorNet):
-    """Baseline: one plain network with the inputs of the operator, shared by the joints.
+    """Baseline: one plain network with the inputs and sensors of the operator, shared by the joints.
 
     It has as many weights as branch and trunk together. The only difference to the operator is the missing product.
     """

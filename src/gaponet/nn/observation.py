@@ -3,7 +3,8 @@
 o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the target applied over
 [s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
 
-x = [ o_t | a_t ] is the input of a network. With sensor_source "fixed" (nn/paper.py), the sensor values S_t follow.
+x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more columns: with fixed probes
+S_t, then with real_state [ q_real − q | q̇_real − q̇ | 1 ], which are all zero where the recorded state is hidden.
 """
 
 from __future__ import annotations
@@ -21,17 +22,17 @@ class Layout:
     """Columns of x as slices. Features of a network have the same columns.
 
     Attributes:
-        q, v, past, payload, action, sensors: The parts of x in their order.
+        q, v, past, payload, action, sensors, real: The parts of x in their order.
         state, observation, query: [q | q̇], o_t and [o_t | a_t].
     """
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         self.n, self.history = n, config.history
         o = config.observation_dim(n)
-        answers = config.sensor_dim(n) * config.needs_simulator
-        sizes = (n, n, 3 * n * config.history, int(config.payload_input), n, answers)
+        answers, real = config.sensor_dim(n) * config.needs_simulator, (2 * n + 1) * config.real_state
+        sizes = (n, n, 3 * n * config.history, int(config.payload_input), n, answers, real)
         parts = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
-        self.q, self.v, self.past, self.payload, self.action, self.sensors = parts
+        self.q, self.v, self.past, self.payload, self.action, self.sensors, self.real = parts
         self.state, self.observation, self.query = slice(0, 2 * n), slice(0, o), slice(0, o + n)
         self.dim = config.input_dim(n)
 
@@ -47,7 +48,7 @@ class Layout:
 class History:
     """Past frames of num_envs robots in the columns `past` of x, a numpy array or a torch tensor.
 
-    Without a stride, the frames are stored in x itself, and `write` does nothing.
+    Without a stride or held sensors, the frames are stored in x itself, and `write` does nothing.
 
     Attributes:
         depth: Number of stored frames.
@@ -61,7 +62,7 @@ class History:
         self.depth = (config.history - 1) * config.stride + 1
         self._observed = slice(0, self.depth, config.stride)
         self._past = x[:, layout.past]
-        self._in_x = config.stride == 1
+        self._in_x = config.stride == config.sensor_hold == 1
         memory = self._past if self._in_x else zeros_like(x, len(x), 3 * n * self.depth)
         self.frames = memory.reshape(len(x), self.depth, 3 * n)  # a view
         self._numpy = isinstance(x, np.ndarray)
@@ -92,10 +93,11 @@ class History:
             self._q[...], self._v[...] = qpos, qvel
         self._u[...] = u
 
-    def write(self) -> None:
-        """Write the observed frames into x."""
+    def write(self, ids: Any = slice(None)) -> None:
+        """Write the observed frames of environments `ids` into x."""
         if not self._in_x:
-            self._past[:] = self.frames[:, self._observed].reshape(self._past.shape)
+            frames = self.frames[ids][:, self._observed]
+            self._past[ids] = frames.reshape(len(frames), self._past.shape[1])
 
     @staticmethod
     def rows_before(t: Array, depth: int) -> Array:

@@ -80,8 +80,9 @@ class _FusedFeatures(nn.Module):
 
 def onnx_content(net: DeltaNet) -> bytes:
     """Return a network in evaluation mode as an ONNX file: x (batch, dim) → delta (batch, n), float32."""
+    linear = net.config.kind != "paper" and net.config.sensors == "off"
     content, x = io.BytesIO(), torch.zeros(2, net.config.input_dim(net.n))
-    exported: Any = net if net.config.kind == "paper" else _FusedFeatures(net)
+    exported: Any = _FusedFeatures(net) if linear else net
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # dynamo=True writes the same function in 2 to 16 s instead of 0.1, and needs onnxscript; torch 2.14 has both.

@@ -48,11 +48,12 @@ class ProbeOracle:
             offsets[k, joint] = sign * (config.probe_small if small else config.probe_large)
         return offsets
 
-    def __call__(self, qpos: Array, qvel: Array) -> Array:
+    def __call__(self, qpos: Array, qvel: Array, offsets: Array | None = None) -> Array:
         """Return sensor values.
 
         Args:
             qpos, qvel: States of the joints that are not locked, (k, n_free).
+            offsets: e_k of each state, (k, m, n) rad; default: the fixed probes.
 
         Returns:
             (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints, or [q', Δt·q̇'] with an absolute target.
@@ -61,7 +62,7 @@ class ProbeOracle:
         rows, state = np.arange(k * m), np.repeat(np.arange(k), m)
         q, v = qpos[state], qvel[state]
         target = q.astype(float)
-        target[:, op] += np.tile(self.offsets, (k, 1))
+        target[:, op] += np.tile(self.offsets, (k, 1)) if offsets is None else offsets.reshape(k * m, -1)
         sim.reset(rows, q, v, past=target[:, None])
         self.target[rows] = target
         sim.step(self.target, None if len(rows) == sim.num_envs else rows)

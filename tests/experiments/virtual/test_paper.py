@@ -64,4 +64,4 @@ def test_our_network_has_the_rows_of_table_2_that_it_supports(make_study):
     ]
     own = Paper().paper_study(study)
     assert (own.config.ppo.std, own.config.pretraining.rounds) == (0.02, 0)
-    assert {row.word for row in table_2_rows(own)} >= {"paper", "paper:payload_input=on", "paper:delta_hold=5"}
+    assert {row.word for row in table_2_rows(own)} >= {"paper", "paper:payload_input=on", "paper:sensor_hold=5"}

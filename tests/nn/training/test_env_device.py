@@ -91,7 +91,7 @@ def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
     robot, data = write_arm(tmp_path / "arm"), tmp_path / "data"
     dataset = write_dataset(data, robot, recordings(robot, 8, rows=80, kp=0.5, delay=2))
     small = TrainConfig(
-        ModelConfig(history=2, branch_hidden=(16,), trunk_hidden=(16,)),
+        ModelConfig(history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
         pretraining=PretrainingConfig(
             rounds=2, num_envs=16, steps=40, gradient_steps=80, batch_size=256, sensor_states=64
         ),

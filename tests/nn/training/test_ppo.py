@@ -12,7 +12,7 @@ from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO, advantages
 from gaponet.nn.training.sensor_fit import fit_inputs
 
-MODEL = ModelConfig(history=2, branch_hidden=(16,), trunk_hidden=(16,))
+MODEL = ModelConfig(history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,))
 SETTINGS = PPOConfig(
     num_envs=16, num_steps=8, epochs=1, mini_batches=2, critic_warmup=0, explained=-1e9, critic_hidden=(32,)
 )

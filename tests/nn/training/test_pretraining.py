@@ -20,7 +20,7 @@ from gaponet.sim.replay import replay
 def fitted(tmp_path_factory):
     torch.manual_seed(0)
     robot = write_arm(tmp_path_factory.mktemp("arm"))
-    config = ModelConfig(history=2, branch_hidden=(16,), trunk_hidden=(16,))
+    config = ModelConfig(history=2, num_probes=4, sensor_hidden=(32,), branch_hidden=(16,), trunk_hidden=(16,))
     env = DeltaEnv(recordings(robot, 4), robot, config, 32, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
     settings = PretrainingConfig(num_envs=32, steps=64, gradient_steps=2)

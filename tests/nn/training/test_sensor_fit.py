@@ -16,7 +16,7 @@ def test_the_predictor_explains_most_of_the_answers_on_held_out_states(tmp_path,
     monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 300)
     torch.manual_seed(0)
     robot = write_arm(tmp_path)
-    config = ModelConfig(kind="paper", history=2, num_probes=4)
+    config = ModelConfig(history=2, sensors="predicted", num_probes=4, sensor_hidden=(64, 64))
     env = DeltaEnv(recordings(robot, 6), robot, config, 64, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
     report = fit_inputs(net, env, env.get_observations()["actor"], 512, seed=0)

@@ -20,7 +20,7 @@ from gaponet.report.methods import METHODS
 from gaponet.report.verdict import LEARNED
 
 SMALL = TrainConfig(
-    model=ModelConfig(history=2, branch_hidden=(32,), trunk_hidden=(32,)),
+    model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
     pretraining=PretrainingConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1, explained=-1e9),
     validate_every=4,
@@ -112,12 +112,18 @@ def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
     assert asked == {1}
 
 
-def test_ppo_alone_has_statistics_of_its_inputs(trained, robot, tmp_path):
-    config = replace(SMALL, pretraining=replace(SMALL.pretraining, rounds=0))
+@pytest.mark.parametrize("sensors", ["predicted", "off"])
+def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(sensors, trained, robot, tmp_path, monkeypatch):
+    monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
+    config = replace(
+        SMALL, pretraining=replace(SMALL.pretraining, rounds=0), model=replace(SMALL.model, sensors=sensors)
+    )
     trainer = Trainer(trained[0], robot, tmp_path / "run", config, Budget(steps=16 * 16))
-    trainer.run()
+    model = trainer.run()
     assert trainer.net.features.standardise.std.min() < 0.9
-    assert trainer.state.sensor_r2 is None
+    assert (trainer.state.sensor_r2 is None) == (sensors == "off")
+    if sensors == "predicted":
+        assert model.card["sensor_r2"]["mean"] > 0.3
 
 
 def test_the_gain_is_halved_if_that_reduces_the_validation_error(tmp_path, robot, trained, monkeypatch):

@@ -69,6 +69,8 @@ TABLE_2: dict[str, tuple[tuple[str, str, Printed | None], ...]] = {
         ("1 period", "", OWN),
         ("3 periods, correction held", "delta_hold=3", Printed(140, (0.017, 0.016, 0.017, 0.018))),
         ("5 periods, correction held", "delta_hold=5", Printed(140, (0.015, 0.016, 0.017, 0.019))),
+        ("3 periods, sensors held", "sensor_hold=3", Printed(140, (0.017, 0.016, 0.017, 0.018))),
+        ("5 periods, sensors held", "sensor_hold=5", Printed(140, (0.015, 0.016, 0.017, 0.019))),
     ),
     "sensor value": (
         ("S(t+1) − S(t)", "", OWN),

@@ -96,7 +96,8 @@ class DeltaEnv:
     """num_envs simulations; each follows one recording from a random row on.
 
     Observation groups: "actor" is x = [o_t | a_t]. "critic" has the recorded state, recorded positions and commands
-    ahead, payload and rate. An environment never changes its payload, rate and gains. The end of a recording is a
+    ahead, payload and rate. The actor observes the recorded state only with model.real_state, and then in a random
+    half of the episodes. An environment never changes its payload, rate and gains. The end of a recording is a
     time-out, not a failure.
 
     Arrays are numpy's on device "cpu", where C MuJoCo steps. Elsewhere they are tensors on the device, and
@@ -159,12 +160,14 @@ class DeltaEnv:
         self.row_on_device, self.last_on_device = (copy_array(place(x)) for x in (self.row, self.last))
         self.recorded = zeros_like(self.track, num_envs, self.track.shape[1])
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
+        self.real_state_visible = zeros_like(self.track, num_envs, 1)  # 1 where the actor observes the recorded state
         self.loop = DeltaLoop(config, sim.range[rows.operated], num_envs, like=self.recorded)
         if config.needs_simulator:
             if device != "cpu":
                 raise UsageError(f"--model.sensor-source fixed asks C MuJoCo: use --device cpu, not {device}")
-            oracle = ProbeOracle(robot, config, conditions, nthread, rows.locked)
-            self.loop.sensors = lambda: oracle(sim.qpos, sim.qvel).reshape(num_envs, -1)
+            self.oracle = ProbeOracle(robot, config, conditions, nthread, rows.locked)
+        if config.needs_simulator or config.real_state:
+            self.loop.extra = self._extra_inputs
         max_delay_periods = int(np.ceil(sim.robot.delay.max() / min(c[2] for c in rows.conditions)))
         self.depth = max(self.loop.history.depth, 1 + max_delay_periods)  # rows before the start that are used
         self.reward_sum, self.reward_count = 0.0, 0
@@ -180,6 +183,9 @@ class DeltaEnv:
         t, last, before = (self.sim.array(x) for x in (t, last, before))
         ids = ids if isinstance(ids, slice) else self.sim.array(ids)
         self.row_on_device[ids], self.last_on_device[ids], self.recorded[ids] = t, last, self.track[t]
+        if self.config.real_state:
+            visible = (self.rng.random((len(group), 1)) < 0.5).astype(np.float32)
+            self.real_state_visible[ids] = self.sim.array(visible)
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
         before = before[:, : self.loop.history.depth]
         self.loop.begin(ids, *(x[before][..., self.operated] for x in (self.qpos, self.qvel, self.ctrl)))
@@ -203,6 +209,17 @@ class DeltaEnv:
         ]
         critic = _float32(array_module(ahead).concatenate(parts, 1))
         return {"actor": torch.as_tensor(actor), "critic": torch.as_tensor(critic)}
+
+    def _extra_inputs(self) -> Any:
+        """Return the columns of x after [o_t | a_t] (nn/observation.py), (num_envs, …)."""
+        sim, concatenate, parts = self.sim, array_module(self.recorded).concatenate, []
+        if self.config.needs_simulator:
+            parts.append(self.oracle(sim.qpos, sim.qvel).reshape(self.num_envs, -1))
+        if self.config.real_state:
+            state = concatenate([sim.qpos[:, self.operated], sim.qvel[:, self.operated]], 1)
+            difference = self.recorded[:, : 2 * self.num_actions] - state
+            parts.append(concatenate([difference, self.real_state_visible], 1) * self.real_state_visible)
+        return concatenate(parts, 1)
 
     def step(self, delta: Any) -> tuple[Any, Any]:
         """Correct targets for delta_hold control periods, and reset environments that have ended.
@@ -232,7 +249,7 @@ class DeltaEnv:
         operated, sim, target = self.operated, self.sim, self.target
         target[:] = _take(self.ctrl, self.row_on_device)
         target[:, operated] = (target[:, operated] + sim.array(delta)).clip(self.low, self.high)
-        self.loop.history.push(sim.qpos[:, operated], sim.qvel[:, operated], target[:, operated])
+        self.loop.push(sim.qpos[:, operated], sim.qvel[:, operated], target[:, operated])
         sim.step(target)
         self.row += 1
         self.elapsed += 1
@@ -269,6 +286,8 @@ class DeltaEnv:
         """Return rows, simulations (with delayed commands), histories and random numbers."""
         arrays = {name: getattr(self, name) for name in COUNTERS} | {"frames": self.loop.history.frames}
         arrays |= self.sim.state()
+        arrays |= {"shown": self.real_state_visible} if self.config.real_state else {}
+        arrays |= {"age": self.loop.age, "x": self.loop.x} if self.loop.holds else {}
         return {
             "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
             "reward": (float(self.reward_sum), self.reward_count),
@@ -283,6 +302,10 @@ class DeltaEnv:
         self.row_on_device[:], self.last_on_device[:] = self.sim.array(self.row), self.sim.array(self.last)
         self.recorded[:] = self.track[self.row_on_device]
         self.loop.history.frames[:] = array_like(self.loop.history.frames, arrays["frames"])
+        for name in ("age", "x") if self.loop.holds else ():
+            getattr(self.loop, name)[:] = array_like(getattr(self.loop, name), arrays[name])
+        if self.config.real_state:
+            self.real_state_visible[:] = array_like(self.real_state_visible, arrays["shown"])
         self.sim.set_state(arrays)
         self.reward_sum, self.reward_count = state["reward"]
         self.rng_state = state["rng"]

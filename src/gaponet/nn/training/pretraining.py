@@ -109,7 +109,7 @@ class Pretraining:
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[Tensor] = []
         self.pool_labels: list[Tensor] = []
-        self.parameters = [p for name, p in net.named_parameters() if not name.startswith("predictor")]
+        self.parameters = [p for name, p in net.named_parameters() if not name.startswith(("predictor", "probes"))]
         self.optimiser = torch.optim.AdamW(self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
         self.rollout_states: list[dict[str, Any]] = []  # network and random numbers before the rollouts of each round
 

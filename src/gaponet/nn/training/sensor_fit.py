@@ -14,7 +14,6 @@ from torch import Tensor
 from gaponet.base.arrays import Array, copy_array, to_numpy
 from gaponet.base.errors import UsageError
 from gaponet.nn.layers import DeltaNet
-from gaponet.nn.paper import PaperNet
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training import ranks
 from gaponet.nn.training.env import DeltaEnv
@@ -52,7 +51,7 @@ def fit_sensors(
     net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0, refit: bool = False
 ) -> SensorReport | None:
     """Fit the sensor predictor; on `refit`, continue its fit at the environment's present states. Result as above."""
-    if not isinstance(net, PaperNet) or net.predictor is None:
+    if net.predictor is None:
         return None
     device = next(net.parameters()).device
     net.cpu()  # C MuJoCo answers the probes
@@ -65,14 +64,15 @@ def fit_sensors(
     return report
 
 
-def _probe(net: PaperNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool) -> tuple[Tensor, Tensor]:
+def _probe(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool) -> tuple[Tensor, Tensor]:
     """Probe the simulator at recorded start states, or on `refit` at the environment's present states.
 
     A third of the states stays there. A third is moved by noise. A third is moved to a random posture within the joint
     limits, with history and action. So the predictor also learns gravity and inertia where no motion was recorded.
 
     Returns:
-        Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm).
+        Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm), or (k, 2n) for learned probes: each is
+        one row of the inputs.
     """
     if states < MIN_STATES:
         raise UsageError(
@@ -107,7 +107,13 @@ def _probe(net: PaperNet, env: DeltaEnv, states: int, seed: int, nthread: int, r
     x[far] += layout.shifted(shift)
     with torch.inference_mode():
         inputs = net.sensor_inputs(torch.from_numpy(x.astype(np.float32)))
-    return inputs.clone(), torch.from_numpy(oracle(q, v).reshape(len(inputs), -1))
+    offsets, m = None, net.config.num_probes
+    if net.config.sensor_source == "learned":
+        # Each probe moves a random subset of the joints.
+        probes = rng.uniform(-1, 1, (len(q), m, n)) * (rng.random((len(q), m, n)) < rng.random((len(q), m, 1)))
+        offsets = net.config.probe_limit * probes
+        inputs = torch.cat([inputs.repeat_interleave(m, 0), torch.from_numpy(probes).float().flatten(0, 1)], dim=1)
+    return inputs.clone(), torch.from_numpy(oracle(q, v, offsets).reshape(len(inputs), -1))
 
 
 def _fit_predictor(
