@@ -1,5 +1,6 @@
 """The paper's network: its dimensions, the weights that its authors published, and what it is when it ships."""
 
+import copy
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -17,7 +18,10 @@ from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.nn.paper import RENAMED
 from gaponet.nn.sensor import ProbeOracle
-from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.ppo import PPO
+from gaponet.nn.training.sensor_fit import fit_inputs
 from gaponet.nn.training.trainer import Trainer
 from gaponet.report.evaluate import evaluate
 from gaponet.robot.spec import load_robot
