@@ -13,10 +13,50 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from gaponet.nn.paper import released_inputs, released_network
+from gaponet.base.arrays import Array
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.paper import PaperNet
 
 LIMIT = 1e-6  # rad
+RELEASED_EPSILON = 0.01  # in the published network's normaliser, (x − mean) / (std + ε)
+
+
+def released_network(weights: dict[str, Array]) -> PaperNet:
+    """Return the network that the authors published (isaac-sim2real/sage, feature/add-plug-in), ten joints.
+
+    Their observation has no present velocities: these columns get weight zero. Their predictor has no variance. Their
+    normaliser of [S | A] only divides by 1 + ε.
+
+    Args:
+        weights: Arrays of their state dict.
+    """
+    net = PaperNet(ModelConfig(kind="paper", payload_input=False, delta_max=10.0), 10).eval()
+    state = net.state_dict()
+    published = {"predictor.net": "sensor_model", "trunk": "trunk_net.net", "branch": "branch_net.branches.0"}
+    for own, name in published.items():
+        for layer in (0, 2, 4, 6):
+            fusion = own == "branch" and layer == 6
+            source = "branch_net.fusion.0" if fusion else f"{name}.{layer}"
+            for part in ("weight", "bias"):
+                if f"{source}.{part}" in weights:
+                    state[f"{own}.{layer}.{part}"] = torch.from_numpy(weights[f"{source}.{part}"])
+    first, n = state["predictor.net.0.weight"], net.n
+    state["predictor.net.0.weight"] = torch.cat([first[:, :n], torch.zeros(len(first), n), first[:, n:]], dim=1)
+    for part in ("weight", "bias"):
+        mean = state[f"predictor.net.4.{part}"]
+        state[f"predictor.net.4.{part}"] = torch.cat([mean, torch.zeros_like(mean)])
+    state["branch.0.weight"] = state["branch.0.weight"] / (1 + RELEASED_EPSILON)
+    state["query_scale.std"] = state["query_scale.std"] * (1 + RELEASED_EPSILON)
+    net.load_state_dict(state)
+    return net
+
+
+def released_inputs(observation: Array, action: Array) -> Tensor:
+    """Convert the published network's observation (B, 130) and action (B, 10) to x = [o_t | a_t]."""
+    o, a = torch.from_numpy(observation), torch.from_numpy(action)
+    return torch.cat([o[:, :10], torch.zeros_like(a), o[:, 10:], a], dim=1)
 
 
 def difference(folder: Path) -> float:

@@ -18,37 +18,8 @@ from gaponet.base.errors import GAPONetError as GAPONetError
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from gaponet.api import adapt_model as adapt_model
-    from gaponet.api import adapt_robot as adapt_robot
-    from gaponet.api import check as check
-    from gaponet.api import collect as collect
-    from gaponet.api import doctor as doctor
-    from gaponet.api import evaluate as evaluate
-    from gaponet.api import excite as excite
-    from gaponet.api import export_network as export_network
-    from gaponet.api import export_robot as export_robot
-    from gaponet.api import gap as gap
-    from gaponet.api import identify as identify
-    from gaponet.api import identify_torque as identify_torque
-    from gaponet.api import import_logs as import_logs
-    from gaponet.api import pair as pair
-    from gaponet.api import randomization as randomization
-    from gaponet.api import replay as replay
-    from gaponet.api import train as train
-    from gaponet.api.results import AdaptResult as AdaptResult
-    from gaponet.api.results import CheckResult as CheckResult
-    from gaponet.api.results import CollectResult as CollectResult
-    from gaponet.api.results import DoctorResult as DoctorResult
-    from gaponet.api.results import EvalResult as EvalResult
-    from gaponet.api.results import ExciteResult as ExciteResult
-    from gaponet.api.results import ExportResult as ExportResult
-    from gaponet.api.results import GapResult as GapResult
-    from gaponet.api.results import IdentifyResult as IdentifyResult
-    from gaponet.api.results import ImportResult as ImportResult
-    from gaponet.api.results import PairResult as PairResult
-    from gaponet.api.results import ReplayResult as ReplayResult
-    from gaponet.api.results import TorqueResult as TorqueResult
-    from gaponet.api.results import TrainResult as TrainResult
+    from gaponet.api import *  # noqa: F403
+    from gaponet.api.results import *  # noqa: F403
     from gaponet.base.progress import progress_bar as progress_bar
     from gaponet.data.store import Dataset as Dataset
     from gaponet.deploy.aligned_sim import AlignedSim as AlignedSim

@@ -11,6 +11,7 @@ from runs import small_model
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
+from gaponet.robot.folder import save_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 
@@ -22,7 +23,9 @@ def robot(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def model(robot, tmp_path_factory):
-    return small_model(robot, tmp_path_factory.mktemp("run") / "model")
+    run = tmp_path_factory.mktemp("run")
+    save_robot(robot, run / "robot")
+    return small_model(robot, run / "model")
 
 
 def test_it_is_the_replay_with_the_corrector(robot, model):
@@ -99,8 +102,9 @@ def test_a_users_mujoco_loop_is_aligned_by_one_call_per_period(robot, model):
 def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_path):
     with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 40\.0 Hz"):
         AlignedSim(robot, model, dt=0.025)
+    bare, other = small_model(robot, tmp_path / "model"), write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0"))
     with pytest.raises(ModelError, match="which does not lie beside it"):
-        AlignedSim(write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0")), model)
+        AlignedSim(other, bare)
     with pytest.raises(UsageError, match="'elbow' is corrected by the model and cannot be locked"):
         AlignedSim(robot, model, locked=("elbow",))
 
@@ -108,12 +112,9 @@ def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_
 def test_a_scene_that_does_not_fit_is_refused(robot, model):
     mj_model = build_model(robot)
     with pytest.raises(ModelError, match=r"trained at 50\.0 Hz"):
-        MujocoAligner(model, mj_model, 0.01, 0.0)
+        MujocoAligner(model, mj_model, 0.025, 0.0)
     with pytest.raises(ModelError, match="moves joint 'left/shoulder', the scene has shoulder, elbow"):
         MujocoAligner(model, mj_model, 0.02, 0.0, prefix="left/")
-    mj_model.actuator_gainprm[1, 0] = 25.0
-    with pytest.raises(ModelError, match="joint 'elbow': kp is 25 in the scene, the model was trained with 20"):
-        MujocoAligner(model, mj_model, 0.02, 0.0)
 
 
 def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):

@@ -20,10 +20,3 @@ def test_with_the_true_delay_the_simulator_follows_exactly(tmp_path):
     values = DelayOffset({"shoulder": 0.04, "elbow": 0.04}, {"shoulder": 0.0, "elbow": 0.0})
     simulated = replay([sequence], robot, values.corrector(robot))[0]
     np.testing.assert_allclose(simulated.qpos, sequence.qpos, atol=1e-6)
-
-
-def test_pieces_cover_long_sequences(tmp_path):
-    robot = write_arm(tmp_path)
-    sequence = record(robot, commands(2500, 0), "m")
-    assert sum(map(len, DelayOffset.pieces([sequence], seconds=20.0))) == 2500
-    assert sum(map(len, DelayOffset.pieces([sequence] * 40, seconds=20.0, max_rows=10_000))) < 20_000

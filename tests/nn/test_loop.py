@@ -77,9 +77,7 @@ def looped(config, limits, num_envs, tensors):
     return DeltaLoop(config, limits, num_envs, lambda x: x @ torch.from_numpy(weights), like=torch.zeros(0))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-@pytest.mark.parametrize("when", [0, 5])
-@pytest.mark.parametrize("tensors", [False, True])
+@pytest.mark.parametrize(("bad", "when", "tensors"), [(np.nan, 0, False), (np.inf, 5, False), (np.nan, 5, True)])
 def test_a_target_that_is_not_finite_affects_one_robot_for_one_period(bad, when, tensors):
     config, limits = ModelConfig(history=3), np.array([[-0.3, 0.3], [-10.0, 10.0]])
     rng = np.random.default_rng(1)
@@ -96,7 +94,7 @@ def test_a_target_that_is_not_finite_affects_one_robot_for_one_period(bad, when,
         np.testing.assert_array_equal(*(np.asarray(loop.applied) for loop in (hit, clean)))
 
 
-@pytest.mark.parametrize("change", [{}, {"stride": 3}, {"payload_input": False}])
+@pytest.mark.parametrize("change", [{}, {"stride": 3, "payload_input": False}])
 def test_torch_and_numpy_arrays_give_the_same_corrections(change):
     config = ModelConfig(**{"history": 3} | change)
     rng = np.random.default_rng(1)

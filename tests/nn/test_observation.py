@@ -19,25 +19,10 @@ def test_layout_is_state_then_frames_newest_first_then_payload_and_action():
     loop = DeltaLoop(ModelConfig(history=2, payload_max=2.0), np.array([[-9.0, 9.0]]), num_envs=1)
     loop.begin(slice(None), *np.full((3, 1, 1, 1), 9.0))
     one = lambda value: np.array([[value]])  # noqa: E731
-    loop.push(one(1.0), one(2.0), one(3.0))
-    loop.push(one(4.0), one(5.0), one(6.0))
+    loop.history.push(one(1.0), one(2.0), one(3.0))
+    loop.history.push(one(4.0), one(5.0), one(6.0))
     x = loop.observe(one(7.0), one(8.0), one(10.0), np.array([1.0]))
     np.testing.assert_array_equal(x, [[7, 8, 4, 5, 6, 1, 2, 3, 0.5, 10]])
-
-
-@pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])
-@pytest.mark.parametrize(("stride", "seen"), [(1, [5, 4, 3]), (3, [5, 2, -1])])
-def test_frames_are_the_last_ones_a_stride_apart(make, stride, seen):
-    config = ModelConfig(history=3, stride=stride)
-    x = make((2, config.input_dim(1)))
-    history, one = History(config, 1, x), make((2, 1)) + 1
-    history.reset(slice(None), *(one[:, None] * (-1 - k) for k in range(3)))
-    for k in range(1, 6):
-        history.push(k * one, 10 * k * one, 100 * k * one)
-    history.write()
-    frames = np.asarray(x)[:, Layout(config, 1).past].reshape(2, 3, 3)
-    assert frames[0, :, 0].tolist() == seen
-    assert frames[1, :2, 2].tolist() == [100 * k for k in seen[:2]]
 
 
 @pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])

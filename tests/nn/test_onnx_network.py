@@ -13,7 +13,7 @@ from gaponet.export.torch_program import export_program
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
-from gaponet.nn.onnx_export import export, onnx_content, sample_inputs
+from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, export, onnx_content, sample_inputs
 from gaponet.nn.onnx_network import OnnxNetwork
 
 SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
@@ -48,10 +48,12 @@ def artifact(robot, tmp_path_factory):
 @pytest.mark.parametrize(
     "how",
     [
-        {}, {"sensors": "predicted"}, {"payload_input": False},
-        {"kind": "mlp", "mlp_hidden": (16, 8)}, {"branch_hidden": (), "sensors": "predicted", "sensor_hidden": (16,)},
-        {"kind": "mlp", "mlp_match": True}, {"kind": "shared_mlp"}, {"kind": "paper"},
-        {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False},
+        {}, {"sensors": "predicted"}, {"payload_input": False}, {"branch_hidden": ()},
+        {"kind": "mlp", "mlp_hidden": (16, 8)}, {"kind": "mlp", "mlp_match": True}, {"kind": "shared_mlp"},
+        {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False}, {"kind": "paper"},
+        {"kind": "paper", "branch_observation": True, "relative_action": True, "payload_trunk": False},
+        {"kind": "paper", "delta_hold": 3}, {"kind": "paper", "sensor_hold": 5}, {"kind": "paper", "stride": 2},
+        {"kind": "paper", "sensor_source": "learned"}, {"kind": "paper", "real_state": True},
     ],
 )  # fmt: skip
 def test_the_onnx_file_equals_the_network(how):
@@ -59,15 +61,8 @@ def test_the_onnx_file_equals_the_network(how):
     x = sample_inputs(net, 20)
     with torch.inference_mode():
         expected = net(torch.from_numpy(x)).numpy()
-    np.testing.assert_allclose(OnnxNetwork(onnx_content(net))(x), expected, atol=1e-6)
+    np.testing.assert_allclose(OnnxNetwork(onnx_content(net))(x), expected, atol=MAX_DIFFERENCE_RAD)
     assert np.abs(expected).mean() > 1e-3
-
-
-def test_drawn_states_have_the_statistics_trained_on():
-    net = trained()
-    z = net.features.standardise(net.features.relative(torch.from_numpy(sample_inputs(net, 4000))))
-    assert abs(float(z.mean())) < 0.05
-    assert abs(float(z.std()) - 1) < 0.05
 
 
 def test_without_onnxruntime_a_model_says_what_to_install(artifact, monkeypatch):

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export, sample_inputs
-from gaponet.nn.paper import RENAMED, released_inputs, released_network
+from gaponet.nn.paper import RENAMED
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
@@ -50,12 +51,17 @@ def test_inputs_have_the_dimensions_of_table_2(history, payload, trunk, seen, as
     assert build_network(net.config, 10)(torch.randn(3, net.config.input_dim(10))).abs().max() == 0
 
 
-def test_the_published_weights_give_the_published_outputs(paper_network):
-    net, pairs = released_network(dict(np.load(paper_network / "weights.npz"))), np.load(paper_network / "pairs.npz")
-    with torch.inference_mode():
-        delta = net(released_inputs(pairs["model_obs"], pairs["action"])).numpy()
-    assert np.abs(delta - pairs["delta"]).max() < 1e-6
-    assert np.abs(pairs["delta"]).max() > 0.1
+@pytest.fixture
+def benchmark(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    import released_network
+
+    return released_network
+
+
+def test_the_published_weights_give_the_published_outputs(paper_network, benchmark):
+    assert benchmark.difference(paper_network) < 1e-6
+    assert np.abs(np.load(paper_network / "pairs.npz")["delta"]).max() > 0.1
 
 
 def test_weights_with_their_earlier_names_are_loaded():
@@ -103,23 +109,6 @@ def test_the_limit_changes_no_correction_within_it():
     assert 0.3 < within.float().mean() < 0.7
     assert torch.equal(limited[within], raw[within])
     assert torch.allclose(limited[~within].abs(), torch.tensor(small.config.delta_max))
-
-
-@pytest.mark.parametrize(
-    "how",
-    [{}, {"payload_input": False}, {"payload_trunk": False}, {"delta_hold": 3}, {"sensor_hold": 5}, {"stride": 2},
-     {"sensor_source": "learned"}, {"branch_observation": True, "relative_action": True, "real_state": True}],
-)  # fmt: skip
-def test_the_exported_paper_network_equals_the_network(tmp_path, how):
-    config, robot = replace(PAPER, **how), write_arm(tmp_path / "arm")
-    net = network(config)
-    assert export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), sample_inputs(net)) <= 1e-5
-    model = GapModel.load(tmp_path / "run")
-    assert model.config == config
-    x = torch.randn(7, config.input_dim(2))
-    with torch.inference_mode():
-        np.testing.assert_allclose(model.infer(x.numpy()), net(x).numpy(), atol=1e-6)
-    assert model.loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1).shape == (2,)
 
 
 def loop(infer, **how):
@@ -303,11 +292,11 @@ def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stoppe
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
     update = 8 * 8 * config.model.delta_hold
     run = tmp_path / "whole"
-    model = Trainer.prepare(*world, run, config, Budget(steps=4 * update)).run()
+    model = Trainer(*world, run, config, Budget(steps=4 * update)).run()
     assert GapModel.how_trained(model.card) == "4 updates of PPO from the untrained network, no supervised pre-training"
     assert model.card["steps"] == 4 * update
-    Trainer.prepare(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
-    Trainer.prepare(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
     whole, parts = (torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts"))
     assert all(torch.equal(x, parts[name]) for name, x in whole.items())
     untrained = build_network(config.model, 2)
@@ -316,7 +305,7 @@ def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stoppe
 
 def test_it_trains_by_labels_too_and_eval_says_how_many_corrections_are_at_the_limit(world, tmp_path, capsys):
     run = tmp_path / "run"
-    card = Trainer.prepare(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
+    card = Trainer(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
     assert GapModel.how_trained(card) == "supervised pre-training (1 rounds), 2 updates of PPO"
     result = evaluate([run], *world).result
     assert list(result["methods"]) == ["nominal", "delay_offset", "paper"]
@@ -333,7 +322,7 @@ def test_a_refitted_predictor_keeps_the_scale_of_the_sensor_values(world, tmp_pa
     for every in (0, 2):
         config = replace(TRAINING, ppo=replace(TRAINING.ppo, refit_sensors=every))
         config = replace(config, pretraining=replace(config.pretraining, rounds=0))
-        trainer = Trainer.prepare(*world, tmp_path / f"run{every}", config, Budget(steps=2 * 64))
+        trainer = Trainer(*world, tmp_path / f"run{every}", config, Budget(steps=2 * 64))
         trainer.run()
         fitted.append(trainer.net.predictor.state_dict())
     once, again = fitted

@@ -29,7 +29,7 @@ def periods(sequence, friction):
 def test_the_inverse_of_a_recording_is_its_command(tmp_path):
     robot = write_arm(tmp_path, xml=XML.replace('frictionloss="0.05"', 'frictionloss="0"'))
     sequence, inverse = smooth(robot), AnalyticInverse.of(BatchSim(robot, [CONDITION]))
-    told = np.concatenate([inverse([p], p.qpos) for p in periods(sequence, 0.0)])
+    told = np.concatenate([inverse([p]) for p in periods(sequence, 0.0)])
     np.testing.assert_allclose(told, sequence.ctrl[:-1], atol=2e-4)
 
 
@@ -64,4 +64,4 @@ def test_torque_limits_bound_the_targets(tmp_path):
     weak = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.1"))
     inverse = AnalyticInverse.of(BatchSim(weak, [CONDITION]))
     still = Period(*np.zeros((5, 1, 2)))
-    assert np.abs(inverse([still], still.qpos)).max() <= 0.1 / 20.0 + 1e-12
+    assert np.abs(inverse([still])).max() <= 0.1 / 20.0 + 1e-12

@@ -42,7 +42,6 @@ def export_robot(
         into: For mjcf and urdf: a file of the user's own; an edited copy is written (mjcf: default the robot's).
         prefix: Prefix of joint names in that file.
         payload_mass: kg in each hand.
-        progress: Called with done, total and a note.
 
     Raises:
         RobotError: The file cannot be edited.
@@ -88,7 +87,8 @@ def export_network(
         return _export_onnx(holder, None if out is None else Path(out))
     model, folder = GapModel.load(holder), Path(out) if out else holder / to
     if to == "torch":
-        return _network(folder, to, model.card["robot"], export_model(model, holder, folder, payload_mass))
+        parity = export_model(model, holder, folder, payload_mass)
+        return ExportResult(path=folder, to=to, robot=model.card["robot"], parity=parity)
     made = export_networks(model, holder, folder, data, payload_mass)
     return _exported(made, folder, to, model.card["robot"])
 
@@ -115,7 +115,6 @@ def randomization(
         scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot: over its type.
         units: For any-robot: robot folders of the type.
         data: Dataset whose motions choose and judge the units; default: the dataset of the identification.
-        progress: Called with done, total and a note.
 
     Returns:
         The file, and the ranges with sampled units.
@@ -158,10 +157,4 @@ def _export_onnx(run: Path, out: Path | None) -> ExportResult:
     parity = write(net, path, card, sample_inputs(net))
     if path != run / "model" and has_stored_robot(run):
         save_robot(load_stored_robot(run, card["robot"]), path / STORED_ROBOT)  # commands can then be transferred
-    return _network(path, "onnx", card["robot"], parity)
-
-
-def _network(path: Path, to: str, robot: str, parity: float) -> ExportResult:
-    return ExportResult(
-        path=path, to=to, robot=robot, errors={}, motions=0, virtual=False, notes=(), parity=parity
-    )  # fmt: skip
+    return ExportResult(path=path, to="onnx", robot=card["robot"], parity=parity)

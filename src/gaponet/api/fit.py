@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gaponet.api.logs import unit_recordings
-from gaponet.api.opening import Place, as_dataset, as_robot, as_run, require_commands
+from gaponet.api.opening import Place, as_dataset, as_robot, as_run, entries_of_unit, require_commands
 from gaponet.api.results import AdaptResult, IdentifyResult, TorqueResult, TrainResult
 from gaponet.base.errors import NoGainError, UsageError
 from gaponet.base.files import write_json, write_text
@@ -73,7 +73,6 @@ def identify(
         threads: 0 for all cores.
         budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.
         stops: Add an end stop to joints that stayed behind several commands; otherwise they are reported.
-        progress: Called with done, total and a note.
 
     Raises:
         DatasetError, UsageError: A unit is not there, or `like` has no joint that corresponds.
@@ -216,14 +215,13 @@ def train(
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         config: Everything else; default `TrainConfig()`.
-        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, inverse. auto: gaponet,
+        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp. auto: gaponet,
             shared_mlp and mlp get a fifth of the budget each, and the best on validation gets the rest. Default: that
             of the config.
         robot: Another robot than the one that the dataset keeps, e.g. the folder that `identify` wrote.
         holdout_units: Units never trained on; their test motions stay in the test split.
         resume: Continue the run in `out`.
         log: tensorboard, wandb.
-        progress: Called with done, total and a note.
 
     Returns:
         The exported model; RUN/model holds it.
@@ -247,7 +245,7 @@ def train(
             def show(status: Status) -> None:
                 progress(spent + share * status.fraction, 1.0, f"{kind}: {status.note}")
 
-            return Trainer.prepare(
+            return Trainer(
                 data, spec, run, replace(config, model=replace(config.model, kind=kind)), whole.part(share),
                 resume=resume, holdout_units=holdout_units, show=show, log=log,
             ).run()  # fmt: skip
@@ -284,7 +282,6 @@ def adapt_model(
         seconds: Duration of the recordings to use, in windows of 8 s.
         robot: Another robot than the one that the dataset keeps.
         mixed_gains: Accept recordings made with different kp or kd together.
-        progress: Called with done, total and a note.
 
     Raises:
         UsageError, ModelError: The unit is not named, or the model fits another robot.
@@ -298,7 +295,9 @@ def adapt_model(
     data, spec = as_dataset(dataset, robot, folder)
     data.require_robot(spec)
     model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
-    entries = Adaptation.recordings(data, model, unit, motions)
+    _, entries = entries_of_unit(data, unit, motions)
+    if not motions:
+        entries = [e for e in entries if e.meta.motion in model.card["motions"]["train"]] or entries
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
     fitted = Adaptation.fit(model, simulator, data.sequences(entries), seconds, _window_rms(progress))
@@ -332,7 +331,6 @@ def adapt_robot(
         motions: Only these.
         seconds: Duration of the recordings to fit, in windows of 8 s; all of them are used for validation.
         payload_mass: kg in each hand, of logs whose format does not state it.
-        progress: Called with done, total and a note.
 
     Raises:
         UsageError: The unit is not named.

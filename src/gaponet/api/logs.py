@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from gaponet.api.opening import Place, as_dataset, as_robot
+from gaponet.api.opening import Place, as_dataset, as_robot, entries_of_unit
 from gaponet.api.results import CollectResult, DoctorResult, ExciteResult, ImportResult, PairResult, Prediction
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.progress import Progress, no_progress, with_note
@@ -75,7 +75,6 @@ def import_logs(
         skip_bad: Cut bad rows and leave out unreadable logs, instead of refusing all.
         strict: Refuse logs with implausible velocity, torque or temperature, instead of repairing them.
         allow_pickle: Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only.
-        progress: Called with done, total and a note.
 
     Raises:
         LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what to do.
@@ -112,7 +111,6 @@ def doctor(
         dataset: Recordings; also the address of a dataset that was pushed to a bucket.
         robot: Another robot than the one that the dataset keeps.
         executor: Where many unchecked recordings are read: local, ray, ray:ADDRESS, or one of concurrent.futures.
-        progress: Called with done, total and a note.
 
     Raises:
         DatasetError: The folder is no dataset, or damaged.
@@ -143,7 +141,6 @@ def pair(
         dataset: Recordings.
         robot: Another robot than the one that the dataset keeps.
         executor: Where they are simulated: local, ray, ray:ADDRESS (docs/scale.md), or one of concurrent.futures.
-        progress: Called with done, total and a note.
 
     Raises:
         DatasetError, JointMismatchError: The folder is no dataset, or one of another robot.
@@ -182,7 +179,6 @@ def collect(
         nproc: Processes, or jobs at a time; 0 for one per core. More than one starts fresh interpreters: a script that
             calls this needs `if __name__ == "__main__":`.
         executor: Where it is played: local, ray or ray:ADDRESS (docs/scale.md).
-        progress: Called with done, total and a note.
 
     Raises:
         UsageError: The recipe names a motion, unit or file that does not exist.
@@ -225,7 +221,6 @@ def excite(
         rate: Commands per second, Hz.
         format: txt (SAGE, 50 Hz), csv (with time) or npz; `gaponet run` and `gaponet record` play each.
         seed: Seed of the motions.
-        progress: Called with done, total and a note.
 
     Raises:
         UsageError: No motion fits, or the robot folder holds no parameter uncertainty.
@@ -325,8 +320,5 @@ def unit_recordings(
         else:
             data, _ = as_dataset(source, robot)
         data.require_robot(robot)
-        units = sorted({e.meta.unit_id for e in data.entries})
-        if unit not in units and (unit or len(units) != 1):
-            raise UsageError(f"--unit {unit or '(none)'}: {source} holds units {', '.join(units)}; name one")
-        unit = unit or units[0]
-        yield unit, data.sequences([e for e in data.select(motions) if e.meta.unit_id == unit])
+        unit, entries = entries_of_unit(data, unit, motions)
+        yield unit, data.sequences(entries)

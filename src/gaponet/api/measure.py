@@ -48,7 +48,6 @@ def gap(
             cause and the model reduce the error, and the floor, on motions that were not used in training; the folder
             keeps it as gap.json, gap.svg and gap.png.
         executor: Where recordings are simulated: local, ray or ray:ADDRESS (docs/scale.md).
-        progress: Called with done, total and a note.
     """
     from gaponet.sim.metrics import Run, summary
     from gaponet.sim.model import model_hash
@@ -110,7 +109,6 @@ def evaluate(
         robot: Another robot than the one that the dataset keeps. If it is not the simulator that the run was trained
             in, it is shown as it is, and with the run transferred into it (deploy/transfer.py).
         units: Only recordings of these, such as the one held out from training.
-        progress: Called with done, total and a note.
 
     Raises:
         DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or
@@ -188,7 +186,6 @@ def replay(
         data: Dataset whose validation motions give the band; default that of the identification.
         described: A logs.toml that says what the rollouts' columns mean.
         payload_mass: kg in each hand.
-        progress: Called with done, total and a note.
 
     Raises:
         UsageError: Neither recordings nor an uncertainty of the robot exist.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gaponet.base.errors import UsageError
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -36,6 +36,19 @@ def as_dataset(
     from gaponet.share.reading import open_dataset
 
     return open_dataset(dataset, robot, run)
+
+
+def entries_of_unit(data: Dataset, unit: str, motions: tuple[str, ...]) -> tuple[str, list[Entry]]:
+    """Return the id and the recordings of a unit, or of the only one; motions: only these.
+
+    Raises:
+        UsageError: The unit is not there, or there are several and none is named.
+    """
+    units = sorted({e.meta.unit_id for e in data.entries})
+    if unit not in units and (unit or len(units) != 1):
+        raise UsageError(f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one")
+    unit = unit or units[0]
+    return unit, [e for e in data.select(motions) if e.meta.unit_id == unit]
 
 
 def driven_by_torque(data: Dataset) -> bool:

@@ -28,11 +28,39 @@ if TYPE_CHECKING:
     from gaponet.sysid.drift import Drift, ParameterChange
     from gaponet.sysid.torque_motors import TorqueDrivenFit
 
+__all__ = [
+    "AdaptResult", "CheckResult", "CollectResult", "DoctorResult", "EvalResult", "ExciteResult", "ExportResult",
+    "GapResult", "IdentifyResult", "ImportResult", "PairResult", "ReplayResult", "TorqueResult", "TrainResult",
+]  # fmt: skip
 Metrics = dict[str, Any]  # mpjae rad, q_dis rad·s, …, and by_joint, by_payload, by_unit, by_motion, by_horizon
 
 
+class Result:
+    """Base class of results."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain data."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, kw_only=True)
-class ImportResult:
+class Measured(Result):
+    """Errors of simulators on recordings.
+
+    Attributes:
+        methods: Method (nominal; also identified, and a model) → metrics.
+    """
+
+    methods: dict[str, Metrics]
+
+    @property
+    def mpjae(self) -> dict[str, float]:
+        """Method → mean absolute joint position error, rad."""
+        return {name: float(metrics["mpjae"]) for name, metrics in self.methods.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportResult(Result):
     """Logs that were read into a dataset.
 
     Attributes:
@@ -65,7 +93,6 @@ class ImportResult:
         return [lag for lag in lags if lag is not None]
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         offsets = self.offsets or {}
         return {
             "dataset": str(self.dataset.path), "imported": [e.id for e in self.added],
@@ -80,7 +107,7 @@ class ImportResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoctorResult:
+class DoctorResult(Result):
     """Problems of a dataset.
 
     Attributes:
@@ -99,7 +126,6 @@ class DoctorResult:
         return sum(f.level == level for f in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         return {
             "verdict": self.verdict, "findings": [asdict(f) for f in self.findings],
             "sequences": [dict(row) for row in self.sequences], "joints": [dict(row) for row in self.joints],
@@ -107,7 +133,7 @@ class DoctorResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairResult:
+class PairResult(Result):
     """Recordings with a paired simulation.
 
     Attributes:
@@ -120,27 +146,19 @@ class PairResult:
     present: int
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         return {"dataset": str(self.dataset.path), "simulated": self.simulated, "present": self.present}
 
 
 @dataclass(frozen=True, kw_only=True)
-class GapResult:
+class GapResult(Measured):
     """Error of the simulator, in open-loop rollouts of whole motions.
 
     Attributes:
-        methods: Method (nominal; also identified, and a model) → metrics.
         table: Everything that `to_dict` returns. Of an identified robot or a run it holds the error after each cause,
             the floor, and the same by joint and payload.
     """
 
-    methods: dict[str, Metrics]
     table: Mapping[str, Any] = field(repr=False)
-
-    @property
-    def mpjae(self) -> dict[str, float]:
-        """Method → mean absolute joint position error, rad."""
-        return {name: float(metrics["mpjae"]) for name, metrics in self.methods.items()}
 
     @property
     def by_cause(self) -> bool:
@@ -148,36 +166,27 @@ class GapResult:
         return "left" in self.table
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         return dict(self.table)
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalResult:
+class EvalResult(Measured):
     """Errors of robots and runs on motions of a dataset.
 
     Attributes:
-        methods: Method → metrics.
         unseen: True if no recording was used in training.
         evaluation: Rollouts, commands and corrections of each method.
     """
 
-    methods: dict[str, Metrics]
     unseen: bool
     evaluation: Evaluation = field(repr=False)
 
-    @property
-    def mpjae(self) -> dict[str, float]:
-        """Method → mean absolute joint position error, rad."""
-        return {name: float(metrics["mpjae"]) for name, metrics in self.methods.items()}
-
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         return dict(self.evaluation.result)
 
 
 @dataclass(frozen=True, kw_only=True)
-class IdentifyResult:
+class IdentifyResult(Result):
     """An identified robot and its error on validation motions.
 
     Attributes:
@@ -215,7 +224,6 @@ class IdentifyResult:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         from gaponet.sim.metrics import standard_error
 
         fit = self.fit
@@ -234,7 +242,7 @@ class IdentifyResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TorqueResult:
+class TorqueResult(Result):
     """An identified torque-driven robot.
 
     Attributes:
@@ -251,7 +259,6 @@ class TorqueResult:
     fit: TorqueDrivenFit = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         from gaponet.sysid.torque_motors import PASSIVE_FIELDS
 
         fit, robot = self.fit, self.robot
@@ -267,7 +274,7 @@ class TorqueResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainResult:
+class TrainResult(Result):
     """A trained model.
 
     Attributes:
@@ -286,14 +293,13 @@ class TrainResult:
         return {name: float(self.card["val_mpjae"][name]) for name in ("nominal", "start", "model")}
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         keys = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
         kind = self.card["model"]["kind"]
         return {key: self.card[key] for key in keys} | {"kind": kind, "candidates": dict(self.candidates)}
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptResult:
+class AdaptResult(Result):
     """Servo parameters of one unit on one day.
 
     Attributes:
@@ -313,7 +319,6 @@ class AdaptResult:
     recordings: int
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         return {
             "unit_id": self.unit_id, "before": self.before, "after": self.after,
             "servos": {joint: dict(servo) for joint, servo in self.servos.items()}, "robot": str(self.folder),
@@ -321,7 +326,7 @@ class AdaptResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckResult:
+class CheckResult(Result):
     """Comparison of new logs with an identified robot.
 
     Attributes:
@@ -337,7 +342,6 @@ class CheckResult:
     drift: Drift = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         d = self.drift
 
         def plain(moved: ParameterChange) -> dict[str, Any]:
@@ -351,7 +355,7 @@ class CheckResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayResult:
+class ReplayResult(Result):
     """Motion that the identified robot would make in rollouts of a policy.
 
     Attributes:
@@ -386,7 +390,6 @@ class ReplayResult:
             np.savez_compressed(file, **arrays)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         return {
             "robot": self.robot.name, "rollouts": [a.name for a in self.rollouts],
             "joints": {j: dict(s) for j, s in self.joints.items()}, "differ": list(self.differ),
@@ -395,7 +398,7 @@ class ReplayResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportResult:
+class ExportResult(Result):
     """Files for another program.
 
     Attributes:
@@ -413,15 +416,14 @@ class ExportResult:
     path: Path
     to: str
     robot: str
-    errors: Mapping[str, float]
-    motions: int
-    virtual: bool
-    notes: tuple[str, ...]
+    errors: Mapping[str, float] = field(default_factory=dict)
+    motions: int = 0
+    virtual: bool = False
+    notes: tuple[str, ...] = ()
     parity: float | None = None
     check: Path | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         if self.parity is not None:
             return {"path": str(self.path), "to": self.to, "parity_rad": self.parity}
         return {
@@ -431,7 +433,7 @@ class ExportResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectResult:
+class CollectResult(Result):
     """Recordings of virtual robots.
 
     Attributes:
@@ -453,7 +455,6 @@ class CollectResult:
         return self.hours * 3600 / self.seconds if self.seconds > 0 else 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         return {
             "virtual": True, "times_real_time": self.times_real_time, "dataset": str(self.dataset),
             "written": self.written, "present": self.present, "hours": self.hours, "wall_s": self.seconds,
@@ -461,7 +462,7 @@ class CollectResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExciteResult:
+class ExciteResult(Result):
     """Motion files to play on a robot.
 
     Attributes:
@@ -480,14 +481,15 @@ class ExciteResult:
     prediction: Prediction | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
-        told = {} if self.prediction is None else self.prediction.to_dict()
-        return {"motions": list(self.motions), "minutes": self.minutes, "payloads": list(self.payloads),
-                "sheet": str(self.sheet), **told}  # fmt: skip
+        prediction = {} if self.prediction is None else self.prediction.to_dict()
+        return {
+            "motions": list(self.motions), "minutes": self.minutes, "payloads": list(self.payloads),
+            "sheet": str(self.sheet),
+        } | prediction  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prediction:
+class Prediction(Result):
     """Standard errors of an identified robot's parameters, before and after further motions.
 
     Attributes:
@@ -504,7 +506,6 @@ class Prediction:
     played: tuple[tuple[float, str], ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
         return {
             "errors": self.before, "errors_then": self.after, "worth_seconds": self.useful_seconds,
             "open": dict(self.undetermined), "played": [list(pair) for pair in self.played],

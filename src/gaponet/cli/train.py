@@ -31,7 +31,6 @@ def train(
     recipe: Literal["labels", "paper"] = "labels",
     budget: str = "10m",
     resume: Flag = False,
-    fast: Flag = False,
     robot: Robot = None,
     holdout_units: tuple[str, ...] = (),
     log: tuple[Literal["tensorboard", "wandb"], ...] = (),
@@ -43,9 +42,8 @@ def train(
     Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model.
 
     Args:
-        recipe: labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with settings for that.
-            PPO options that you give keep their values.
-        fast: PPO with one pass over each batch and a smaller critic; it overrides the options below.
+        recipe: labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with settings for that;
+            PPO options that are given keep their values.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         config: Settings of the training.
     """
@@ -54,7 +52,6 @@ def train(
 
     screen = Out(json)
     config = config.paper_recipe() if recipe == "paper" else config
-    config = config.fast() if fast else config
     with nullcontext(no_progress) if started() else progress_bar(f"training {model}") as update:
         trained = api.train(
             dataset, out=out, budget=budget, config=config, model=model, robot=robot, holdout_units=holdout_units,

@@ -7,17 +7,15 @@ like the corrected one (deploy/transfer.py).
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.deploy.transfer import Inverse, Reference, Transfer, control_periods_of
+from gaponet.deploy.transfer import Reference, Transfer, control_periods_of
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import PROBES, AnalyticInverse, ProbingInverse
+from gaponet.sim.inverse import AnalyticInverse
 
 
 class AlignedSim:
@@ -43,7 +41,6 @@ class AlignedSim:
         locked: tuple[str, ...] = (),
         extrapolate: bool = False,
         simulator_payload: Array | float | None = None,
-        inverse: Inverse = "closed",
     ) -> None:
         """
         Args:
@@ -58,7 +55,6 @@ class AlignedSim:
             locked: Joints clamped at home (sim.model.idle_joints): quicker; arrays are without them.
             extrapolate: Take payloads beyond those trained on, and simulators beyond those measured.
             simulator_payload: kg that the simulator has in its hands, where it does not know of payload_mass.
-            inverse: How a simulator that is not the model's is inverted: closed form, or by its answers to probes.
         """
         self.dt = robot.dt if dt is None else dt
         if isinstance(model, GapModel):
@@ -84,8 +80,8 @@ class AlignedSim:
         if trained is not None and trained.is_trained_in(robot) and control_periods_of(trained, self.dt) == 1:
             self.loop = trained.loop(self.num_envs)
         elif model is not None:
-            inverted = _inverse_of(self.sim, robot, own, locked, inverse, nthread)
-            self.transfer = Transfer(model, inverted, conditions, locked, nthread, extrapolate)
+            inverse = AnalyticInverse.of(BatchSim(robot, own, nthread, locked))
+            self.transfer = Transfer(model, inverse, conditions, locked, nthread, extrapolate)
         delay = max(robot.delay.max(), 0.0 if self.transfer is None else self.transfer.sim.robot.delay.max())
         self._depth = 1 + int(np.ceil(delay / self.dt))  # past targets that delayed servos need
         self.target = np.zeros((self.num_envs, self.n))
@@ -149,26 +145,3 @@ class AlignedSim:
 
     def _past(self, target: Array) -> Array:
         return np.repeat(target[:, None], self._depth, axis=1)
-
-
-def _inverse_of(
-    sim: BatchSim, robot: RobotSpec, conditions: list[Condition], locked: tuple[str, ...], how: Inverse, nthread: int
-) -> AnalyticInverse | ProbingInverse:
-    """Return the inverse dynamics of a batch of robots; by probes, from copies of each robot without the table."""
-    if how == "closed":
-        return AnalyticInverse.of(BatchSim(robot, conditions, nthread, locked))
-    count = max(len(PROBES), 1 + sim.n)
-    copies = BatchSim(replace(robot, table=None), conditions * count, nthread, locked)
-    ahead = int(np.ceil(robot.delay.max() / conditions[0].dt - 1e-9))
-
-    def answer(targets: Array, qvel: Array) -> tuple[Array, Array]:
-        rows = np.arange(len(targets) * sim.num_envs)
-        copies.set_state({name: np.concatenate([x] * count) for name, x in sim.state().items()})
-        copies.qvel[:] = np.tile(qvel, (count, 1))
-        full = np.zeros((copies.num_envs, copies.n))
-        full[rows] = targets.reshape(len(rows), -1)
-        for _ in range(1 + ahead):
-            copies.step(full, rows)
-        return copies.qpos[rows].reshape(targets.shape), copies.qvel[rows].reshape(targets.shape)
-
-    return ProbingInverse(answer, conditions[0].dt, ahead)

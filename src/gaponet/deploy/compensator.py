@@ -62,8 +62,6 @@ class CompensatorConfig:
     """Largest |u − a|, rad."""
     blend: float = 1.0
     """Time in which the compensation increases from 0 to 1 after a start, s."""
-    lead: int = 0
-    """Control periods by which targets are given early, if the motion is known ahead. Zero is causal."""
     payload_max: float = 3.0
     """Largest payload without a model, stated or estimated, kg. With a model, the training data give it."""
 
@@ -71,8 +69,7 @@ class CompensatorConfig:
         if not (
             0 < self.gain <= 1
             and min(self.limit, self.iterations) > 0
-            and min(self.feedback, self.feedback_time, self.blend, self.lead) >= 0
-            and min(self.acceleration_time, self.payload_max) >= 0
+            and min(self.feedback, self.feedback_time, self.blend, self.acceleration_time, self.payload_max) >= 0
         ):
             raise UsageError(
                 "compensator: gain must be in (0, 1], limit and iterations positive, the rest not negative"
@@ -147,7 +144,6 @@ class Compensator:
         self.payload_mass, self.payload_stated, self.periods = np.zeros(num), False, 0
         self.offset, self.command = np.zeros((2, num, len(self.op)))  # u − a′ of the iteration; last command, rad
         self._target: Array | None = None  # last finite target; None before `reset`
-        self._references: list[Array] = []  # positions that the robot should have, newest last
 
     # ---- use
 
@@ -202,7 +198,6 @@ class Compensator:
         self.shadow.batch.forward(self.ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         for _ in range(SETTLING_PERIODS):
             self._step_shadow(rest, self._shadow_target(rest[:, self.operated]))
-        self._references = [self._shadow_qpos()] * (self.config.lead + 1)
 
     def set_payload(self, payload_mass: Array | float) -> None:
         """Set the payload after a pick or place, kg, one number or (num_envs,); errors as of `reset`."""
@@ -234,8 +229,7 @@ class Compensator:
         """Commands for the coming control period, rad.
 
         Args:
-            target: Target of the robot, rad; with a lead, that many periods from now. If it is not finite, the last
-                finite one holds.
+            target: Target of the robot, rad. If it is not finite, the last finite one holds.
             qpos: Measured position, rad; None if no new state has arrived. Feedback then pauses, as it does for a qpos
                 or qvel that is not finite.
             qvel: Measured velocity, rad/s.
@@ -249,7 +243,6 @@ class Compensator:
         given = self._as_rows(target)
         self._target = targets = np.where(np.isfinite(given), given, self._target)
         a = targets[:, self.op]
-        self._references = [*self._references[1:], self._shadow_qpos()]
         if qpos is not None:
             v, torque = (None if x is None else self._as_rows(x)[:, self.op] for x in (qvel, tau))
             self._process_state(self._as_rows(qpos)[:, self.op], v, torque)
@@ -298,14 +291,11 @@ class Compensator:
         v = np.zeros_like(q) if v is None else v
         valid = np.isfinite(q + v + (0.0 if tau is None else tau)).all(axis=1)  # robots
         if self.periods:
-            self.feedback.update(self._references[0] - q, valid)
+            self.feedback.update(self.shadow.qpos[: self.num_envs, self.operated] - q, valid)
         if not self.payload_stated:
             self._carry(self.payload_estimate.update(q, v, self.command, tau, valid))
         elif self.single and len(self.masses) > 1:
             self.payload_estimate.update(q, v, self.command, tau, valid)
-
-    def _shadow_qpos(self) -> Array:
-        return self.shadow.qpos[: self.num_envs, self.operated]
 
     def _step_shadow(self, targets: Array, operated_targets: Array) -> None:
         full = np.zeros((self.shadow.num_envs, self.shadow.n))

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
-from gaponet.deploy.transfer import Inverse, Reference, Transfer, control_periods_of
+from gaponet.deploy.transfer import Reference, Transfer, control_periods_of
 from gaponet.nn.artifact import GapModel
-from gaponet.robot.folder import has_stored_robot, stored_robot_holder
-from gaponet.robot.spec import RobotSpec
+from gaponet.nn.loop import DeltaLoop
 from gaponet.sim.batch import Batch, BatchSim, Condition
-from gaponet.sim.inverse import AnalyticInverse, ProbingInverse
-
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-GAIN_TOLERANCE = 1e-3  # relative, of kp and kd in a scene
+from gaponet.sim.inverse import AnalyticInverse
 
 
 class MujocoAligner:
@@ -41,44 +36,43 @@ class MujocoAligner:
         payload_mass: float,
         prefix: str = "",
         extrapolate: bool = False,
-        inverse: Inverse = "closed",
     ) -> None:
         """
         Args:
-            model: The identified robot that the scene is to move like, or a trained model. If the model's folder has no
-                simulator, the scene must have the gains of training.
+            model: The identified robot that the scene is to move like, or a trained model with its simulator.
             mj_model: The compiled scene.
             dt: Control period, s.
             payload_mass: kg in each hand of the robot that the scene is to move like.
             prefix: Prefix of the robot's names in the scene ("left/").
             extrapolate: Accept a payload outside the training data, and a scene outside the measured ranges.
-            inverse: Inverse dynamics in closed form, which needs position actuators, or by probes of copies.
 
         Raises:
             ModelError: The scene, the control period or the payload does not fit.
         """
-        operated = model.card["joint_names"] if isinstance(model, GapModel) else model.operated
-        source = model.path if isinstance(model, GapModel) else model.folder
-        self.payload_mass, self.loop = payload_mass, None
+        robot, source = (model.simulator(), model.path) if isinstance(model, GapModel) else (model, model.folder)
         scene_joints = [mj_model.joint(j).name for j in range(mj_model.njnt)]
-        for name in operated:
+        for name in robot.operated:
             if prefix + name not in scene_joints:
                 raise ModelError(
                     f"{source}: moves joint '{prefix + name}', the scene has {', '.join(scene_joints)}; give prefix"
                 )
-        self.transfer: Transfer | None = None
-        self._set_scene: Callable[[mujoco.MjData], None] = lambda data: None
-        condition = Condition(payload_mass, "both", dt)
+        unchanged = not robot.has_servo_model
         if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
-        if isinstance(model, RobotSpec) or has_stored_robot(stored_robot_holder(model.path)):
-            self._prepare_transfer(model, mj_model, condition, prefix, extrapolate, inverse)
-        else:
-            _require_gains(model, mj_model, prefix)
-        if self.transfer is None and isinstance(model, GapModel):
-            model.require_rate(dt)
-            self.loop = model.loop()  # the scene equals the simulator of training
-        joints = operated if self.transfer is None else self.transfer.joint_names
+            unchanged = control_periods_of(model, dt) == 1
+        driven = {mj_model.joint(j).name for j in mj_model.actuator_trnid[:, 0]}
+        locked = tuple(name for name in robot.joint_names if prefix + name not in driven)
+        condition = Condition(payload_mass, "both", dt)
+        reference = BatchSim(robot, [condition], 1, locked)
+        joints = reference.joint_names
+        inverse = _of_scene(mj_model, tuple(prefix + name for name in joints), dt)
+        self.payload_mass = payload_mass
+        self.loop: DeltaLoop | None = None
+        self.transfer: Transfer | None = None
+        if not (unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range)):
+            self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
+        elif isinstance(model, GapModel):
+            self.loop, joints = model.loop(), robot.operated
         names = [prefix + name for name in joints]
         self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])
         self.qvel = np.array([mj_model.joint(name).dofadr[0] for name in names])
@@ -101,82 +95,17 @@ class MujocoAligner:
         elif self.transfer is not None:  # else the scene equals the robot
             if self._fresh:
                 self.transfer.reset(slice(None), q, v, a[:, None])
-            self._set_scene(data)
+            self.transfer.inverse.set_state(data)
             out[self.actuator] = self.transfer.command(q, v, a)[0]
         self._fresh = False
         return out
 
-    def _prepare_transfer(
-        self,
-        model: Reference,
-        scene: mujoco.MjModel,
-        condition: Condition,
-        prefix: str,
-        extrapolate: bool,
-        how: Inverse,
-    ) -> None:
-        """Set self.transfer, unless the scene equals the robot or the simulator of training."""
-        robot = model.simulator() if isinstance(model, GapModel) else model
-        driven = {scene.joint(j).name for j in scene.actuator_trnid[:, 0]}
-        locked = tuple(name for name in robot.joint_names if prefix + name not in driven)
-        reference = BatchSim(robot, [condition], 1, locked)
-        joints = tuple(prefix + name for name in reference.joint_names)
-        inverse: AnalyticInverse | ProbingInverse
-        if how == "closed":
-            inverse = _of_scene(scene, joints, condition.dt)
-            unchanged = (
-                control_periods_of(model, condition.dt) == 1
-                if isinstance(model, GapModel)
-                else not robot.has_servo_model
-            )
-            if unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range):
-                return
-            self._set_scene = inverse.set_state
-        else:
-            copies = _SceneCopies(scene, joints, condition.dt)
-            inverse = ProbingInverse(copies, condition.dt)
-            self._set_scene = copies.set_scene
-        self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
-
-
-class _SceneCopies:
-    """Next states of a scene's robot for several targets, from a copy of its MjData without contacts."""
-
-    def __init__(self, scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> None:
-        self.scene, self.steps = _without_contacts(scene), round(dt / scene.opt.timestep)
-        self.qpos = [scene.joint(name).qposadr[0] for name in joints]
-        self.qvel = [scene.joint(name).dofadr[0] for name in joints]
-        self.actuator = [_actuator(scene, name) for name in joints]
-        self.copy, self.data = mujoco.MjData(self.scene), mujoco.MjData(self.scene)
-
-    def set_scene(self, data: mujoco.MjData) -> None:
-        """Set the present state of the scene."""
-        self.data = data
-
-    def __call__(self, targets: Array, speeds: Array) -> tuple[Array, Array]:
-        """Return next qpos and qvel, each (k, 1, n), for targets (k, 1, n) rad and initial speeds (1, n) rad/s."""
-        qpos, qvel = np.empty_like(targets), np.empty_like(targets)
-        state = np.empty(mujoco.mj_stateSize(self.scene, STATE))
-        mujoco.mj_getState(self.scene, self.data, state, STATE)
-        for k, target in enumerate(targets[:, 0]):
-            mujoco.mj_setState(self.scene, self.copy, state, STATE)
-            self.copy.qvel[self.qvel] = speeds[0]
-            self.copy.ctrl[self.actuator] = target
-            mujoco.mj_step(self.scene, self.copy, self.steps)
-            qpos[k, 0], qvel[k, 0] = self.copy.qpos[self.qpos], self.copy.qvel[self.qvel]
-        return qpos, qvel
-
 
 def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> AnalyticInverse:
-    """Return the inverse dynamics of a robot in a scene."""
-    model, h = _without_contacts(scene), scene.opt.timestep
+    """Return the inverse dynamics of a robot in a scene, without contacts."""
+    model, h = copy.copy(scene), scene.opt.timestep
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return AnalyticInverse(Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h]))
-
-
-def _without_contacts(scene: mujoco.MjModel) -> mujoco.MjModel:
-    changed = copy.copy(scene)
-    changed.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    return changed
 
 
 def _actuator(scene: mujoco.MjModel, joint: str) -> int:
@@ -184,17 +113,3 @@ def _actuator(scene: mujoco.MjModel, joint: str) -> int:
     if len(actuators) != 1:
         raise ModelError(f"joint '{joint}' has {len(actuators)} actuators in the scene; the model needs one, position")
     return int(actuators[0])
-
-
-def _require_gains(model: GapModel, scene: mujoco.MjModel, prefix: str) -> None:
-    for joint, *trained in zip(model.card["joint_names"], model.card["kp"], model.card["kd"], strict=True):
-        i = _actuator(scene, prefix + joint)
-        gains = scene.actuator_gainprm[i, 0], -scene.actuator_biasprm[i, 2]
-        for name, gain, trained_gain in zip(("kp", "kd"), gains, trained, strict=True):
-            if abs(gain - trained_gain) > GAIN_TOLERANCE * max(abs(trained_gain), 1.0):
-                raise ModelError(
-                    f"joint '{prefix + joint}': {name} is {gain:g} in the scene, the model was trained with "
-                    f"{trained_gain:g}; "
-                    "load the model with its run folder, so that commands can be transferred, or set the gains trained "
-                    "with (card.json)"
-                )

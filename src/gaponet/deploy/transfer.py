@@ -14,7 +14,6 @@ identified robot), the target's motors stop the motion.
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from typing import Literal
 
 import numpy as np
 
@@ -24,10 +23,9 @@ from gaponet.data.sequence import Sequence
 from gaponet.nn.artifact import RATE_TOLERANCE, GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import AnalyticInverse, Period, ProbingInverse
+from gaponet.sim.inverse import AnalyticInverse, Period
 from gaponet.sim.replay import idle_limbs
 
-Inverse = Literal["closed", "probes"]
 Reference = GapModel | RobotSpec  # a model with the simulator of its run, or a simulator alone
 
 # Ranges in which transfer was measured.
@@ -47,7 +45,7 @@ class Transfer:
     def __init__(
         self,
         reference: Reference,
-        inverse: AnalyticInverse | ProbingInverse,
+        inverse: AnalyticInverse,
         conditions: list[Condition],
         locked: tuple[str, ...] = (),
         nthread: int = 1,
@@ -77,7 +75,6 @@ class Transfer:
         self.loop = None if model is None else model.loop(self.num_envs)
         self.payload_mass = np.array([c.payload_mass for c in conditions])
         self._delta = np.zeros((self.num_envs, len(self.op)))
-        self._offset = np.zeros((self.num_envs, sim.n))  # last command minus position, rad
         self._elapsed = 0  # control periods since the start
         self._frictionloss = sim.batch.expand("dof_frictionloss")  # the servo model writes it
         self._constraint_force: Array = sim.batch.bind("qfrc_constraint")
@@ -86,7 +83,7 @@ class Transfer:
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array) -> None:
         """Reset simulations to a state, (k, n), with the targets of past control periods, (k, depth, n)."""
         self.sim.reset(ids, qpos, qvel, past=past)
-        self._offset[ids], self._delta[ids] = 0.0, 0.0
+        self._delta[ids] = 0.0
         if self.loop is not None:
             self.loop.reset(ids)
         if len(np.arange(self.num_envs)[ids]) == self.num_envs:
@@ -106,9 +103,7 @@ class Transfer:
             state = self.sim.state()
             periods += [self._step_reference(corrected) for _ in range(self.inverse.ahead)]
             self.sim.set_state(state)
-        commands = self.inverse(periods, qpos + self._offset)
-        self._offset = commands - qpos
-        return commands
+        return self.inverse(periods)
 
     def _corrected(self, qpos: Array, qvel: Array, target: Array) -> Array:
         """Return target + Δa. The model has the control period of training, which can be several of these."""
@@ -169,21 +164,16 @@ class TransferCorrector:
         return commands
 
 
-def _require_measured(
-    inverse: AnalyticInverse | ProbingInverse, reference: AnalyticInverse, joints: tuple[str, ...]
-) -> None:
+def _require_measured(inverse: AnalyticInverse, reference: AnalyticInverse, joints: tuple[str, ...]) -> None:
     """Refuse a target outside the measured ranges."""
-    periods = (inverse.ahead - reference.ahead) * reference.dt
-    extra_delay = periods if isinstance(inverse, ProbingInverse) else inverse.delay - reference.delay
+    extra_delay = inverse.delay - reference.delay
     if extra_delay.max() > MAX_EXTRA_DELAY_S:
-        joint = joints[extra_delay.argmax() % len(joints)]
+        joint = joints[extra_delay.argmax()]
         raise ModelError(
             f"joint '{joint}': its servo is {1e3 * extra_delay.max():.0f} ms later than the reference's, and cannot "
             "follow it: the reference moves before this servo receives a target. Make the reference as late (delay in "
             "robot.toml; gaponet identify), or extrapolate (extrapolate=True, --extrapolate)"
         )
-    if isinstance(inverse, ProbingInverse):
-        return  # its parameters are unknown
     for quantity, values, (low, high) in (
         ("kp, as a ratio to the reference's,", inverse.kp / reference.kp, KP_RATIO_BOUNDS),
         ("frictionloss / kp, rad,", inverse.frictionloss / inverse.kp, (0.0, MAX_FRICTION_BAND_RAD)),

@@ -83,7 +83,7 @@ def train_cell(cell: Cell, report: Report) -> dict[str, Any]:
             resume = (cell.folder / "checkpoint.pt").is_file()
             write_text(cell.folder / SETUP_FILE, json.dumps(cell.setup(data), indent=1) + "\n")
             budget = Budget.parse(cell.budget)
-            trainer = Trainer.prepare(
+            trainer = Trainer(
                 data, cell.robot, cell.folder, config, budget,
                 resume=resume, holdout_units=cell.holdout_units, show=show,
             )  # fmt: skip

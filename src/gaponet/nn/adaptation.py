@@ -19,7 +19,6 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.files import lock_folder, write_json
 from gaponet.base.structure import read_json
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import Dataset, Entry
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.adapt import FIELDS, Field, adapt
@@ -105,20 +104,6 @@ class Adaptation:
                 )
             adaptations[adaptation.unit_id] = adaptation
         return adaptations
-
-    @staticmethod
-    def recordings(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
-        """Select the recordings of a unit: of these motions, else of the training motions, else all.
-
-        Raises:
-            UsageError: The unit does not exist, or it is not given and the dataset has several.
-        """
-        units = sorted({e.meta.unit_id for e in data.entries})
-        if unit not in units and (unit or len(units) != 1):
-            raise UsageError(f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one")
-        entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
-        trained = [e for e in entries if e.meta.motion in model.card["motions"]["train"]]
-        return entries if motions else trained or entries
 
 
 def _one_unit(sequences: ListOf[Sequence]) -> str:

@@ -284,6 +284,8 @@ class GapModel:
         for field, value in REMOVED_OPTIONS.items():
             if (given := card["model"].pop(field, value)) != value:
                 raise ModelError(f"{file}: trained with {field} {given}, which is no more; train again without it")
+        if card["model"].get("kind") == "inverse":  # a removed recipe for the mlp
+            card["model"]["kind"] = "mlp"
         if stages := card.get("stages"):
             card["stages"] = {RENAMED_STAGES.get(name, name): value for name, value in stages.items()}
         config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)

@@ -9,7 +9,7 @@ from annotated_types import Interval, Len
 
 from gaponet.base.errors import UsageError
 
-Kind = Literal["gaponet", "paper", "shared_mlp", "mlp", "inverse"]
+Kind = Literal["gaponet", "paper", "shared_mlp", "mlp"]
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max")
@@ -26,8 +26,7 @@ class ModelConfig:
     kind: Kind = "gaponet"
     """gaponet: the operator. paper: the network of the paper in its literal form, with the paper's layer widths
     (nn/paper.py). shared_mlp: one plain network for all joints, with the inputs of the operator and as many weights as
-    branch and trunk. mlp: a plain network on [observation, action], the form of ASAP. inverse: the mlp, pre-trained
-    in one round on recorded motions, without PPO."""
+    branch and trunk. mlp: a plain network on [observation, action], the form of ASAP."""
     history: Annotated[int, Interval(ge=1, le=1000)] = 4
     """H, number of past frames in the observation. They must be longer than the robot's lag."""
     stride: Annotated[int, Interval(ge=1, le=1000)] = 1

@@ -15,7 +15,7 @@ from gaponet.base.errors import ModelError
 from gaponet.base.structure import Angle, read_json
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.replay import Progress, replay
+from gaponet.sim.replay import replay
 
 MAX_DELAY_S = 0.16
 PIECE_S = 20.0  # duration of a rollout in the fit
@@ -44,9 +44,7 @@ class DelayOffset:
         return DelayOffsetCorrector(self, robot)
 
     @classmethod
-    def fit(
-        cls, sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, progress: Progress | None = None
-    ) -> DelayOffset:
+    def fit(cls, sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> DelayOffset:
         """Fit delay and offset of each joint by rollouts with all delays in whole control periods.
 
         All joints have the same delay in a rollout. Each joint takes the delay with the least error after its offset:
@@ -67,8 +65,6 @@ class DelayOffset:
                 e = np.concatenate(errors or [np.zeros(1)])
                 offset[i, k] = np.median(e)
                 error[i, k] = np.abs(e - offset[i, k]).mean()
-            if progress:
-                progress(i + 1, len(delays))
         best = error.argmin(axis=0)
         return DelayOffset(
             {j: round(float(delays[best[k]]), 6) for k, j in enumerate(names)},

@@ -45,7 +45,7 @@ class DeltaLoop:
         """
         Args:
             qpos_range: Limits of the operated joints, (n, 2) rad.
-            network: The model. Without one, call `observe` and `push` only, as in training.
+            network: The model. Without one, call `observe` and `history.push` only, as in training.
             like: A float32 array or tensor. All buffers are of its kind and device; default numpy.
         """
         n = len(qpos_range)

@@ -82,12 +82,13 @@ def onnx_content(net: DeltaNet) -> bytes:
     """Return a network in evaluation mode as an ONNX file: x (batch, dim) → delta (batch, n), float32."""
     linear = net.config.kind != "paper" and net.config.sensors == "off"
     content, x = io.BytesIO(), torch.zeros(2, net.config.input_dim(net.n))
+    exported: Any = _FusedFeatures(net) if linear else net
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # dynamo=True writes the same function in 2 to 16 s instead of 0.1, and needs onnxscript; torch 2.14 has both.
         torch.onnx.export(
-            _FusedFeatures(net) if linear else net, (x,), content, input_names=["x"], output_names=["delta"],  # type: ignore[arg-type]
-            dynamo=False, dynamic_axes={name: {0: "batch"} for name in ("x", "delta")},
+            exported, (x,), content, input_names=["x"], output_names=["delta"], dynamo=False,  # type: ignore[arg-type]
+            dynamic_axes={name: {0: "batch"} for name in ("x", "delta")},
         )  # fmt: skip
     return content.getvalue()
 

@@ -18,7 +18,6 @@ METHODS = {  # title, colour
     "nominal": ("nominal simulator", "#8c8c8c"),
     "delay_offset": ("delay + offset", "#d99000"),
     "identified": ("identification", "#2a9d6f"),
-    "inverse": ("labels alone", "#12465b"),
     "shared_mlp": ("MLP", "#3b7dd8"),
     "mlp": ("MLP, full coupling", "#7a8fe0"),
     "gaponet": ("GAPONet", "#c8102e"),

@@ -12,7 +12,7 @@ from gaponet.report.methods import IDENTIFIED, title
 from gaponet.robot.folder import STORED_ROBOT
 from gaponet.sim.metrics import standard_error
 
-LEARNED = ("inverse", "mlp", "shared_mlp", "paper", "gaponet")  # kinds of model
+LEARNED = ("mlp", "shared_mlp", "paper", "gaponet")  # kinds of model
 WITHOUT_NETWORK = ("nominal", "delay_offset", "identified")
 MIN_RELATIVE_REDUCTION = 0.02  # of the base's error, by a network that is worth having
 

@@ -1,11 +1,9 @@
 """Inverse of a simulator: position targets, held for a control period, that move it along a given motion.
 
-AnalyticInverse needs the simulator's parameters. The mean torque of a period is inverse dynamics at its mean
+The mean torque of a period is inverse dynamics at its mean
 acceleration and at the mean state before its physics steps. A position actuator gives the mean of
 kp·(u + offset − q) − kd·v over the physics steps, each within the motor's limits. The remaining error is the variation
 of torques within a period.
-
-ProbingInverse only simulates: from seven targets for all joints at once it interpolates the target, and refines it.
 """
 
 from __future__ import annotations
@@ -25,15 +23,6 @@ from gaponet.sim.servo import friction_limit, present
 
 # Agreement of two simulators: largest difference of targets, and number of random motions that are compared.
 MAX_TARGET_DIFFERENCE_RAD, COMPARED_MOTIONS = 1e-4, 32
-PROBES = np.array([-0.4, -0.1, -0.02, 0.0, 0.02, 0.1, 0.4])  # rad, around the target of the period before
-MIN_PROBE_SCALE, PROBE_SCALE_RATIO = 0.1, 3.0  # of PROBES; scale over the present error
-REFINEMENTS, MAX_REFINEMENT_RAD = 2, 0.1  # of the interpolated target
-SLOPE_STEP_RAD, SLIDING_SPEED = 1e-3, 0.5  # of one joint's target; rad/s of all joints, so that none sticks
-MIN_SLOPE, START_SLOPE, MIN_SLOPE_RATIO = 0.05, 1e-4, 0.1  # of position over target; ratio to the slope before
-POSITION_TOLERANCE_RAD = 1e-6  # positions that differ by less are equal, as within a friction band
-
-# Targets (k, num, n) rad and qvel (num, n) rad/s → qpos and qvel at the end of the period, (k, num, n).
-Simulate = Callable[[Array, Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -92,7 +81,7 @@ class AnalyticInverse:
             nstep, timestep: Physics steps per control period, their length in s; (num,) each.
 
         Raises:
-            UsageError: A joint without exactly one position actuator; use ProbingInverse.
+            UsageError: A joint without exactly one position actuator.
         """
         self.batch, self.num = batch, batch.nsim
         self.at = np.array([model.joint(name).qposadr[0] for name in joints])
@@ -124,10 +113,10 @@ class AnalyticInverse:
         """Copy positions and velocities of a scene, (nq,) rad and (nv,) rad/s."""
         self.qpos[:], self.qvel[:] = data.qpos, data.qvel
 
-    def __call__(self, periods: ListOf[Period], near: Array) -> Array:
+    def __call__(self, periods: ListOf[Period]) -> Array:
         """Return the targets to send, (num, n) rad, not limited to any range.
 
-        `periods` are the coming one and `ahead` more; only ProbingInverse uses `near`.
+        periods: The coming one and `ahead` more.
         """
         held = np.stack([self._targets_in_force(period) for period in periods])
         if not self.ahead:
@@ -179,7 +168,7 @@ class AnalyticInverse:
             v, a, friction = (rng.uniform(-top, top, (1, n)) for top in (1.0, 5.0, 1.0))
             ends = q + self.dt * (v + 0.5 * self.dt * a), v + self.dt * a
             period = Period(q, v, *ends, friction)
-            mine, theirs = (inverse([period] * (1 + inverse.ahead), q) for inverse in (self, other))
+            mine, theirs = (inverse([period] * (1 + inverse.ahead)) for inverse in (self, other))
             if np.abs(mine - theirs).max() > MAX_TARGET_DIFFERENCE_RAD:
                 return False
         return True
@@ -203,99 +192,10 @@ class AnalyticInverse:
         return before, speeds
 
 
-class ProbingInverse:
-    """Targets along a motion from simulations of other targets.
-
-    Joints pull at each other, and each has a friction band and a torque limit. So the response of all joints to each
-    joint's target is measured in each period, while all joints slide and no motor is near its limit. Errors are
-    converted by it to errors of each joint's own target: a joint at its limit then has no effect on others.
-    """
-
-    def __init__(self, simulate: Simulate, dt: Array | float, ahead: int = 0) -> None:
-        """
-        Args:
-            simulate: Simulation of held targets from each robot's present position with given speeds, without
-                contacts.
-            dt: Control period, s, one or (num, 1).
-            ahead: Number of control periods after the coming one at whose end `simulate` returns the state, because
-                servos have a delay.
-        """
-        self.simulate, self.dt, self.ahead = simulate, dt, ahead
-        self._slope: Array | None = None  # of each joint's answer over each joint's target, (num, n, n)
-
-    def __call__(self, periods: ListOf[Period], near: Array) -> Array:
-        """Return the targets (num, n) rad nearest to `near` that lead to the end of the period.
-
-        Position and speed at the end count together, q + q̇·dt: the speed alone would drift, the position alone ring.
-        """
-        period, own = periods[-1], np.linalg.inv(self._slopes(periods[0]))
-
-        def target_errors(targets: Array) -> Array:
-            qpos, qvel = self.simulate(targets, periods[0].qvel)
-            return np.einsum("kij,pkj->pki", own, qpos - period.next_qpos + self.dt * (qvel - period.next_qvel))
-
-        error = target_errors(near[None])[0]
-        wide = np.clip(PROBE_SCALE_RATIO * np.abs(error) / PROBES[-1], MIN_PROBE_SCALE, 1.0)
-        probes = PROBES[PROBES != 0, None, None] * wide
-        probed = np.insert(target_errors(near + probes), len(PROBES) // 2, error, axis=0)
-        more, slope = _crossing(_rising(probed / wide))
-        away = near - periods[0].qpos
-        saturated = (slope <= MIN_SLOPE) & (error * np.sign(away) > MIN_SLOPE * np.abs(away))  # far beyond a limit
-        more, moves = np.where(saturated, -away, more * wide), saturated | (slope > MIN_SLOPE)
-        targets, errors = [near], [error]
-        for _ in range(1 + REFINEMENTS):
-            targets.append(targets[-1] + more)
-            errors.append(target_errors(targets[-1][None])[0])
-            steps = np.abs(more) > POSITION_TOLERANCE_RAD
-            slope = np.maximum(slope, np.divide(errors[-1] - errors[-2], more, out=slope.copy(), where=steps))
-            more = np.where(
-                moves, np.clip(-errors[-1] / np.maximum(slope, MIN_SLOPE), -MAX_REFINEMENT_RAD, MAX_REFINEMENT_RAD), 0.0
-            )
-        best = np.abs(errors).sum(axis=2).argmin(axis=0)
-        return np.array(targets)[best, np.arange(len(near))]
-
-    def _slopes(self, period: Period) -> Array:
-        """Return the response of all joints to each joint's target, (num, n, n); the last one where nothing moves."""
-        n = period.qpos.shape[1]
-        if self._slope is None:
-            self._slope = np.tile(np.eye(n), (len(period.qpos), 1, 1)) * START_SLOPE
-        targets = period.qpos + SLOPE_STEP_RAD * np.concatenate([np.zeros((1, n)), np.eye(n)])[:, None]
-        qpos, qvel = self.simulate(targets, np.where(period.next_qpos < period.qpos, -SLIDING_SPEED, SLIDING_SPEED))
-        reached = qpos + self.dt * qvel
-        slope = ((reached[1:] - reached[0]) / SLOPE_STEP_RAD).transpose(1, 2, 0)
-        moves = np.einsum("kjj->kj", slope) > MIN_SLOPE_RATIO * np.einsum("kjj->kj", self._slope)
-        self._slope = np.where(moves[:, None], slope, self._slope)
-        return self._slope
-
-
 def _own(batch: Batch, model: mujoco.MjModel, name: str) -> Array:
     """Return a field of the model by simulation, (num or 1, …)."""
     values = batch.expanded(name)
     return getattr(model, name)[None] if values is None else values
-
-
-def _rising(errors: Array) -> Array:
-    """Return errors over PROBES, (7, num, n), made monotonic from the middle outwards.
-
-    Beyond a motor's limit the error of a joint only shows other joints.
-    """
-    middle = len(PROBES) // 2
-    below = np.minimum.accumulate(errors[middle::-1], axis=0)[:0:-1]
-    return np.concatenate([below, np.maximum.accumulate(errors[middle:], axis=0)])
-
-
-def _crossing(errors: Array) -> tuple[Array, Array]:
-    """Return the target, rad, at which errors that rise over PROBES, (7, num, n), pass zero, and their slope there.
-
-    If one of them is zero, or none passes it, the result is the smallest target with the least error: friction or a
-    motor's limit hides the effect of larger ones.
-    """
-    above = np.clip((errors < 0).sum(axis=0), 1, len(PROBES) - 1)
-    low, high = (np.take_along_axis(errors, i[None], axis=0)[0] for i in (above - 1, above))
-    rise, wide = np.maximum(high - low, 1e-15), PROBES[above] - PROBES[above - 1]
-    passed = (low < -POSITION_TOLERANCE_RAD) & (high > POSITION_TOLERANCE_RAD)
-    least = (np.abs(errors) + MIN_SLOPE * np.abs(PROBES)[:, None, None]).argmin(axis=0)
-    return np.where(passed, PROBES[above - 1] - low / rise * wide, PROBES[least]), rise / wide
 
 
 def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:

@@ -127,7 +127,9 @@ class VirtualH12:
 
     def save_heard(self, path: Path) -> None:
         """Write the received commands as npz, an array per field."""
-        columns = {name: np.array([row[name] for row in self.heard]) for name in next(iter(self.heard), {})}
+        columns: dict[str, Any] = {
+            name: np.array([row[name] for row in self.heard]) for name in next(iter(self.heard), {})
+        }
         with atomic_write(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **columns)
 

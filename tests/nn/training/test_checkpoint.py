@@ -25,7 +25,7 @@ def world(tmp_path_factory):
     robot = write_arm(place / "arm")
     data = write_dataset(place / "data", robot, recordings(robot, 8, rows=60, kp=0.5))
     late = robot.with_servos({j: {"delay": 0.03} for j in robot.operated})
-    Trainer.prepare(data, late, place / "whole", TINY_TRAINING, STEPS).run()
+    Trainer(data, late, place / "whole", TINY_TRAINING, STEPS).run()
     return data, late, read_checkpoint(place / "whole")
 
 
@@ -42,14 +42,14 @@ def stop(stage, at):
     return show
 
 
-@pytest.mark.parametrize(("stage", "at"), [("pretraining", 5), ("pretraining", 15), ("ppo", 1)])
+@pytest.mark.parametrize(("stage", "at"), [("pretraining", 5), ("pretraining", 15)])
 def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage, at):
     data, robot, whole = world
     begun = not (stage == "pretraining" and at < 10)
     with nullcontext() if begun else pytest.raises(ModelError, match="before the first step of training"):
-        Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, show=stop(stage, at)).run()
+        Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, show=stop(stage, at)).run()
     assert read_checkpoint(tmp_path / "run")["steps"] < whole["steps"]
-    Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True).run()
+    Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True).run()
     again = read_checkpoint(tmp_path / "run")
     assert differences(whole, again) == []
     assert [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").open()] == again["progress"]
@@ -57,33 +57,33 @@ def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage,
 
 def test_a_checkpoint_with_earlier_names_is_resumed(world, tmp_path):
     data, robot, whole = world
-    model = Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, show=stop("ppo", 6)).run()
+    model = Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, show=stop("ppo", 6)).run()
     assert model.card["interrupted"]
     with pytest.raises(UsageError, match="--resume"):
-        Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS)
+        Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS)
     earlier = {today: name for name, today in RENAMED.items()}
     state = {earlier.get(name, name): value for name, value in read_checkpoint(tmp_path / "run").items()}
     state["net"]["bounded.unit"] = state["net"].pop("bounded.scale")
     torch.save(state, tmp_path / "run" / "checkpoint.pt")
-    model = Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True).run()
+    model = Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True).run()
     assert not model.card["interrupted"]
     assert differences(whole, read_checkpoint(tmp_path / "run")) == []
 
 
 def test_a_run_killed_before_its_first_checkpoint_is_begun_again(world, tmp_path):
     data, robot, whole = world
-    Trainer.prepare(data, robot, tmp_path / "run", replace(TINY_TRAINING, seed=1), STEPS)
+    Trainer(data, robot, tmp_path / "run", replace(TINY_TRAINING, seed=1), STEPS)
     assert (tmp_path / "run" / "config.json").is_file()
-    Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, STEPS).run()
+    Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS).run()
     assert differences(whole, read_checkpoint(tmp_path / "run")) == []
 
 
 def test_a_run_is_not_resumed_on_other_recordings(world, tmp_path):
     data, robot, _ = world
-    Trainer.prepare(data, robot, tmp_path / "run", TINY_TRAINING, Budget(steps=0)).run()
+    Trainer(data, robot, tmp_path / "run", TINY_TRAINING, Budget(steps=0)).run()
     other = write_dataset(tmp_path / "other", robot, recordings(robot, 8, rows=50, kp=0.5))
     with pytest.raises(UsageError, match=r"run: was trained on other recordings than this dataset holds; train anew"):
-        Trainer.prepare(other, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True)
+        Trainer(other, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True)
 
 
 def test_a_resumed_run_continues_with_gain_1(world, tmp_path, monkeypatch):
@@ -96,7 +96,7 @@ def test_a_resumed_run_continues_with_gain_1(world, tmp_path, monkeypatch):
     monkeypatch.setattr("gaponet.nn.training.trainer.choose_gain", halve)
     monkeypatch.setattr("gaponet.nn.training.validation.Validator.errors", better_each_time())
     warm = replace(TINY_TRAINING, pretraining=replace(TINY_TRAINING.pretraining, rounds=4))
-    card = Trainer.prepare(data, robot, tmp_path / "run", warm, Budget(steps=WARM)).run().card
+    card = Trainer(data, robot, tmp_path / "run", warm, Budget(steps=WARM)).run().card
     assert card["gain"] == 0.5
     gains = []
 
@@ -104,9 +104,7 @@ def test_a_resumed_run_continues_with_gain_1(world, tmp_path, monkeypatch):
         if status.stage == "ppo":
             gains.append(trainer.net.bounded.gain.item())
 
-    trainer = Trainer.prepare(
-        data, robot, tmp_path / "run", warm, Budget(steps=4 * WARM + UPDATE), resume=True, show=watch
-    )
+    trainer = Trainer(data, robot, tmp_path / "run", warm, Budget(steps=4 * WARM + UPDATE), resume=True, show=watch)
     assert trainer.net.bounded.gain == 1.0
     trainer.run()
     assert set(gains) == {1.0}
@@ -124,4 +122,4 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(world, tmp_path, content):
     (tmp_path / "run" / "split.json").write_text("{}")
     (tmp_path / "run" / "checkpoint.pt").write_bytes(content)
     with pytest.raises(ModelError, match=r"checkpoint\.pt: does not fit this model or is damaged"):
-        Trainer.prepare(dataset, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True)
+        Trainer(dataset, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True)

@@ -39,7 +39,7 @@ def test_the_default_number_of_simulations_depends_on_the_device():
         TrainConfig(),
         CHANGED,
         TrainConfig(ModelConfig(kind="paper", delta_hold=3)).paper_recipe(),
-        replace(TrainConfig(), seed=9).fast(),
+        replace(TrainConfig(), seed=9),
     ],
 )
 def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):

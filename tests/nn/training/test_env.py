@@ -78,13 +78,6 @@ def test_an_unrecorded_joint_stands_still_and_has_neither_reward_nor_label(robot
     assert np.isfinite(fit["label_rmse"])
 
 
-def test_without_an_error_the_reward_is_zero(robot):
-    env = make(robot, recordings(robot, 2, rows=60))
-    for _ in range(10):
-        reward, _ = env.step(np.zeros((env.num_envs, 2), np.float32))
-    assert reward.min() > -1e-4
-
-
 def test_the_critic_looks_ahead_of_the_simulation(robot):
     env = make(robot, recordings(robot, 2, rows=60, kp=0.6))
     seen, n, many = env.get_observations()["critic"].numpy(), 2, len(CRITIC_PREVIEW)

@@ -99,8 +99,8 @@ def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
         device="warp-cpu",
     )
     steps = 2 * 16 * 40 + 2 * 16 * 8
-    Trainer.prepare(dataset, robot, tmp_path / "run", small, Budget(steps=steps)).run()
-    model = Trainer.prepare(dataset, robot, tmp_path / "run", small, Budget(steps=steps + 256), resume=True).run()
+    Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps)).run()
+    model = Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps + 256), resume=True).run()
     assert model.card["stages"]["ppo_updates"] >= 4
     assert model.card["val_mpjae"]["model"] < 0.9 * model.card["val_mpjae"]["nominal"]
 

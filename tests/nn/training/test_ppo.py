@@ -63,7 +63,7 @@ def test_exploration_has_the_set_correlation_and_width(env):
     torch.manual_seed(0)
     learner = PPO(env, build_network(MODEL, 2), PPOConfig(num_envs=16, num_steps=32, noise_share=1.0, std=0.01))
     seen = []
-    for _ in range(20):
+    for _ in range(8):
         learner.collect()
         seen.append(learner.noise.clone())
     assert torch.stack(seen).std().item() == pytest.approx(0.01, rel=0.15)

@@ -9,18 +9,11 @@ from arm import TOML, recordings, write_arm
 
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
-from gaponet.nn.training.config import PretrainingConfig, RewardConfig, TrainConfig
+from gaponet.nn.training.config import PretrainingConfig, RewardConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.pretraining import Pretraining, pretraining_config, trajectory_labels
+from gaponet.nn.training.pretraining import Pretraining, trajectory_labels
 from gaponet.robot.spec import Table
 from gaponet.sim.replay import replay
-
-
-def test_the_label_baseline_is_one_round():
-    warm = PretrainingConfig(rounds=4, gradient_steps=50)
-    assert pretraining_config(TrainConfig(pretraining=warm)) == warm
-    once = pretraining_config(TrainConfig(ModelConfig(kind="inverse"), pretraining=warm))
-    assert (once.rounds, once.gradient_steps) == (1, 200)
 
 
 @pytest.fixture(scope="module")

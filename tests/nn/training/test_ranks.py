@@ -85,7 +85,7 @@ def test_an_interrupt_of_one_rank_ends_both_and_the_resumed_run_is_equal_bit_for
 def test_a_run_is_resumed_by_as_many_processes(place):
     data, robot = Dataset(place / "data"), write_arm(place / "arm")
     with pytest.raises(UsageError, match="was trained by 2 processes; resume with torchrun --nproc-per-node 2"):
-        Trainer.prepare(data, robot, place / "run-whole", TINY_TRAINING, Budget(steps=STEPS), resume=True)
+        Trainer(data, robot, place / "run-whole", TINY_TRAINING, Budget(steps=STEPS), resume=True)
 
 
 def test_what_ranks_cannot_share_evenly_is_refused(monkeypatch):

@@ -188,7 +188,7 @@ def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
         write_text(split, json.dumps({"parts": parts}))
         config = replace(_recipe(steps), model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
         resume = (training / "checkpoint.pt").is_file()
-        trainer = Trainer.prepare(dataset, start.robot, training, config, Budget(steps=steps), resume=resume)
+        trainer = Trainer(dataset, start.robot, training, config, Budget(steps=steps), resume=resume)
         trainer.baseline = fit_delay_offset(question)
         trainer.run()
     model = GapModel.load(training)

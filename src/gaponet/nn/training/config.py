@@ -166,10 +166,6 @@ class TrainConfig:
         omp = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
         return self.threads or (int(omp) if omp.isdigit() else 0) or os.cpu_count() or 1
 
-    def fast(self) -> TrainConfig:
-        """Return this configuration with one pass over each PPO batch and a smaller critic."""
-        return replace(self, ppo=replace(self.ppo, epochs=1, critic_hidden=(128,)))
-
     def paper_recipe(self) -> TrainConfig:
         """Return this configuration with the paper's training: PPO from an untrained network.
 

@@ -26,7 +26,7 @@ from gaponet.base.arrays import Array, array_module
 from gaponet.data.sequence import Sequence
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.training import ranks
-from gaponet.nn.training.config import PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import PretrainingConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.sensor_fit import SensorReport, fit_inputs
 from gaponet.robot.spec import RobotSpec
@@ -93,17 +93,6 @@ def _commanded(sequence: Sequence, delta: Array, op: Array) -> Sequence:
 
 HUBER_DELTA = 0.5  # in units of the RMS of the labels
 MAX_POOL_STATES = 2_000_000  # if more are visited, the pool takes a part of the environments of each period, in turn
-
-
-def pretraining_config(config: TrainConfig) -> PretrainingConfig:
-    """Return the pre-training of a run.
-
-    Kind "inverse" has one round, in which the labels lead, with the gradient steps of all rounds.
-    """
-    pretraining = config.pretraining
-    if config.model.kind != "inverse" or not pretraining.rounds:
-        return pretraining
-    return replace(pretraining, rounds=1, gradient_steps=pretraining.rounds * pretraining.gradient_steps)
 
 
 class Pretraining:

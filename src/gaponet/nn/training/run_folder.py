@@ -9,19 +9,17 @@ RUN/robot/             the simulator that is corrected      RUN/tensorboard/    
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import write_text
+from gaponet.base.files import write_json
 from gaponet.data.sequence import Sequence, require_same_gains
 from gaponet.data.split import Splits, resolve_splits, stratified_subset
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import CHECKPOINT
 from gaponet.nn.training.config import Budget, TrainConfig, command
@@ -33,7 +31,6 @@ from gaponet.sim.model import model_hash
 MAX_VALIDATION_ROLLOUTS = 24  # per validation, of all payloads, units and rates
 
 
-@dataclass(frozen=True)
 class TrainingData:
     """Recordings of a run by split.
 
@@ -43,37 +40,27 @@ class TrainingData:
         val: Validation recordings, at most MAX_VALIDATION_ROLLOUTS.
     """
 
-    dataset: Dataset
-    robot: RobotSpec
-    holdout_units: tuple[str, ...]
-    splits: Splits
-    train: list[Sequence]
-    val: list[Sequence]
-
-    @classmethod
-    def load(
-        cls, dataset: Dataset, robot: RobotSpec, config: TrainConfig, holdout_units: tuple[str, ...]
-    ) -> TrainingData:
+    def __init__(self, dataset: Dataset, robot: RobotSpec, config: TrainConfig, holdout_units: tuple[str, ...]) -> None:
         """Split a dataset and read what training needs.
 
         Raises:
             DatasetError, UsageError: Another robot, recordings with several gains, or splits that share a recording.
         """
         dataset.require_robot(robot)
+        self.dataset, self.robot, self.holdout_units = dataset, robot, holdout_units
         rule = (holdout_units, config.holdout_payloads, config.rates, config.train_share)
-        splits = resolve_splits(dataset, config.split, *rule)
+        self.splits: Splits = resolve_splits(dataset, config.split, *rule)
         if not config.mixed_gains:
-            metas = (e.meta for entries in splits.values() for e in entries)
+            metas = (e.meta for entries in self.splits.values() for e in entries)
             require_same_gains(metas, dataset.joint_names, robot.operated)
-        train = dataset.sequences(splits["train"], optional=False)
-        val = dataset.sequences(stratified_subset(splits["val"], MAX_VALIDATION_ROLLOUTS), optional=False)
-        data = cls(dataset, robot, holdout_units, splits, train, val)
-        if not config.mixed_gains and (other := next((c for c in data.conditions if c.kp or c.kd), None)):
+        self.train = dataset.sequences(self.splits["train"], optional=False)
+        val = stratified_subset(self.splits["val"], MAX_VALIDATION_ROLLOUTS)
+        self.val = dataset.sequences(val, optional=False)
+        if not config.mixed_gains and (other := next((c for c in self.conditions if c.kp or c.kd), None)):
             raise UsageError(
                 f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says others: write there "
                 "what the robot runs with, or add --mixed-gains to train in simulators of the recordings' own gains"
             )
-        return data
 
     @property
     def conditions(self) -> set[Condition]:
@@ -87,47 +74,31 @@ class TrainingData:
         return self.dataset.sequences(stratified_subset(entries, count), optional=False)
 
 
-class RunFolder:
-    """Folder of a run: refuses unsuitable ones and writes the files that describe the run."""
+def require_suitable(run: Path, robot: RobotSpec, resume: bool) -> None:
+    """Refuse a folder that holds a run and is not to be resumed, or that holds no run of this simulator and is.
 
-    def __init__(self, path: Path, robot: RobotSpec, resume: bool) -> None:
-        """
-        Args:
-            path: Folder; it need not exist.
-            robot: The simulator that the network corrects.
-            resume: Continue the run in this folder.
+    Raises:
+        UsageError: The folder does not fit.
+    """
+    if not resume and any((run / name).exists() for name in (CHECKPOINT, "model/card.json")):
+        raise UsageError(f"{run}: holds a run already; add --resume to go on with it, or choose another --out")
+    if resume and not (run / CHECKPOINT).is_file():
+        raise UsageError(f"{run}: nothing to resume (no {CHECKPOINT}); train without --resume")
+    if resume and has_stored_robot(run) and model_hash(load_stored_robot(run, robot.name)) != model_hash(robot):
+        raise UsageError(f"{run}: was trained in another simulator; resume with --robot {run / STORED_ROBOT}")
 
-        Raises:
-            UsageError: The folder holds a run and resume is false, or no run of this simulator and resume is true.
-        """
-        if not resume and any((path / name).exists() for name in (CHECKPOINT, "model/card.json")):
-            raise UsageError(f"{path}: holds a run already; add --resume to go on with it, or choose another --out")
-        if resume and not (path / CHECKPOINT).is_file():
-            raise UsageError(f"{path}: nothing to resume (no {CHECKPOINT}); train without --resume")
-        if resume and has_stored_robot(path) and model_hash(load_stored_robot(path, robot.name)) != model_hash(robot):
-            raise UsageError(f"{path}: was trained in another simulator; resume with --robot {path / STORED_ROBOT}")
-        self.path, self.robot, self.resume = path, robot, resume
 
-    def write_setup(self, data: TrainingData, config: TrainConfig, budget: Budget) -> None:
-        """Write config.json, split.json and the robot."""
-        dataset = data.dataset
-        source = dataset.address or dataset.path
-        words = command(source, self.path, budget, config, self.robot, data.holdout_units, ranks.world())
-        facts = asdict(config) | {
-            "budget": asdict(budget), "holdout_units": list(data.holdout_units), "robot": self.robot.name,
-            "command": words, "dataset": dataset.address or os.path.relpath(dataset.path, self.path),
-            "dataset_hash": dataset_hash(dataset.entries),
-        }  # fmt: skip
-        write_text(self.path / "config.json", json.dumps(facts, indent=1) + "\n")
-        folder = self.path / STORED_ROBOT
-        if self.robot.folder.resolve() != folder.resolve() and not (self.resume and has_stored_robot(self.path)):
-            save_robot(self.robot, folder)
-        split = {part: {e.id: e.hash for e in entries} for part, entries in data.splits.items()}
-        write_text(self.path / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
-
-    def write_baseline(self, baseline: DelayOffset) -> None:
-        """Write delay_offset.json."""
-        write_text(self.path / "delay_offset.json", json.dumps(asdict(baseline), indent=1) + "\n")
+def write_setup(run: Path, data: TrainingData, config: TrainConfig, budget: Budget, resume: bool) -> None:
+    """Write config.json, split.json and the robot."""
+    dataset, robot = data.dataset, data.robot
+    words = command(dataset.address or dataset.path, run, budget, config, robot, data.holdout_units, ranks.world())
+    write_json(run / "config.json", asdict(config) | {
+        "budget": asdict(budget), "holdout_units": data.holdout_units, "robot": robot.name, "command": words,
+        "dataset": dataset.address or os.path.relpath(dataset.path, run), "dataset_hash": dataset_hash(dataset.entries),
+    })  # fmt: skip
+    if robot.folder.resolve() != (run / STORED_ROBOT).resolve() and not (resume and has_stored_robot(run)):
+        save_robot(robot, run / STORED_ROBOT)
+    write_json(run / "split.json", {part: {e.id: e.hash for e in entries} for part, entries in data.splits.items()})
 
 
 LOG_KINDS = ("tensorboard", "wandb")
@@ -147,7 +118,12 @@ class Loggers:
         Raises:
             UsageError: A package is not installed.
         """
-        self.writers = [{"tensorboard": _tensorboard, "wandb": _wandb}[kind](out, config) for kind in kinds]
+        self.writers: list[Writer] = []
+        for kind in kinds:
+            try:
+                self.writers.append(_tensorboard(out) if kind == "tensorboard" else _wandb(out, config))
+            except ImportError:
+                raise UsageError(f"--log {kind}: not installed; run: pip install 'gaponet[{kind}]'") from None
 
     def write(self, line: dict[str, Any]) -> None:
         """Log one line of progress.jsonl."""
@@ -161,11 +137,9 @@ class Loggers:
             close()
 
 
-def _tensorboard(out: Path, config: dict[str, Any]) -> Writer:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise _missing("tensorboard") from None
+def _tensorboard(out: Path) -> Writer:
+    from torch.utils.tensorboard import SummaryWriter
+
     board = SummaryWriter(str(out / "tensorboard"))
 
     def write(numbers: dict[str, float], steps: int) -> None:
@@ -177,13 +151,7 @@ def _tensorboard(out: Path, config: dict[str, Any]) -> Writer:
 
 
 def _wandb(out: Path, config: dict[str, Any]) -> Writer:
-    try:
-        import wandb
-    except ImportError:
-        raise _missing("wandb") from None
+    import wandb
+
     run = wandb.init(project="gaponet", name=out.name, dir=str(out), config=config)
     return lambda numbers, steps: run.log(numbers, step=steps), run.finish
-
-
-def _missing(kind: str) -> UsageError:
-    return UsageError(f"--log {kind}: {kind} is not installed; run: pip install 'gaponet[{kind}]'")

@@ -5,7 +5,6 @@ The predictor learns the simulator's answers to probes at visited and at random 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ MIN_STATES = 8
 POSITION_NOISE_RAD, VELOCITY_NOISE_RAD_S = 0.05, 0.3  # σ of the states near recorded ones
 SensorReport = dict[str, Any]  # R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}
 
-VISITED, NEAR, RANDOM = range(3)  # origin of a state
+NEAR, RANDOM = 1, 2  # origin of a state; 0 for one that was visited
 
 
 def fit_inputs(
@@ -42,88 +41,60 @@ def fit_inputs(
     Returns:
         R² of the sensor predictor on held-out states; None for a network without one.
     """
-    net.cpu().fit_inputs(x.cpu())  # C MuJoCo answers the probes
+    net.cpu().fit_inputs(x.cpu())
     ranks.pool_statistics(net)
-    report = None
-    if net.predictor is not None:
-        report = _fit_on_first_rank(net, env, states, seed, nthread, refit=False)
     net.to(x.device)
-    return report
+    return fit_sensors(net, env, states, seed, nthread)
 
 
-def refit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0) -> SensorReport:
-    """Continue the fit of the sensor predictor at the environment's present states; return its held-out R²."""
+def fit_sensors(
+    net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0, refit: bool = False
+) -> SensorReport | None:
+    """Fit the sensor predictor; on `refit`, continue its fit at the environment's present states. Result as above."""
+    if net.predictor is None:
+        return None
     device = next(net.parameters()).device
-    report = _fit_on_first_rank(net.cpu(), env, states, seed, nthread, refit=True)
+    net.cpu()  # C MuJoCo answers the probes
+    report = ranks.once(
+        lambda: _fit_predictor(net, *_probe(net, env, states, seed, nthread, refit), env.robot.operated, seed, refit)
+    )
+    net.predictor.requires_grad_(False)
+    ranks.broadcast(net.predictor)
     net.to(device)
     return report
 
 
-def _fit_on_first_rank(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool) -> SensorReport:
-    def fit() -> SensorReport:
-        samples = _probe(net, env, states, seed, nthread, refit)
-        return _fit_predictor(net, samples, env.robot.operated, seed, refit)
-
-    report = ranks.once(fit)
-    net.predictor.requires_grad_(False)
-    ranks.broadcast(net.predictor)
-    return report
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm), or (k, 2n) for learned probes."""
-
-    inputs: Tensor
-    answers: Tensor
-
-    def __getitem__(self, rows: slice) -> _Samples:
-        return _Samples(self.inputs[rows], self.answers[rows])
-
-
-def _probe(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool) -> _Samples:
+def _probe(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool) -> tuple[Tensor, Tensor]:
     """Probe the simulator at recorded start states, or on `refit` at the environment's present states.
 
-    A third of the states stays there. A third is moved by noise. A third is moved to a random posture.
+    A third of the states stays there. A third is moved by noise. A third is moved to a random posture within the joint
+    limits, with history and action. So the predictor also learns gravity and inertia where no motion was recorded.
+
+    Returns:
+        Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm), or (k, 2n) for learned probes: each is
+        one row of the inputs.
     """
     if states < MIN_STATES:
         raise UsageError(
             f"--pretraining.sensor-states {states}: too few to fit a predictor on; give {MIN_STATES} or more"
         )
     rng = np.random.default_rng(seed)
-    xs: list[Array] = []
-    qs: list[Array] = []
-    vs: list[Array] = []
-    while sum(map(len, xs)) < states:
+    visited: list[tuple[Array, Array, Array]] = []
+    while len(visited) * env.num_envs < states:
         if not refit:
             env.reset()
-        xs.append(to_numpy(env.get_observations()["actor"]))
-        qs.append(copy_array(to_numpy(env.sim.qpos)))
-        vs.append(copy_array(to_numpy(env.sim.qvel)))
-    x, q, v = (np.concatenate(part) for part in (xs, qs, vs))
-    env_of_state = np.tile(np.arange(env.num_envs), len(xs))
+        x = to_numpy(env.get_observations()["actor"])
+        visited.append((x, copy_array(to_numpy(env.sim.qpos)), copy_array(to_numpy(env.sim.qvel))))
+    x, q, v = (np.concatenate(part) for part in zip(*visited, strict=True))
+    env_of_state = np.tile(np.arange(env.num_envs), len(visited))
     chosen = rng.permutation(np.sort(rng.permutation(len(x))[:states]))
     origin = rng.integers(0, 3, len(x))
     if refit:  # the same states repeat: the copies are moved, so that none is both fitted and held out
         origin[env.num_envs :] = NEAR + origin[env.num_envs :] % 2
     conditions = [env.rows.conditions[g] for g in env.rows.group[env_of_state[chosen]]]
     oracle = ProbeOracle(env.robot, net.config, conditions, nthread, env.rows.locked)
-    return _answers(net, oracle, x[chosen], q[chosen], v[chosen], origin[chosen], seed, env)
+    x, q, v, origin = x[chosen], q[chosen], v[chosen], origin[chosen]
 
-
-def _answers(
-    net: DeltaNet, oracle: ProbeOracle, x: Array, q: Array, v: Array, origin: Array, seed: int, env: DeltaEnv
-) -> _Samples:
-    """Move states as their origin says, and return predictor inputs and the simulator's answers there.
-
-    A random posture moves the whole frame, with history and action, within the joint limits. So the predictor also
-    learns gravity and inertia where no motion was recorded. Learned probes are random: each is one row of the inputs.
-
-    Args:
-        x: Inputs of the network, (k, dim).
-        q, v: Joints that are not locked, (k, n_free) rad, rad/s.
-        origin: VISITED, NEAR or RANDOM, (k,).
-    """
     rng = np.random.default_rng(seed)
     n, layout, op = net.n, net.features.layout, oracle.operated
     near, far = np.flatnonzero(origin == NEAR), np.flatnonzero(origin == RANDOM)
@@ -142,42 +113,36 @@ def _answers(
         probes = rng.uniform(-1, 1, (len(q), m, n)) * (rng.random((len(q), m, n)) < rng.random((len(q), m, 1)))
         offsets = net.config.probe_limit * probes
         inputs = torch.cat([inputs.repeat_interleave(m, 0), torch.from_numpy(probes).float().flatten(0, 1)], dim=1)
-    return _Samples(inputs.clone(), torch.from_numpy(oracle(q, v, offsets).reshape(len(inputs), -1)))
+    return inputs.clone(), torch.from_numpy(oracle(q, v, offsets).reshape(len(inputs), -1))
 
 
-def _fit_predictor(net: DeltaNet, samples: _Samples, joints: tuple[str, ...], seed: int, refit: bool) -> SensorReport:
+def _fit_predictor(
+    net: DeltaNet, inputs: Tensor, answers: Tensor, joints: tuple[str, ...], seed: int, refit: bool
+) -> SensorReport:
     """Maximise the Gaussian likelihood on three quarters of the samples; return R² on the rest.
 
     `refit` keeps the scale of the sensor values, because the branch net has learned it. PPO does not train the
     predictor: it would change the predicted answers in favour of the policy.
     """
-    predictor = net.predictor
+    predictor, held_out = net.predictor, len(inputs) // 4
     generator = torch.Generator().manual_seed(seed)
-    held_out = len(samples.inputs) // 4
-    train = samples[held_out:]
     if not refit:
-        predictor.outputs.fit(train.answers, min_std=1e-6)
-    target = predictor.outputs(train.answers)
+        predictor.outputs.fit(answers[held_out:], min_std=1e-6)
+    target, train = predictor.outputs(answers[held_out:]), inputs[held_out:]
     predictor.requires_grad_(True)
     optimiser = torch.optim.Adam(predictor.parameters(), lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, FIT_STEPS)
     for _ in range(FIT_STEPS):
         batch = torch.randint(0, len(target), (BATCH_SIZE,), generator=generator)
-        mean, log_var = predictor(train.inputs[batch])
+        mean, log_var = predictor(train[batch])
         loss = 0.5 * ((mean - target[batch]) ** 2 * (-log_var).exp() + log_var).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
-    predictor.requires_grad_(False)
-    return _r2(net, samples[:held_out], joints)
-
-
-def _r2(net: DeltaNet, samples: _Samples, joints: tuple[str, ...]) -> SensorReport:
-    """Return R² of the predictor's mean over these samples, averaged over sensor values."""
     with torch.inference_mode():
-        truth = net.predictor.outputs(samples.answers)
-        residual = ((net.predictor(samples.inputs)[0] - truth) ** 2).mean(0)
+        truth = predictor.outputs(answers[:held_out])
+        residual = ((predictor(inputs[:held_out])[0] - truth) ** 2).mean(0)
         variance = ((truth - truth.mean(0)) ** 2).mean(0).clamp_min(1e-9)
         r2 = (1 - residual / variance).reshape(-1, 2, len(joints))  # (m, positions and velocities, n)
         by_joint = dict(zip(joints, r2.mean((0, 1)).tolist(), strict=True))

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.base.files import lock_folder
+from gaponet.base.files import lock_folder, write_json
 from gaponet.base.structure import validated
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset, dataset_hash
@@ -32,9 +32,9 @@ from gaponet.nn.training.checkpoint import Checkpoint, StateDict
 from gaponet.nn.training.config import Budget, Status, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO, Update
-from gaponet.nn.training.pretraining import Pretraining, pretraining_config, trajectory_labels
-from gaponet.nn.training.run_folder import Loggers, RunFolder, TrainingData
-from gaponet.nn.training.sensor_fit import fit_inputs, refit_sensors
+from gaponet.nn.training.pretraining import Pretraining, trajectory_labels
+from gaponet.nn.training.run_folder import Loggers, TrainingData, require_suitable, write_setup
+from gaponet.nn.training.sensor_fit import fit_inputs, fit_sensors
 from gaponet.nn.training.validation import Validator, choose_gain
 from gaponet.robot.spec import RobotSpec
 
@@ -50,30 +50,6 @@ class Trainer:
 
     def __init__(
         self,
-        data: TrainingData,
-        folder: RunFolder,
-        config: TrainConfig,
-        budget: Budget,
-        net: DeltaNet,
-        checkpoint: Checkpoint,
-        loggers: Loggers,
-        show: Callable[[Status], None],
-    ) -> None:
-        """Use Trainer.prepare to make one. On resume, net and torch's random numbers are those of the checkpoint."""
-        self.data, self.folder, self.config, self.budget = data, folder, config, budget
-        self.robot, self.net, self.state, self.loggers, self.show = folder.robot, net, checkpoint, loggers, show
-        self.rank_config = ranks.share(config)
-        self.baseline: DelayOffset | None = None
-        self.validator = Validator(data.val, self.robot, config.model, self.rank_config.threads)
-        self.rng_state = torch.get_rng_state()
-        self.nominal_error = float("nan")
-        self.update = Update()
-        self.interrupted, self.stage = False, "start"
-        self.started_at = time.monotonic()
-
-    @classmethod
-    def prepare(
-        cls,
         dataset: Dataset,
         robot: RobotSpec,
         out: Path,
@@ -84,7 +60,7 @@ class Trainer:
         holdout_units: tuple[str, ...] = (),
         show: Callable[[Status], None] = lambda status: None,
         log: tuple[str, ...] = (),
-    ) -> Trainer:
+    ) -> None:
         """Read the recordings and write the run's setup. All inputs are checked before training takes time.
 
         Args:
@@ -100,24 +76,31 @@ class Trainer:
             ModelError: The checkpoint is damaged.
         """
         config = validated(TrainConfig, asdict(config), "training options", UsageError).sized()
-        folder = RunFolder(out, robot, resume)
-        data = TrainingData.load(dataset, robot, config, holdout_units)
+        require_suitable(out, robot, resume)
+        self.robot, self.out, self.config, self.budget, self.show = robot, out, config, budget, show
+        self.data, self.rank_config = TrainingData(dataset, robot, config, holdout_units), ranks.share(config)
         torch.manual_seed(config.seed)
-        torch.set_num_threads(ranks.share(config).learner_threads)
-        net = build_network(config.model, len(robot.operated))
+        torch.set_num_threads(self.rank_config.learner_threads)
+        self.net = net = build_network(config.model, len(robot.operated))
         if ranks.rank():  # equal networks, different noise
             torch.manual_seed(_rank_seed(config.seed))
         weights = copy.deepcopy(net.state_dict())
-        checkpoint = Checkpoint(weights, weights, dataset_hash=dataset_hash(dataset.entries))
+        self.state = Checkpoint(weights, weights, dataset_hash=dataset_hash(dataset.entries))
         with ranks.on_first(lock_folder(out, "run")):
             if resume:
-                checkpoint = Checkpoint.read(out, net, checkpoint.dataset_hash)
+                self.state = Checkpoint.read(out, net, self.state.dataset_hash)
             if not ranks.rank():
-                folder.write_setup(data, config, budget)
-                checkpoint.write_progress(out)
+                write_setup(out, self.data, config, budget, resume)
+                self.state.write_progress(out)
         net.to(config.network_device())
-        loggers = Loggers(() if ranks.rank() else log, out, asdict(config))
-        return cls(data, folder, config, budget, net, checkpoint, loggers, show)
+        self.loggers = Loggers(() if ranks.rank() else log, out, asdict(config))
+        self.baseline: DelayOffset | None = None
+        self.validator = Validator(self.data.val, robot, config.model, self.rank_config.threads)
+        self.rng_state = torch.get_rng_state()
+        self.nominal_error = float("nan")
+        self.update = Update()
+        self.interrupted, self.stage = False, "start"
+        self.started_at = time.monotonic()
 
     def run(self) -> GapModel:
         """Train until the budget is spent or Ctrl-C, and return the exported best model.
@@ -126,7 +109,7 @@ class Trainer:
             FolderError: Another process writes into the run folder.
             ModelError: The budget ended before the first training step.
         """
-        with ranks.on_first(lock_folder(self.folder.path, "run")):
+        with ranks.on_first(lock_folder(self.out, "run")):
             self.baseline = ranks.once(self._write_baseline)
             self.nominal_error = float(self.validator.errors(None, self.robot.nominal).mean())
             try:
@@ -136,7 +119,7 @@ class Trainer:
             if not self.state.steps:
                 why = "interrupted" if self.interrupted else "the budget ended"
                 raise ModelError(
-                    f"{self.folder.path}: {why} after {self.seconds():.0f} s, before the first step of training: "
+                    f"{self.out}: {why} after {self.seconds():.0f} s, before the first step of training: "
                     "nothing was learned, no model written. Give --budget more than that; gaponet train … --resume "
                     "goes on here"
                 )
@@ -149,9 +132,8 @@ class Trainer:
     # ---- stages
 
     def _run_stages(self) -> None:
-        state, rounds = self.state, pretraining_config(self.config).rounds
+        state, rounds = self.state, self.config.pretraining.rounds
         if not np.isfinite(state.best_error):  # the untrained network corrects nothing: the error to improve on
-            self.validator.set_errors(self.net, self.validator.errors(None))
             self._save_if_best(self.net, self.validator.errors(None).mean())
         if state.ppo is None and state.pretraining_rounds < rounds:
             self._pretrain()
@@ -163,12 +145,12 @@ class Trainer:
     def _write_baseline(self) -> DelayOffset:
         robot = self.robot.before_identification
         baseline = self.baseline or DelayOffset.fit(self.data.train, robot, self.rank_config.threads)
-        self.folder.write_baseline(baseline)
+        write_json(self.out / "delay_offset.json", baseline)
         return baseline
 
     def _pretrain(self) -> None:
         """Supervised pre-training (nn/training/pretraining.py)."""
-        state, config, threads = self.state, pretraining_config(self.rank_config), self.rank_config.threads
+        state, config, threads = self.state, self.rank_config.pretraining, self.rank_config.threads
         self.stage = "labels"
         sequences = self.data.labelled_subset(config.rows)
         env = self._env(config.num_envs, UNLIMITED, self.config.seed, sequences=sequences)
@@ -201,7 +183,7 @@ class Trainer:
 
     def _ppo(self) -> None:
         config, state = self.rank_config.ppo, self.state
-        if self._spent() >= 1 or self.config.model.kind == "inverse":
+        if self._spent() >= 1:
             return
         self.stage = "ppo"
         episode_steps = round(self.config.episode_s / self.data.train[0].dt)
@@ -218,13 +200,9 @@ class Trainer:
             self.update = ppo.update()
             state.ppo_updates += 1
             state.steps += ranks.world() * config.num_envs * config.num_steps * self.config.model.delta_hold
-            if (
-                config.refit_sensors
-                and state.ppo_updates % config.refit_sensors == 0
-                and self.net.predictor is not None
-            ):
+            if config.refit_sensors and state.ppo_updates % config.refit_sensors == 0:
                 states, seed = self.rank_config.pretraining.sensor_states, self.config.seed + state.ppo_updates
-                state.sensor_r2 = refit_sensors(self.net, env, states, seed, self.rank_config.threads)
+                state.sensor_r2 = fit_sensors(self.net, env, states, seed, self.rank_config.threads, refit=True)
             self._tick()
             if state.ppo_updates % self.config.validate_every == 0:
                 state.ppo, state.env = ppo.state_dict(), env.state()
@@ -236,7 +214,7 @@ class Trainer:
         """Return the best pre-trained weights, or untrained ones if these have a larger error than no correction."""
         state = self.state
         too_large = state.best_trained_error > state.untrained_error
-        state.ppo_from_untrained = bool(pretraining_config(self.config).rounds) and too_large
+        state.ppo_from_untrained = bool(self.config.pretraining.rounds) and too_large
         if not state.ppo_from_untrained:
             return state.best_trained_state
         with torch.random.fork_rng():
@@ -263,13 +241,13 @@ class Trainer:
         reduction, error = self.validator.improvement(net)
         improvement = {"added": reduction} | ({} if np.isnan(error) else {"error": error})
         ranks.once(lambda: self._export(net, improvement))
-        return GapModel.load(self.folder.path)
+        return GapModel.load(self.out)
 
     def _export(self, net: DeltaNet, improvement: dict[str, float]) -> None:
         env = self._env(max(64, len(self.data.conditions)), 10, 0, device="cpu")
         self.loggers.close()
         samples = env.get_observations()["actor"].numpy()
-        export(net, self.folder.path / "model", self._card(improvement), samples)
+        export(net, self.out / "model", self._card(improvement), samples)
 
     # ---- parts of stages
 
@@ -314,7 +292,7 @@ class Trainer:
         state.progress.append({k: v if v == v else None for k, v in line.items()})
         self.loggers.write(line)
         state.seconds, self.started_at = self.seconds(), time.monotonic()
-        state.write(self.folder.path, self.net)
+        state.write(self.out, self.net)
         self._tick()
 
     def _spent(self) -> float:
@@ -351,7 +329,7 @@ class Trainer:
             seconds=round(self.seconds(), 1),
             interrupted=self.interrupted,
             stages={
-                "pretraining_rounds": [state.pretraining_rounds, pretraining_config(self.config).rounds],
+                "pretraining_rounds": [state.pretraining_rounds, self.config.pretraining.rounds],
                 "ppo_updates": state.ppo_updates,
                 "ppo_from_untrained": state.ppo_from_untrained,
             },

@@ -49,10 +49,6 @@ class Validator:
             self._cache[key] = ranks.each(self.sequences, lambda own: self._rollout_errors(own, net, robot))
         return self._cache[key]
 
-    def set_errors(self, net: DeltaNet, errors: Array) -> None:
-        """Set the errors of a network without simulation, because it corrects nothing."""
-        self._cache[self._key(net)] = errors
-
     def improvement(self, net: DeltaNet) -> tuple[float, float]:
         """Return the error reduction by a network, rad: mean and standard error over motions."""
         return error_reduction(self.sequences, self.errors(None), self.errors(net))
