@@ -56,9 +56,7 @@ def adversity(data: Path, work: Path, wanted: int, rng: np.random.Generator) -> 
 
     def start(out: Path, mark: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {"TRIAL": mark}
-        return subprocess.Popen(
-            command(data, out, 4000, [*TRAIN, "--model.sensors", "off"], 2), stdout=log, stderr=log, env=environment
-        )
+        return subprocess.Popen(command(data, out, 4000, TRAIN, 2), stdout=log, stderr=log, env=environment)
 
     began, whole = time.monotonic(), work / "whole"
     if start(whole, f"{work}-whole").wait():
