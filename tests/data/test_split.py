@@ -304,3 +304,15 @@ def test_one_unit_cannot_be_split_by_unit(arm, tmp_path):
     data.append(arm_sequence(arm, wave(60, 2), wave(60, 2)))
     with pytest.raises(UsageError, match=r"one unit only \(a\); split it by another property"):
         make_split(data, "unit")
+
+
+def test_a_held_out_payload_is_in_the_test_split_alone(arm, tmp_path):
+    data = Dataset.create(tmp_path / "held_out", arm)
+    for seed in range(4):
+        for payload in (0.0, 0.2):
+            data.append(record(arm, commands(40, seed), f"motion{seed}", payload))
+    parts = split_entries(data, holdout_payloads=(0.2,))
+    assert {e.meta.payload_mass for e in parts["train"] + parts["val"]} == {0.0}
+    assert {e.meta.payload_mass for e in parts["test"]} == {0.0, 0.2}
+    with pytest.raises(UsageError, match=r"no recording with 3 kg .* it holds 0, 0.2 kg"):
+        split_entries(data, holdout_payloads=(3.0,))
