@@ -144,7 +144,6 @@ def export_robot(
     with lock_folder(out, FOLDER_KIND):
         if to == "mjcf":
             file, not_rad = edit_mjcf(source or robot.mjcf, out, plain, facts, payload_mass)
-            facts["file"] = str(file.relative_to(out))
             for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
                 if form == "plain" or robot.has_servo_model:
                     errors[f"{file.name} {what}"] = _error_in_mujoco(file, facts, validation, robot, form)
@@ -154,13 +153,13 @@ def export_robot(
         elif to == "urdf":
             assert source is not None
             file = edit_urdf(source, out, facts, robot.operated)
-            facts["file"] = file.name
             errors[f"{file.name} alone, all else as before"] = rollout_error(validation, with_urdf_fields(plain))
         elif to != "json":
             file = out / ROBOT
             _write_scene(robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab")
             if to in TEMPLATES:
                 write_text(out / "robot_cfg.py", engine_config(to, robot.name, facts))
+        facts["file"] = str(file.relative_to(out)) if file else ROBOT
         _write_motions(out / CHECK, motions)
         _write_shipped(out, to, facts)
     return ExportedFolder(file, errors, len(validation), validation[0].meta.virtual, tuple(notes))
