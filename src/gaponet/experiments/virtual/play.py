@@ -184,7 +184,7 @@ def play(
     """
     count = len(mass)
     locked = idle_joints(robot, robot.operated)
-    robots = VirtualRobot(robot, [unit] * count, [(float(m), "both") for m in mass], robot.dt, locked=locked)
+    robots = VirtualRobot(robot, [unit] * count, [(float(m), "both") for m in mass], robot.dt, locked=locked, nthread=1)
     robots.reset(targets[0], list(range(count)), START_WARMING_K)
     compensator = None
     if compensation is not None:
