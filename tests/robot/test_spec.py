@@ -131,13 +131,6 @@ def test_an_unknown_identified_joint_or_field_is_refused(tmp_path):
         write_arm(tmp_path, TOML + "[identified.elbow]\nmass = 3.0\n")
 
 
-@pytest.mark.parametrize("name", ["so101", "h1_2", "g1_29", "g1_23", "fr3", "ur10e"])
-def test_a_copied_robot_folder_can_be_moved(name, tmp_path):
-    save_robot(load_robot(name), tmp_path / "here")
-    (tmp_path / "here").rename(tmp_path / "there")
-    assert load_robot(tmp_path / "there").mjcf.parent == tmp_path / "there"
-
-
 def test_robot_argument_leads_to_the_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(Path("mine"))

@@ -17,6 +17,7 @@ import numpy as np
 from gaponet.base.arrays import array_module
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder, write_text
+from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
 from gaponet.export.engine_configs import TEMPLATES, engine_config
 from gaponet.export.mjcf_edit import edit_mjcf
@@ -104,7 +105,7 @@ def export_robot(
     source: Path | None = None,
     prefix: str = "",
     payload_mass: float = 0.0,
-    progress: Callable[[float, float, str], None] = lambda done, total, note: None,
+    progress: Progress = no_progress,
 ) -> ExportedFolder:
     """Write a robot for an engine.
 
@@ -142,7 +143,7 @@ def export_robot(
     file, notes = None, _notes(robot, facts, to)
     with lock_folder(out, FOLDER_KIND):
         if to == "mjcf":
-            file, not_rad = _write_mjcf(robot, plain, out, facts, source or robot.mjcf, payload_mass)
+            file, not_rad = edit_mjcf(source or robot.mjcf, out, plain, facts, payload_mass)
             for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
                 if form == "plain" or robot.has_servo_model:
                     errors[f"{file.name} {what}"] = _error_in_mujoco(file, facts, validation, robot, form)
@@ -151,29 +152,17 @@ def export_robot(
                 notes.append(f"{text}: now they are; ctrl of keyframes not")
         elif to == "urdf":
             assert source is not None
-            file, changes = edit_urdf(source, out, facts["plain"], robot.operated, prefix)
-            facts["file"] = file.name
-            write_text(out / "changes.diff", changes)
+            file = edit_urdf(source, out, facts, robot.operated)
             errors[f"{file.name} alone, all else as before"] = rollout_error(validation, with_urdf_fields(plain))
         elif to != "json":
             file = out / ROBOT
             _write_scene(robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab")
             if to in TEMPLATES:
                 write_text(out / "robot_cfg.py", engine_config(to, robot.name, facts))
+        facts["file"] = str(file.relative_to(out)) if file else ROBOT
         _write_motions(out / CHECK, motions)
         _write_shipped(out, to, facts)
     return ExportedFolder(file, errors, len(validation), validation[0].meta.virtual, tuple(notes))
-
-
-def _write_mjcf(
-    robot: RobotSpec, plain: RobotSpec, out: Path, facts: dict[str, Any], source: Path, payload_mass: float
-) -> tuple[Path, tuple[str, ...]]:
-    """Write an edited copy of a user's MJCF; return it and the joints with targets in another unit than rad."""
-    delays = {n: max(facts[form][n]["delay"] for form in ("joints", "plain")) for n in robot.joint_names}
-    file, changes, not_rad = edit_mjcf(source, out, plain, facts["plain"], delays, facts["prefix"], payload_mass)
-    facts["file"] = str(file.relative_to(out))
-    write_text(out / "changes.diff", changes)
-    return file, not_rad
 
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:

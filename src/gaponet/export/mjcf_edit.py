@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError
-from gaponet.base.files import lock_folder
+from gaponet.base.files import lock_folder, write_text
 from gaponet.export.simulator_facts import Joints
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
@@ -150,42 +150,35 @@ class Source:
             raise RobotError(f"{self.main}: has {len(tags)} {what}; one is needed. Delete or rename the others")
         return tags[0] if tags else None
 
-    def difference(self) -> str:
-        """Return the changes as a unified diff."""
+    def write_changes(self, folder: Path) -> None:
+        """Write the changes as a unified diff, changes.diff."""
         edited, lines = self.edited(), list[str]()
         for file, old in self.text.items():
             a, b = (text.decode("utf-8").splitlines(keepends=True) for text in (old, edited[file]))
             lines += difflib.unified_diff(a, b, f"a/{file.name}", f"b/{file.name}", n=1)
-        return "".join(lines)
+        write_text(folder / "changes.diff", "".join(lines))
 
 
 def edit_mjcf(
-    path: Path,
-    out: Path,
-    robot: RobotSpec,
-    joints: Joints,
-    max_delay: dict[str, float],
-    prefix: str = "",
-    payload_mass: float = 0.0,
-) -> tuple[Path, str, tuple[str, ...]]:
+    path: Path, out: Path, robot: RobotSpec, facts: dict[str, Any], payload_mass: float = 0.0
+) -> tuple[Path, list[str]]:
     """Write a copy of an MJCF and of all its files, with the servos of a robot.
 
     Args:
         path: The file.
         out: Folder for the copy.
         robot: Robot with the table and payload mounts to add.
-        joints: Servos by joint (facts.json). A joint that is not operated changes only if the file has no servo for it.
-        max_delay: Joint → longest delay that its servo must be able to hold, s.
-        prefix: Text before each joint's name in the file, e.g. of one of two robots in a scene.
+        facts: facts.json, with the prefix of joint names in the file. The plain form is written; delay buffers are long
+            enough for both forms. A joint that is not operated changes only if the file has no servo for it.
         payload_mass: In each hand, kg.
 
     Returns:
-        The copied main file, the changes as a unified diff, and joints with targets in another unit than rad.
+        The copied main file, and joints with targets in another unit than rad. changes.diff in `out` has the changes.
 
     Raises:
         RobotError: A joint is not in the text or has several servos, or the compiled copy lacks the wanted servos.
     """
-    path = path.resolve()
+    path, joints, prefix = path.resolve(), facts["plain"], facts["prefix"]
     before = compile_spec(spec := read_mjcf(path), path)
     source, added, not_rad = Source(path), list[str](), list[str]()
     for name, servo in joints.items():
@@ -204,7 +197,8 @@ def edit_mjcf(
             changed["ref"] = text_of(math.degrees(ref) if spec.compiler.degree else ref)
         changed |= {"solreffriction": text_of(*STIFF_SOLREF), "solimpfriction": text_of(*STIFF_SOLIMP)}
         source.set(tag, **changed)
-        samples = math.ceil(max_delay[name] / before.opt.timestep - 1e-9) + 2 if max_delay[name] else 0
+        delay = max(servo["delay"], facts["joints"][name]["delay"])
+        samples = math.ceil(delay / before.opt.timestep - 1e-9) + 2 if delay else 0
         if actuator is not None:
             source.replace(actuator, _servo(servo, samples, _servo_attributes(actuator, before, full)))
             not_rad += [full] * (abs(_radians_per_unit(before, full) - 1) > 1e-3)
@@ -217,7 +211,8 @@ def edit_mjcf(
     _add_surroundings(source, robot, prefix, payload_mass, before)
     target = _write(source, out)
     _require(compile_spec(read_mjcf(target), target), before, joints, robot, prefix, target)
-    return target, source.difference(), tuple(not_rad)
+    source.write_changes(out)
+    return target, not_rad
 
 
 def _servo(servo: dict[str, Any], samples: int, own: dict[str, str]) -> str:

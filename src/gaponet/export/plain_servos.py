@@ -33,7 +33,6 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
 
 T = TypeVar("T")
-Servos = dict[str, dict[str, float]]  # joint → SERVO_FIELDS
 
 CACHE = "plain_servos.json"  # in the robot folder
 MAX_CHECK_MOTIONS = 5
@@ -91,14 +90,15 @@ def fit_plain_servos(
     without: dict[str, Any] = dict.fromkeys(SERVO_TERMS, np.array(0.0))
     start = replace(robot, **without)
 
-    def fit() -> Servos:
+    def fit() -> dict[str, dict[str, float]]:
         fitted = identify(recordings, start, terms=(), table=False, progress=progress).robot
         return {
             joint: {name: float(v) for name in SERVO_FIELDS if np.isfinite(v := getattr(fitted, name)[i])}
             for i, joint in enumerate(robot.joint_names)
         }
 
-    return start.with_servos(stored_result(robot.folder / CACHE, Servos, fit, start, recordings))
+    kind = dict[str, dict[str, float]]  # joint → SERVO_FIELDS
+    return start.with_servos(stored_result(robot.folder / CACHE, kind, fit, start, recordings))
 
 
 def stored_result(

@@ -7,42 +7,41 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gaponet.base.errors import RobotError
 from gaponet.base.files import lock_folder, write_text
 from gaponet.export.mjcf_edit import Source, Tag, text_of
-from gaponet.export.simulator_facts import Joints
 from gaponet.robot.spec import RobotSpec
 
 MISSING_FIELDS = ("kp", "kd", "armature", "delay", "offset", "zero")  # of a joint, which a URDF lacks
 
 
-def edit_urdf(path: Path, out: Path, joints: Joints, operated: tuple[str, ...], prefix: str = "") -> tuple[Path, str]:
+def edit_urdf(path: Path, out: Path, facts: dict[str, Any], operated: tuple[str, ...]) -> Path:
     """Write a copy with the numbers of operated joints.
 
     Args:
         path: URDF; files that it names stay where they are.
-        out: Folder for the copy.
-        joints: Servos by joint (facts.json).
+        out: Folder for the copy and changes.diff.
+        facts: facts.json, with the prefix of joint names in the file.
         operated: The joints to change.
-        prefix: Text before each joint's name in the file.
 
     Returns:
-        The copy, and the changes as a unified diff.
+        The copy.
 
     Raises:
         RobotError: A joint is not in the file, or it is no URDF.
     """
-    source = Source(path.resolve())
+    source, prefix = Source(path.resolve()), facts["prefix"]
     if source.tags[0].name != "robot":
         raise RobotError(f"{path}: begins with <{source.tags[0].name}>, so it is no URDF")
     tags = {t.attributes.get("name", ""): t for t in source.tags if t.name == "joint" and t.parent == "robot"}
     for name in operated:
         if (tag := tags.get(prefix + name)) is None:
             raise RobotError(f"{path}: has no joint '{prefix + name}' (--prefix); it has {', '.join(tags)}")
-        servo = joints[name]
+        servo = facts["plain"][name]
         values = {"damping": text_of(servo["damping"]), "friction": text_of(servo["frictionloss"])}
         dynamics, limit = (_within(source, tag, element) for element in ("dynamics", "limit"))
         if dynamics is not None:
@@ -54,7 +53,8 @@ def edit_urdf(path: Path, out: Path, joints: Joints, operated: tuple[str, ...], 
     target = out / path.name
     with lock_folder(out, "engine"):
         write_text(target, source.edited()[source.main].decode("utf-8"))
-    return target, source.difference()
+    source.write_changes(out)
+    return target
 
 
 def with_urdf_fields(plain: RobotSpec) -> RobotSpec:

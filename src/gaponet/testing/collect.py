@@ -157,22 +157,19 @@ def _require_same_source(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recip
 
 
 def _batches(missing: list[Take], nproc: int) -> Iterator[list[Take]]:
-    """Yield takes of whole motions at one rate; fewer towards the end, so that no process waits long for the last."""
-    by_rate: dict[float, dict[str, list[Take]]] = {}
+    """Yield takes of whole motions at one rate; a resumed run keeps their order."""
+    groups: dict[tuple[float, str], list[Take]] = {}
     for take in missing:
-        by_rate.setdefault(take.rate, {}).setdefault(take.motion, []).append(take)
-    remaining = len(missing)
-    for _, motions in sorted(by_rate.items()):  # by rate, so that a resumed run keeps the order
-        part: list[Take] = []
-        for group in motions.values():
-            if part and len(part) + len(group) > min(max(remaining // (2 * nproc), TAKES_PER_JOB[0]), TAKES_PER_JOB[1]):
-                yield part
-                remaining -= len(part)
-                part = []
-            part = part + group
-        if part:
+        groups.setdefault((take.rate, take.motion), []).append(take)
+    size = min(max(len(missing) // (4 * nproc), TAKES_PER_JOB[0]), TAKES_PER_JOB[1])
+    part: list[Take] = []
+    for (rate, _), group in sorted(groups.items(), key=lambda item: item[0][0]):
+        if part and (part[0].rate != rate or len(part) + len(group) > size):
             yield part
-            remaining -= len(part)
+            part = []
+        part = part + group
+    if part:
+        yield part
 
 
 def _play_jobs(

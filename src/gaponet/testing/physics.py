@@ -6,6 +6,7 @@ The numbers and their sources are in fleets/*.toml.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,11 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 
 
-def _joint(effect: str, neutral: float, unit: str) -> dict[str, Any]:
-    return {"effect": effect, "neutral": neutral, "unit": unit, "scope": "joint"}
+def _metadata(scope: str, effect: str, neutral: float, unit: str) -> dict[str, Any]:
+    return {"effect": effect, "neutral": neutral, "unit": unit, "scope": scope}
 
 
-def _unit(effect: str, neutral: float, unit: str) -> dict[str, Any]:
-    return {"effect": effect, "neutral": neutral, "unit": unit, "scope": "unit"}
+_joint, _unit = partial(_metadata, "joint"), partial(_metadata, "unit")
 
 
 @dataclass(frozen=True)

@@ -164,9 +164,7 @@ class VirtualSO101:
         """Write readings into the registers."""
         order = self._order
         qpos, qvel, tau, temperature = self.live.read()
-        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[
-            order
-        ]  # also beyond the limits
+        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[order]  # may pass the limits
         share = (tau / self.robot.effort_limit)[order]
         values = {
             reg.PRESENT_POSITION: np.clip(steps, 0, STEPS_PER_TURN - 1),
@@ -189,9 +187,8 @@ class VirtualSO101:
             if not _get(memory, reg.TORQUE_ENABLE):
                 kp[joint], kd[joint] = 0.0, FREE_DAMPING
                 continue
-            goals[joint] = np.clip(
-                _get(memory, reg.GOAL_POSITION), _get(memory, reg.MIN_POSITION), _get(memory, reg.MAX_POSITION)
-            )
+            limits = _get(memory, reg.MIN_POSITION), _get(memory, reg.MAX_POSITION)
+            goals[joint] = np.clip(_get(memory, reg.GOAL_POSITION), *limits)
             self.live.ctrl[joint] = self.calibration.qpos(goals)[joint]
         self.live.set_gains(kp, kd, effort)
 

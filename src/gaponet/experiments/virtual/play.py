@@ -164,7 +164,7 @@ def _play(
     targets = np.stack([np.concatenate([c, np.repeat(c[-1:], len(ctrl[0]) - len(c), axis=0)]) for c in ctrl], axis=1)
     locked = idle_joints(robot, robot.operated)
     loads = [(float(m), "both") for m in mass]
-    robots = VirtualRobot(robot, [unit] * len(mass), loads, robot.dt, locked=locked)
+    robots = VirtualRobot(robot, [unit] * len(mass), loads, robot.dt, locked=locked, nthread=1)
     robots.reset(targets[0], list(range(len(mass))), START_WARMING_K)
     if compensator is not None:
         compensator.reset(targets[0], mass)
