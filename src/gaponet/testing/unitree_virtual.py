@@ -131,7 +131,7 @@ class VirtualH12:
             name: np.array([row[name] for row in self.heard]) for name in next(iter(self.heard), {})
         }
         with atomic_write(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **columns)  # type: ignore[arg-type]
+            np.savez_compressed(file, **columns)
 
     def _send_state(self, k: int, now: float) -> None:
         wrong = self.first_command is not None and now - self.first_command >= self.fault_at
