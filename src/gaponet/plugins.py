@@ -3,7 +3,8 @@
 A package names them in its metadata, as entry points of one of three groups:
 
     gaponet.formats   a module that reads logs (gaponet.data.formats says what it has)
-    gaponet.drivers   a function (robot, **options) that returns a Driver (gaponet.hw.control.driver)
+    gaponet.drivers   a function (robot, **options) that returns a Driver (gaponet.hw.control.driver). `gaponet run`
+                      gives it those options of --help that are its parameters, such as port
     gaponet.methods   a function that `gaponet experiment real --method NAME` compares (docs/benchmark.md)
 
 A built-in name cannot be replaced. A failure of an extension is logged once as a warning, and gaponet continues

@@ -4,7 +4,7 @@ from contacts import Contacts
 
 from gaponet.base.errors import RobotError
 from gaponet.robot.collision import CLEARANCE_M, Collision, read_shapes, segment_distance
-from gaponet.robot.spec import load_robot
+from gaponet.robot.spec import load_robot, packaged_robots
 from gaponet.sim.model import build_model
 from gaponet.sim.robot_check import check_robot
 
@@ -78,7 +78,7 @@ def test_a_shape_on_an_unknown_body_is_an_error(arm):
         Collision(arm, build_model(arm))
 
 
-@pytest.mark.parametrize("name", ["so101", "h1_2", "g1_29", "g1_23", "fr3", "ur10e"])
+@pytest.mark.parametrize("name", sorted({*packaged_robots()} - {"xl330_bench"}))  # a bench has no shapes
 def test_packaged_robots_are_free_at_home_and_have_a_plane(name):
     robot = load_robot(name)
     collision = Collision(robot, build_model(robot))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gaponet.data.sequence import Sequence
     from gaponet.data.store import Entry
     from gaponet.nn.artifact import GapModel
-    from gaponet.nn.config import Kind
+    from gaponet.nn.config import ModelKind
     from gaponet.nn.training.config import Status, TrainConfig
     from gaponet.sysid.acceptance import Covariance, HeldOut
     from gaponet.sysid.uncertainty import ParameterUncertainty
@@ -198,7 +198,7 @@ def train(
     out: Place,
     budget: str = "10m",
     config: TrainConfig | None = None,
-    model: Kind | Literal["auto"] | None = None,
+    model: ModelKind | Literal["auto"] | None = None,
     robot: RobotSpec | Place | None = None,
     holdout_units: tuple[str, ...] = (),
     resume: bool = False,
@@ -241,7 +241,7 @@ def train(
         data, spec = as_dataset(dataset, robot)
         require_commands(data)
 
-        def one(kind: Kind, run: Path, share: float, spent: float, resume: bool) -> GapModel:
+        def one(kind: ModelKind, run: Path, share: float, spent: float, resume: bool) -> GapModel:
             def show(status: Status) -> None:
                 progress(spent + share * status.fraction, 1.0, f"{kind}: {status.note}")
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gaponet.data.store import Dataset, Entry
     from gaponet.export.rollout import RolloutPrediction
     from gaponet.nn.artifact import GapModel
-    from gaponet.nn.config import Kind
+    from gaponet.nn.config import ModelKind
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.finding import Finding
     from gaponet.robot.spec import RobotSpec
@@ -285,7 +285,7 @@ class TrainResult(Result):
 
     model: GapModel
     card: dict[str, Any] = field(repr=False)
-    candidates: Mapping[Kind, float] = field(default_factory=dict)
+    candidates: Mapping[ModelKind, float] = field(default_factory=dict)
 
     @property
     def val_mpjae(self) -> dict[str, float]:

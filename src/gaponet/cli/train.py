@@ -15,7 +15,7 @@ from gaponet.base.progress import no_progress, progress_bar
 from gaponet.cli.gap import show_methods, show_verdict
 from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
-from gaponet.nn.config import Kind
+from gaponet.nn.config import ModelKind
 from gaponet.nn.training.config import TrainConfig
 from gaponet.report.methods import title
 from gaponet.report.tables import mrad
@@ -27,7 +27,7 @@ from gaponet.robot.folder import STORED_ROBOT
 def train(
     dataset: Source,
     out: Path,
-    model: Kind | Literal["auto"] = "auto",
+    model: ModelKind | Literal["auto"] = "auto",
     recipe: Literal["labels", "paper"] = "labels",
     budget: str = "10m",
     resume: Flag = False,

@@ -68,7 +68,7 @@ def import_logs(
     What was written before a full disk or a kill stays, complete, and the same call adds the rest.
 
     Args:
-        src: File or folder in one of data.formats.available_formats().
+        src: File or folder in one of data.formats.formats().
         unit_id: Name of the robot copy, to which offsets belong. None if the format states it.
         payload_mass: In each hand named by payload_side, kg; 0.0 when empty. None if the format states it.
         out: Dataset folder; created, or appended to by one process at a time.

@@ -9,7 +9,7 @@ from annotated_types import Interval, Len
 
 from gaponet.base.errors import UsageError
 
-Kind = Literal["gaponet", "paper", "shared_mlp", "mlp"]
+ModelKind = Literal["gaponet", "paper", "shared_mlp", "mlp"]
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max")
@@ -23,7 +23,7 @@ PAPER_ONLY = (  # options of kind "paper" alone
 class ModelConfig:
     """Options of a delta-action model. They and the number of operated joints n give all dimensions."""
 
-    kind: Kind = "gaponet"
+    kind: ModelKind = "gaponet"
     """gaponet: the operator. paper: the network of the paper in its literal form, with the paper's layer widths
     (nn/paper.py). shared_mlp: one plain network for all joints, with the inputs of the operator and as many weights as
     branch and trunk. mlp: a plain network on [observation, action], the form of ASAP."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from gaponet.base.arrays import Array
-from gaponet.nn.config import ModelConfig
+from gaponet.nn.config import ModelConfig, ModelKind
 from gaponet.nn.layers import DeltaNet, dense, num_parameters
 from gaponet.nn.observation import Layout
 from gaponet.nn.paper import PaperNet, SensorPredictor
@@ -131,6 +131,11 @@ class SharedMLP(OperatorNet):
         return self.bounded(self.net(prepared).squeeze(-1))
 
 
+NETWORKS: dict[ModelKind, Callable[[ModelConfig, int], DeltaNet]] = {
+    "gaponet": OperatorNet, "paper": PaperNet, "shared_mlp": SharedMLP, "mlp": DeltaMLP,
+}  # fmt: skip
+
+
 def build_network(config: ModelConfig, n: int) -> DeltaNet:
     """Return an untrained network for n operated joints.
 
@@ -138,14 +143,8 @@ def build_network(config: ModelConfig, n: int) -> DeltaNet:
         UsageError: An option belongs to another kind of network.
     """
     config.require_kind()
-    if config.kind == "gaponet":
-        return OperatorNet(config, n)
-    if config.kind == "paper":
-        return PaperNet(config, n)
-    if config.kind == "shared_mlp":
-        return SharedMLP(config, n)
-    if not config.mlp_match:
-        return DeltaMLP(config, n)
+    if not config.mlp_match or config.kind != "mlp":
+        return NETWORKS[config.kind](config, n)
     with torch.device("meta"):  # shapes only
         parameters = num_parameters(OperatorNet(replace(config, kind="gaponet"), n))
     hidden = DeltaMLP.matched_hidden(config.mlp_hidden, parameters, lambda widths: DeltaMLP(config, n, widths))

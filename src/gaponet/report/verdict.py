@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
+from gaponet.nn.config import ModelKind
 from gaponet.report.methods import IDENTIFIED, title
 from gaponet.robot.folder import STORED_ROBOT
 from gaponet.sim.metrics import standard_error
 
-LEARNED = ("mlp", "shared_mlp", "paper", "gaponet")  # kinds of model
+LEARNED: tuple[str, ...] = get_args(ModelKind)[::-1]
 WITHOUT_NETWORK = ("nominal", "delay_offset", "identified")
 MIN_RELATIVE_REDUCTION = 0.02  # of the base's error, by a network that is worth having
 

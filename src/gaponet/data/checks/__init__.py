@@ -6,7 +6,7 @@ run on every dataset. The gravity and static checks need a gravity model too (da
 
 from __future__ import annotations
 
-from gaponet.data.checks import motor, recording, timing, wiring
+from gaponet.data.checks import completeness, motor, timing, wiring
 from gaponet.data.checks.check import Check
 
-CHECKS: tuple[Check, ...] = (*wiring.CHECKS, *timing.CHECKS, *recording.CHECKS, *motor.CHECKS)
+CHECKS: tuple[Check, ...] = (*wiring.CHECKS, *timing.CHECKS, *completeness.CHECKS, *motor.CHECKS)

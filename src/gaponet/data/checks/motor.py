@@ -8,7 +8,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
-from gaponet.data.checks.recording import unsigned_torque
+from gaponet.data.checks.completeness import unsigned_torque
 from gaponet.data.checks.survey import Survey
 from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
 from gaponet.data.static_poses import StaticError, StaticPoses

@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError
-from gaponet.data.describe.recording import SECONDS, Recording
+from gaponet.data.describe.raw_recording import SECONDS, RawRecording
 from gaponet.robot.spec import RobotSpec
 
 # Words by which the world calls them; a name with a word of an earlier line is not looked for in a later one.
@@ -29,7 +29,7 @@ ROWS = 4000  # that are looked at
 APART = 0.5  # of a command's own motion by which repetitions of it differ at the most
 
 
-def guess_logs(recordings: list[Recording], robot: RobotSpec, fmt: str, known: dict[str, Any]) -> str:
+def guess_logs(recordings: list[RawRecording], robot: RobotSpec, fmt: str, known: dict[str, Any]) -> str:
     """The text of a logs.toml.
 
     Args:
@@ -77,7 +77,7 @@ def _kind(name: str) -> str | None:
     return found[0] if found else None
 
 
-def _channels(recording: Recording) -> dict[str, str]:
+def _channels(recording: RawRecording) -> dict[str, str]:
     """channel → array, or pattern of columns with {joint}."""
     found: dict[str, str] = {}
     arrays = [n for n, labels in recording.signals.items() if labels]
@@ -112,7 +112,7 @@ def _patterns(name: str) -> list[str]:
     return found or [name]
 
 
-def _joints(recording: Recording, channels: dict[str, str]) -> list[str]:
+def _joints(recording: RawRecording, channels: dict[str, str]) -> list[str]:
     """Names of the joints as the log has them, in its order; digits where it has none."""
     pattern = channels.get("qpos") or channels.get("ctrl")
     if pattern is None:
@@ -149,7 +149,7 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
     return lines
 
 
-def _clock(recording: Recording, told: dict[str, Any]) -> list[str]:
+def _clock(recording: RawRecording, told: dict[str, Any]) -> list[str]:
     """time or rate, and time_unit."""
     if "rate" in told:
         return [f"rate = {told['rate']:g}  # Hz"]
@@ -165,7 +165,7 @@ def _clock(recording: Recording, told: dict[str, Any]) -> list[str]:
     return [*lines, f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s']
 
 
-def _values(recording: Recording, pattern: str) -> Array | None:
+def _values(recording: RawRecording, pattern: str) -> Array | None:
     """(rows, joints) of a channel, in the log's own order."""
     if pattern in recording.signals:
         values = recording.load([pattern])[pattern].values[:ROWS]
@@ -180,7 +180,7 @@ def _values(recording: Recording, pattern: str) -> Array | None:
     return np.stack([loaded[n].values[:ROWS] for n in names], axis=1)
 
 
-def _positions(recording: Recording, channels: dict[str, str]) -> list[str]:
+def _positions(recording: RawRecording, channels: dict[str, str]) -> list[str]:
     values = _values(recording, channels.get("qpos") or channels.get("ctrl") or "")
     if values is None or not np.isfinite(values).any():
         return ['position_unit = "rad"  # ?']
@@ -189,7 +189,7 @@ def _positions(recording: Recording, channels: dict[str, str]) -> list[str]:
     return [f'position_unit = "{unit}"  # ? values up to {span:.3g}']
 
 
-def _repeated(recordings: list[Recording], ctrl: str) -> bool:
+def _repeated(recordings: list[RawRecording], ctrl: str) -> bool:
     """Return True if the first two recordings have equal commands: a final number in their names counts repetitions."""
     told = [_values(recording, ctrl) for recording in recordings[:2]]
     if len(told) < 2 or any(x is None for x in told):

@@ -2,7 +2,7 @@
 
 The first line of a format's docstring says what the format is. A format whose columns logs.toml explains has
 
-    recordings(path, told)  yields Recordings (data.describe.recording)
+    recordings(path, told)  yields Recordings (data.describe.raw_recording)
     DEFAULT                 content of logs.toml unless the recording or the user states something else; default nothing
 
 and a format that says itself what its columns are has
@@ -16,6 +16,9 @@ Both have SUFFIXES, of files that are recordings, at or below a folder; or, if t
     find(path)              the recordings under a path: files or folders, sorted; default: files with SUFFIXES
 
 and, if it needs an extra of the package, EXTRA.
+
+A field of logs.toml that is neither in ALWAYS nor in OPTIONS is refused: the format fixes it. A file that another
+format detects is no `table`. The shortest readers to copy are pace.py (`recordings`) and bam.py (`read`).
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ from gaponet import plugins
 from gaponet.base.errors import LogError, UsageError
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.plausibility import require_plausible
-from gaponet.data.describe.recording import COMMAND, Recording
+from gaponet.data.describe.raw_recording import COMMAND, RawRecording
 from gaponet.data.log import Channel, Log, skipped_rows
 from gaponet.plugins import attempt
 from gaponet.robot.spec import RobotSpec
@@ -91,6 +94,11 @@ def detect(path: Path) -> str:
     if not path.exists():
         raise LogError(f"{path}: does not exist")
     found = [fmt for fmt, where in formats().items() if attempt(where, partial(_detects, fmt, path), False)]
+    others = [fmt for fmt in found if fmt != "table"]
+    if others and len(found) > len(others):
+        tables = module("table").find(path)
+        if all(any(_detects(fmt, file) for fmt in others) for file in tables):
+            found = others
     if len(found) > 1:
         ways = " or ".join(f"--format {fmt}" for fmt in found)
         raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in found)}; say {ways}")
@@ -175,7 +183,7 @@ def read_logs(
 
 def look(
     path: Path, fmt: str | None = None, logs: str | Path | None = None, allow_pickle: bool = False
-) -> tuple[str, LogsFile, list[Recording]]:
+) -> tuple[str, LogsFile, list[RawRecording]]:
     """The format, what is said of it already, and the first recordings as they lie there; arguments as of read_logs."""
     told, _ = read_logs_file(path, logs)
     reader = _reader(path, fmt or told.get("format"))
@@ -221,7 +229,7 @@ def _loaders(
         yield recording.name, partial(recording.to_log, robot, told, names or None)
 
 
-def _recordings(reader: ModuleType, path: Path, told: LogsFile) -> Iterator[Recording]:
+def _recordings(reader: ModuleType, path: Path, told: LogsFile) -> Iterator[RawRecording]:
     """Read the logs. Values of the format apply unless the recording or `told` states others."""
     for recording in reader.recordings(path, _defaults(reader) | told):
         yield replace(recording, default=_defaults(reader) | recording.default)
@@ -231,7 +239,7 @@ def _defaults(reader: ModuleType) -> LogsFile:
     return getattr(reader, "DEFAULT", LogsFile())
 
 
-def _with_commands(found: list[Recording], pattern: str) -> Iterator[Recording]:
+def _with_commands(found: list[RawRecording], pattern: str) -> Iterator[RawRecording]:
     """Each recording together with its command_file, which is then no recording of its own."""
     by_file = {Path(r.source).name: r for r in found}
     wanted = {r.source: pattern.replace("{name}", r.name) for r in found}

@@ -17,7 +17,7 @@ from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json, read_limited
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, restated
+from gaponet.data.describe.raw_recording import RawRecording, restated
 from gaponet.data.formats import files_under, pickles
 from gaponet.data.sequence import OPTIONAL
 
@@ -27,7 +27,7 @@ DEFAULT: LogsFile = {"ctrl": "action", "qpos": "dof", "qvel": "dof_vel", "positi
 TARGETS = "target"  # signal made of action, where the file says how
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
     """Every motion of every file."""
     for file in files_under(path, SUFFIXES):
         found = _read(file)
@@ -44,7 +44,7 @@ def _read(file: Path) -> Any:
     return pickles.load(read_limited(file, LogError, "split it", MAX_ARRAYS_BYTES), str(file))
 
 
-def _recording(file: Path, name: str, motion: dict[str, Any]) -> Recording:
+def _recording(file: Path, name: str, motion: dict[str, Any]) -> RawRecording:
     where = f"{file}#{name}"
     arrays = {k: v for k, v in motion.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiu" and v.ndim}
     fps = motion.get("fps")
@@ -66,4 +66,4 @@ def _recording(file: Path, name: str, motion: dict[str, Any]) -> Recording:
         meta["stated"] = restated(parse_json(dict[str, Any], motion["stated"], where, LogError), where)
         default |= {c: c for c in ("ctrl", *OPTIONAL) if c in arrays}  # type: ignore[typeddict-item]
     motion_name = str(meta["stated"]["motion"]) if meta else name
-    return Recording.of_arrays(file, arrays, labels, motion_name, part=name, meta=meta, default=default)
+    return RawRecording.of_arrays(file, arrays, labels, motion_name, part=name, meta=meta, default=default)

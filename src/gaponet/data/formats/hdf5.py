@@ -20,7 +20,7 @@ from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import WIDEST, Recording, Signal, reading
+from gaponet.data.describe.raw_recording import WIDEST, RawRecording, Signal, reading
 from gaponet.data.formats import files_under
 
 SUFFIXES = (".h5", ".hdf5")
@@ -32,7 +32,7 @@ ALOHA: LogsFile = {
 DEEPEST, MOST = 6, 5000  # groups in groups; arrays in a file
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
     """Every file, or every demonstration in it."""
     for file in files_under(path, SUFFIXES):
         arrays = _listed(file)
@@ -43,7 +43,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
             name = f"{file.stem}-{part}" if part else file.stem
             aloha = not demo and {"action", "observations/qpos"} <= members.keys()
             default = {k: v for k, v in ALOHA.items() if v in members or k == "position_unit"} if aloha else {}
-            yield Recording(
+            yield RawRecording(
                 name, f"{file}#{part}" if part else str(file), members, partial(_load, file, demo), str(file),
                 (str(file),), default=cast("LogsFile", default),
             )  # fmt: skip

@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording
+from gaponet.data.describe.raw_recording import RawRecording
 from gaponet.data.formats import parquet
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def joint_column(names: list[str], logs: LogsFile) -> str | None:
     return next((name for name in names if name.lower() in JOINT_COLUMNS), None)
 
 
-def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> Recording:
+def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> RawRecording:
     """Return a table with a row per joint and time as a recording whose signals have a column per joint.
 
     Args:
@@ -55,7 +55,7 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> Recor
     used = {n for n in names if n in logs.values() or not table.column(n).null_count} - {joint, time}
     numbers = [n for n in names if n in used and _is_number(table.column(n).type)]
     arrays = {n: np.stack([_numbers(file, table, n)[rows] for rows in order], axis=1) for n in numbers}
-    recording = Recording.of_arrays(file, {time: stamps[order[0]]} | arrays, joints, default={"time": time})
+    recording = RawRecording.of_arrays(file, {time: stamps[order[0]]} | arrays, joints, default={"time": time})
     return replace(recording, where=f"{file}:1")
 
 

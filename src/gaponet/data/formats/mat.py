@@ -14,17 +14,17 @@ import numpy as np
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, reading
+from gaponet.data.describe.raw_recording import RawRecording, reading
 from gaponet.data.formats import files_under
 
 SUFFIXES = (".mat",)
 DEFAULT: LogsFile = {"time": "time"}
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
     """Every file."""
     for file in files_under(path, SUFFIXES):
-        yield Recording.of_arrays(file, _read(file))
+        yield RawRecording.of_arrays(file, _read(file))
 
 
 @sandboxed(LogError, "scipy.io")

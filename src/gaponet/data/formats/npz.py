@@ -20,7 +20,7 @@ from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import parse_json
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, restated
+from gaponet.data.describe.raw_recording import RawRecording, restated
 from gaponet.data.formats import files_under, pickles
 from gaponet.data.log import CHANNELS, DERIVED
 
@@ -34,7 +34,7 @@ NAMES = ("joint_names", "joint_sequence", "dof_names")
 OURS = "gaponet"  # array with JSON in a file of ours
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
     """Every file, or every motion in it."""
     for file in files_under(path, SUFFIXES):
         arrays = _read(file)
@@ -44,20 +44,20 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         elif all(k in arrays for k in ("real_dof_positions", "real_dof_positions_cmd")):
             yield from _motions(file, arrays, names)
         else:
-            yield Recording.of_arrays(file, arrays, names)
+            yield RawRecording.of_arrays(file, arrays, names)
 
 
-def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Recording:
+def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> RawRecording:
     """Read a file that data.writers.npz wrote, in SI units, with all its metadata."""
     told = parse_json(dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again")
     stated = restated(told.get("stated"), f"{file}: {OURS}")
     default = LogsFile(time_unit="s", position_unit="rad")
     default |= {c: c for c in (*CHANNELS, *DERIVED) if c in arrays}  # type: ignore[typeddict-item]
     meta = {"stated": stated} | ({"dt": told["dt"]} if isinstance(told.get("dt"), float) else {})
-    return Recording.of_arrays(file, arrays, names, str(stated["motion"]), meta=meta, default=default)
+    return RawRecording.of_arrays(file, arrays, names, str(stated["motion"]), meta=meta, default=default)
 
 
-def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[Recording]:
+def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[RawRecording]:
     """GAPONet's: the first axis counts motions."""
     keys = [k for k in GAPONET.values() if k in arrays]
     count = min(len(arrays[k]) for k in keys)
@@ -77,7 +77,7 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
         default = {k: v for k, v in GAPONET.items() if v in one or k.endswith("_unit")}
         one = {k: a[:end] for k, a in one.items()}
         joints = names[i : i + 1] if single else names
-        yield Recording.of_arrays(
+        yield RawRecording.of_arrays(
             file, one, joints, f"{file.stem}-{i:04d}", str(i), meta={"stated": stated}, default=default
         )
 

@@ -16,7 +16,7 @@ import numpy as np
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording
+from gaponet.data.describe.raw_recording import RawRecording
 from gaponet.data.formats import files_under, pickles
 
 SUFFIXES = (".pt",)
@@ -27,7 +27,7 @@ DEFAULT: LogsFile = {
 GAINS = ("kp", "kd")
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
     """Every file."""
     for file in files_under(path, SUFFIXES):
         arrays = _read(file)
@@ -43,7 +43,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
                     )
                 arrays[name] = np.broadcast_to(stated.ravel(), qpos.shape)
                 gains[name] = name  # type: ignore[literal-required]
-        yield Recording.of_arrays(file, arrays, default=gains)
+        yield RawRecording.of_arrays(file, arrays, default=gains)
 
 
 @sandboxed(LogError, "numpy")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES
-from gaponet.data.describe.recording import reading
+from gaponet.data.describe.raw_recording import reading
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -21,7 +21,7 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES
-from gaponet.data.describe.recording import reading
+from gaponet.data.describe.raw_recording import reading
 
 KINDS = "biufUS"  # of dtypes: numbers and text of fixed size
 STORAGES = {"Float": "f4", "Double": "f8", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1",

@@ -25,7 +25,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, Signal, reading
+from gaponet.data.describe.raw_recording import RawRecording, Signal, reading
 from gaponet.data.formats import files_under
 
 SUFFIXES = (".db3", ".mcap", ".bag")
@@ -64,7 +64,7 @@ def find(path: Path) -> list[Path]:
     return sorted({f.parent if (f.parent / "metadata.yaml").is_file() and path.is_dir() else f for f in files})
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
     """Every bag."""
     for bag in find(path):
         topics = _peeked(bag)
@@ -72,7 +72,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         files = tuple(map(str, files_under(bag, SUFFIXES)))
         meta: dict[str, Any] = {}
         load = partial(_load, bag, meta)
-        yield Recording(bag.stem, str(bag), signals, load, "", files, meta=meta, default=_usual(signals))
+        yield RawRecording(bag.stem, str(bag), signals, load, "", files, meta=meta, default=_usual(signals))
 
 
 def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:

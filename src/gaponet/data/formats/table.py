@@ -19,7 +19,7 @@ import numpy as np
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, Signal
+from gaponet.data.describe.raw_recording import RawRecording, Signal
 from gaponet.data.formats import files_under, joint_rows, parquet
 from gaponet.data.log import CHANNELS, skipped_rows
 
@@ -44,7 +44,7 @@ def find(path: Path) -> list[Path]:
     return sorted(f for f in tables if not f.name.startswith(".") and _is_table(f))
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
     """Every table, except the manifest."""
     files = [f for f in find(path) if f.name != told.get("manifest")]
     if not files:
@@ -62,7 +62,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
             yield joint_rows.recording(file, names, joint, told)
             continue
         where, line = f"{file}:1", 1 if _is_parquet(file) else first + 1
-        yield Recording(file.stem, str(file), dict.fromkeys(names, ()), load, where, (str(file),), line)
+        yield RawRecording(file.stem, str(file), dict.fromkeys(names, ()), load, where, (str(file),), line)
 
 
 def _is_table(file: Path) -> bool:

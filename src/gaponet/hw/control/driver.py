@@ -94,7 +94,7 @@ class Driver(Protocol):
         """
 
     def read(self) -> State:
-        """Return the newest state without waiting; the same one again if no newer one has come."""
+        """Return the newest state, the same one again if no newer one has come; take a small part of a period at most."""
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Send position targets of the commanded joints.
@@ -133,5 +133,7 @@ class Driver(Protocol):
     def watchdog(self) -> dict[str, object] | None:
         """Return the arguments of open_driver with which another process connects to this robot to damp it.
 
-        That driver must send nothing before it damps (control.watchdog). None: no other process can damp the robot.
+        `kind` is the driver's name, `robot` the folder of its robot; the others are parameters of the driver. The
+        process connects before the first command and must send nothing until it damps (control.watchdog). None: no
+        other process can damp the robot.
         """

@@ -38,8 +38,11 @@ def open_driver(kind: str, robot: RobotSpec | str | Path, **options: Any) -> Dri
         options: Parameters of the driver's class or function.
 
     Raises:
-        UsageError: There is no such driver, or its package is broken.
+        UsageError: There is no such driver, its package is broken, or it lacks a member of Driver.
     """
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     driver: Driver = plugins.require(plugins.DRIVERS, kind, DRIVERS, "driver")(spec, **options)
+    members = [*Driver.__annotations__, *(name for name in vars(Driver) if not name.startswith("_"))]
+    if missing := [name for name in members if not hasattr(driver, name)]:
+        raise UsageError(f"driver '{kind}' lacks {', '.join(missing)} (gaponet.hw.control.driver.Driver says what they do)")
     return driver

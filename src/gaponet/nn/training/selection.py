@@ -11,14 +11,14 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.files import write_json
 from gaponet.base.structure import read_json
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.config import Kind
+from gaponet.nn.config import ModelKind
 from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import CHECKPOINT
 
-CANDIDATES: tuple[Kind, ...] = ("gaponet", "shared_mlp", "mlp")
+CANDIDATES: tuple[ModelKind, ...] = ("gaponet", "shared_mlp", "mlp")
 SHARE = 0.2  # of the budget, for each candidate
 FOLDER, ERRORS = "candidates", "candidates.json"
-Train = Callable[[Kind, Path, float, float, bool], GapModel]  # kind, run, share of the budget, share spent, resume
+Train = Callable[[ModelKind, Path, float, float, bool], GapModel]  # kind, run, share of the budget, share spent, resume
 
 
 def train_best(out: Path, resume: bool, train: Train) -> GapModel:
@@ -54,18 +54,18 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     return train(best, out, 1 - spent, spent, True)
 
 
-def candidate_errors(run: Path) -> dict[Kind, float]:
+def candidate_errors(run: Path) -> dict[ModelKind, float]:
     """Return the validation error of each candidate of a run, rad; empty if one kind was given."""
-    return read_json(dict[Kind, float], run / ERRORS, ModelError) if (run / ERRORS).is_file() else {}
+    return read_json(dict[ModelKind, float], run / ERRORS, ModelError) if (run / ERRORS).is_file() else {}
 
 
-def _kind(run: Path) -> Kind | None:
+def _kind(run: Path) -> ModelKind | None:
     """Return the kind of network of a run; None if no run is there."""
     if not (run / CHECKPOINT).is_file():
         return None
     return read_json(dict[str, Any], run / "config.json", ModelError)["model"]["kind"]
 
 
-def _copy(out: Path, kind: Kind) -> None:
+def _copy(out: Path, kind: ModelKind) -> None:
     ignore = shutil.ignore_patterns(".*")
     ranks.once(lambda: shutil.copytree(out / FOLDER / kind, out, dirs_exist_ok=True, ignore=ignore))

@@ -42,7 +42,7 @@ class Signal(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Recording:
+class RawRecording:
     """One recording.
 
     A signal's columns are named by digits where the file does not name them, and by () for a single column.
@@ -72,7 +72,7 @@ class Recording:
         names = [f"{name}[{len(labels)}]" if labels else name for name, labels in self.signals.items()]
         return ", ".join(names[:most]) + (", …" if len(names) > most else "")
 
-    def beside(self, commands: Recording) -> Recording:
+    def beside(self, commands: RawRecording) -> RawRecording:
         """This recording with the signals of another file, under COMMAND."""
 
         def load(names: list[str]) -> dict[str, Signal]:
@@ -92,7 +92,7 @@ class Recording:
         name: str = "",
         part: str = "",
         **more: Any,
-    ) -> Recording:
+    ) -> RawRecording:
         """A recording of arrays in memory; those that are not one row of numbers per sample are left alone.
 
         Args:
@@ -113,7 +113,7 @@ class Recording:
         }
         source = f"{file}#{part}" if part else str(file)
         load = lambda wanted: {n: Signal(kept[n].astype(float)) for n in wanted}  # noqa: E731
-        return Recording(name or file.stem, source, signals, load, source, (str(file),), **more)
+        return RawRecording(name or file.stem, source, signals, load, source, (str(file),), **more)
 
     def to_log(self, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Log:
         """The columns that `told` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
@@ -196,7 +196,7 @@ Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
 Chosen = dict[str, Columns]  # by channel
 
 
-def _choose(recording: Recording, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Chosen:
+def _choose(recording: RawRecording, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Chosen:
     """Which column holds what."""
     where, columns = recording.where or recording.source, recording.columns
     single = told.get("columns", {})
@@ -218,7 +218,7 @@ def _choose(recording: Recording, robot: RobotSpec, told: LogsFile, joint_map: d
     return found
 
 
-def _matching(recording: Recording, told: LogsFile, channel: str, taken: set[str]) -> list[tuple[str, str]]:
+def _matching(recording: RawRecording, told: LogsFile, channel: str, taken: set[str]) -> list[tuple[str, str]]:
     """(joint, column) of a pattern: "{joint}_des", or an array whose columns are joints."""
     pattern = told.get(channel)
     if not isinstance(pattern, str):
@@ -248,7 +248,7 @@ def _matching(recording: Recording, told: LogsFile, channel: str, taken: set[str
     ]  # fmt: skip
 
 
-def _gain_columns(recording: Recording, told: LogsFile, name: str, ctrl: Columns) -> Columns:
+def _gain_columns(recording: RawRecording, told: LogsFile, name: str, ctrl: Columns) -> Columns:
     """joint → column, where logs.toml says that an array holds the gains; it has the columns of the command's."""
     said = told.get(name)
     if not isinstance(said, str):
@@ -262,7 +262,7 @@ def _gain_columns(recording: Recording, told: LogsFile, name: str, ctrl: Columns
     return {joint: (said, which) for joint, (_, which) in ctrl.items()}
 
 
-def _constant(recording: Recording, name: str, values: Array) -> float:
+def _constant(recording: RawRecording, name: str, values: Array) -> float:
     """A gain that stood still."""
     if np.ptp(values) > 1e-3 * max(abs(float(values[0])), 1e-9):
         raise LogError(
@@ -272,7 +272,7 @@ def _constant(recording: Recording, name: str, values: Array) -> float:
     return float(values[0])
 
 
-def _require_complete(found: Chosen, recording: Recording, told: LogsFile) -> None:
+def _require_complete(found: Chosen, recording: RawRecording, told: LogsFile) -> None:
     where = recording.where or recording.source
     for need in REQUIRED:
         if need in found:
@@ -307,7 +307,7 @@ def _units(robot: RobotSpec, told: LogsFile, joints: list[str], joint_map: dict[
 
 
 def _time(
-    recording: Recording, told: LogsFile, loaded: dict[str, Signal], clock: str | None, channel: str,
+    recording: RawRecording, told: LogsFile, loaded: dict[str, Signal], clock: str | None, channel: str,
     columns: Columns,
 ) -> Array:  # fmt: skip
     """The time stamps of a channel, s, from any start."""
