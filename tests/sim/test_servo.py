@@ -100,6 +100,22 @@ def test_a_restored_state_continues_identically(arm):
     np.testing.assert_array_equal(*ends)
 
 
+def test_compiled_and_array_servo_models_agree(arm):
+    pytest.importorskip("numba")
+    terms = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "friction_external": 0.1}
+    robot = servo_model(arm, **terms, min_torque=0.03, encoder_step=0.002)
+    sims = [BatchSim(robot, [(0.5, "both", 0.02)] * 3, 1) for _ in range(2)]
+    for sim in sims:
+        for x in sim.servo_model.values.values():
+            x *= [[0.0, 1.0], [1.0, 0.0], [1.0, 2.0]]
+        sim.reset(slice(None), np.full((3, 2), 0.1), np.zeros((3, 2)))
+    sims[1].servo_model._set_joints = None
+    for t in range(50):
+        for sim in sims:
+            sim.step(np.full((3, 2), 0.3 * np.sin(0.2 * t)))
+    np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=1e-9)
+
+
 def test_the_mujoco_model_holds_the_servo_model(arm):
     model = build_model(servo_model(arm, stribeck=0.1, stribeck_speed=0.05))
     assert model.actuator_user[0].tolist() == [0.1, 0.05, 0.0, 0.0, 0.0, 0.0]

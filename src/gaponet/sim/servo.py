@@ -9,6 +9,7 @@ The model stands here twice: of arrays for numpy and torch, and of one joint for
 
 from __future__ import annotations
 
+import functools
 from importlib import import_module
 from typing import Any
 
@@ -90,6 +91,27 @@ def joint_friction(
     return limit
 
 
+def set_joints(
+    terms: Any, deadband: float, dry: Any, own_bias: Any, gain: Any, ctrl: Any, qpos: Any, qvel: Any, torque: Any,
+    load: Any, bias: Any, limit: Any,
+) -> None:  # fmt: skip
+    """Fill `bias` (unless terms[…, 4:] are zero) and `limit`, (nsim, nu), as ServoModel.before does; numba compiles it.
+
+    Args:
+        terms: In the order of SERVO_TERMS, (nsim, nu, terms).
+    """
+    for i in range(len(qpos)):
+        for j in range(qpos.shape[1]):
+            rest, speed, by_motor, by_load, least, step = terms[i, j]
+            limit[i, j] = joint_friction(
+                dry[i, j], rest, speed, by_motor, by_load, qvel[i, j], torque[i, j], load[i, j]
+            )
+            if least > 0.0 or step > 0.0:
+                kp, q = gain[i, j], qpos[i, j]
+                aim = ctrl[i, j] + own_bias[i, j] / kp
+                bias[i, j] = requested_torque(kp, aim, q, least, step, deadband) - kp * (ctrl[i, j] - q)
+
+
 def advance(
     first: int, last: int, values: Any, has_terms: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
     lengths: Any, stiffer: Any, kd: Any, stops: Any, periods: Any, count: int, thin: int, out: Any,
@@ -141,19 +163,26 @@ def advance(
                 out[:, item, (t + 1) // thin] = q - qpos[j, p, t + 1]
 
 
+@functools.cache
 def compiled(function: Any) -> Any:
     """Return a function of this file compiled by numba; None without numba, which is an extra."""
     try:
         numba, extending = import_module("numba"), import_module("numba.extending")
     except ImportError:
         return None
-    extending.overload(exp)(lambda x: lambda x: np.exp(x))
-    for used in (passing_friction, resting_friction, requested_torque, joint_friction):
-        extending.register_jitable(used)
+    _extend(extending)
     try:
         return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError:  # no folder for the cache is writable
         return numba.njit(nogil=True, error_model="numpy")(function)
+
+
+@functools.cache
+def _extend(extending: Any) -> None:
+    """Make functions of this file known to numba."""
+    extending.overload(exp)(lambda x: lambda x: np.exp(x))
+    for function in (passing_friction, resting_friction, requested_torque, joint_friction):
+        extending.register_jitable(function)
 
 
 class ServoModel:
@@ -180,11 +209,22 @@ class ServoModel:
         }
         self.frictionloss, self.bias = self._limit.copy(), self._bias[:, :, 0].copy()
         self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
+        self._set_joints = compiled(set_joints)
+        self._take_terms()
+        bias, limit = self._bias.copy(), self._limit.copy()
+        self.before()  # compiles now, since the first step may belong to a control loop
+        self._bias[:], self._limit[:] = bias, limit
+
+    def _take_terms(self) -> None:
+        """Take the present values of the terms for the steps to come."""
         self.active = present(self.values)
+        none = np.zeros(self._force.shape)
+        self._packed = np.stack([self.active.get(name, none) for name in SERVO_TERMS], axis=-1)
+        self._deadband = DEADBAND_STEPS * ("min_torque" in self.active)
 
     def reset(self, ids: Array, target: Array) -> None:
         """Begin again for simulations `ids`, which were put into a state, under position targets (k, nu) rad."""
-        self.active = present(self.values)
+        self._take_terms()
         requested = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
         self.torque[ids] = requested.clip(*np.moveaxis(self.force_range[ids], -1, 0))
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
@@ -202,9 +242,16 @@ class ServoModel:
         MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is under way.
         """
         gain, bias, qpos = self._gain[:, :, 0], self._bias[:, :, 0], self._qpos
+        state = (self._qvel, self.torque, self.load)
+        if self._set_joints is not None:
+            self._set_joints(
+                self._packed, self._deadband, self.frictionloss, self.bias, gain, self._ctrl, qpos, *state, bias,
+                self._limit,
+            )  # fmt: skip
+            return
         if "encoder_step" in self.active or "min_torque" in self.active:
             bias[:] = servo_torque(self.active, gain, self._ctrl + self.bias / gain, qpos) - gain * (self._ctrl - qpos)
-        self._limit[:] = friction_limit(self.active, self.frictionloss, self._qvel, self.torque, self.load)
+        self._limit[:] = friction_limit(self.active, self.frictionloss, *state)
 
     def after(self, ids: Any = None) -> None:
         """Store torque and load after a physics step of these simulations."""

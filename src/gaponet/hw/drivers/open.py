@@ -44,5 +44,7 @@ def open_driver(kind: str, robot: RobotSpec | str | Path, **options: Any) -> Dri
     driver: Driver = plugins.require(plugins.DRIVERS, kind, DRIVERS, "driver")(spec, **options)
     members = [*Driver.__annotations__, *(name for name in vars(Driver) if not name.startswith("_"))]
     if missing := [name for name in members if not hasattr(driver, name)]:
-        raise UsageError(f"driver '{kind}' lacks {', '.join(missing)} (gaponet.hw.control.driver.Driver says what they do)")
+        raise UsageError(
+            f"driver '{kind}' lacks {', '.join(missing)} (gaponet.hw.control.driver.Driver says what they do)"
+        )
     return driver
