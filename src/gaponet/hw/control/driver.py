@@ -94,7 +94,10 @@ class Driver(Protocol):
         """
 
     def read(self) -> State:
-        """Return the newest state, the same one again if no newer one has come; take a small part of a period at most."""
+        """Return the newest state; the same one again if no newer one has come.
+
+        It may take a small part of a control period.
+        """
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Send position targets of the commanded joints.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet import plugins
+from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Driver
 from gaponet.robot.spec import RobotSpec, load_robot
 
