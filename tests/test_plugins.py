@@ -78,14 +78,19 @@ def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, c
     installed(
         "[gaponet.formats]\nwav = HERE_wav\n[gaponet.drivers]\ntoy = HERE_toy:Toy\n"
         "[gaponet.methods]\nhalf = HERE_toy:half\n",
-        wav='"""Sound."""\nEXTRA = ""\ndef detects(path): return path.suffix == ".wav"',
-        toy="class Toy:\n    def __init__(self, robot, port): self.robot, self.port = robot, port\n\n"
-        "def half(q): return q",
+        wav='"""Sound."""\nEXTRA = ""\ndef detects(path): return path.is_file() and b"acme" in path.read_bytes()',
+        toy="class Toy:\n    def __init__(self, robot, port): self.robot, self.port = robot, port\n"
+        "    def __getattr__(self, name): return None\n\ndef half(q): return q",
     )
     assert main(["import", "--formats"]) == 0
     assert "Sound" in capsys.readouterr().out
-    (tmp_path / "a.wav").touch()
-    assert detect(tmp_path / "a.wav") == "wav"
+    for name, text, fmt in (
+        ("a.wav", "acme", "wav"),
+        ("b.csv", "# acme\n1,2\n", "wav"),
+        ("c.csv", "x,y\n1,2\n", "table"),
+    ):
+        (tmp_path / name).write_text(text)
+        assert detect(tmp_path / name) == fmt
     driver = open_driver("toy", "so101", port="x")
     assert (driver.robot.name, driver.port) == ("so101", "x")
     name, method = load_method("half")
@@ -110,6 +115,12 @@ def test_run_lists_and_opens_the_drivers_of_extensions(installed, tmp_path):
 def test_a_broken_driver_is_refused(installed):
     installed("[gaponet.drivers]\ntoy = HERE_toy:Toy\n", toy="import no_such_module")
     with pytest.raises(UsageError, match="the package that brings driver 'toy' is broken"):
+        open_driver("toy", "so101")
+
+
+def test_a_driver_that_lacks_a_member_is_refused(installed):
+    installed("[gaponet.drivers]\ntoy = HERE_toy:Toy\n", toy="class Toy:\n    def __init__(self, robot): pass")
+    with pytest.raises(UsageError, match="driver 'toy' lacks address, .* watchdog"):
         open_driver("toy", "so101")
 
 
