@@ -120,7 +120,7 @@ def test_a_broken_driver_is_refused(installed):
 
 def test_a_driver_that_lacks_a_member_is_refused(installed):
     installed("[gaponet.drivers]\ntoy = HERE_toy:Toy\n", toy="class Toy:\n    def __init__(self, robot): pass")
-    with pytest.raises(UsageError, match="driver 'toy' lacks address, .* watchdog"):
+    with pytest.raises(UsageError, match=r"driver 'toy' lacks address, .* watchdog"):
         open_driver("toy", "so101")
 
 

@@ -9,9 +9,9 @@ import tyro
 
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
-from gaponet.cli.gap import show_verdict
 from gaponet.cli.options import Flag, Json, Known, Robot
 from gaponet.cli.out import Out
+from gaponet.cli.show import show_verdict
 from gaponet.nn.artifact import CARD, GapModel
 from gaponet.report.methods import method, title
 from gaponet.report.run_files import read_config, read_metrics, read_progress

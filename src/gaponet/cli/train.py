@@ -12,9 +12,9 @@ import tyro
 
 from gaponet import api
 from gaponet.base.progress import no_progress, progress_bar
-from gaponet.cli.gap import show_methods, show_verdict
 from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
+from gaponet.cli.show import show_methods, show_verdict
 from gaponet.nn.config import ModelKind
 from gaponet.nn.training.config import TrainConfig
 from gaponet.report.methods import title

@@ -25,7 +25,8 @@ from gaponet.report.tables import by_group, mrad, mrad_and_degrees, totals
 from gaponet.report.verdict import network_gain, verdict
 from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sim.model import dataset_robot, require_stored_robot
+from gaponet.sim.dataset_robot import dataset_robot
+from gaponet.sim.model import require_stored_robot
 
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
 OPEN_TRAJECTORIES = 3  # motions shown without a click

@@ -32,7 +32,7 @@ def open_dataset(
         dataset: Folder; or the address (s3://, gs://, file://, hf://) of a pushed dataset, which is read without a
             pull.
         robot: Robot to use instead of the one in the dataset folder.
-        run: Run or robot folder that is used with the dataset (sim.model.dataset_robot).
+        run: Run or robot folder that is used with the dataset (sim.dataset_robot).
 
     Raises:
         DatasetError: There is no dataset, it is damaged, or it cannot be reached.
@@ -43,7 +43,7 @@ def open_dataset(
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if robot is not None:
         return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
-    from gaponet.sim.model import dataset_robot  # imports mujoco, before which view and report choose OpenGL
+    from gaponet.sim.dataset_robot import dataset_robot  # imports mujoco, before which view and report choose OpenGL
 
     spec = dataset_robot(data, None if run is None else Path(run))
     if not has_stored_robot(data.path) and (run is None or not has_stored_robot(Path(run))):
