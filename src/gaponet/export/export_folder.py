@@ -42,7 +42,7 @@ FACTS, ROBOT, CHECK = "facts.json", "robot.xml", "check.npz"
 SHIPPED = Path(__file__).parent / "shipped"
 ACTION_TERM = {"scene_facts.py": "scene_facts.py", "gaponet_action.py": "gaponet_action.py"}
 # Engine → name in the export folder → file in SHIPPED; beside mujoco_servos.py and servo_law.py.
-FILES: dict[str, dict[str, str]] = {
+CHECK_FILES: dict[str, dict[str, str]] = {
     "mjcf": {"check.py": "check_mjcf.py", "check_mjx.py": "check_mjx.py"},
     "urdf": {},
     "mjlab": ACTION_TERM | {"check.py": "check_mjlab.py"},
@@ -279,7 +279,7 @@ def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
     )
     functions = [inspect.getsource(f) for f in SERVO_MODEL]
     write_text(folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + constants, *functions]))
-    for name, file in ({"mujoco_servos.py": "mujoco_servos.py"} | FILES[to]).items():
+    for name, file in ({"mujoco_servos.py": "mujoco_servos.py"} | CHECK_FILES[to]).items():
         text = OWN_IMPORTS.sub(r"from \1 import", (SHIPPED / file).read_text(encoding="utf-8"))
         write_text(folder / name, text.replace("from servo import", "from servo_law import"))
     write_text(folder / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
