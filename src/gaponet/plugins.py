@@ -30,11 +30,11 @@ _WARNED: set[str] = set()
 
 def registry(group: str, builtin: Mapping[str, str]) -> dict[str, str]:
     """Return name → "module:attribute" of a group: the built-in ones, then those of extensions."""
-    found = dict(builtin)
+    entries = dict(builtin)
     for point in _points(group):
-        if found.setdefault(point.name, point.value) != point.value:
+        if entries.setdefault(point.name, point.value) != point.value:
             _warn(f"{_package(point)}: '{point.name}' of {group}", "exists already and is not replaced")
-    return found
+    return entries
 
 
 def require(group: str, name: str, builtin: Mapping[str, str], what: str) -> Any:
@@ -46,10 +46,10 @@ def require(group: str, name: str, builtin: Mapping[str, str], what: str) -> Any
     known = registry(group, builtin)
     if name not in known:
         raise UsageError(f"no {what} '{name}'; use one of {', '.join(known)}")
-    found = attempt(known[name], lambda: load(known[name]), None)
-    if found is None:
+    entries = attempt(known[name], lambda: load(known[name]), None)
+    if entries is None:
         raise UsageError(f"the package that brings {what} '{name}' is broken; update or uninstall it")
-    return found
+    return entries
 
 
 def load(where: str) -> Any:

@@ -119,10 +119,10 @@ def doctor(
     from gaponet.sim.dynamics import gravity_of
 
     data, spec = as_dataset(dataset, robot)
-    found = Diagnosis.of(data, spec, gravity_model=gravity_of(spec), progress=progress, executor=executor)
+    diagnosis = Diagnosis.of(data, spec, gravity_model=gravity_of(spec), progress=progress, executor=executor)
     return DoctorResult(
-        verdict=found.verdict, findings=tuple(found.findings), sequences=tuple(found.sequences),
-        joints=tuple(found.joints),
+        verdict=diagnosis.verdict, findings=tuple(diagnosis.findings), sequences=tuple(diagnosis.sequences),
+        joints=tuple(diagnosis.joints),
     )  # fmt: skip
 
 

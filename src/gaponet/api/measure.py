@@ -217,10 +217,10 @@ def replay(
             progress=progress,
         )  # fmt: skip
         rollouts = report.dataset.sequences(list(report.added))
-    found = predict(spec, rollouts, errors, drawn)
-    joints = summary(found, spec.operated)
+    prediction = predict(spec, rollouts, errors, drawn)
+    joints = summary(prediction, spec.operated)
     differ = sorted((j for j, s in joints.items() if s["inside"] < BAND_SHARE), key=lambda j: joints[j]["inside"])
     return ReplayResult(
-        robot=spec, joints=joints, differ=tuple(differ), rollouts=tuple(found), share=BAND_SHARE, drawn=len(drawn),
+        robot=spec, joints=joints, differ=tuple(differ), rollouts=tuple(prediction), share=BAND_SHARE, drawn=len(drawn),
         band_from_recordings=recordings is not None,
     )  # fmt: skip

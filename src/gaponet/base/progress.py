@@ -87,7 +87,10 @@ def _lines(title: str, console: Console) -> Iterator[_Show]:
 
     def show(running: Running, done: float, total: float, note: str = "") -> None:
         nonlocal last, fraction, newest
-        tasks = [note, *(f"{name} {100 * part:.0f} % {said}".rstrip() for name, (part, said) in running.items())]
+        tasks = [
+            note,
+            *(f"{name} {100 * part:.0f} % {progress_text}".rstrip() for name, (part, progress_text) in running.items()),
+        ]
         fraction, newest = done / total if total else 0.0, "; ".join(task for task in tasks if task)
         if time.monotonic() - last >= LINE_INTERVAL_S and (fraction < 1 or last >= start):
             last = time.monotonic()

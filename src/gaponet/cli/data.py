@@ -170,20 +170,20 @@ def _labels(
 
     screen, spec = Out(json), load_robot(robot)
     gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
-    found = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
-    write(found, out, rate)
+    labels = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
+    write(labels, out, rate)
     columns = ["joint", "to, rad", "recordings", "N·m a kg", "bands apart", "units, N·m", "payload determined"]
     screen.table("Held torque at equal commands", columns, [
         [c.joint, f"{c.command:+.2f}", str(c.count), f"{c.slope:+.2f}", f"{c.band_distance:.1f}",
          ", ".join(f"{u:+.2f}" for u in c.units), "yes" if c.determined else "no"]
-        for c in found.groups
+        for c in labels.groups
     ])  # fmt: skip
-    for line in found.remarks:
+    for line in labels.remarks:
         screen.say(line)
     screen.say(
         f"written: {out / 'labels.csv'!s}; next: gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}"
     )
-    screen.result({"cells": found.groups, "agreement": found.agreement, "recordings": found.recordings})
+    screen.result({"cells": labels.groups, "agreement": labels.agreement, "recordings": labels.recordings})
 
 
 @actions(card=_card, split=_split, figures=_figures, export=_export, remove=_remove, labels=_labels)

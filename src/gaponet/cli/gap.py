@@ -44,26 +44,27 @@ def gap(
     out.result(result.to_dict())
 
 
-def _show_steps(out: Out, found: Mapping[str, Any]) -> None:
+def _show_steps(out: Out, result: Mapping[str, Any]) -> None:
     """Print the error after each step, in total, by joint and by payload, and its reduction in total."""
-    who = "VIRTUAL robot" if found["virtual"] else "real robot"
-    kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"
-    joints, loads, ends = found["by_joint"], found["by_payload"], ("floor", "unexplained")
+    who = "VIRTUAL robot" if result["virtual"] else "real robot"
+    kind = "held-out recordings" if result["unseen"] else "recordings, some of them used in training"
+    joints, loads, ends = result["by_joint"], result["by_payload"], ("floor", "unexplained")
     rest = lambda part: (part["floor"]["both"], part["unexplained"])  # noqa: E731
     rows = [
-        [title(s), mrad(left), *map(mrad, found["removed"].get(s, ())), *[""] * (0 if s in found["removed"] else 2),
+        [title(s), mrad(left), *map(mrad, result["removed"].get(s, ())), *[""] * (0 if s in result["removed"] else 2),
          *(mrad(p[s]) for p in loads.values())]
-        for s, left in found["left"].items()
+        for s, left in result["left"].items()
     ]  # fmt: skip
-    rows += [[end, mrad(of), *[""] * (2 + len(loads))] for end, of in zip(ends, rest(found), strict=True)]
+    rows += [[end, mrad(of), *[""] * (2 + len(loads))] for end, of in zip(ends, rest(result), strict=True)]
     out.table(
-        f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
+        f"Mean |error| left after each step, mrad: {result['sequences']} {kind} of a {who}",
         ["step", "left", "removed", "± over motions", *(f"{p} kg" for p in loads)],
         rows,
     )
-    out.table("The same by joint", ["joint", *map(title, found["left"]), *ends], [
-        [name, *(mrad(part["left"][s]) for s in found["left"]), *map(mrad, rest(part))] for name, part in joints.items()
+    steps = list(result["left"])
+    out.table("Error left by joint", ["joint", *map(title, steps), *ends], [
+        [name, *(mrad(part["left"][s]) for s in steps), *map(mrad, rest(part))] for name, part in joints.items()
     ])  # fmt: skip
-    if found["floor"]["repeatability"] is None:
-        seen = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
+    if result["floor"]["repeatability"] is None:
+        seen = "unknown, encoders too" if result["floor"]["encoder"] is None else "encoder only"
         out.say(f"floor: {seen}; no motion was recorded twice or repeats itself: repeatability is unknown")

@@ -78,9 +78,9 @@ def identify(
 
 def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     """Print the verdict, the servos as a table, and what each term gave."""
-    found, errors, values = made.fit, made.errors, made.values()
+    fit, errors, values = made.fit, made.errors, made.values()
     nominal, left = (f"{mrad(e.mean())} ± {mrad(standard_error(e))}" for e in errors.values())
-    ratio, count, folds = errors["identified"].mean() / errors["nominal"].mean(), len(errors["nominal"]), found.held_out
+    ratio, count, folds = errors["identified"].mean() / errors["nominal"].mean(), len(errors["nominal"]), fit.held_out
     screen.say(f"nominal {nominal} → identified {left} mrad ({ratio:.2f} of nominal); independent motions: {count}")
     if len(folds) > 1:
         screen.say(
@@ -89,28 +89,28 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         )
     if made.taken_from:
         taken = ", ".join(f"{joint} from {source}" for joint, source in made.taken_from.items())
-        end = "" if found.improved else " No fit was better, so these servos are written as they are."
+        end = "" if fit.improved else " No fit was better, so these servos are written as they are."
         screen.say(f"Start and prior: {taken}.{end}")
     shown = [f for f in SERVO_FIELDS if any(v.get(f) for v in values.values())]
-    rows = [[j, *(_cell(v.get(f), found.std[j].get(f), SERVO_FIELDS[f].factor) for f in shown)]
+    rows = [[j, *(_cell(v.get(f), fit.std[j].get(f), SERVO_FIELDS[f].factor) for f in shown)]
             for j, v in values.items()]  # fmt: skip
-    for servo in dict.fromkeys(filter(None, (found.robot.servos[i] for i in found.robot.operated_index))):
+    for servo in dict.fromkeys(filter(None, (fit.robot.servos[i] for i in fit.robot.operated_index))):
         published = [_cell(servo.published.get(f), None, SERVO_FIELDS[f].factor) for f in shown]
         rows.append([f"published for {servo.name}, {servo.source}", *published])
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in shown)]
     screen.wide_table("Identified servos, ± standard error", columns, rows)
-    for term in found.comparisons:
+    for term in fit.comparisons:
         fell, error = (mrad(x) for x in term.gain)
         judges = "motions" if term.name == "torque" else "recordings"
-        told = f"{len(term.before)} {judges}; {'not ' * (not term.accepted)}kept"
-        screen.say(f"{term.name}: validation error falls by {fell} ± {error} mrad over {told}")
-    if found.chosen == "torque":
-        for m in found.robot.payload_mounts:
+        verdict = f"{len(term.before)} {judges}; {'not ' * (not term.accepted)}kept"
+        screen.say(f"{term.name}: validation error falls by {fell} ± {error} mrad over {verdict}")
+    if fit.chosen == "torque":
+        for m in fit.robot.payload_mounts:
             screen.say(
                 f"payload_mount {m.side}: at {m.pos} m of {m.body}, where {m.mass:g} kg hang that the model lacks"
             )
-    if found.table_fit is not None and found.table_fit.motions:
-        touch, table = found.table_fit, found.robot.table
+    if fit.table_fit is not None and fit.table_fit.motions:
+        touch, table = fit.table_fit, fit.robot.table
         what = "none that explains them"
         if touch.accepted and table is not None:
             what = f"height {table.height:.4f} m, friction {table.friction:.2f}, {table.stiffness:.0f} N/m"
@@ -118,8 +118,8 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
             f"table: {what}; where tips are low {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "
             f"{', '.join(touch.motions)}"
         )
-    unknown = [w for w in found.warnings if UNDETERMINED in w]
-    for warning in found.warnings:
+    unknown = [w for w in fit.warnings if UNDETERMINED in w]
+    for warning in fit.warnings:
         if details or warning not in unknown:
             screen.say(f"  {warning}", "warning", "yellow")
     if unknown and not details:
@@ -135,26 +135,24 @@ def _cell(value: float | None, std: float | None, factor: float) -> str:
 
 def _show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
     """Print the parameters of a torque-driven robot and its errors before and after."""
-    found, spec, virtual = made.fit, made.robot, "VIRTUAL " if made.virtual else ""
+    fit, spec, virtual = made.fit, made.robot, "VIRTUAL " if made.virtual else ""
     rows = []
     for j, name in enumerate(spec.operated):
         i = spec.operated_index[j]
-        values = {f: float(getattr(found.robot, f)[i]) for f in PASSIVE_FIELDS}
+        values = {f: float(getattr(fit.robot, f)[i]) for f in PASSIVE_FIELDS}
         cells = [
-            format_uncertainty(SERVO_FIELDS[f].factor * v, SERVO_FIELDS[f].factor * found.std[name][f]) if v else "0"
+            format_uncertainty(SERVO_FIELDS[f].factor * v, SERVO_FIELDS[f].factor * fit.std[name][f]) if v else "0"
             for f, v in values.items()
         ]
-        rows.append([name, *cells, f"{1e3 * found.robot.delay[i]:.0f}", f"{found.bias[j]:+.2g}",
-                     *([format_uncertainty(float(found.constant[j]), found.std[name]["constant"])] if current else []),
-                     *(f"{x[j]:.3g}" for x in found.torque)])  # fmt: skip
+        rows.append([name, *cells, f"{1e3 * fit.robot.delay[i]:.0f}", f"{fit.bias[j]:+.2g}",
+                     *([format_uncertainty(float(fit.constant[j]), fit.std[name]["constant"])] if current else []),
+                     *(f"{x[j]:.3g}" for x in fit.torque)])  # fmt: skip
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in PASSIVE_FIELDS), "delay, ms", "bias, N·m"]
     columns += ["N·m per unit"] * current + ["torque apart before, N·m", "after"]
     screen.table("Torque-driven joints, ± standard error; medians on recordings that were not fitted", columns, rows)
-    ahead = (
-        f"Angle apart from the {virtual}robot, so long after its state, mrad: before → after, {found.windows} starts"
-    )
-    screen.table(ahead, ["joint", *(f"{h:g} s" for h in found.angle)], [
-        [name, *(f"{mrad(a[j])} → {mrad(b[j])}" for a, b in found.angle.values())]
+    ahead = f"Angle apart from the {virtual}robot, so long after its state, mrad: before → after, {fit.windows} starts"
+    screen.table(ahead, ["joint", *(f"{h:g} s" for h in fit.angle)], [
+        [name, *(f"{mrad(a[j])} → {mrad(b[j])}" for a, b in fit.angle.values())]
         for j, name in enumerate(spec.operated)
     ])  # fmt: skip
     screen.say(

@@ -146,10 +146,10 @@ def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
             implausible[channel].append((entry.meta.motion, rows))
     lines = [f"{', '.join(motions)}: {cut}; what follows was left out" for cut, motions in cuts.items()]
     lines += [
-        f"{channel} is nonsense in {sum(rows['rows'] for _, rows in found)} rows of {len(found)} recordings (first "
-        f"{found[0][1]['worst']:.4g} of {found[0][1]['joints'][0]} in {found[0][0]}): "
-        f"{', '.join(dict.fromkeys(rows['done'] for _, rows in found))}; --strict refuses them"
-        for channel, found in implausible.items()
+        f"{channel} is nonsense in {sum(rows['rows'] for _, rows in counts)} rows of {len(counts)} recordings (first "
+        f"{counts[0][1]['worst']:.4g} of {counts[0][1]['joints'][0]} in {counts[0][0]}): "
+        f"{', '.join(dict.fromkeys(rows['done'] for _, rows in counts))}; --strict refuses them"
+        for channel, counts in implausible.items()
     ]
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
     where = "not in every recording, taken to stand at home there; [posture] in logs.toml says where"
@@ -194,8 +194,8 @@ def _show_import(out: Out, made: ImportResult) -> None:
 def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, JointOffset]) -> None:
     """Show lag and static errors by joint."""
     rows = []
-    for name, found in lags.items():
-        median = f"{np.median(found) * 1e3:.0f}" if found else "–"
+    for name, counts in lags.items():
+        median = f"{np.median(counts) * 1e3:.0f}" if counts else "–"
         joint = offsets.get(name)
         at_rest = _signed_mrad(joint.static_error, joint.stiction_band) if joint else "–"
         rows.append([name, median, at_rest, _signed_mrad(joint.tracking_offset) if joint else "–"])

@@ -134,8 +134,8 @@ def _purpose(where: str) -> str:
     assert spec
     assert spec.origin
     tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
-    found = next(n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
-    return (ast.get_docstring(found) or "").splitlines()[0]
+    definition = next(n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
+    return (ast.get_docstring(definition) or "").splitlines()[0]
 
 
 def _say(text: str) -> int:

@@ -41,8 +41,8 @@ def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
 
     def decorate(command: Command) -> Command:
         own, theirs = (inspect.getdoc(f) or "" for f in (command, function))
-        said = theirs.partition("Args:\n")[2].partition("\n\n")[0]
-        command.__doc__ = own + ("\n" if "Args:\n" in own else "\n\nArgs:\n") + said
+        arguments = theirs.partition("Args:\n")[2].partition("\n\n")[0]
+        command.__doc__ = own + ("\n" if "Args:\n" in own else "\n\nArgs:\n") + arguments
         return command
 
     return decorate

@@ -47,24 +47,24 @@ def report(
 
 def _show_runs(screen: Out, folder: Path) -> None:
     """List the training runs in a folder and below it, best first."""
-    found = [
+    runs = [
         _facts(p.parent, folder) for p in sorted(folder.rglob("config.json")) if (p.parent / "split.json").is_file()
     ]
-    if not found:
+    if not runs:
         raise UsageError(f"{folder}: no run here or below (a run has config.json and split.json); train one first")
-    found.sort(key=lambda r: r["val_ratio"] if r["val_ratio"] is not None else float("inf"))
+    runs.sort(key=lambda r: r["val_ratio"] if r["val_ratio"] is not None else float("inf"))
     screen.table(
         f"Runs in {folder}: mean |error| of whole held-out motions in free run, mrad (of nominal)",
         ["run", "model", "seed", "minutes", "validation", "evaluated"],
         [
             [r["run"], title(r["model"]), str(r["seed"]), "" if r["seconds"] is None else f"{r['seconds'] / 60:.1f}",
              _error(r["val_mpjae"], r["val_ratio"]), _error(r["test_mpjae"], r["test_ratio"])]
-            for r in found
+            for r in runs
         ],
     )  # fmt: skip
-    if any(r["virtual"] for r in found):
+    if any(r["virtual"] for r in runs):
         screen.say("Runs marked V were trained on VIRTUAL robots.")
-    screen.result({"runs": found})
+    screen.result({"runs": runs})
 
 
 def _facts(run: Path, folder: Path) -> dict[str, Any]:

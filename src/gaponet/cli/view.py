@@ -102,9 +102,9 @@ def _require_viewer(render: Path | None) -> None:
 
 
 def _introduce(out: Out, meta: SequenceMeta, errors: dict[str, float], seen: bool | None) -> None:
-    said = ", ".join(f"{name} {mrad(error)} mrad" for name, error in errors.items())
-    whose = "VIRTUAL " if meta.virtual else ""
-    out.say(f", {whose}unit {meta.unit_id}, {meta.payload_mass:g} kg; {said}", meta.motion)
+    errors_text = ", ".join(f"{name} {mrad(error)} mrad" for name, error in errors.items())
+    kind = "VIRTUAL " if meta.virtual else ""
+    out.say(f", {kind}unit {meta.unit_id}, {meta.payload_mass:g} kg; {errors_text}", meta.motion)
     if seen:
         out.say("", "a model was trained or chosen on this recording: it is not held-out", "yellow")
 

@@ -89,8 +89,8 @@ def virtual(
     finally:
         if heard:
             humanoid.save_heard(heard)
-    told = f"heard {len(humanoid.heard)} commands, refused {humanoid.refused}, late {humanoid.missed} periods"
-    out.say(f"{label}: {told}")
+    summary = f"heard {len(humanoid.heard)} commands, refused {humanoid.refused}, late {humanoid.missed} periods"
+    out.say(f"{label}: {summary}")
 
 
 def _live(served: VirtualH12 | VirtualSO101, seconds: float, out: Out, where: str) -> None:

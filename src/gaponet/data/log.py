@@ -75,9 +75,9 @@ class Log:
 
     def _cut_bad_rows(self, bad: list[str]) -> None:
         """Cut rows that are not finite or go back in time, in all channels of the same clock; they are listed."""
-        kept: dict[str, Channel] = {}
+        channels: dict[str, Channel] = {}
         for name, (clock, _) in self.channels.items():
-            if name in kept:
+            if name in channels:
                 continue
             same = [n for n, c in self.channels.items() if np.array_equal(c.time, clock, equal_nan=True)]
             good = np.isfinite(clock)
@@ -86,11 +86,11 @@ class Log:
             latest = np.maximum.accumulate(np.where(good, clock, -np.inf))
             good[1:] &= clock[1:] > latest[:-1]
             bad += [f"{self.row(name, int(row))}: cut" for row in np.flatnonzero(~good)]
-            kept |= {n: Channel(clock[good], self.channels[n].values[good]) for n in same}
-        cut = max(len(c.time) - len(kept[n].time) for n, c in self.channels.items())
+            channels |= {n: Channel(clock[good], self.channels[n].values[good]) for n in same}
+        cut = max(len(c.time) - len(channels[n].time) for n, c in self.channels.items())
         if cut:
             self.meta["notes"] = self.meta.get("notes", {}) | {"rows_cut": cut}
-            object.__setattr__(self, "channels", kept)
+            object.__setattr__(self, "channels", channels)
 
     def _check(self, name: str, time: Array, values: Array) -> None:
         if name not in UNITS:

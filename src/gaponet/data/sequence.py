@@ -250,8 +250,8 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     if converted:
         notes["converted_from"] = converted
     gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
-    said = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
-    notes["gains"] = said[0] if said[0] == said[1] else f"kp {said[0]}, kd {said[1]}"
+    origins = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
+    notes["gains"] = origins[0] if origins[0] == origins[1] else f"kp {origins[0]}, kd {origins[1]}"
     return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
 
 

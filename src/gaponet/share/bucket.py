@@ -163,9 +163,9 @@ class Bucket:
                 os.close(descriptor)
 
     def prune(self, index: Index) -> int:
-        kept = set(map(self._object, _digests(index.text().encode()) | _digests(self._index)))
+        current = set(map(self._object, _digests(index.text().encode()) | _digests(self._index)))
         now = time.time()
-        old = [p for p, i in self._objects().items() if p not in kept and now - _modified(i) > MIN_PRUNE_AGE_S]
+        old = [p for p, i in self._objects().items() if p not in current and now - _modified(i) > MIN_PRUNE_AGE_S]
         with network_errors(self.address):
             if old:
                 self.fs.rm(old)

@@ -126,9 +126,9 @@ class RemoteDataset(Dataset):
                 meta = SequenceMeta(**(episode["stated"] | {"robot": self.robot.name}))
                 digest, first = str(episode.get("content_hash")), rows.get(file, 0)
                 channels = tuple(c for c in ARRAYS if FEATURES[c] in part.features)
-                found = episode["findings"]
+                findings = episode["findings"]
                 header = EntryHeader(entry_id(meta, digest), digest, part.dt, episode["length"], channels)
-                entry = Entry.create(header, meta, found)
+                entry = Entry.create(header, meta, findings)
                 self._locations[digest], rows[file] = (part, episode, first), first + entry.rows
                 yield entry
 

@@ -127,8 +127,8 @@ class AnalyticInverse:
         return first + (late - whole) * (second - first)
 
     def _targets_in_force(self, period: Period) -> Array:
-        way, gain = period.next_qpos - period.qpos, period.next_qvel - period.qvel
-        ends = np.stack([self.h * period.qvel, self.h * period.next_qvel, way])
+        displacement, gain = period.next_qpos - period.qpos, period.next_qvel - period.qvel
+        ends = np.stack([self.h * period.qvel, self.h * period.next_qvel, displacement])
         qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self.before, ends)  # at which physics steps begin
         before = np.einsum("ibkx,bkj->ikj", self.speeds, ends) / self.h
         after, mean = before[1:], lambda x: np.einsum("ik,ikj->kj", self.share, x)

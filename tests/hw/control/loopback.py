@@ -116,6 +116,11 @@ def living(
     return clock
 
 
+def received(robot: VirtualH12) -> dict[str, list]:
+    """Return the commands that arrived at a virtual robot, a list per field."""
+    return {name: [row[name] for row in robot.heard] for name in robot.heard[0]}
+
+
 def judge(recording: Recording, received: dict[str, list], robot: RobotSpec, safety: SafetyConfig) -> None:
     """Assert that commands stayed within the limits, and that damping was for good; `received` is in motor order.
 

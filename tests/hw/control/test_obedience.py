@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hw.control.loopback import RATE, judge, living
+from hw.control.loopback import RATE, judge, living, received
 from hw.noted_arm import fake_watchdog, phases
 from servos import Wire
 
@@ -300,10 +300,10 @@ def test_a_fault_of_an_h1_2_ends_in_damp(monkeypatch, fault, kind, periods):
     recording, robot = swing(monkeypatch, fault=fault, at=FAULT_S, size=0.25)
     assert recording.fault.kind == kind, recording.fault
     assert phases(recording)[-3:] == ["run", "damp", "stopped"]
-    damped = next(time for time, kp in zip(robot.heard.time, robot.heard.kp, strict=True) if kp[16] == 0)
+    damped = next(row["time"] for row in robot.heard if row["kp"][16] == 0)
     state_age = 1 / RATE  # a fault is in the next state, which the controller reads in the next period
     assert 0 < damped - (robot.first_command + FAULT_S) <= periods * 0.02 + state_age + 1e-6
-    judge(recording, vars(robot.heard), robot.robot, SafetyConfig())
+    judge(recording, received(robot), robot.robot, SafetyConfig())
     silent = fault in ("stop", "repeat", "checksum")
     text = "could NOT be damped: switch the supply off (nothing was heard" if silent else "damped and let go"
     assert recording.events[-1].text.startswith(text)
@@ -319,7 +319,7 @@ def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(monkeypatch):
     recording, robot = swing(monkeypatch, during=step)
     assert recording.fault.kind == "stale", recording.fault
     assert 71 <= sum(r.phase == "run" for r in recording.rows) <= 74
-    judge(recording, vars(robot.heard), robot.robot, SafetyConfig())
+    judge(recording, received(robot), robot.robot, SafetyConfig())
 
 
 @pytest.mark.parametrize(
@@ -351,10 +351,10 @@ def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_d
 
 def test_the_weight_waits_until_a_joint_has_followed(monkeypatch):
     _, robot = swing(monkeypatch, "listens midway", 2.5)
-    assert 0.0 < max(robot.heard.weight) <= 0.3 + 1e-6
+    assert 0.0 < max(received(robot)["weight"]) <= 0.3 + 1e-6
     recording, robot = swing(monkeypatch)
     assert recording.fault is None
-    assert max(robot.heard.weight) == 1.0
+    assert max(received(robot)["weight"]) == 1.0
     assert recording.events[-1].text == "handed over"
     assert recording.summary()["obeyed"]
 

@@ -40,7 +40,7 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 j = int(others[s.follows[i, others].argmax()])
                 candidates[int(i), j].append(float(s.follows[i, j]))
     candidates |= _swapped_pairs(surveys, motions)
-    swapped = {pair: found for pair, found in candidates.items() if 2 * len(found) >= motions[pair[0]]}
+    swapped = {pair: evidence for pair, evidence in candidates.items() if 2 * len(evidence) >= motions[pair[0]]}
     for (own, other), correlations in swapped.items():
         a, b = robot.joint_names[own], robot.joint_names[other]
         text = (

@@ -39,13 +39,13 @@ def guess_logs(recordings: list[RawRecording], robot: RobotSpec, fmt: str, known
     if not recordings:
         raise LogError("no recording found")
     first = recordings[0]
-    told = dict(known) | {k: v for k, v in first.default.items() if k not in known}
+    specified = dict(known) | {k: v for k, v in first.default.items() if k not in known}
     lines = [f"# {fmt}; the first recording: {first.where or first.source}",
              f"# its columns: {first.shown(40)}", "# Lines with a ? are guesses: look at them.", ""]  # fmt: skip
-    said = {c: told[c] for c in WORDS if c in told and _values(first, told[c]) is not None}
-    channels = _channels(first) | said
+    stated = {c: specified[c] for c in WORDS if c in specified and _values(first, specified[c]) is not None}
+    channels = _channels(first) | stated
     joints = _joints(first, channels)
-    lines += _clock(first, told)
+    lines += _clock(first, specified)
     lines += _positions(first, channels)
     lines += [f"{channel} = {_text(name)}" for channel, name in channels.items()]
     for need in ("ctrl", "qpos"):
@@ -71,20 +71,20 @@ def _tokens(name: str) -> list[str]:
 
 def _kind(name: str) -> str | None:
     """Which channel a name speaks of; of a command's, positions only."""
-    found = [channel for channel, words in WORDS.items() if any(w in words for w in _tokens(name))]
-    if found and found[0] == "ctrl" and any(c in found for c in NOT_POSITIONS):
+    matches = [channel for channel, words in WORDS.items() if any(w in words for w in _tokens(name))]
+    if matches and matches[0] == "ctrl" and any(c in matches for c in NOT_POSITIONS):
         return None  # a commanded velocity or torque
-    return found[0] if found else None
+    return matches[0] if matches else None
 
 
 def _channels(recording: RawRecording) -> dict[str, str]:
     """channel → array, or pattern of columns with {joint}."""
-    found: dict[str, str] = {}
+    matches: dict[str, str] = {}
     arrays = [n for n, labels in recording.signals.items() if labels]
     for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
         kind = _kind(name)
         if kind:
-            found.setdefault(kind, name)
+            matches.setdefault(kind, name)
     singles = [n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS]
     shapes: dict[str, dict[str, int]] = {}
     for name in singles:
@@ -94,22 +94,22 @@ def _channels(recording: RawRecording) -> dict[str, str]:
             counts[pattern] = counts.get(pattern, 0) + 1
     for kind, counts in shapes.items():
         best = max(counts, key=lambda p: (counts[p], len(p)))
-        if kind not in found:
-            found[kind] = best
-    return found
+        if kind not in matches:
+            matches[kind] = best
+    return matches
 
 
 def _patterns(name: str) -> list[str]:
     """Each way to read a name as joint and words: shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}."""
     words = list(re.finditer(r"[A-Za-z0-9]+", name))
-    found = []
-    for known, run in groupby(words, lambda m: any(m[0].lower() in told for told in WORDS.values())):
+    matches = []
+    for known, run in groupby(words, lambda m: any(m[0].lower() in specified for specified in WORDS.values())):
         first, *_, last = *(together := list(run)), together[-1]
         if known and last.end() < len(name):
-            found.append(name[: last.end() + 1] + "{joint}")
+            matches.append(name[: last.end() + 1] + "{joint}")
         if known and first.start():
-            found.append("{joint}" + name[first.start() - 1 :])
-    return found or [name]
+            matches.append("{joint}" + name[first.start() - 1 :])
+    return matches or [name]
 
 
 def _joints(recording: RawRecording, channels: dict[str, str]) -> list[str]:
@@ -131,8 +131,8 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
     if all(j.isdigit() for j in joints) and "{joint}" not in (channels.get("qpos") or channels["ctrl"]):
         n = len(joints)
         own = list(robot.joint_names[:n]) + [""] * (n - len(robot.joint_names))
-        said = "the robot's order: is it the log's?" if n >= len(robot.joint_names) else "which joints are these?"
-        return [f"joints = {json.dumps(own)}  # ? {said}"]
+        stated = "the robot's order: is it the log's?" if n >= len(robot.joint_names) else "which joints are these?"
+        return [f"joints = {json.dumps(own)}  # ? {stated}"]
     strange = []
     for joint in joints:
         try:
@@ -149,12 +149,12 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
     return lines
 
 
-def _clock(recording: RawRecording, told: dict[str, Any]) -> list[str]:
+def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     """time or rate, and time_unit."""
-    if "rate" in told:
-        return [f"rate = {told['rate']:g}  # Hz"]
+    if "rate" in specified:
+        return [f"rate = {specified['rate']:g}  # Hz"]
     named = [n for n, labels in recording.signals.items() if not labels]
-    clock = next((n for n in named if n == told.get("time") or n.lower() in CLOCKS), None)
+    clock = next((n for n in named if n == specified.get("time") or n.lower() in CLOCKS), None)
     if clock is None:
         own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
         return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
@@ -191,10 +191,10 @@ def _positions(recording: RawRecording, channels: dict[str, str]) -> list[str]:
 
 def _repeated(recordings: list[RawRecording], ctrl: str) -> bool:
     """Return True if the first two recordings have equal commands: a final number in their names counts repetitions."""
-    told = [_values(recording, ctrl) for recording in recordings[:2]]
-    if len(told) < 2 or any(x is None for x in told):
+    specified = [_values(recording, ctrl) for recording in recordings[:2]]
+    if len(specified) < 2 or any(x is None for x in specified):
         return True
-    a, b = (np.nan_to_num(x[: min(map(len, told))]) for x in told)  # type: ignore[arg-type, index]
+    a, b = (np.nan_to_num(x[: min(map(len, specified))]) for x in specified)  # type: ignore[arg-type, index]
     return bool(np.abs(a - b).mean() <= APART * np.abs(a - a.mean(axis=0)).mean())
 
 

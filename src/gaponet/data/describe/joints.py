@@ -21,22 +21,22 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
     Raises:
         JointMismatchError: A name is no joint of this robot, or two names are one joint.
     """
-    found, strange = [], []
+    matched, strange = [], []
     for name in names:
         try:
-            found.append(robot.resolve(name, where, joint_map))
+            matched.append(robot.resolve(name, where, joint_map))
         except JointMismatchError as error:
             strange.append((name, error))
     if len(strange) == 1:
         raise strange[0][1]
-    kin = [] if found or joint_map else [name for name in packaged_robots() if _all_of(name, names)]
+    kin = [] if matched or joint_map else [name for name in packaged_robots() if _all_of(name, names)]
     if strange and kin:
         raise JointMismatchError(
             f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of robot '{kin[0]}': "
             f"give that one (import --robot {kin[0]}; start {kin[0]} LOGS)"
         )
     if strange:
-        free = [j for j in robot.joint_names if j not in found]
+        free = [j for j in robot.joint_names if j not in matched]
         maps = []
         for name, _ in strange:
             close = difflib.get_close_matches(name.split("/")[-1], free, n=1, cutoff=0.5)
@@ -48,9 +48,9 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
             f"Map them with {' '.join(maps)}{left}, or under [names] in logs.toml; "
             'what is no joint of this robot is left out by ignore = ["NAME", …] there'
         )
-    if len(set(found)) != len(found):
-        raise JointMismatchError(f"{where}: two names map to one joint: {', '.join(found)}; mend --map or [names]")
-    return found
+    if len(set(matched)) != len(matched):
+        raise JointMismatchError(f"{where}: two names map to one joint: {', '.join(matched)}; mend --map or [names]")
+    return matched
 
 
 def _all_of(name: str, joints: Sequence[str]) -> bool:

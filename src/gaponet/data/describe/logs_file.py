@@ -87,20 +87,22 @@ def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile
 class Naming:
     """Labels of recordings by their names: from the pattern `motion` and the sheet `manifest`."""
 
-    def __init__(self, told: LogsFile, where: Path | None) -> None:
+    def __init__(self, specified: LogsFile, where: Path | None) -> None:
         self.where = str(where or "logs.toml")
-        self.pattern, self.by_path = _pattern(told.get("motion"), self.where)
-        self.text = told.get("motion", "")
-        if Path(told.get("manifest", "")).name != told.get("manifest", ""):
-            raise UsageError(f'{self.where}: manifest = "{told["manifest"]}": it lies beside logs.toml; give its name')
-        self.sheet = _read_sheet((where or Path()).parent / told["manifest"]) if "manifest" in told else None
+        self.pattern, self.by_path = _pattern(specified.get("motion"), self.where)
+        self.text = specified.get("motion", "")
+        if Path(specified.get("manifest", "")).name != specified.get("manifest", ""):
+            raise UsageError(
+                f'{self.where}: manifest = "{specified["manifest"]}": it lies beside logs.toml; give its name'
+            )
+        self.sheet = _read_sheet((where or Path()).parent / specified["manifest"]) if "manifest" in specified else None
         self.unused = set(range(len(self.sheet or ())))
-        said = {k: told[k] for k in ("unit", "payload", "side", "kp", "kd") if k in told}
-        self.all = {FIELDS[k][0]: v for k, v in said.items() if k in ("unit", "side") or not isinstance(v, str)}
+        stated = {k: specified[k] for k in ("unit", "payload", "side", "kp", "kd") if k in specified}
+        self.all = {FIELDS[k][0]: v for k, v in stated.items() if k in ("unit", "side") or not isinstance(v, str)}
 
     def of(self, name: str, path: str) -> dict[str, Any]:
         """Fields of SequenceMeta for a recording called `name` at a path relative to the logs."""
-        found, path = dict(self.all), "#".join(map(_stem, path.split("#")))
+        facts, path = dict(self.all), "#".join(map(_stem, path.split("#")))
         if self.pattern:
             match = self.pattern.fullmatch(path if self.by_path else name)
             if not match:
@@ -108,7 +110,7 @@ class Naming:
                     f'{path}: its name does not look like motion = "{self.text}" of {self.where}; rename it, or list '
                     "the recordings in a manifest"
                 )
-            found |= _fields(match.groupdict(), path)
+            facts |= _fields(match.groupdict(), path)
         if self.sheet is not None:
             rows = [
                 i for i, row in enumerate(self.sheet)
@@ -120,8 +122,8 @@ class Naming:
                     f"{name} under file"
                 )
             self.unused -= set(rows)
-            found |= _fields({k: v for k, v in self.sheet[rows[0]].items() if k != "file"}, path)
-        return found
+            facts |= _fields({k: v for k, v in self.sheet[rows[0]].items() if k != "file"}, path)
+        return facts
 
     def require_all_used(self) -> None:
         """Refuse rows of the sheet that name no recording: one that is missing, or a name with a slip."""
@@ -147,10 +149,10 @@ def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool
     return re.compile("".join(parts)), "/" in text
 
 
-def _fields(said: dict[str, str], where: str) -> dict[str, Any]:
+def _fields(stated: dict[str, str], where: str) -> dict[str, Any]:
     """Words and their texts → fields of SequenceMeta; kp.<joint> becomes {"kp": {joint: number}}."""
-    found: dict[str, Any] = {}
-    for word, text in said.items():
+    facts: dict[str, Any] = {}
+    for word, text in stated.items():
         if text is None or not text.strip():
             continue
         kind, _, joint = word.partition(".")
@@ -169,10 +171,10 @@ def _fields(said: dict[str, str], where: str) -> dict[str, Any]:
                 raise LogError(f"{where}: {field} is '{text}'; write yes or no")
             value = value == "yes"
         if joint:
-            gains = found.get(field, {})
+            gains = facts.get(field, {})
             value = (gains if isinstance(gains, dict) else {"": gains}) | {joint: value}
-        found[field] = value
-    return found
+        facts[field] = value
+    return facts
 
 
 def _stem(file: str) -> str:

@@ -57,7 +57,7 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
             f"{log.source}: every commanded position stands still while the joints move by up to {moved:.3g} rad: a "
             "robot driven by torques, by velocities or by hand; such commands are no position targets to learn from"
         )
-    channels, told = dict(log.channels), {}
+    channels, replaced = dict(log.channels), {}
     for name in (n for n in UNITS if n in log.channels):
         values = log.channels[name].values
         if name in ("ctrl", "qpos"):
@@ -71,17 +71,20 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
                 f"{UNITS[name]}: no joint does that; repair or cut the row, or leave the column out"
             )
         if wrong.any():
-            kept = wrong.mean(axis=0).max() <= MOSTLY
-            told[name] = {
+            tolerable = wrong.mean(axis=0).max() <= MOSTLY
+            source = "from positions" if name == "qvel" else "from the rows around them"
+            replaced[name] = {
                 "rows": int(wrong.any(axis=1).sum()), "of": len(values), "worst": float(values[wrong][0]),
                 "joints": [j for j, bad in zip(log.joint_names, np.ravel(wrong.any(axis=0)), strict=True) if bad],
-                "done": "left out" if not kept else "from positions" if name == "qvel" else "from the rows around them",
+                "done": source if tolerable else "left out",
             }  # fmt: skip
             channels.pop(name)
-            channels |= {name: Channel(log.channels[name].time, _made_up(name, log, wrong))} if kept else {}
-    if not told:
+            channels |= {name: Channel(log.channels[name].time, _made_up(name, log, wrong))} if tolerable else {}
+    if not replaced:
         return log
-    return replace(log, channels=channels, meta=log.meta | {"notes": log.meta.get("notes", {}) | {"nonsense": told}})
+    return replace(
+        log, channels=channels, meta=log.meta | {"notes": log.meta.get("notes", {}) | {"nonsense": replaced}}
+    )
 
 
 def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:

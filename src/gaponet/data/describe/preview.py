@@ -26,13 +26,18 @@ class DescriptionNeededError(LogError):
 
 
 def read_first_recording(
-    logs: Path, robot: RobotSpec, told: Path | None = None, anyhow: bool = False, skip_bad: bool = False, **options: Any
+    logs: Path,
+    robot: RobotSpec,
+    specified: Path | None = None,
+    anyhow: bool = False,
+    skip_bad: bool = False,
+    **options: Any,
 ) -> tuple[Log, int, str]:
     """The first recording, how many there are, and the logs.toml that was guessed; "" where none was needed.
 
     Args:
         logs: File or folder.
-        told: A logs.toml; nothing is guessed beside it.
+        specified: A logs.toml; nothing is guessed beside it.
         anyhow: Also by a guess of which joint is which.
         skip_bad: Leave out recordings that cannot be read.
         options: Arguments of read_logs.
@@ -48,8 +53,8 @@ def read_first_recording(
             raise UsageError(f"{logs}: holds no recording")
         return first[1], len(find_logs(logs, options.get("fmt"))), described
 
-    if told is not None:
-        return by(told)
+    if specified is not None:
+        return by(specified)
     try:
         return by(None)
     except GAPONetError as error:
@@ -62,9 +67,9 @@ def read_first_recording(
         file = Path(place) / "logs.toml"
         write_text(file, text)
         try:
-            found = by(file, text)
+            matches = by(file, text)
         except GAPONetError as again:
             raise DescriptionNeededError(str(again), text) from None
     if NAMED.search(text) and not anyhow:
         raise DescriptionNeededError("which joint is which is a guess", text)
-    return found
+    return matches

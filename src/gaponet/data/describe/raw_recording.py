@@ -101,7 +101,7 @@ class RawRecording:
             part: Which of several in the file.
             more: meta, default.
         """
-        kept = {
+        columns_kept = {
             n: a
             for n, a in arrays.items()
             if isinstance(a, np.ndarray) and a.dtype.kind in "fiu" and len(a.shape) in (1, 2) and len(a) > 1
@@ -109,29 +109,31 @@ class RawRecording:
         }  # fmt: skip
         signals = {
             n: () if a.ndim == 1 else names if a.shape[1] == len(names) else tuple(map(str, range(a.shape[1])))
-            for n, a in kept.items()
+            for n, a in columns_kept.items()
         }
         source = f"{file}#{part}" if part else str(file)
-        load = lambda wanted: {n: Signal(kept[n].astype(float)) for n in wanted}  # noqa: E731
+        load = lambda wanted: {n: Signal(columns_kept[n].astype(float)) for n in wanted}  # noqa: E731
         return RawRecording(name or file.stem, source, signals, load, source, (str(file),), **more)
 
-    def to_log(self, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Log:
-        """The columns that `told` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
-        told = self.default | told
-        chosen = _choose(self, robot, told, joint_map)
-        units = _units(robot, told, list(chosen["ctrl"]), joint_map)
-        clocks = {channel: told.get("clock", {}).get(channel) or told.get("time") for channel in chosen}
-        gains = {name: _gain_columns(self, told, name, chosen["ctrl"]) for name in ("kp", "kd")}
+    def to_log(self, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None) -> Log:
+        """The columns that `specified` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
+        specified = self.default | specified
+        chosen = _choose(self, robot, specified, joint_map)
+        units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
+        clocks = {channel: specified.get("clock", {}).get(channel) or specified.get("time") for channel in chosen}
+        gains = {name: _gain_columns(self, specified, name, chosen["ctrl"]) for name in ("kp", "kd")}
         names = {signal for joints in (*chosen.values(), *gains.values()) for signal, _ in joints.values()}
         loaded = self.load([*names, *{c for c in clocks.values() if c in self.signals and c not in names}])
-        times = {channel: _time(self, told, loaded, clocks[channel], channel, chosen[channel]) for channel in chosen}
+        times = {
+            channel: _time(self, specified, loaded, clocks[channel], channel, chosen[channel]) for channel in chosen
+        }
         joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
         in_units = [units[j] for j in joints]
         channels = {}
         for channel, columns in chosen.items():
             values = np.stack([_column(loaded, *columns[j]) for j in joints], axis=1).astype(float)
-            if channel == "ctrl" and "action_scale" in told:
-                values = robot.qpos_home[robot.index(joints)] + told["action_scale"] * values
+            if channel == "ctrl" and "action_scale" in specified:
+                values = robot.qpos_home[robot.index(joints)] + specified["action_scale"] * values
             channels[channel] = Channel(times[channel], to_radians(channel, values, joints, in_units, robot))
         start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
         shifted = {id(c.time): c.time - start for c in channels.values()}  # epoch nanoseconds would lose their digits
@@ -139,8 +141,8 @@ class RawRecording:
         for name, columns in gains.items():
             if columns:
                 meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
-        if "rate" in told:
-            meta["dt"] = 1 / told["rate"]
+        if "rate" in specified:
+            meta["dt"] = 1 / specified["rate"]
         return Log(
             robot.name, joints, {n: Channel(shifted[id(c.time)], c.values) for n, c in channels.items()}, self.source,
             meta | {
@@ -152,9 +154,9 @@ class RawRecording:
         )  # fmt: skip
 
 
-def restated(told: Any, where: str) -> dict[str, Any]:
+def restated(specified: Any, where: str) -> dict[str, Any]:
     """Return the checked fields of SequenceMeta that an export of this package states."""
-    fields = told if isinstance(told, dict) else {}
+    fields = specified if isinstance(specified, dict) else {}
     again = "export it again"
     meta = asdict(validated(SequenceMeta, fields | {"robot": "?"}, where, LogError, again))
     return {name: meta[name] for name in fields if name != "robot"}
@@ -196,49 +198,51 @@ Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
 Chosen = dict[str, Columns]  # by channel
 
 
-def _choose(recording: RawRecording, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Chosen:
+def _choose(recording: RawRecording, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None) -> Chosen:
     """Which column holds what."""
     where, columns = recording.where or recording.source, recording.columns
-    single = told.get("columns", {})
+    single = specified.get("columns", {})
     for ours, theirs in single.items():
         if ours.partition(".")[0] not in CHANNELS or "." not in ours:
             raise UsageError(f"logs.toml: '{ours}' is neither time nor {'.<joint>, '.join(CHANNELS)}.<joint>")
         if theirs not in columns:
             raise LogError(f"{where}: column '{theirs}' (for {ours}) is missing; there are: {recording.shown()}")
-    found: Chosen = {}
+    chosen: Chosen = {}
     for channel in (*CHANNELS, *DERIVED):
-        named = _matching(recording, told, channel, set(single.values()))
+        named = _matching(recording, specified, channel, set(single.values()))
         named += [(ours.partition(".")[2], theirs) for ours, theirs in single.items() if ours.startswith(f"{channel}.")]
-        named = [(joint, column) for joint, column in named if not ignored(joint, told.get("ignore", ()))]
+        named = [(joint, column) for joint, column in named if not ignored(joint, specified.get("ignore", ()))]
         if not named:
             continue
         joints = resolve_all([joint for joint, _ in named], robot, where, joint_map)
-        found[channel] = {joint: columns[column] for joint, (_, column) in zip(joints, named, strict=True)}
-    _require_complete(found, recording, told)
-    return found
+        chosen[channel] = {joint: columns[column] for joint, (_, column) in zip(joints, named, strict=True)}
+    _require_complete(chosen, recording, specified)
+    return chosen
 
 
-def _matching(recording: RawRecording, told: LogsFile, channel: str, taken: set[str]) -> list[tuple[str, str]]:
+def _matching(recording: RawRecording, specified: LogsFile, channel: str, taken: set[str]) -> list[tuple[str, str]]:
     """(joint, column) of a pattern: "{joint}_des", or an array whose columns are joints."""
-    pattern = told.get(channel)
+    pattern = specified.get(channel)
     if not isinstance(pattern, str):
         return []
     if pattern in recording.signals and "{joint}" not in pattern:
-        own, given = recording.signals[pattern], told.get("joints")
+        own, given = recording.signals[pattern], specified.get("joints")
         labels = own or ("0",)
         if all(label.isdigit() for label in labels):
             if given is None or len(given) != len(labels):
-                said = f"joints has {len(given)}" if given else "nothing names them"
+                explanation = f"joints has {len(given)}" if given else "nothing names them"
                 raise LogError(
-                    f"{recording.where or recording.source}: {pattern} has {len(labels)} columns and {said}; write "
-                    f"joints = [{len(labels)} names, in its order] into logs.toml"
+                    f"{recording.where or recording.source}: {pattern} has {len(labels)} columns and {explanation}; "
+                    f"write joints = [{len(labels)} names, in its order] into logs.toml"
                 )
             labels = tuple(given)
         return [(joint, f"{pattern}[{x}]" if own else pattern) for joint, x in zip(labels, own or "0", strict=True)]
     if pattern.count("{joint}") != 1:
         return []  # an array that this recording does not have
     # q_{joint} reads q_des_1 as well: where another channel says more of a column's name, it is that channel's.
-    longer = [str(p) for c in CHANNELS if (p := told.get(c)) and "{joint}" in str(p) and len(str(p)) > len(pattern)]
+    longer = [
+        str(p) for c in CHANNELS if (p := specified.get(c)) and "{joint}" in str(p) and len(str(p)) > len(pattern)
+    ]
     mine, *others = [re.compile("(?P<joint>.+?)".join(map(re.escape, p.split("{joint}")))) for p in (pattern, *longer)]
     return [
         (m["joint"], column)
@@ -248,18 +252,18 @@ def _matching(recording: RawRecording, told: LogsFile, channel: str, taken: set[
     ]  # fmt: skip
 
 
-def _gain_columns(recording: RawRecording, told: LogsFile, name: str, ctrl: Columns) -> Columns:
+def _gain_columns(recording: RawRecording, specified: LogsFile, name: str, ctrl: Columns) -> Columns:
     """joint → column, where logs.toml says that an array holds the gains; it has the columns of the command's."""
-    said = told.get(name)
-    if not isinstance(said, str):
+    explanation = specified.get(name)
+    if not isinstance(explanation, str):
         return {}
     widths = {len(recording.signals[signal]) for signal, _ in ctrl.values()}
-    if said not in recording.signals or widths != {len(recording.signals[said])}:
+    if explanation not in recording.signals or widths != {len(recording.signals[explanation])}:
         raise LogError(
-            f'{recording.where or recording.source}: {name} = "{said}" is no array like the command\'s; there are: '
-            f"{recording.shown()}"
+            f'{recording.where or recording.source}: {name} = "{explanation}" is no array like the command\'s; '
+            f"there are: {recording.shown()}"
         )
-    return {joint: (said, which) for joint, (_, which) in ctrl.items()}
+    return {joint: (explanation, index) for joint, (_, index) in ctrl.items()}
 
 
 def _constant(recording: RawRecording, name: str, values: Array) -> float:
@@ -272,63 +276,66 @@ def _constant(recording: RawRecording, name: str, values: Array) -> float:
     return float(values[0])
 
 
-def _require_complete(found: Chosen, recording: RawRecording, told: LogsFile) -> None:
+def _require_complete(columns: Chosen, recording: RawRecording, specified: LogsFile) -> None:
     where = recording.where or recording.source
     for need in REQUIRED:
-        if need in found:
+        if need in columns:
             continue
-        said = f' (said to be "{told[need]}")' if need in told else ""  # type: ignore[literal-required]
+        explanation = f' (said to be "{specified[need]}")' if need in specified else ""  # type: ignore[literal-required]
         why = f": {NO_COMMANDS}" if need == "ctrl" else ""
         raise LogError(
-            f'{where}: no column holds {need}.<joint>{said}; there are: {recording.shown()}. Say {need} = "…" in '
-            f"logs.toml ({HINT}){why}"
+            f'{where}: no column holds {need}.<joint>{explanation}; there are: {recording.shown()}. Say {need} = "…" '
+            f"in logs.toml ({HINT}){why}"
         )
-    for kind in found:
-        odd = sorted(found["ctrl"].keys() ^ found[kind].keys())
+    for kind in columns:
+        odd = sorted(columns["ctrl"].keys() ^ columns[kind].keys())
         if odd:
-            other = kind if odd[0] in found["ctrl"] else "ctrl"
+            other = kind if odd[0] in columns["ctrl"] else "ctrl"
             raise LogError(f"{where}: column '{other}.{odd[0]}' is missing: every channel needs the same joints")
 
 
-def _units(robot: RobotSpec, told: LogsFile, joints: list[str], joint_map: dict[str, str] | None) -> dict[str, str]:
-    """The unit of each joint's positions; refuses one that nobody said."""
+def _units(
+    robot: RobotSpec, specified: LogsFile, joints: list[str], joint_map: dict[str, str] | None
+) -> dict[str, str]:
+    """The unit of each joint's positions; refuses one that nobody specified."""
     single = {
-        robot.resolve(j, "[joint_units] of logs.toml", joint_map): u for j, u in told.get("joint_units", {}).items()
+        robot.resolve(j, "[joint_units] of logs.toml", joint_map): u
+        for j, u in specified.get("joint_units", {}).items()
     }
     for what, unit, known in (
-        ("time unit", told.get("time_unit", "s" if "rate" in told else ""), tuple(SECONDS)),
-        ("position unit", told.get("position_unit", ""), LOG_UNITS),
+        ("time unit", specified.get("time_unit", "s" if "rate" in specified else ""), tuple(SECONDS)),
+        ("position unit", specified.get("position_unit", ""), LOG_UNITS),
         *((f"unit of {joint}", unit, LOG_UNITS) for joint, unit in single.items()),
     ):
         if unit not in known:
             given = f"'{unit}' is not one of {', '.join(known)}" if unit else "is not given"
             raise UsageError(f"the table's {what} {given}; say it with {SAY_UNITS}")
-    return {joint: single.get(joint, told["position_unit"]) for joint in joints}
+    return {joint: single.get(joint, specified["position_unit"]) for joint in joints}
 
 
 def _time(
-    recording: RawRecording, told: LogsFile, loaded: dict[str, Signal], clock: str | None, channel: str,
+    recording: RawRecording, specified: LogsFile, loaded: dict[str, Signal], clock: str | None, channel: str,
     columns: Columns,
 ) -> Array:  # fmt: skip
     """The time stamps of a channel, s, from any start."""
     where = recording.where or recording.source
     own = next(loaded[signal] for signal, _ in columns.values())
-    if channel not in told.get("clock", {}) and own.time is not None:
+    if channel not in specified.get("clock", {}) and own.time is not None:
         return own.time
-    if "rate" in told:
-        return np.arange(len(own.values)) / told["rate"]
+    if "rate" in specified:
+        return np.arange(len(own.values)) / specified["rate"]
     if clock not in recording.signals:
-        said = f"'{clock or 'time'}' (the clock of {channel})"
+        explanation = f"'{clock or 'time'}' (the clock of {channel})"
         raise LogError(
-            f'{where}: column {said} is missing; there are: {recording.shown()}. Say time = "…" in logs.toml, or '
-            f"rate = 50.0 (Hz) where the log has no clock ({HINT})"
+            f'{where}: column {explanation} is missing; there are: {recording.shown()}. Say time = "…" in logs.toml, '
+            f"or rate = 50.0 (Hz) where the log has no clock ({HINT})"
         )
     time = np.asarray(loaded[clock].values, float)
     if time.shape != (len(own.values),):
         raise LogError(f"{where}: clock '{clock}' has shape {time.shape}, {channel} {len(own.values)} rows")
-    return time * SECONDS[told.get("time_unit", "s")]
+    return time * SECONDS[specified.get("time_unit", "s")]
 
 
-def _column(loaded: dict[str, Signal], signal: str, which: int | None) -> Array:
+def _column(loaded: dict[str, Signal], signal: str, index: int | None) -> Array:
     values = loaded[signal].values
-    return values if which is None else values[:, which]
+    return values if index is None else values[:, index]

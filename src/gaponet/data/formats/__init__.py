@@ -2,7 +2,7 @@
 
 The first line of a format's docstring says what the format is. A format whose columns logs.toml explains has
 
-    recordings(path, told)  yields Recordings (data.describe.raw_recording)
+    recordings(path, specified)  yields RawRecordings (data.describe.raw_recording)
     DEFAULT                 content of logs.toml unless the recording or the user states something else; default nothing
 
 and a format that says itself what its columns are has
@@ -85,27 +85,27 @@ def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
     """The file, or those with these suffixes in a folder and below it; hidden ones are left alone."""
     if path.is_file():
         return [path] if path.suffix.lower() in suffixes else []
-    found = (f for f in path.rglob("*") if f.suffix.lower() in suffixes and f.is_file())
-    return sorted(f for f in found if not any(part.startswith(".") for part in f.relative_to(path).parts))
+    matches = (f for f in path.rglob("*") if f.suffix.lower() in suffixes and f.is_file())
+    return sorted(f for f in matches if not any(part.startswith(".") for part in f.relative_to(path).parts))
 
 
 def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    found = [fmt for fmt, where in formats().items() if attempt(where, partial(_detects, fmt, path), False)]
-    others = [fmt for fmt in found if fmt != "table"]
-    if others and len(found) > len(others):
+    matches = [fmt for fmt, where in formats().items() if attempt(where, partial(_detects, fmt, path), False)]
+    others = [fmt for fmt in matches if fmt != "table"]
+    if others and len(matches) > len(others):
         tables = module("table").find(path)
         if all(any(_detects(fmt, file) for fmt in others) for file in tables):
-            found = others
-    if len(found) > 1:
-        ways = " or ".join(f"--format {fmt}" for fmt in found)
-        raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in found)}; say {ways}")
-    if not found:
+            matches = others
+    if len(matches) > 1:
+        ways = " or ".join(f"--format {fmt}" for fmt in matches)
+        raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in matches)}; say {ways}")
+    if not matches:
         known = "; ".join(f"{fmt}: {about(fmt)}" for fmt in formats())
         raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
-    return found[0]
+    return matches[0]
 
 
 def _detects(fmt: str, path: Path) -> bool:
@@ -152,21 +152,21 @@ def read_logs(
     Raises:
         LogError, JointMismatchError, UsageError: What, where and what to do.
     """
-    told, file = read_logs_file(path, logs)
-    reader = _reader(path, fmt or told.get("format"))
+    specified, file = read_logs_file(path, logs)
+    reader = _reader(path, fmt or specified.get("format"))
     by_hand = {"position_unit": position_unit, "time_unit": time_unit, "rate": rate}
-    told = told | {k: v for k, v in by_hand.items() if v is not None}  # type: ignore[assignment]
+    specified = specified | {k: v for k, v in by_hand.items() if v is not None}  # type: ignore[assignment]
     kind = _require_allowed(reader, path, allow_pickle)
-    for name in told:
+    for name in specified:
         if name not in ALWAYS and name not in _options(reader):
-            said = f"--{name.replace('_', '-')}" if by_hand.get(name) is not None else f"{file}: {name}"
-            raise UsageError(f"{said} means nothing to the {kind} format, which fixes it itself; leave it out")
-    names = told.get("names", {}) | (joint_map or {})
-    naming, root = Naming(told, file), path if path.is_dir() else path.parent
+            option = f"--{name.replace('_', '-')}" if by_hand.get(name) is not None else f"{file}: {name}"
+            raise UsageError(f"{option} means nothing to the {kind} format, which fixes it itself; leave it out")
+    names = specified.get("names", {}) | (joint_map or {})
+    naming, root = Naming(specified, file), path if path.is_dir() else path.parent
     bad = skipped_rows()
-    for name, load in _loaders(reader, path, robot, told, names):
+    for name, load in _loaders(reader, path, robot, specified, names):
         try:
-            log = _corrected(require_plausible(load(), robot, strict), robot, told, names)
+            log = _corrected(require_plausible(load(), robot, strict), robot, specified, names)
         except LogError as error:
             if bad is None:
                 raise
@@ -185,12 +185,12 @@ def look(
     path: Path, fmt: str | None = None, logs: str | Path | None = None, allow_pickle: bool = False
 ) -> tuple[str, LogsFile, list[RawRecording]]:
     """The format, what is said of it already, and the first recordings as they lie there; arguments as of read_logs."""
-    told, _ = read_logs_file(path, logs)
-    reader = _reader(path, fmt or told.get("format"))
+    specified, _ = read_logs_file(path, logs)
+    reader = _reader(path, fmt or specified.get("format"))
     kind = _require_allowed(reader, path, allow_pickle)
     if not hasattr(reader, "recordings"):
         raise UsageError(f"{path}: {about(kind)}: the format says itself what its columns are")
-    return kind, told, list(islice(_recordings(reader, path, told), LOOK))
+    return kind, specified, list(islice(_recordings(reader, path, specified), LOOK))
 
 
 def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
@@ -212,26 +212,26 @@ def _reader(path: Path, fmt: str | None) -> ModuleType:
 
 
 def _loaders(
-    reader: ModuleType, path: Path, robot: RobotSpec, told: LogsFile, names: dict[str, str]
+    reader: ModuleType, path: Path, robot: RobotSpec, specified: LogsFile, names: dict[str, str]
 ) -> Iterator[tuple[str, Callable[[], Log]]]:
     """(name, what reads it) of every recording."""
     if not hasattr(reader, "recordings"):
         yield from reader.read(
-            path, robot, names or None, **{k: v for k, v in told.items() if k in getattr(reader, "OPTIONS", ())}
+            path, robot, names or None, **{k: v for k, v in specified.items() if k in getattr(reader, "OPTIONS", ())}
         )
         return
-    found = _recordings(reader, path, told)
-    if "command_file" in told:
-        full = _defaults(reader) | told
-        told = cast("LogsFile", told | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
-        found = _with_commands(list(found), told["command_file"])
-    for recording in found:
-        yield recording.name, partial(recording.to_log, robot, told, names or None)
+    matches = _recordings(reader, path, specified)
+    if "command_file" in specified:
+        full = _defaults(reader) | specified
+        specified = cast("LogsFile", specified | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
+        matches = _with_commands(list(matches), specified["command_file"])
+    for recording in matches:
+        yield recording.name, partial(recording.to_log, robot, specified, names or None)
 
 
-def _recordings(reader: ModuleType, path: Path, told: LogsFile) -> Iterator[RawRecording]:
-    """Read the logs. Values of the format apply unless the recording or `told` states others."""
-    for recording in reader.recordings(path, _defaults(reader) | told):
+def _recordings(reader: ModuleType, path: Path, specified: LogsFile) -> Iterator[RawRecording]:
+    """Read the logs. Values of the format apply unless the recording or `specified` states others."""
+    for recording in reader.recordings(path, _defaults(reader) | specified):
         yield replace(recording, default=_defaults(reader) | recording.default)
 
 
@@ -239,11 +239,11 @@ def _defaults(reader: ModuleType) -> LogsFile:
     return getattr(reader, "DEFAULT", LogsFile())
 
 
-def _with_commands(found: list[RawRecording], pattern: str) -> Iterator[RawRecording]:
+def _with_commands(matches: list[RawRecording], pattern: str) -> Iterator[RawRecording]:
     """Each recording together with its command_file, which is then no recording of its own."""
-    by_file = {Path(r.source).name: r for r in found}
-    wanted = {r.source: pattern.replace("{name}", r.name) for r in found}
-    for recording in found:
+    by_file = {Path(r.source).name: r for r in matches}
+    wanted = {r.source: pattern.replace("{name}", r.name) for r in matches}
+    for recording in matches:
         if Path(recording.source).name in wanted.values():
             continue
         if wanted[recording.source] not in by_file:
@@ -251,19 +251,19 @@ def _with_commands(found: list[RawRecording], pattern: str) -> Iterator[RawRecor
         yield recording.beside(by_file[wanted[recording.source]])
 
 
-def _beside_clock(told: LogsFile) -> dict[str, str]:
+def _beside_clock(specified: LogsFile) -> dict[str, str]:
     """Commands in a file of their own have the clock of that file."""
-    clock = told.get("clock", {})
-    mine = clock.get("ctrl") or told.get("time")
+    clock = specified.get("clock", {})
+    mine = clock.get("ctrl") or specified.get("time")
     return clock | ({"ctrl": COMMAND + mine} if mine else {})
 
 
-def _corrected(log: Log, robot: RobotSpec, told: LogsFile, names: dict[str, str]) -> Log:
+def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str, str]) -> Log:
     """Signs and offsets, where logs.toml says some, noted; and where joints stood that the log does not hold."""
-    stood = {robot.resolve(j, "[posture] of logs.toml", names): v for j, v in told.get("posture", {}).items()}
+    stood = {robot.resolve(j, "[posture] of logs.toml", names): v for j, v in specified.get("posture", {}).items()}
     if stood:
         log = replace(log, meta=log.meta | {"posture": stood})
-    signs, offsets = ({robot.resolve(j, f"[{t}] of logs.toml", names): v for j, v in told.get(t, {}).items()}  # type: ignore[attr-defined]
+    signs, offsets = ({robot.resolve(j, f"[{t}] of logs.toml", names): v for j, v in specified.get(t, {}).items()}  # type: ignore[attr-defined]
                       for t in ("signs", "offsets"))  # fmt: skip
     if not signs and not offsets:
         return log
@@ -281,25 +281,25 @@ def _corrected(log: Log, robot: RobotSpec, told: LogsFile, names: dict[str, str]
     return require_plausible(replace(log, channels=turned, meta=log.meta | {"notes": notes}), robot)
 
 
-def _named(log: Log, said: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:
+def _named(log: Log, option: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:
     """The log with what its name and logs.toml say of it; what the format itself says must not contradict."""
     meta, stated = dict(log.meta), dict(log.meta.get("stated", {}))
     for name in ("kp", "kd"):
-        if name in said:
-            meta[name] = _gains(name, said.pop(name), log, robot, names)
-    if "estimated" in said:
-        meta["notes"] = meta.get("notes", {}) | {"estimated": said.pop("estimated")}
-    for name, value in said.items():
+        if name in option:
+            meta[name] = _gains(name, option.pop(name), log, robot, names)
+    if "estimated" in option:
+        meta["notes"] = meta.get("notes", {}) | {"estimated": option.pop("estimated")}
+    for name, value in option.items():
         if stated.get(name) not in (None, value):
             raise UsageError(f"{log.source}: {name} is {stated[name]} in the file and {value} in logs.toml; mend one")
         stated[name] = value
     return replace(log, meta=meta | ({"stated": stated} if stated else {}))
 
 
-def _gains(name: str, said: Any, log: Log, robot: RobotSpec, names: dict[str, str]) -> list[float]:
+def _gains(name: str, option: Any, log: Log, robot: RobotSpec, names: dict[str, str]) -> list[float]:
     """One number for all joints, or {joint: number} with the robot's own for the others ("": for all others)."""
-    if not isinstance(said, dict):
-        return [said] * len(log.joint_names)
-    given = {robot.resolve(j, f"{name} of logs.toml", names) if j else "": value for j, value in said.items()}
+    if not isinstance(option, dict):
+        return [option] * len(log.joint_names)
+    given = {robot.resolve(j, f"{name} of logs.toml", names) if j else "": value for j, value in option.items()}
     own = getattr(robot.nominal or robot, name)[robot.index(log.joint_names)]
     return [given.get(j, given.get("", float(o))) for j, o in zip(log.joint_names, own, strict=True)]

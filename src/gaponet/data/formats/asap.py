@@ -27,11 +27,11 @@ DEFAULT: LogsFile = {"ctrl": "action", "qpos": "dof", "qvel": "dof_vel", "positi
 TARGETS = "target"  # signal made of action, where the file says how
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
+def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every motion of every file."""
     for file in files_under(path, SUFFIXES):
-        found = _read(file)
-        motions = found if isinstance(found, dict) else {}
+        motions = _read(file)
+        motions = motions if isinstance(motions, dict) else {}
         motions = {str(k): v for k, v in motions.items() if isinstance(v, dict) and "dof" in v}
         if not motions:
             raise LogError(f"{file}: no motion with dof in it; an ASAP file is {{motion: {{dof, action, fps}}}}")

@@ -79,32 +79,32 @@ def read(
     if not files:
         raise LogError(f"{path}: no recording of BAM (JSON with trajectory and entries)")
     for file in files:
-        told = read_json(BamFile, file, LogError, "record it again, or leave the file out", allow_extra=True)
-        yield told["trajectory"], partial(_log, file, told, robot, joint_map)
+        log_data = read_json(BamFile, file, LogError, "record it again, or leave the file out", allow_extra=True)
+        yield log_data["trajectory"], partial(_log, file, log_data, robot, joint_map)
 
 
-def _log(file: Path, told: BamFile, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
-    joint = robot.resolve(told["motor"], str(file), joint_map)
+def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
+    joint = robot.resolve(log_data["motor"], str(file), joint_map)
     servo = robot.servos[robot.index([joint])[0]]
     if servo is None or servo.gain is None:
         raise LogError(
-            f"{file}: motor is '{told['motor']}': what its kp {told['kp']:g} means in N·m/rad is not known; write gain "
-            f"(and gain_volts) into the [[servo]] of {joint} in the robot.toml of {robot.name}"
+            f"{file}: motor is '{log_data['motor']}': what its kp {log_data['kp']:g} means in N·m/rad is not known; "
+            f"write gain (and gain_volts) into the [[servo]] of {joint} in the robot.toml of {robot.name}"
         )
-    on = told["entries"]
+    on = log_data["entries"]
     off = next((i for i, e in enumerate(on) if not e["torque_enable"] or e["goal_position"] is None), len(on))
     if off < 2:
         raise LogError(f"{file}: torque is off from the start; a log needs commands that the servo follows")
     on, cut = on[:off], on[off:]
     channels = {"ctrl": "goal_position", "qpos": "position", "qvel": "speed", "temperature": "temp"}
     time = np.array([e["timestamp"] for e in on])
-    volts = float(np.median([e.get("input_volts", told["vin"]) for e in on]))
-    if abs(volts - told["vin"]) > MAX_VOLTS_RATIO * told["vin"]:
+    volts = float(np.median([e.get("input_volts", log_data["vin"]) for e in on]))
+    if abs(volts - log_data["vin"]) > MAX_VOLTS_RATIO * log_data["vin"]:
         logging.getLogger("gaponet").warning(
             "%s: vin says %g V, the servo measured %g V: the gain is taken at vin; correct the file if that is wrong",
-            file, told["vin"], volts,
+            file, log_data["vin"], volts,
         )  # fmt: skip
-    gain = told["kp"] * servo.gain * (told["vin"] / servo.gain_volts if servo.gain_volts else 1.0)
+    gain = log_data["kp"] * servo.gain * (log_data["vin"] / servo.gain_volts if servo.gain_volts else 1.0)
     return Log(
         robot.name,
         (joint,),
@@ -118,10 +118,11 @@ def _log(file: Path, told: BamFile, robot: RobotSpec, joint_map: dict[str, str] 
             "files": {name: str(file) for name in channels},
             "kp": [gain],
             "stated": {
-                "payload_mass": told["mass"] + 0.5 * told.get("arm_mass", 0.0),  # its weight as seen from the joint
-                "payload_side": f"{1e3 * told['length']:.0f}mm",
+                "payload_mass": log_data["mass"]
+                + 0.5 * log_data.get("arm_mass", 0.0),  # its weight as seen from the joint
+                "payload_side": f"{1e3 * log_data['length']:.0f}mm",
             },
-            "notes": {"firmware_kp": told["kp"], "volts": told["vin"]}
+            "notes": {"firmware_kp": log_data["kp"], "volts": log_data["vin"]}
             | ({"cut": f"torque is off from {cut[0]['timestamp']:.2f} s on"} if cut else {}),
         },
     )

@@ -32,7 +32,7 @@ ALOHA: LogsFile = {
 DEEPEST, MOST = 6, 5000  # groups in groups; arrays in a file
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
+def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every file, or every demonstration in it."""
     for file in files_under(path, SUFFIXES):
         arrays = _listed(file)
@@ -91,10 +91,10 @@ def _listed(file: Path) -> dict[str, tuple[str, ...]]:
 @sandboxed(LogError, "h5py")
 def _load(file: Path, demo: str, names: list[str]) -> dict[str, Signal]:
     with _opened(file) as root:
-        found = {}
+        arrays = {}
         for name in names:
             item = root[f"{demo}/{name}".lstrip("/")]
             if item.size * 8 > MAX_ARRAYS_BYTES:
                 raise LogError(f"{file}: {name} has {item.shape} numbers; cut the log into shorter ones")
-            found[name] = Signal(np.asarray(item[()], float))
-        return found
+            arrays[name] = Signal(np.asarray(item[()], float))
+        return arrays

@@ -98,10 +98,10 @@ def _unit(part: Set, given: str | None) -> str:
             raise UsageError(f"--position-unit {given}: {part.path}/meta/info.json says rad; leave it out")
         return "rad"
     if given not in POSITION_UNITS:
-        said = f"'{given}' is not one of {', '.join(POSITION_UNITS)}" if given else "is not written in the set"
+        explanation = f"'{given}' is not one of {', '.join(POSITION_UNITS)}" if given else "is not written in the set"
         raise UsageError(
-            f"{part.path}: the unit of positions {said}; say --position-unit deg (SO-101 sets), signed_percent (older "
-            "ones, −100..100) or rad"
+            f"{part.path}: the unit of positions {explanation}; say --position-unit deg (SO-101 sets), signed_percent "
+            "(older ones, −100..100) or rad"
         )
     return given
 
@@ -176,15 +176,18 @@ class _Frames:
             "converted_from": {j: u for j, u in zip(self.joints, self.units, strict=True) if u != "rad"},
         }
         if self.part.ours:
-            said = self.part.ours["dataset"]
-            meta |= {"stated": row["stated"], "dataset": {k: v for k, v in said.items() if k in Stated.__annotations__}}
+            explanation = self.part.ours["dataset"]
+            meta |= {
+                "stated": row["stated"],
+                "dataset": {k: v for k, v in explanation.items() if k in Stated.__annotations__},
+            }
         return Log(self.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
 
     def _time(self, where: Array) -> Array:
         """Frames are a period apart; their timestamps, float32, lose digits and are believed only where they differ."""
         regular = np.arange(len(where)) * self.part.dt
-        told = self.timestamp[where] - self.timestamp[where[0]]
-        return regular if np.abs(told - regular).max(initial=0) < max(1e-3, 1e-6 * regular[-1]) else told
+        since_start = self.timestamp[where] - self.timestamp[where[0]]
+        return regular if np.abs(since_start - regular).max(initial=0) < max(1e-3, 1e-6 * regular[-1]) else since_start
 
     def _si(self, channel: str, values: Array) -> Array:
         """Percentages to fractions, then as for every format."""
@@ -201,8 +204,8 @@ def _motion(episode: dict[str, Any], tasks: dict[int, str]) -> str:
     """The motion's own name in an export; in a stock set, whose episodes are not repetitions, task and number."""
     if "stated" in episode:
         return str(episode["stated"]["motion"])
-    told = episode.get("tasks") or list(tasks.values())[:1] or ["episode"]
-    slug = re.sub(r"[^a-z0-9]+", "_", told[0].lower()).strip("_")[:40] or "episode"
+    since_start = episode.get("tasks") or list(tasks.values())[:1] or ["episode"]
+    slug = re.sub(r"[^a-z0-9]+", "_", since_start[0].lower()).strip("_")[:40] or "episode"
     return f"{slug}-{episode['episode_index']:04d}"
 
 

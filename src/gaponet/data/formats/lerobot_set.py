@@ -142,7 +142,7 @@ def _open(file: Path) -> Set:
         )
     root, features = file.parents[1], info["features"]
     ours = file.with_name(OURS)
-    told = (
+    stated = (
         read_json(Ours, ours, LogError, "restore it, or delete it to read the set as a stock one", allow_extra=True)
         if ours.is_file()
         else None
@@ -151,7 +151,9 @@ def _open(file: Path) -> Set:
     if listed.is_file():
         episodes = _listed(listed, info.get("chunks_size", 1000))
     else:
-        episodes = [row for f in sorted((root / "meta" / "episodes").glob("*/*.parquet")) for row in _episodes(f, told)]
+        episodes = [
+            row for f in sorted((root / "meta" / "episodes").glob("*/*.parquet")) for row in _episodes(f, stated)
+        ]
     if not episodes:
         raise LogError(f"{root}: meta/episodes lists no episode; {AGAIN}")
     episodes.sort(key=lambda e: e["episode_index"])
@@ -160,7 +162,7 @@ def _open(file: Path) -> Set:
         for f in FEATURES.values()
         if f in features
     }
-    part = Set(root, info, known, episodes, told)
+    part = Set(root, info, known, episodes, stated)
     if not listed.is_file():
         return part
     here = [e for e in episodes if part.data_file(e).is_file()]  # v2: one file an episode, and often only some of them
@@ -179,9 +181,9 @@ def _listed(file: Path, chunk: int) -> list[dict[str, Any]]:
 
 
 def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
-    said = STATED if ours else ()
+    columns = STATED if ours else ()
     hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
-    table = read_table(file, (*NEEDED, *said), ("tasks", "content_hash", "findings"), hint)
+    table = read_table(file, (*NEEDED, *columns), ("tasks", "content_hash", "findings"), hint)
     rows = _rows(file, table)
     known = validated(list[Episode], rows, file, LogError, AGAIN, allow_extra=True)
     return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
@@ -190,15 +192,15 @@ def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
 def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
     """A row of an export's episodes, with what it says of its recording checked, as `stated`."""
     where = f"{file}: episode {row['episode_index']}"
-    told = {name: row[name] for name in STATED if name in row} | {"robot": "?"}
-    told["notes"] = parse_json(dict[str, Any], str(row["notes"]), f"{where}: notes", LogError, hint)
+    stated = {name: row[name] for name in STATED if name in row} | {"robot": "?"}
+    stated["notes"] = parse_json(dict[str, Any], str(row["notes"]), f"{where}: notes", LogError, hint)
     for name in GAINS:
-        gains = str(told.pop(name))
+        gains = str(stated.pop(name))
         if gains != "null":
-            told[name] = parse_json(list[float], gains, f"{where}: {name}", LogError, hint)
-    stated = asdict(validated(SequenceMeta, told, where, LogError, hint))
-    found = parse_json(Findings, str(row.get("findings", "{}")), f"{where}: findings", LogError, hint)
-    return row | {"stated": {name: stated[name] for name in STATED}, "findings": found}
+            stated[name] = parse_json(list[float], gains, f"{where}: {name}", LogError, hint)
+    stated = asdict(validated(SequenceMeta, stated, where, LogError, hint))
+    findings = parse_json(Findings, str(row.get("findings", "{}")), f"{where}: findings", LogError, hint)
+    return row | {"stated": {name: stated[name] for name in STATED}, "findings": findings}
 
 
 def _rows(file: Path, table: Any) -> list[dict[str, Any]]:

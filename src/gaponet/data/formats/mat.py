@@ -21,7 +21,7 @@ SUFFIXES = (".mat",)
 DEFAULT: LogsFile = {"time": "time"}
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
+def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every file."""
     for file in files_under(path, SUFFIXES):
         yield RawRecording.of_arrays(file, _read(file))
@@ -35,6 +35,6 @@ def _read(file: Path) -> dict[str, Any]:
         if b"MATLAB 7.3" in stream.read(128):
             raise LogError(f"{file}: a v7.3 file, which is HDF5: rename it to .h5, or save it with -v7")
     with reading(file, ".mat file"):
-        told = loadmat(file, simplify_cells=True)
-        told |= {f"{name}.{k}": x for name, v in told.items() if isinstance(v, dict) for k, x in v.items()}
-        return {n: x for n, x in told.items() if isinstance(x, np.ndarray) and x.dtype.kind in "fiu"}
+        specified = loadmat(file, simplify_cells=True)
+        specified |= {f"{name}.{k}": x for name, v in specified.items() if isinstance(v, dict) for k, x in v.items()}
+        return {n: x for n, x in specified.items() if isinstance(x, np.ndarray) and x.dtype.kind in "fiu"}

@@ -34,7 +34,7 @@ NAMES = ("joint_names", "joint_sequence", "dof_names")
 OURS = "gaponet"  # array with JSON in a file of ours
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
+def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every file, or every motion in it."""
     for file in files_under(path, SUFFIXES):
         arrays = _read(file)
@@ -49,11 +49,11 @@ def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
 
 def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> RawRecording:
     """Read a file that data.writers.npz wrote, in SI units, with all its metadata."""
-    told = parse_json(dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again")
-    stated = restated(told.get("stated"), f"{file}: {OURS}")
+    specified = parse_json(dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again")
+    stated = restated(specified.get("stated"), f"{file}: {OURS}")
     default = LogsFile(time_unit="s", position_unit="rad")
     default |= {c: c for c in (*CHANNELS, *DERIVED) if c in arrays}  # type: ignore[typeddict-item]
-    meta = {"stated": stated} | ({"dt": told["dt"]} if isinstance(told.get("dt"), float) else {})
+    meta = {"stated": stated} | ({"dt": specified["dt"]} if isinstance(specified.get("dt"), float) else {})
     return RawRecording.of_arrays(file, arrays, names, str(stated["motion"]), meta=meta, default=default)
 
 
@@ -95,7 +95,7 @@ def _array(data: bytes, where: str) -> Any:
     header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
     if header is None or not header(stream)[2].hasobject:
         return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-    found = pickles.load(stream.read(), where)
-    if not isinstance(found, np.ndarray):
+    arrays = pickles.load(stream.read(), where)
+    if not isinstance(arrays, np.ndarray):
         raise LogError(f"{where}: not an array")
-    return found
+    return arrays

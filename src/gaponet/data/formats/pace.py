@@ -27,11 +27,11 @@ DEFAULT: LogsFile = {
 GAINS = ("kp", "kd")
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
+def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every file."""
     for file in files_under(path, SUFFIXES):
         arrays = _read(file)
-        qpos = arrays.get(str(told.get("qpos")))
+        qpos = arrays.get(str(specified.get("qpos")))
         gains: LogsFile = {}
         for name in GAINS:
             stated = arrays.pop(name, None)
@@ -55,8 +55,8 @@ def _read(file: Path) -> dict[str, Any]:
             raise LogError(f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the right file?")
         if f"{top}byteorder" in packed.namelist() and packed.read(f"{top}byteorder") != b"little":
             raise LogError(f"{file}: written big-endian; load it and save it again on another machine")
-        told = pickles.load(packed.read(f"{top}data.pkl"), str(file), lambda key: packed.read(f"{top}data/{key}"))
-    if not isinstance(told, dict):
+        specified = pickles.load(packed.read(f"{top}data.pkl"), str(file), lambda key: packed.read(f"{top}data/{key}"))
+    if not isinstance(specified, dict):
         raise LogError(f"{file}: holds no dictionary of tensors; save {{time, dof_pos, des_dof_pos}}")
-    arrays = {str(name): value for name, value in told.items() if isinstance(value, (np.ndarray, int, float))}
+    arrays = {str(name): value for name, value in specified.items() if isinstance(value, (np.ndarray, int, float))}
     return {n: np.asarray(v, float) for n, v in arrays.items() if np.asarray(v).dtype.kind in "fiub"}

@@ -64,7 +64,7 @@ def find(path: Path) -> list[Path]:
     return sorted({f.parent if (f.parent / "metadata.yaml").is_file() and path.is_dir() else f for f in files})
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
+def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every bag."""
     for bag in find(path):
         topics = _peeked(bag)
@@ -80,22 +80,22 @@ def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
     measured = lambda s: ".feedback." in s or ".actual." in s  # noqa: E731
     is_command = lambda s: not measured(s) and (any(w in s.lower() for w in COMMANDS) or s.endswith(".point"))  # noqa: E731
     states = [s for s in signals if s.endswith((".position", ".q")) and not is_command(s)]
-    told: LogsFile = {}
+    specified: LogsFile = {}
     commands = [s for s in signals if is_command(s) and s.endswith((".position", ".point", ".data", ".q"))]
     if len(states) > 1:  # a controller's feedback repeats what another topic says
         states = [s for s in states if not measured(s)] or states
     if len(states) == 1:
-        told["qpos"] = states[0]
+        specified["qpos"] = states[0]
         for channel, (theirs, motors) in {"qvel": ("velocity", "dq"), "tau": ("effort", "tau_est")}.items():
             name = states[0].rpartition(".")[0] + "." + (motors if states[0].endswith(".q") else theirs)
             if name in signals:
-                told[channel] = name  # type: ignore[literal-required]
+                specified[channel] = name  # type: ignore[literal-required]
     if len(commands) == 1:
-        told["ctrl"] = commands[0]
+        specified["ctrl"] = commands[0]
         gain = commands[0].rpartition(".")[0]
         if f"{gain}.kp" in signals:
-            told["kp"], told["kd"] = f"{gain}.kp", f"{gain}.kd"
-    return told
+            specified["kp"], specified["kd"] = f"{gain}.kp", f"{gain}.kd"
+    return specified
 
 
 @contextmanager
@@ -165,8 +165,8 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
     """The same, and notes."""
     with _opened(bag) as reader:
         topics = _peek(bag, reader)
-        asked = {t: {f: labels for f, labels in fields.items() if f"{t}.{f}" in names} for t, fields in topics.items()}
-        wanted = {topic: fields for topic, fields in asked.items() if fields}
+        wanted = {t: {f: labels for f, labels in fields.items() if f"{t}.{f}" in names} for t, fields in topics.items()}
+        wanted = {topic: fields for topic, fields in wanted.items() if fields}
         rows: dict[str, list[Any]] = {topic: [] for topic in wanted}
         used = {topic.split("#")[0] for topic in wanted}
         for connection, time, fields, stamp in _messages(reader, [c for c in _known(reader) if c.topic in used]):
@@ -180,7 +180,9 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
                         values.append(list(numbers) if own == labels else [numbers[own.index(name)] for name in labels])
                     rows[topic].append((time, time if stamp is None else stamp, stamp is not None, values))
     notes: dict[str, Any] = {}
-    times = _clocks({t: np.array([r[:3] for r in found], float).reshape(-1, 3) for t, found in rows.items()}, notes)
+    times = _clocks(
+        {t: np.array([r[:3] for r in messages], float).reshape(-1, 3) for t, messages in rows.items()}, notes
+    )
     loaded: dict[str, Signal] = {}
     for topic, known in wanted.items():
         columns = [np.array([r[3][i] for r in rows[topic]], float) for i in range(len(known))]
@@ -228,32 +230,32 @@ def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]
 
 def _numbers(topic: str, m: Any) -> Fields:
     """Numbers of any message: its arrays of numbers, and a number of each part where it holds a list of parts."""
-    found: Fields = {}
+    messages: Fields = {}
     texts: list[tuple[str, ...]] = []
     for name in m.__dataclass_fields__:
         value = getattr(m, name)
         if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.dtype.itemsize > 1:
-            found[name] = (), value
+            messages[name] = (), value
         elif isinstance(value, list) and value and isinstance(value[0], str):
             texts.append(tuple(value))
         elif isinstance(value, list) and value and hasattr(value[0], "__dataclass_fields__"):
             numbers = [f for f in value[0].__dataclass_fields__ if isinstance(getattr(value[0], f), int | float)]
-            found |= {f"{name}.{f}": ((), [getattr(part, f) for part in value]) for f in numbers}
+            messages |= {f"{name}.{f}": ((), [getattr(part, f) for part in value]) for f in numbers}
             texts += [tuple(t) for f in ("name", "joint_name") if all(t := [getattr(x, f, "") for x in value])]
         elif hasattr(value, "__dataclass_fields__") and name != "header":
-            found |= {f"{name}.{f}": x for f, x in _numbers(topic, value).items()}
+            messages |= {f"{name}.{f}": x for f, x in _numbers(topic, value).items()}
     named = lambda k: next((t for t in texts if len(t) == k), tuple(map(str, range(k))))  # noqa: E731
-    return {f: (labels or named(len(x)), x) for f, (labels, x) in found.items() if 0 < len(x) <= MOST}
+    return {f: (labels or named(len(x)), x) for f, (labels, x) in messages.items() if 0 < len(x) <= MOST}
 
 
 def _controller(topic: str, m: Any) -> Fields:
-    names, found = tuple(m.joint_names), {}
+    names, messages = tuple(m.joint_names), {}
     for part in ("reference", "desired", "feedback", "actual"):
         point = getattr(m, part, None)
         for theirs, ours in (("positions", "position"), ("velocities", "velocity"), ("effort", "effort")):
             if point is not None and len(values := getattr(point, theirs)) == len(names):
-                found[f"{part}.{ours}"] = (names, values)
-    return found
+                messages[f"{part}.{ours}"] = (names, values)
+    return messages
 
 
 def _trajectory(topic: str, m: Any) -> Fields:

@@ -44,22 +44,22 @@ def find(path: Path) -> list[Path]:
     return sorted(f for f in tables if not f.name.startswith(".") and _is_table(f))
 
 
-def recordings(path: Path, told: LogsFile) -> Iterator[RawRecording]:
+def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every table, except the manifest."""
-    files = [f for f in find(path) if f.name != told.get("manifest")]
+    files = [f for f in find(path) if f.name != specified.get("manifest")]
     if not files:
         raise LogError(f"{path}: no .csv, .txt or .parquet file in it; point at a table or a folder of tables")
     for file in files:
         if _is_parquet(file):
             names, load = _parquet_header(file), partial(_read_parquet, file)
         else:
-            names, first = _csv_header(file, told.get("header"))
+            names, first = _csv_header(file, specified.get("header"))
             load = partial(_read_csv, file, names, first)
         for name in names:
             if names.count(name) > 1:
                 raise LogError(f"{file}:1: column '{name}' stands twice; rename one")
-        if joint := joint_rows.joint_column(names, told):
-            yield joint_rows.recording(file, names, joint, told)
+        if joint := joint_rows.joint_column(names, specified):
+            yield joint_rows.recording(file, names, joint, specified)
             continue
         where, line = f"{file}:1", 1 if _is_parquet(file) else first + 1
         yield RawRecording(file.stem, str(file), dict.fromkeys(names, ()), load, where, (str(file),), line)
@@ -153,7 +153,7 @@ def _read_slowly(
 ) -> list[list[float]]:
     """Line by line: raises for the first with too few cells or a cell that is no number; NaN where rows are cut."""
     places, bad = {name: names.index(name) for name in wanted}, skipped_rows()
-    found: list[list[float]] = []
+    numbers: list[list[float]] = []
     rows = csv.reader(body.split("\n"), delimiter=delimiter)
     while True:
         where = f"{file}:{rows.line_num + first + 1}"
@@ -161,12 +161,12 @@ def _read_slowly(
             row = next(rows)
             values = {name: _number(row, place, names, name) for name, place in places.items()}
         except StopIteration:
-            return found
+            return numbers
         except (csv.Error, ValueError) as error:
             if bad is None:
                 raise LogError(f"{where}: {error}; repair or cut the row") from None
             values = dict.fromkeys(places, np.nan)
-        found.append(list(values.values()))
+        numbers.append(list(values.values()))
 
 
 def _number(row: list[str], place: int, names: list[str], name: str) -> float:
@@ -179,8 +179,8 @@ def _number(row: list[str], place: int, names: list[str], name: str) -> float:
 
 
 def _parquet_header(file: Path) -> list[str]:
-    names, said = parquet.header(file)
-    if reason := said.get(NOT_OBEYED):
+    names, metadata = parquet.header(file)
+    if reason := metadata.get(NOT_OBEYED):
         raise LogError(
             f"{file}: no data, the robot did not do what it was told ({reason[:300]}); leave it out, or --skip-bad does"
         )

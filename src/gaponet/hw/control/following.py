@@ -59,14 +59,14 @@ class FollowingMonitor:
         self._low, self._qpos_low = np.where(lower, reference, self._low), np.where(lower, qpos, self._qpos_low)
         self._high, self._qpos_high = np.where(higher, reference, self._high), np.where(higher, qpos, self._qpos_high)
         up, down = reference - self._low >= STRIDE_RAD, self._high - reference >= STRIDE_RAD
-        way = np.where(up, qpos - self._qpos_low, self._qpos_high - qpos)
+        distance = np.where(up, qpos - self._qpos_low, self._qpos_high - qpos)
         done = up | down
         side = np.sign(command - qpos)
         pushes = state.tau[joints] / limit * side >= MIN_PUSH_SHARE
         if (done & pushes).any():
             load = static_torque(self._model, state.qpos[None])[0, joints] / limit
             pushes &= load * side >= MIN_LOAD_SHARE * MIN_PUSH_SHARE
-        follows = done & ((way >= self.share * STRIDE_RAD) | pushes)
+        follows = done & ((distance >= self.share * STRIDE_RAD) | pushes)
         self.shown |= follows & ~pushes
         self._span_low = np.where(follows, reference, np.minimum(self._span_low, reference))
         self._span_high = np.where(follows, reference, np.maximum(self._span_high, reference))

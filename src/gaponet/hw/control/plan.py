@@ -371,12 +371,12 @@ class CollisionGuard:
 
 def _describe_changes(wanted: Motion, fitted: Motion) -> str:
     """Return how a motion was changed to fit, in words."""
-    said = []
+    sentences = []
     slower = fitted.duration / wanted.duration
     if slower > 1.01:
-        said.append(f"played {slower:.2f} times slower")
+        sentences.append(f"played {slower:.2f} times slower")
     span, was = np.ptp(fitted.ctrl, axis=0), np.ptp(wanted.ctrl, axis=0)
     share = float((span[was > NO_MOVEMENT] / was[was > NO_MOVEMENT]).min(initial=1.0))
     if share < 0.99:
-        said.append(f"brought down to {share:.2f} of its size")
-    return " and ".join(said)
+        sentences.append(f"brought down to {share:.2f} of its size")
+    return " and ".join(sentences)

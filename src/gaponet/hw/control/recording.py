@@ -162,6 +162,6 @@ class Recording:
                         pq.write_table(table, temporary)
                 write_text(folder / f"{name}.json", json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n")
             except OSError as error:
-                kept = f"{error.strerror or error}; all periods that were written are in {name}{ROWS_SUFFIX}"
-                raise OSError(error.errno, kept, error.filename) from error
+                explanation = f"{error.strerror or error}; all periods that were written are in {name}{ROWS_SUFFIX}"
+                raise OSError(error.errno, explanation, error.filename) from error
             return path

@@ -320,8 +320,8 @@ class StateMonitor:
         integral = self._integral + state.qvel[self.commanded] * (state.time - last.time)
         self._anchor, self._integral = anchor, np.where(moved, 0.0, integral)
         self._still_states = np.where(moved, 0, self._still_states + 1)
-        way = np.maximum(np.abs(ctrl - anchor), np.abs(self._integral))
-        beyond = np.where(self._still_states < MIN_STILL_STATES, 0.0, way)
+        distance = np.maximum(np.abs(ctrl - anchor), np.abs(self._integral))
+        beyond = np.where(self._still_states < MIN_STILL_STATES, 0.0, distance)
         worst = int(beyond.argmax())
         if beyond[worst] <= self.config.frozen_joint:
             return None

@@ -75,10 +75,10 @@ class Watchdog:
 
     def fired(self) -> bool:
         """Return True if the watchdog damps the robot or has damped it: nothing more may be sent."""
-        said = self._out.read(4096) or b""  # None: nothing new; does not wait
-        if ANSWER in said:
+        answer = self._out.read(4096) or b""  # None: nothing new; does not wait
+        if ANSWER in answer:
             self._answer_time = time.monotonic()
-        self._fired = self._fired or FIRED in said
+        self._fired = self._fired or FIRED in answer
         return self._fired
 
     def beat(self, weight: float) -> bool:

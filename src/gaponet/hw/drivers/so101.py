@@ -299,8 +299,8 @@ class SO101Driver:
     def _disobedience_fault(self, wrong: list[tuple[int, str]]) -> Fault | None:
         """Return the fault of servos and what is wrong with each, by joint; None if nothing is."""
         names = dict(zip(self.arm.servos, self.joint_names, strict=True))
-        said = "; ".join(f"servo {servo} ({names[servo]}): {what}" for servo, what in wrong)
-        return Fault("obedience", f"{said}; look at supply and cables") if wrong else None
+        reports = "; ".join(f"servo {servo} ({names[servo]}): {what}" for servo, what in wrong)
+        return Fault("obedience", f"{reports}; look at supply and cables") if wrong else None
 
     def verify(self) -> Fault | None:
         """Return a fault if anything has changed since the run began; all servos are read."""
@@ -313,11 +313,13 @@ class SO101Driver:
     def _fault(self, bus: reg.ServoBus) -> Fault | None:
         """Return the errors that the servos have reported in any reply, else their disobedience."""
         numbers = dict(zip(self.arm.servos, self.joint_names, strict=True))
-        said = [
+        reports = [
             f"servo {servo} ({joint}): " + ", ".join(w for bit, w in enumerate(reg.ERRORS) if w and errors >> bit & 1)
             for servo, joint in numbers.items() if (errors := bus.errors.get(servo, 0) & reg.FAULTY)
         ]  # fmt: skip
-        return Fault("robot", "; ".join(said) + "; look at load, supply and cables") if said else self._disobedience
+        return (
+            Fault("robot", "; ".join(reports) + "; look at load, supply and cables") if reports else self._disobedience
+        )
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Send goal positions of all servos in one packet, within the calibrated range.
