@@ -15,8 +15,9 @@ from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import Table, load_robot
 from gaponet.sim.batch import BatchSim
+from gaponet.sim.dataset_robot import dataset_robot
 from gaponet.sim.dynamics import inverse_dynamics
-from gaponet.sim.model import build_model, dataset_robot, model_hash, write_table
+from gaponet.sim.model import build_model, model_hash, write_table
 
 
 def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
