@@ -224,6 +224,11 @@ def test_torques_that_hold_up_the_arm_as_logged_are_fine(arm, tmp_path, payload)
     assert diagnosis.verdict.startswith("Good")
 
 
+def test_few_torques_and_rests_say_nothing_about_gravity(arm, tmp_path):
+    short = arm_sequence(arm, wave(40, 2), late(wave(40, 2), 3))
+    assert "too few torques and rests" in found(weigh(arm, tmp_path, short), "gravity", "ok").message
+
+
 @pytest.mark.parametrize(("joint", "turn"), [(0, 0.6), (1, 0.8), (0, -1.2)])
 def test_a_zero_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_path, joint, turn):
     s, shift = hanging(arm), turn * np.eye(2)[joint]

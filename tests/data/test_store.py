@@ -75,9 +75,13 @@ def no_space(*_):
 
 def test_what_is_removed_leaves_no_file_and_the_rest_stays_as_it_is(dataset, sequence):
     other = dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    simulated = dataset.path / "replays/abc" / f"{other.id}.parquet"
+    simulated.parent.mkdir(parents=True)
+    simulated.touch()
     with pytest.raises(DatasetError, match=r"no sequence '\*-3kg-\*'; sequences.jsonl in it lists the ids"):
         dataset.remove(("*-1kg-*", "*-3kg-*"))
     assert dataset.remove(("*-1kg-*",)) == [other]
+    assert not simulated.exists()
     (left,) = Dataset(dataset.path).entries
     assert [f.stem for f in (dataset.path / "sequences").iterdir()] == [left.id]
     assert Dataset(dataset.path).read(left).content_hash() == left.hash
@@ -148,6 +152,13 @@ def test_peeking_makes_nothing(arm, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FolderError, match="file: is no folder; choose another place"):
         Dataset.open_existing(tmp_path / "file", arm)
+
+
+def test_a_half_written_file_is_named(dataset):
+    file = next((dataset.path / "sequences").iterdir())
+    file.write_bytes(file.read_bytes()[:200])
+    with pytest.raises(DatasetError, match=r"\.parquet: not a readable Parquet file .* import the log again"):
+        dataset.read(dataset.entries[0])
 
 
 def test_a_newer_format_asks_for_an_upgrade_and_another_folder_says_how_to_make_a_dataset(dataset, tmp_path):
