@@ -46,7 +46,7 @@ def export(
 
     Args:
         to: Simulator of a robot or a run: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py
-            that needs no gaponet; urdf (or SDF: damping, friction, effort limits); json (the numbers). Network of a
+            that needs no gaponet; urdf (damping, friction, effort limits); json (the numbers). Network of a
             run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac
             Lab), actuator-net (one network per joint; its inputs are past target − position and speed, its output is
             the torque). randomization: ranges of a robot's parameters for training. lerobot: add the correction to the

@@ -103,7 +103,7 @@ def _patterns(name: str) -> list[str]:
     """Each way to read a name as joint and words: shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}."""
     words = list(re.finditer(r"[A-Za-z0-9]+", name))
     matches = []
-    for known, run in groupby(words, lambda m: any(m[0].lower() in specified for specified in WORDS.values())):
+    for known, run in groupby(words, lambda m: any(m[0].lower() in words for words in WORDS.values())):
         first, *_, last = *(together := list(run)), together[-1]
         if known and last.end() < len(name):
             matches.append(name[: last.end() + 1] + "{joint}")
@@ -131,8 +131,8 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
     if all(j.isdigit() for j in joints) and "{joint}" not in (channels.get("qpos") or channels["ctrl"]):
         n = len(joints)
         own = list(robot.joint_names[:n]) + [""] * (n - len(robot.joint_names))
-        stated = "the robot's order: is it the log's?" if n >= len(robot.joint_names) else "which joints are these?"
-        return [f"joints = {json.dumps(own)}  # ? {stated}"]
+        question = "the robot's order: is it the log's?" if n >= len(robot.joint_names) else "which joints are these?"
+        return [f"joints = {json.dumps(own)}  # ? {question}"]
     strange = []
     for joint in joints:
         try:
@@ -191,10 +191,10 @@ def _positions(recording: RawRecording, channels: dict[str, str]) -> list[str]:
 
 def _repeated(recordings: list[RawRecording], ctrl: str) -> bool:
     """Return True if the first two recordings have equal commands: a final number in their names counts repetitions."""
-    specified = [_values(recording, ctrl) for recording in recordings[:2]]
-    if len(specified) < 2 or any(x is None for x in specified):
+    commands = [_values(recording, ctrl) for recording in recordings[:2]]
+    if len(commands) < 2 or any(x is None for x in commands):
         return True
-    a, b = (np.nan_to_num(x[: min(map(len, specified))]) for x in specified)  # type: ignore[arg-type, index]
+    a, b = (np.nan_to_num(x[: min(map(len, commands))]) for x in commands)  # type: ignore[arg-type, index]
     return bool(np.abs(a - b).mean() <= APART * np.abs(a - a.mean(axis=0)).mean())
 
 

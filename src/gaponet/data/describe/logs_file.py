@@ -61,9 +61,8 @@ class LogsFile(TypedDict, total=False):
     header: Annotated[list[str], Len(1, 2000)]  # names of the columns of a table that has none
     joints: Annotated[list[str], Len(1, 500)]  # of the columns of an array that does not name them, in its order
     ignore: list[str]  # columns that are no joints of this robot; "" in joints does the same
-    action_scale: Annotated[
-        float, Interval(ge=1e-6, le=1e3)
-    ]  # ctrl is a policy's action: target = home + scale · action
+    # ctrl is a policy's action: target = home + scale · action
+    action_scale: Annotated[float, Interval(ge=1e-6, le=1e3)]
     kp: Gain | dict[str, Gain] | Text  # while recording, N·m/rad: of all joints, by joint, or an array's name
     kd: Gain | dict[str, Gain] | Text  # N·m·s/rad
     columns: dict[str, str]  # single columns, ours = the log's: "ctrl.elbow" = "cmd_1"

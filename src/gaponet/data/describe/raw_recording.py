@@ -101,7 +101,7 @@ class RawRecording:
             part: Which of several in the file.
             more: meta, default.
         """
-        columns_kept = {
+        numeric = {
             n: a
             for n, a in arrays.items()
             if isinstance(a, np.ndarray) and a.dtype.kind in "fiu" and len(a.shape) in (1, 2) and len(a) > 1
@@ -109,10 +109,10 @@ class RawRecording:
         }  # fmt: skip
         signals = {
             n: () if a.ndim == 1 else names if a.shape[1] == len(names) else tuple(map(str, range(a.shape[1])))
-            for n, a in columns_kept.items()
+            for n, a in numeric.items()
         }
         source = f"{file}#{part}" if part else str(file)
-        load = lambda wanted: {n: Signal(columns_kept[n].astype(float)) for n in wanted}  # noqa: E731
+        load = lambda wanted: {n: Signal(numeric[n].astype(float)) for n in wanted}  # noqa: E731
         return RawRecording(name or file.stem, source, signals, load, source, (str(file),), **more)
 
     def to_log(self, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None) -> Log:
@@ -254,16 +254,16 @@ def _matching(recording: RawRecording, specified: LogsFile, channel: str, taken:
 
 def _gain_columns(recording: RawRecording, specified: LogsFile, name: str, ctrl: Columns) -> Columns:
     """joint → column, where logs.toml says that an array holds the gains; it has the columns of the command's."""
-    explanation = specified.get(name)
-    if not isinstance(explanation, str):
+    array = specified.get(name)
+    if not isinstance(array, str):
         return {}
     widths = {len(recording.signals[signal]) for signal, _ in ctrl.values()}
-    if explanation not in recording.signals or widths != {len(recording.signals[explanation])}:
+    if array not in recording.signals or widths != {len(recording.signals[array])}:
         raise LogError(
-            f'{recording.where or recording.source}: {name} = "{explanation}" is no array like the command\'s; '
+            f'{recording.where or recording.source}: {name} = "{array}" is no array like the command\'s; '
             f"there are: {recording.shown()}"
         )
-    return {joint: (explanation, index) for joint, (_, index) in ctrl.items()}
+    return {joint: (array, index) for joint, (_, index) in ctrl.items()}
 
 
 def _constant(recording: RawRecording, name: str, values: Array) -> float:

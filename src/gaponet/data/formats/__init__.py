@@ -220,12 +220,12 @@ def _loaders(
             path, robot, names or None, **{k: v for k, v in specified.items() if k in getattr(reader, "OPTIONS", ())}
         )
         return
-    matches = _recordings(reader, path, specified)
+    recordings = _recordings(reader, path, specified)
     if "command_file" in specified:
         full = _defaults(reader) | specified
         specified = cast("LogsFile", specified | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
-        matches = _with_commands(list(matches), specified["command_file"])
-    for recording in matches:
+        recordings = _with_commands(list(recordings), specified["command_file"])
+    for recording in recordings:
         yield recording.name, partial(recording.to_log, robot, specified, names or None)
 
 
@@ -239,11 +239,11 @@ def _defaults(reader: ModuleType) -> LogsFile:
     return getattr(reader, "DEFAULT", LogsFile())
 
 
-def _with_commands(matches: list[RawRecording], pattern: str) -> Iterator[RawRecording]:
+def _with_commands(recordings: list[RawRecording], pattern: str) -> Iterator[RawRecording]:
     """Each recording together with its command_file, which is then no recording of its own."""
-    by_file = {Path(r.source).name: r for r in matches}
-    wanted = {r.source: pattern.replace("{name}", r.name) for r in matches}
-    for recording in matches:
+    by_file = {Path(r.source).name: r for r in recordings}
+    wanted = {r.source: pattern.replace("{name}", r.name) for r in recordings}
+    for recording in recordings:
         if Path(recording.source).name in wanted.values():
             continue
         if wanted[recording.source] not in by_file:
