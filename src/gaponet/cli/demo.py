@@ -13,8 +13,10 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
+from gaponet.cli.show import show_methods
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
-from gaponet.report.view.portrait import prepare
+from gaponet.report.verdict import verdict
+from gaponet.report.view.portrait import portrait, prepare
 from gaponet.robot.spec import load_robot, robot_argument
 
 # Many small rounds: minutes, not hours.
@@ -42,17 +44,19 @@ def demo(
     if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")):
         raise UsageError("the demo trains and draws: pip install 'gaponet[train,report]'")
     prepare()  # before mujoco is imported
-    from gaponet.cli.gap import gap
     from gaponet.cli.identify import identify
-    from gaponet.cli.report import report
-    from gaponet.cli.train import evaluate
+    from gaponet.report.report import write_report
 
     screen, began = Out(json), time.monotonic()
     dataset, identified, run = out / "dataset", out / "robot", out / "network"
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
         screen.say(f": how far is the simulator from the robot?  (gaponet gap {dataset})", "1 Measure")
         holdout = _make_dataset(dataset, data, robot, screen)
-        gap(str(dataset), robot=robot)
+        with progress_bar("gap") as update:
+            gap = api.gap(str(dataset), robot=robot, progress=update)
+        show_methods(screen, gap.to_dict(), ("joint",))
+        for sentence in verdict(gap.methods):
+            screen.say(sentence)
         screen.say(f": which causes explain that?  (gaponet identify {dataset} --out {identified})", "2 Identify")
         if not (identified / "robot.toml").is_file():
             identify(str(dataset), identified, budget=budget, robot=robot, holdout_units=holdout)
@@ -69,12 +73,17 @@ def demo(
                 f"{network} were over before a network learned anything; --network 5m gives it more", "", "yellow"
             )
             run = identified
-    evaluate(run, str(dataset), json=json)
-    with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
-        report(run)
-        screen.say(f"{time.monotonic() - began:.0f} s in all")
+        with progress_bar("evaluating") as update:
+            result = api.evaluate(run, str(dataset), progress=update).to_dict()
+        show_methods(screen, result, ("joint", "payload"))
+        with progress_bar("report") as update:
+            path = write_report(run, progress=update, picture=portrait)
+        for sentence in verdict(result["methods"]):
+            screen.say(sentence)
+        screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
         view = f"gaponet view {dataset} --robot {robot_argument(identified)}"
         screen.say(f"next: gaponet export {identified} --to mjcf; {view}")
+    screen.result(result)
 
 
 def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tuple[str, ...]:
