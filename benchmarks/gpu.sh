@@ -1,10 +1,9 @@
 #!/bin/sh
-# Speed of gaponet on a GPU, in about ten minutes (never run on one), without a network. Install gaponet[warp] and a CUDA
-# build of torch before.
+# Speed of gaponet on a GPU, without a network, in about ten minutes. Install gaponet[warp] and a CUDA build of torch before.
 #     benchmarks/gpu.sh OUT
 # Measures control steps per second beside bare mujoco_warp. Then trains once on the CPU and once on the GPU, which gets
-# ten times the steps, and evaluates both on test motions. Results: OUT/speed.txt, OUT/reached.txt, OUT/eval.txt. The same
-# command resumes after an interrupt.
+# ten times the steps, and evaluates both on test motions. STEPS=90s DEVICE_STEPS=90s gives both the same time. Results:
+# OUT/speed.txt, OUT/reached.txt, OUT/eval.txt. The same command resumes after an interrupt.
 # Test without a GPU: DEVICE=warp-cpu SIZES="8 16" SECONDS_EACH=1 STEPS=10500 DEVICE_STEPS=10500 ENVS=8.
 set -eu
 OUT=${1:?give a folder for the results}
@@ -21,7 +20,7 @@ mkdir -p "$OUT"
 train() {
     [ ! -f "$OUT/$1/model/card.json" ] || return 0
     [ -f "$OUT/$1/checkpoint.pt" ] && resume=--resume || resume=
-    $PYTHON -m gaponet train "$OUT/data" --out "$OUT/$1" --device "$1" --budget "$2" $resume \
+    $PYTHON -m gaponet train "$OUT/data" --out "$OUT/$1" --device "$1" --budget "$2" --model gaponet $resume \
         --pretraining.num-envs "$ENVS" --ppo.num-envs "$ENVS"
 }
 train cpu "$STEPS"

@@ -89,6 +89,8 @@ class _Worlds:
             )
             self.model.opt.timestep = warp.array(timestep, dtype=float)
             self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
+            # float32 seldom reaches that tolerance: no message each time, as in C MuJoCo.
+            self.model.opt.warn_overflow &= ~mujoco_warp.OverflowType.ITERATIONS
             self._servo_inputs = None if sim.servo_model is None else self._inputs(sim.servo_model, rows)
         for name, x in own.items():
             view = warp.to_torch(getattr(self.model, name))
