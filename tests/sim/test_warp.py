@@ -10,8 +10,10 @@ from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import load_robot, packaged_robots
 from gaponet.sim.batch import BatchSim, Condition
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
+
+import torch
 
 from gaponet.sim.warp import WarpSim
 
