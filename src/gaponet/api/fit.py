@@ -20,7 +20,7 @@ from gaponet.base.files import write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, PROVENANCE_FILE, UNCERTAINTY_FILE
-from gaponet.robot.servo_fields import DEFAULT_TERMS, Term
+from gaponet.robot.servo_fields import Term
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def identify(
     like: RobotSpec | Place | None = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
-    terms: tuple[Term, ...] = DEFAULT_TERMS,
+    terms: tuple[Term, ...] | None = None,
     table: bool = True,
     threads: int = 0,
     budget: str | None = None,
@@ -68,7 +68,8 @@ def identify(
             or type of servo: another arm, another unit, another robot.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
-        terms: Terms of the servo model to try; each is accepted only if validation motions improve.
+        terms: Terms of the servo model to try; each is accepted only if validation motions improve. Default: stribeck
+            and load, after limit if a joint reaches its stated torque limit.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml).
         threads: 0 for all cores.
         budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.

@@ -14,7 +14,7 @@ from gaponet.cli import options
 from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import Out, writes
 from gaponet.report.tables import mrad
-from gaponet.robot.servo_fields import DEFAULT_TERMS, SERVO_FIELDS, Term
+from gaponet.robot.servo_fields import SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
@@ -29,7 +29,7 @@ def identify(
     dataset: Source,
     out: Path,
     windows: int = 40,
-    terms: tuple[Term, ...] = DEFAULT_TERMS,
+    terms: tuple[Term, ...] | None = None,
     table: bool = True,
     threads: int = 0,
     budget: str | None = None,

@@ -28,7 +28,7 @@ from gaponet.sim.metrics import Comparison
 from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
-from gaponet.sysid.motion_limits import stop_questions, with_speed_limits, with_stops
+from gaponet.sysid.motion_limits import reaches_torque_limit, stop_questions, with_speed_limits, with_stops
 from gaponet.sysid.problem import (
     CHAIN_ITERATIONS,
     SEARCH_ITERATIONS,
@@ -105,7 +105,7 @@ def identify(
     robot: RobotSpec,
     validation: ListOf[Sequence] = (),
     windows: int = WINDOWS,
-    terms: tuple[Term, ...] = DEFAULT_TERMS,
+    terms: tuple[Term, ...] | None = None,
     table: bool = True,
     nthread: int = 0,
     progress: Progress = lambda done, total, note: None,
@@ -123,12 +123,15 @@ def identify(
         robot: Start of the fit; its payload masses are taken as true, its gains where recordings state them.
         validation: Recordings that choose among candidates; without them the fitted windows do.
         windows: Number of rollouts of 8 s, taken evenly from the recordings.
-        terms: Terms of the servo model, from TERMS, in the order in which they are fitted.
+        terms: Terms of the servo model, from TERMS, in the order in which they are fitted. Default: DEFAULT_TERMS, after
+            "limit" if a joint reaches its stated torque limit.
         table: Fit a table under the robot's tips.
         budget: Time of the searches, s, without the table's; results are the same on every machine only without it.
         stops: Give joints that stayed behind several commands a stop there.
         folds: Folds of the cross-validation, at most; 1 for none.
     """
+    if terms is None:
+        terms = ("limit", *DEFAULT_TERMS) if reaches_torque_limit(sequences, robot) else DEFAULT_TERMS
     splits = cross_validation(sequences, validation, folds)
     options = (splits, validation, windows, terms, table, nthread, progress, stops)
 

@@ -1,4 +1,4 @@
-"""Limits of motion that recordings show: joint stops, and servos that limit the speed of their targets.
+"""Limits of motion that recordings show: joint stops, torque limits, and servos that limit the speed of their targets.
 
 A servo's own trajectory generator moves its target along a ramp, and the joint follows the ramp, never the command. So
 the recorded state is compared with the commands, with commands behind a first-order lag, and with ramps of several
@@ -31,6 +31,7 @@ MIN_RAMP_ERROR_RAD, MIN_RAMP_DELAY_S = 0.02, 0.3  # RMS and time by which a ramp
 MIN_BEYOND_STOP_RAD, MIN_STOP_ROWS = 0.1, 50  # that commands go beyond a stop, and further there; rows that show it
 AT_STOP_RAD = 0.005  # from the end of a joint's path
 MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
+AT_TORQUE_LIMIT, MIN_LIMITED_SHARE = 0.9, 0.01  # of the stated limit; of the rows of a joint, that its limit is fitted
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
@@ -70,6 +71,18 @@ def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
                     " if that is a stop, identify with --stops; if something was in its way, leave those motions out"
                 )
     return questions
+
+
+def reaches_torque_limit(sequences: ListOf[Sequence], robot: RobotSpec) -> bool:
+    """Return whether gains and recorded errors ask a joint for its stated torque limit in one row of a hundred."""
+    op, at_limit, rows = robot.operated_index, 0.0, 0.0
+    for s in sequences:
+        own = robot.with_gains(*s.meta.recorded_gains)
+        torque = np.abs(own.kp * (s.ctrl - s.qpos) - own.kd * s.qvel)[:, op]
+        held = [j not in s.meta.unrecorded for j in robot.operated]
+        at_limit = at_limit + held * (torque > AT_TORQUE_LIMIT * robot.effort_limit[op]).sum(axis=0)
+        rows = rows + len(s) * np.array(held)
+    return bool((at_limit > MIN_LIMITED_SHARE * rows).any())
 
 
 def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
