@@ -10,7 +10,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
-from gaponet.sysid.motion_limits import target_speeds
+from gaponet.sysid.motion_limits import default_terms, target_speeds
 
 
 def recorded(robot, count=6, rows=400):
@@ -55,6 +55,13 @@ def test_identification_finds_a_ramp_and_warns(tmp_path, servos):
     assert found.comparisons[-1].name == "ramp"
     assert "profile velocity" in found.warnings[0]
     assert found.robot.before_identification.target_speed.max() == 0
+
+
+@pytest.mark.parametrize(("limit", "terms"), [(3.0, ("limit", "stribeck", "load")), (50.0, ("stribeck", "load"))])
+def test_a_torque_limit_is_fitted_where_recordings_reach_it(tmp_path, servos, limit, terms):
+    logs = recorded(write_arm(tmp_path).with_servos(servos), 3, rows=240)
+    limits = {j: {"effort_limit": limit} for j in servos}
+    assert default_terms(logs, write_arm(tmp_path).with_servos(limits)) == terms
 
 
 def test_single_joint_rollouts_follow_ramps(tmp_path, servos):

@@ -22,13 +22,13 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.robot.servo_fields import DEFAULT_TERMS, SERVO_FIELDS, TERMS, Term
+from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Comparison
 from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
-from gaponet.sysid.motion_limits import reaches_torque_limit, stop_questions, with_speed_limits, with_stops
+from gaponet.sysid.motion_limits import default_terms, stop_questions, with_speed_limits, with_stops
 from gaponet.sysid.problem import (
     CHAIN_ITERATIONS,
     SEARCH_ITERATIONS,
@@ -123,15 +123,14 @@ def identify(
         robot: Start of the fit; its payload masses are taken as true, its gains where recordings state them.
         validation: Recordings that choose among candidates; without them the fitted windows do.
         windows: Number of rollouts of 8 s, taken evenly from the recordings.
-        terms: Terms of the servo model, from TERMS, in the order in which they are fitted. Default: DEFAULT_TERMS, after
-            "limit" if a joint reaches its stated torque limit.
+        terms: Terms of the servo model, from TERMS, in the order in which they are fitted;
+            default: motion_limits.default_terms.
         table: Fit a table under the robot's tips.
         budget: Time of the searches, s, without the table's; results are the same on every machine only without it.
         stops: Give joints that stayed behind several commands a stop there.
         folds: Folds of the cross-validation, at most; 1 for none.
     """
-    if terms is None:
-        terms = ("limit", *DEFAULT_TERMS) if reaches_torque_limit(sequences, robot) else DEFAULT_TERMS
+    terms = default_terms(sequences, robot) if terms is None else terms
     splits = cross_validation(sequences, validation, folds)
     options = (splits, validation, windows, terms, table, nthread, progress, stops)
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
+from gaponet.robot.servo_fields import DEFAULT_TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.metrics import Comparison
@@ -31,7 +32,7 @@ MIN_RAMP_ERROR_RAD, MIN_RAMP_DELAY_S = 0.02, 0.3  # RMS and time by which a ramp
 MIN_BEYOND_STOP_RAD, MIN_STOP_ROWS = 0.1, 50  # that commands go beyond a stop, and further there; rows that show it
 AT_STOP_RAD = 0.005  # from the end of a joint's path
 MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
-AT_TORQUE_LIMIT, MIN_LIMITED_SHARE = 0.9, 0.01  # of the stated limit; of the rows of a joint, that its limit is fitted
+AT_TORQUE_LIMIT, MIN_LIMITED_SHARE = 0.9, 0.01  # of the robot's limit; of a joint's rows
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
@@ -73,16 +74,19 @@ def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
     return questions
 
 
-def reaches_torque_limit(sequences: ListOf[Sequence], robot: RobotSpec) -> bool:
-    """Return whether gains and recorded errors ask a joint for its stated torque limit in one row of a hundred."""
+def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, ...]:
+    """Return DEFAULT_TERMS, after "limit" if gains and recorded errors ask a joint for its torque limit.
+
+    It is reached if the servo asks for AT_TORQUE_LIMIT of the robot's limit in MIN_LIMITED_SHARE of a joint's rows.
+    """
     op, at_limit, rows = robot.operated_index, 0.0, 0.0
     for s in sequences:
         own = robot.with_gains(*s.meta.recorded_gains)
         torque = np.abs(own.kp * (s.ctrl - s.qpos) - own.kd * s.qvel)[:, op]
-        held = [j not in s.meta.unrecorded for j in robot.operated]
-        at_limit = at_limit + held * (torque > AT_TORQUE_LIMIT * robot.effort_limit[op]).sum(axis=0)
-        rows = rows + len(s) * np.array(held)
-    return bool((at_limit > MIN_LIMITED_SHARE * rows).any())
+        recorded = [j not in s.meta.unrecorded for j in robot.operated]
+        at_limit = at_limit + recorded * (torque > AT_TORQUE_LIMIT * robot.effort_limit[op]).sum(axis=0)
+        rows = rows + len(s) * np.array(recorded)
+    return ("limit", *DEFAULT_TERMS) if (at_limit > MIN_LIMITED_SHARE * rows).any() else DEFAULT_TERMS
 
 
 def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
