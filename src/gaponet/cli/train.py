@@ -73,11 +73,7 @@ def train(
         f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
     gain = NetworkGain("identified", val["added"], val.get("error", math.nan), val["start"])
-    scatter = "" if math.isnan(gain.standard_error) else f" ± {mrad(gain.standard_error)}"
-    screen.say(
-        f"{kind} reduces the error by {mrad(gain.reduction)}{scatter} mrad on "
-        + ("validation motions (paired)" if scatter else "the one validation motion")
-    )
+    screen.say(f"{kind} reduces the error of validation motions by {gain.text}")
     step = f"gaponet eval {out} {quote(dataset)}"
     if not gain.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"

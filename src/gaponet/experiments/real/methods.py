@@ -22,6 +22,7 @@ from gaponet.nn.training.config import Budget, PretrainingConfig, TrainConfig
 from gaponet.report.verdict import NetworkGain
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.metrics import runs
 from gaponet.sim.replay import Corrector, replay
 from gaponet.sysid.adapt import adapt
 from gaponet.sysid.identify import identify
@@ -53,11 +54,7 @@ class FittedSim:
 
     def errors(self, sequences: list[Sequence]) -> list[float]:
         """Return the mean |error| of each rollout over the recorded joints, rad."""
-        positions = self.positions(sequences)
-        return [
-            float(np.abs((q - s.qpos)[1:, recorded_joints(s, self.robot)]).mean())
-            for s, q in zip(sequences, positions, strict=True)
-        ]
+        return [run.mean_error() for run in runs(sequences, self.positions(sequences), self.robot)]
 
 
 Method = Callable[[Question], FittedSim]
