@@ -20,7 +20,7 @@ from gaponet.nn.layers import DeltaNet
 
 TREES, LEAVES, MAX_DEPTH = 120, 31, 8  # per joint; per tree
 NODES = 2 * LEAVES - 1
-MIN_LEAF_ROWS, MAX_ROWS = 60, 60_000  # of a leaf; of the fit of a joint
+MIN_LEAF_ROWS, MAX_ROWS, MEASURED_ROWS = 60, 60_000, 2_000  # of a leaf; of the fit of a joint; of the error of a fit
 MAX_DIFFERENCE = 1e-4  # between scikit-learn and the stored trees, in units of the RMS of the labels
 
 
@@ -77,7 +77,7 @@ class TreesNet(DeltaNet):
         """Fit the trees to visited inputs x and labels, (rows, n) rad; NaN is no label.
 
         Returns:
-            Mean squared error of the labels, (1,) rad².
+            Mean squared error of a part of the labels, (1,) rad².
 
         Raises:
             UsageError: scikit-learn is not installed.
@@ -99,7 +99,7 @@ class TreesNet(DeltaNet):
                 stored = self._sums(torch.from_numpy(inputs[some[:MIN_LEAF_ROWS]]).to(x.device))[:, j].cpu().numpy()
                 if not np.abs(stored - ensemble.predict(inputs[some[:MIN_LEAF_ROWS]])).max() < MAX_DIFFERENCE:
                     raise ModelError("this scikit-learn stores trees in an unknown form; install 1.5 to 1.9")
-        error = self(x[rows[:MAX_ROWS]]).cpu().numpy() - targets[:MAX_ROWS]
+        error = self(x[rows[:MEASURED_ROWS]]).cpu().numpy() - targets[:MEASURED_ROWS]
         return np.array([np.nanmean(error**2)])
 
     def _store(self, j: int, ensemble: Any) -> None:
