@@ -23,6 +23,7 @@ from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.uncertainty import from_axes, to_axes
 
+RANGE_PERCENT = 5, 95
 Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
 
 CACHES = "drawn_robots.json", "drawn_plain_robots.json"  # in the robot folder: with the servo model, without it
@@ -30,9 +31,8 @@ CACHES = "drawn_robots.json", "drawn_plain_robots.json"  # in the robot folder: 
 DRAWN, KEPT_SHARE = 128, 0.25  # number of units, and the share that is retained
 NEAR = 0.5  # every second unit deviates by this share of what was drawn
 WINDOWS, WINDOW_S = 8, 8.0  # rollouts that choose
-JUDGED = 12  # units whose error on validation motions is stated
+JUDGED = 20  # robots of each kind whose error on validation motions is stated
 BY_HAND, BY_HAND_FIELDS = 0.2, ("kp", "damping", "frictionloss", "armature")  # the usual randomisation: ± 20 %
-NARROWINGS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)  # of ranges from which numbers are drawn one by one
 
 
 class _Drawn(TypedDict):
@@ -40,8 +40,6 @@ class _Drawn(TypedDict):
 
     units: dict[str, list[list[float]]]
     errors: dict[str, float]
-    ranges: dict[str, dict[str, tuple[float, float]]]
-    narrowing: float
 
 
 @dataclass(frozen=True)
@@ -51,16 +49,13 @@ class DrawnRobots:
     Attributes:
         robot: The robot of this form.
         units: The retained units.
-        errors: "exported", "units", "by hand" and "one by one" → mean |error| on validation motions, rad.
-        ranges: Joint → field → (low, high) for engines that draw numbers one by one.
-        narrowing: Share of the 90 % range that `ranges` has.
+        errors: "exported", "units", "one by one" (each number from the range of 9 of 10 units) and "by hand" → mean
+            |error| on validation motions, rad.
     """
 
     robot: RobotSpec
     units: Units
     errors: dict[str, float]
-    ranges: dict[str, dict[str, tuple[float, float]]]
-    narrowing: float
 
     def require_better_than_by_hand(self) -> None:
         """Refuse units that follow the recordings worse than the robot with ± 20 % on each number.
@@ -105,41 +100,31 @@ def draw_robots(
     inputs = *first.values(), np.array([len(train), len(validation)])
     result = stored_result(robot.folder / CACHES[plain], _Drawn, draw, robot, [*train, *validation], *inputs)
     units = {f: np.array(v) for f, v in result["units"].items()}
-    return DrawnRobots(base, units, result["errors"], result["ranges"], result["narrowing"])
+    return DrawnRobots(base, units, result["errors"])
 
 
 def _draw(
     base: RobotSpec, drawn: Units, train: ListOf[Sequence], validation: ListOf[Sequence], progress: Progress
 ) -> _Drawn:
-    every, windows = robots_of(base, drawn), _windows(train)
-    costs = []
-    for i, one in enumerate(every):
-        costs.append(rollout_error(windows, one))
-        progress(i + 1, len(every), "units on training motions")
-    best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(every)), 1)])
-    units = {field: values[best] for field, values in drawn.items()}
-    rng = np.random.default_rng(0)
+    def errors_of(motions: ListOf[Sequence], robots: ListOf[RobotSpec], what: str) -> list[float]:
+        errors = []
+        for i, one in enumerate(robots):
+            errors.append(rollout_error(motions, one))
+            progress(i + 1, len(robots), what)
+        return errors
 
-    def error(robots: ListOf[RobotSpec]) -> float:
-        return float(np.mean([rollout_error(validation, one) for one in robots]))
-
-    progress(0, 1, "units on validation motions")
-    errors = {"exported": error([base]), "units": error(robots_of(base, units)[:JUDGED])}
-    errors["by hand"] = error(_by_hand(base, rng))
-    center = _values(base, tuple(units))
-    low, high = ({f: np.percentile(v, side, axis=0) for f, v in units.items()} for side in (5, 95))
-    limit = max(errors["by hand"], errors["units"])
-    for narrowing in NARROWINGS:
-        ends = [{f: center[f] + narrowing * (side[f] - center[f]) for f in units} for side in (low, high)]
-        alone = {f: rng.uniform(ends[0][f], ends[1][f], (JUDGED, len(center[f]))) for f in units}
-        errors["one by one"] = error(robots_of(base, alone))
-        if errors["one by one"] <= limit:
-            break
-    ranges = {
-        joint: {f: (float(ends[0][f][i]), float(ends[1][f][i])) for f in units} for i, joint in enumerate(base.operated)
-    }
-    stored = {field: values.tolist() for field, values in units.items()}
-    return {"units": stored, "errors": errors, "ranges": ranges, "narrowing": narrowing}
+    costs = errors_of(_windows(train), robots_of(base, drawn), "units on training motions")
+    best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(costs)), 1)])
+    units, rng = {field: values[best] for field, values in drawn.items()}, np.random.default_rng(0)
+    low, high = (np.array([np.percentile(v, side, axis=0) for v in units.values()]) for side in RANGE_PERCENT)
+    alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
+    robots = {
+        "exported": [base], "units": robots_of(base, units)[:JUDGED],
+        "one by one": robots_of(base, dict(zip(units, alone, strict=True))), "by hand": _by_hand(base, rng),
+    }  # fmt: skip
+    judged = iter(errors_of(validation, [r for kind in robots.values() for r in kind], "robots on validation motions"))
+    errors = {kind: float(np.mean([next(judged) for _ in several])) for kind, several in robots.items()}
+    return {"units": {field: values.tolist() for field, values in units.items()}, "errors": errors}
 
 
 def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
