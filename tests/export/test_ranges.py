@@ -127,7 +127,7 @@ def test_the_file_of_an_engine_needs_no_gaponet_and_reads_whole_units(arm, tmp_p
     file = folder / "randomization" / f"{engine}_randomization.py"
     assert not re.search(r"^(from|import) gaponet", file.read_text(), re.M)
     events, env = runpy.run_path(str(file)), SimpleNamespace(num_envs=9, device="cpu")
-    ids, joints, units = events["draw_units"](file.parent / "randomization.json", "plain_units", env, None)
+    ids, joints, units = events["draw_units"](file.parent / "randomization.json", "plain_units", env, None, None)
     assert (len(ids), joints) == (9, ["shoulder", "elbow"])
     stored = json.loads((file.parent / "randomization.json").read_text())["units"]
     row = int(np.abs(np.array(stored["kp"])[:, 0] - float(units["kp"][4, 0])).argmin())

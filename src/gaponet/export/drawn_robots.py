@@ -12,7 +12,6 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 
 import numpy as np
-from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import NoGainError
@@ -35,26 +34,17 @@ JUDGED = 20  # robots of each kind whose error on validation motions is stated
 BY_HAND, BY_HAND_FIELDS = 0.2, ("kp", "damping", "frictionloss", "armature")  # the usual randomisation: ± 20 %
 
 
-class _Drawn(TypedDict):
-    """A `DrawnRobots` as it is stored, without its robot."""
-
-    units: dict[str, list[list[float]]]
-    errors: dict[str, float]
-
-
 @dataclass(frozen=True)
 class DrawnRobots:
     """Units of one form of a robot: with its servo model, or fitted without it.
 
     Attributes:
-        robot: The robot of this form.
-        units: The retained units.
+        units: Field → (retained units, n) in SI units; a row is one unit.
         errors: "exported", "units", "one by one" (each number from the range of 9 of 10 units) and "by hand" → mean
             |error| on validation motions, rad.
     """
 
-    robot: RobotSpec
-    units: Units
+    units: dict[str, list[list[float]]]
     errors: dict[str, float]
 
     def require_better_than_by_hand(self) -> None:
@@ -91,21 +81,20 @@ def draw_robots(
         progress: Called with done, total and a note.
     """
     train, validation = recordings
+    note = ", without the servo model" * plain
     base = fit_plain_servos(robot, train, progress=progress) if plain else robot
     first = {f: v[:DRAWN] for f, v in drawn.items()}
 
-    def draw() -> _Drawn:
-        return _draw(base, _moved(robot, base, first), train, validation, progress)
+    def draw() -> DrawnRobots:
+        return _draw(base, _moved(robot, base, first), train, validation, lambda i, n, s: progress(i, n, s + note))
 
     inputs = *first.values(), np.array([len(train), len(validation)])
-    result = stored_result(robot.folder / CACHES[plain], _Drawn, draw, robot, [*train, *validation], *inputs)
-    units = {f: np.array(v) for f, v in result["units"].items()}
-    return DrawnRobots(base, units, result["errors"])
+    return stored_result(robot.folder / CACHES[plain], DrawnRobots, draw, robot, [*train, *validation], *inputs)
 
 
 def _draw(
     base: RobotSpec, drawn: Units, train: ListOf[Sequence], validation: ListOf[Sequence], progress: Progress
-) -> _Drawn:
+) -> DrawnRobots:
     def errors_of(motions: ListOf[Sequence], robots: ListOf[RobotSpec], what: str) -> list[float]:
         errors = []
         for i, one in enumerate(robots):
@@ -124,7 +113,7 @@ def _draw(
     }  # fmt: skip
     judged = iter(errors_of(validation, [r for kind in robots.values() for r in kind], "robots on validation motions"))
     errors = {kind: float(np.mean([next(judged) for _ in several])) for kind, several in robots.items()}
-    return {"units": {field: values.tolist() for field, values in units.items()}, "errors": errors}
+    return DrawnRobots({field: values.tolist() for field, values in units.items()}, errors)
 
 
 def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
@@ -134,10 +123,6 @@ def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
         base.with_servos({j: {f: float(v[k, i]) for f, v in units.items()} for i, j in enumerate(base.operated)})
         for k in range(count)
     ]
-
-
-def _values(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:
-    return {f: np.asarray(getattr(robot, f)[robot.operated_index], float) for f in fields}
 
 
 def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
@@ -155,7 +140,7 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
 
 
 def _by_hand(base: RobotSpec, rng: np.random.Generator) -> list[RobotSpec]:
-    values = _values(base, BY_HAND_FIELDS)
+    values = {f: getattr(base, f)[base.operated_index] for f in BY_HAND_FIELDS}
     return robots_of(base, {f: v * rng.uniform(1 - BY_HAND, 1 + BY_HAND, (JUDGED, len(v))) for f, v in values.items()})
 
 

@@ -58,10 +58,6 @@ class Randomization:
     judged: DrawnRobots | None = None
     plain: DrawnRobots | None = None
 
-    def for_engine(self, engine: Engine) -> DrawnRobots | None:
-        """Return the judged units in the form that an engine runs."""
-        return self.plain if engine in ("mujoco", "isaaclab") else self.judged
-
 
 def sample_units(
     robot: RobotSpec | Path, scope: Scope = "today", others: ListOf[Path] = (), samples: int = 256, seed: int = 0
@@ -131,12 +127,13 @@ def judge_units(
     judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
     if robot.has_servo_model:
         plain = draw_robots(robot, made.units, (train, validation), plain=True, progress=progress)
-    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in judged.units.items()}
+    units = {f: np.array(v) for f, v in judged.units.items()}
+    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items()}
     ranges = {
         joint: {f: (float(ends[f][0, i]), value, float(ends[f][1, i])) for f, (_, value, _) in by_field.items()}
         for i, (joint, by_field) in enumerate(made.ranges.items())
     }
-    return replace(made, units=judged.units, ranges=ranges, judged=judged, plain=plain)
+    return replace(made, units=units, ranges=ranges, judged=judged, plain=plain)
 
 
 def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
@@ -198,8 +195,8 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
     Raises:
         NoGainError: Units of the engine's form follow the recordings worse than ± 20 % on each number.
     """
-    if (judged := made.for_engine(engine)) is not None:
-        judged.require_better_than_by_hand()
+    if (runs := made.plain if engine in ("mujoco", "isaaclab") else made.judged) is not None:
+        runs.require_better_than_by_hand()
     content: dict[str, Any] = {
         "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
         "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}

@@ -366,11 +366,7 @@ class DelayedAction:
     """Mix-in that delays commands in the action term: worlds start at rest, and no delay is rounded to a step."""
 
     def set_delays(self, delay: Any) -> None:
-        """Set the delays of the term's joints, s, (num_envs, n) or (1, n).
-
-        Raises:
-            ValueError: The physics executes the servos itself.
-        """
+        """Set the delays of the term's joints, s, (num_envs, n) or (1, n)."""
         me: Any = self
         self.delay = torch.as_tensor(delay, device=me.device, dtype=torch.float)
         steps = self.delay / me._env.physics_dt

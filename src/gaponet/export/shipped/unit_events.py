@@ -34,9 +34,7 @@ def read_units(file: str | Path, form: str) -> tuple[list[str], Units]:
     return drawn["joints"], {field: torch.tensor(x) for field, x in drawn.get(form, drawn["units"]).items()}
 
 
-def draw_units(
-    file: str | Path, form: str, env: Any, env_ids: Any, rows: Any = None
-) -> tuple[Tensor, list[str], Units]:
+def draw_units(file: str | Path, form: str, env: Any, env_ids: Any, rows: Any) -> tuple[Tensor, list[str], Units]:
     """Draw a unit for each of the worlds `env_ids` (indices, a slice; None for all).
 
     Args:
