@@ -54,12 +54,12 @@ class Actions:
 @configclass
 class Events:
     start = EventTermCfg(func=reset, mode="reset")
+    unit: EventTermCfg | None = None
 
 
 events = Events()
 if sys.argv[1:]:
-    rows = [int(sys.argv[2])] * check.worlds
-    unit = {"asset_cfg": SceneEntityCfg("robot"), "file": sys.argv[1], "rows": rows}
+    unit = {"file": sys.argv[1], "rows": [int(sys.argv[2])] * check.worlds, "asset_cfg": SceneEntityCfg("robot")}
     events.unit = EventTermCfg(func=apply_units, mode="reset", params=unit)
 fields = ("integrator", "tolerance", "iterations", "ls_iterations")
 solver = MJWarpSolverCfg(disable_contacts=True, **{field: check.facts["options"][field] for field in fields})
