@@ -121,7 +121,7 @@ def apply_units(
     columns = columns_of(joints, robot.joint_names, "joints of the articulation")
     groups = {joint: group for group in robot.actuators.values() if not hasattr(group, "network")
               for joint in getattr(group, "joint_names", ())}  # fmt: skip
-    columns_of(joints, groups, "joints with PD actuators (none with cfg.sim.use_newton_actuators)")
+    columns_of(joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)")
     if term is None:
         _delay(joints, groups, units["delay"] / env.physics_dt, ids)
     elif hasattr(action := env.action_manager.get_term(term), "set_units"):
