@@ -13,8 +13,10 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 
+FEEDFORWARD = "feedforward_torque"  # that a controller adds to its PD torque; data.sequence makes it a position
+COMMANDS = ("ctrl", FEEDFORWARD)  # channels that are held between their rows
 # Channel names and their SI units. ctrl is the commanded joint position.
-CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C"}
+CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C", FEEDFORWARD: "N·m"}
 # What others computed from these; kept where a format states it (an exported dataset), never looked for elsewhere.
 DERIVED = {"qacc": "rad/s²", "tau_eq": "N·m"}
 UNITS = {"time": "s"} | CHANNELS | DERIVED

@@ -13,8 +13,9 @@ from annotated_types import Interval
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import Json
-from gaponet.data.log import Log
+from gaponet.data.log import COMMANDS, FEEDFORWARD, Log
 from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
+from gaponet.robot.finding import masked_names
 from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
@@ -252,6 +253,12 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
     origins = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
     notes["gains"] = origins[0] if origins[0] == origins[1] else f"kp {origins[0]}, kd {origins[1]}"
+    if FEEDFORWARD in arrays:
+        kp, assumed = np.array(gains["kp"]), origins[0] == ASSUMED
+        further = _feedforward_position(arrays.pop(FEEDFORWARD), kp, assumed, log, robot)
+        arrays["ctrl"] = arrays["ctrl"] + further
+        largest = {j: round(float(x), 4) for j, x in zip(robot.joint_names, abs(further).max(axis=0), strict=True) if x}
+        notes |= {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}} if largest else {}
     return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
 
 
@@ -335,9 +342,32 @@ def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
         grid, near = begin + dt * np.arange(round((stop - begin) / dt) + 1), 0.5
     grid = np.clip(grid, start, stop)
     return {
-        name: resample_zoh(c.time, c.values, grid, near) if name == "ctrl" else resample_linear(c.time, c.values, grid)
+        name: (resample_zoh(c.time, c.values, grid, near) if name in COMMANDS
+               else resample_linear(c.time, c.values, grid))
         for name, c in log.channels.items()
-    }
+    }  # fmt: skip
+
+
+def _feedforward_position(torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec) -> Array:
+    """Return by how much a PD controller with a feed-forward torque is commanded further, (T, n) rad: torque / kp.
+
+    kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇.
+
+    Args:
+        assumed: kp is that of the robot's file, since neither the log nor the user states it.
+    """
+    fed = np.abs(torque).max(axis=0) > 0  # (n,)
+    if fed.any() and assumed:
+        raise LogError(
+            f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and nothing states the kp of the "
+            "recording; give kp in logs.toml, or --kp"
+        )
+    if (fed & (kp == 0)).any():
+        raise LogError(
+            f"{log.source}: {', '.join(masked_names(robot, fed & (kp == 0)))} had kp 0 and a {FEEDFORWARD}: driven by "
+            "torque, without a position command; leave these joints out with ignore in logs.toml"
+        )
+    return torque / np.where(kp > 0, kp, 1.0)
 
 
 def _to_robot(name: str, values: Array, log: Log, robot: RobotSpec) -> Array:

@@ -12,10 +12,12 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError
 from gaponet.data.describe.raw_recording import SECONDS, RawRecording
+from gaponet.data.log import FEEDFORWARD
 from gaponet.robot.spec import RobotSpec
 
 # Words by which the world calls them; a name with a word of an earlier line is not looked for in a later one.
 WORDS = {
+    FEEDFORWARD: ("ff", "feedforward", "ffwd"),
     "ctrl": ("ctrl", "cmd", "command", "commanded", "des", "desired", "target", "goal", "ref", "reference", "action",
              "setpoint", "sp"),
     "qvel": ("qvel", "vel", "velocity", "velocities", "dq", "qd", "speed", "dof_vel"),
@@ -72,8 +74,9 @@ def _tokens(name: str) -> list[str]:
 def _kind(name: str) -> str | None:
     """Which channel a name speaks of; of a command's, positions only."""
     matches = [channel for channel, words in WORDS.items() if any(w in words for w in _tokens(name))]
-    if matches and matches[0] == "ctrl" and any(c in matches for c in NOT_POSITIONS):
-        return None  # a commanded velocity or torque
+    excluded = {"ctrl": NOT_POSITIONS, FEEDFORWARD: ("qpos", "qvel", "temperature")}.get(matches[0] if matches else "")
+    if excluded and any(c in matches for c in excluded):
+        return None  # a commanded velocity or torque; a feed-forward of something else
     return matches[0] if matches else None
 
 
