@@ -115,7 +115,8 @@ class Log:
         if back.size:
             raise LogError(
                 f"{self.row(name, int(back[0]) + 1)}: time does not increase in channel {name} "
-                f"({time[back[0]]:.6f} s, then {time[back[0] + 1]:.6f} s); sort the rows or cut the log there"
+                f"({time[back[0]]:.6f} s, then {time[back[0] + 1]:.6f} s); sort the rows or cut the log there "
+                "(--skip-bad does)"
             )
 
     def row(self, name: str, index: int) -> str:

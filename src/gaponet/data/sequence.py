@@ -242,9 +242,17 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
         "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated",
         "rate_hz": round(1 / median, 3),
         "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
+        "uneven_ms": round(float(np.percentile(np.abs(period - median), 95)) * 1e3, 3),
         "longest_gap_ms": round(float(period.max()) * 1e3, 3),
         "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
     }
+    if not regular:
+        notes["why_resampled"] = (
+            "its channels have clocks of their own" if not shared
+            else "no even period fits its rows" if even
+            else f"its rows lie {1e3 * period.min():.1f} to {1e3 * period.max():.1f} ms apart, and shorter delays are "
+            "not known"
+        )  # fmt: skip
     posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
     absent = [name for name in robot.joint_names if name not in log.joint_names and name not in posture]
     notes |= ({"posture": posture} if posture else {}) | ({"held_at_home": absent} if absent else {})
@@ -297,7 +305,8 @@ def _median_period(log: Log) -> float:
     if time[-1] - time[0] > MAX_GROWTH * median * len(time):
         raise LogError(
             f"{log.source}: {len(time)} rows lie in bursts over {time[-1] - time[0]:.4g} s: at their median period of "
-            f"{median * 1e3:.3g} ms there would be {(time[-1] - time[0]) / median:.0f}; mend the timestamps"
+            f"{median * 1e3:.3g} ms there would be {(time[-1] - time[0]) / median:.0f}; mend the timestamps, or give "
+            "the rate of even rows (rate in logs.toml, --rate), which replaces the clock"
         )
     stated = log.meta.get("dt", median)
     if abs(stated - median) > 0.1 * stated:

@@ -133,24 +133,26 @@ def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
 
 def _fit(poses: _Poses) -> _Fit:
     """Fit the coefficients of the one joint of these poses."""
-    x, formal_std, scatter = _solve(poses.columns, poses.error)
+    x, formal_std, scatter = solve(poses.columns, poses.error)
     numbers, index = np.unique(poses.sequence, return_inverse=True)
     fold = index % MAX_FOLDS
     folds = range(min(len(numbers), MAX_FOLDS))
-    without = {f: _solve(poses.columns[fold != f], poses.error[fold != f])[0] for f in folds}
+    without = {f: solve(poses.columns[fold != f], poses.error[fold != f])[0] for f in folds}
     every = np.array(list(without.values()))
     jackknife = np.sqrt((len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0))
     std = np.maximum(formal_std, jackknife) if len(every) > 2 else 3 * formal_std
     return _Fit(x, std, scatter, {s: without[i % MAX_FOLDS] for i, s in enumerate(numbers.tolist())})
 
 
-def _solve(columns: Array, error: Array) -> tuple[Array, Array, float]:
+def solve(
+    columns: Array, error: Array, expected: Array = PRIOR, expected_std: Array = PRIOR_STD
+) -> tuple[Array, Array, float]:
     """Return robust least-squares coefficients, their formal standard errors, and the scatter of the residuals."""
-    x, scatter, weight, prior = PRIOR, 0.01, np.ones(len(error)), np.diag(1 / PRIOR_STD)
+    x, scatter, weight, prior = expected, 0.01, np.ones(len(error)), np.diag(1 / expected_std)
     a = prior
     for _ in range(MAX_ITERATIONS):
         a = np.concatenate([columns * (weight / scatter)[:, None], prior])
-        x = np.linalg.lstsq(a, np.concatenate([error * weight / scatter, prior @ PRIOR]), rcond=None)[0]
+        x = np.linalg.lstsq(a, np.concatenate([error * weight / scatter, prior @ expected]), rcond=None)[0]
         residual = np.abs(error - columns @ x)
         scatter = max(1.48 * float(np.median(residual)), MIN_SCATTER_RAD) if len(residual) else scatter
         weight = np.sqrt(1 / np.maximum(1, residual / (3 * scatter)))
@@ -188,7 +190,7 @@ def _swapped_labels(surveys: list[Survey], poses: _Poses, judged: list[int]) -> 
         evidence = 0.0
         for j in judged:
             own = poses.joint == j
-            scatters = [_solve(c[own], poses.error[own])[2] for c in (poses.columns, columns)]
+            scatters = [solve(c[own], poses.error[own])[2] for c in (poses.columns, columns)]
             evidence += float(own.sum() * np.log(scatters[0] / scatters[1]))
         best = max(best, (evidence, order))
     loaded = np.abs(poses.per_kg) * (labels[-1] - labels[0]) > MIN_LOAD_CHANGE_RAD
@@ -206,7 +208,7 @@ def _two_units(
     median = np.full((len(surveys), len(judged)), np.nan)  # residual of each sequence and joint, rad
     for column, j in enumerate(judged):
         own = poses.of_joint(j)
-        residual = own.error - own.columns @ _solve(own.columns, own.error)[0]
+        residual = own.error - own.columns @ solve(own.columns, own.error)[0]
         for number in set(own.sequence.tolist()):
             if len(part := residual[own.of_sequence(number)]) > 1:
                 median[number, column] = np.median(part)

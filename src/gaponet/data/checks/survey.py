@@ -39,6 +39,7 @@ REPEATED_COMMAND_RAD = 0.1  # the command must move by this while the state repe
 SLOPE_MIN_RANGE_RAD = 0.2  # of the command; below, sag and stiction decide the slope
 SLOW_HZ = 0.3  # faster, a servo's resonance changes the slope
 GRAVITY_SAMPLES, SLOW_RAD_S = 60, 0.5  # rows in which torque is compared with gravity, and the highest speed there
+HOLD_S, HELD_COMMAND_RAD = 0.4, 2e-3  # time and range of a command that stands still
 TORQUE_TOLERANCE = 0.05  # share of the torque limit by which a reading may exceed it
 EQUAL_RAD = 1e-5  # command and state that differ by less are one signal
 JUMP_RAD, JUMP_RAD_S2 = 0.1, 1000.0  # distance from the line between the neighbouring rows that no joint reaches
@@ -62,6 +63,19 @@ class Torque(NamedTuple):
     flat: Array  # rows at exactly the greatest magnitude
 
 
+class Holds(NamedTuple):
+    """Means over stretches in which one joint rests under a constant command, k of all joints."""
+
+    joint: Array  # index, (k)
+    qpos: Array  # of all joints, (k, n) rad
+    error: Array  # command − position of the joint, (k) rad
+    tau: Array  # of the joint, (k) N·m
+
+    def of_joint(self, joint: int) -> Holds:
+        """Return those of a joint."""
+        return Holds(*(values[self.joint == joint] for values in self))
+
+
 @dataclass(frozen=True)
 class Survey:
     """Measurements of one sequence; n joints in robot order.
@@ -72,8 +86,9 @@ class Survey:
 
     entry: Entry
     samples: str  # hash of command and state alone, without unit and payload
-    rate_hz: float  # from the state's timestamps, like the two below
+    rate_hz: float  # from the state's timestamps, like the three below
     jitter_ms: float  # largest deviation of a period from the median
+    uneven_ms: float  # 95th percentile of these deviations
     longest_gap_ms: float
     ctrl_limits: Array  # least and greatest, (n, 2) rad
     qpos_limits: Array
@@ -102,6 +117,7 @@ class Survey:
     velocity_correlation: Array  # of the command with the measured velocity, (n)
     torque_correlation: Array  # of the command with the measured torque, (n)
     gravity_samples: Array | None  # positions and torques in slow rows, (2, k, n); None if no torque was recorded
+    holds: Holds | None
 
     @property
     def motion(self) -> str:
@@ -135,6 +151,7 @@ class Survey:
             samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
             rate_hz=float(notes.get("rate_hz", 1 / dt)),
             jitter_ms=float(notes.get("jitter_ms", 0.0)),
+            uneven_ms=float(notes.get("uneven_ms", 0.0)),
             longest_gap_ms=float(notes.get("longest_gap_ms", dt * 1e3)),
             ctrl_limits=np.stack([ctrl.min(axis=0), ctrl.max(axis=0)], axis=1),
             qpos_limits=np.stack([qpos.min(axis=0), qpos.max(axis=0)], axis=1),
@@ -160,6 +177,7 @@ class Survey:
             spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]).astype(np.float32),
             **_kind_of_command(sequence),
             gravity_samples=_gravity_samples(sequence),
+            holds=_holds(sequence),
         )
 
 
@@ -308,6 +326,31 @@ def _gravity_samples(sequence: Sequence) -> Array | None:
     slow = np.flatnonzero((np.abs(sequence.qvel) < SLOW_RAD_S).all(axis=1))
     rows = slow[:: max(1, len(slow) // GRAVITY_SAMPLES)]
     return np.stack([sequence.qpos[rows], sequence.tau[rows]])
+
+
+def _holds(sequence: Sequence) -> Holds | None:
+    if sequence.tau is None:
+        return None
+    spans = ((sequence.ctrl, HOLD_S, HELD_COMMAND_RAD), (sequence.qpos, HOLD_S / 4, STANDSTILL_RAD))
+    rests = np.logical_and(*(_range_before(x, max(2, round(s / sequence.dt))) < most for x, s, most in spans))
+    rests[: round(HOLD_S / sequence.dt)] = False
+    least = HOLD_S / 2 / sequence.dt
+    stretches = [(j, run) for j, mask in enumerate(rests.T) for run in _runs(mask) if run.stop - run.start > least]
+    joint = np.array([j for j, _ in stretches], int)
+    ctrl, qpos, tau = (
+        np.reshape([x[run].mean(axis=0, dtype=float) for _, run in stretches], (-1, rests.shape[1]))
+        for x in (sequence.ctrl, sequence.qpos, sequence.tau)
+    )
+    at = np.arange(len(joint)), joint
+    return Holds(joint, qpos, ctrl[at] - qpos[at], tau[at])
+
+
+def _range_before(values: Array, rows: int) -> Array:
+    """Return greatest less least value of each row and those before it, `rows` in all, (T, n)."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    most, least = (f(values, rows, axis=0, origin=(rows - 1) // 2) for f in (maximum_filter1d, minimum_filter1d))
+    return np.asarray(most - least)
 
 
 def _qvel_ratio(sequence: Sequence) -> Array:

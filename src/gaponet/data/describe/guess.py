@@ -161,11 +161,12 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     if clock is None:
         own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
         return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
-    period = float(np.median(np.diff(recording.load([clock])[clock].values[:ROWS])))
+    low, period, high = np.percentile(np.diff(recording.load([clock])[clock].values[:ROWS]), [5, 50, 95])
     units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
     unit = units[0] if units else "s"
     lines = [] if clock == "time" else [f"time = {_text(clock)}"]
-    return [*lines, f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s']
+    uneven = f"; uneven: {low * SECONDS[unit]:.3g} to {high * SECONDS[unit]:.3g} s" if high - low > 0.2 * period else ""
+    return [*lines, f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s{uneven}']
 
 
 def _values(recording: RawRecording, pattern: str) -> Array | None:
