@@ -63,7 +63,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
             )
             findings.append(Finding("warning", "lag", text, (name,), {"extra_s": float(extra)}))
-    findings += _drift(complete, common.shifts)
+    findings += _drift(complete, common.shifts, unknown)
     commanded, moved = np.mean([s.spectra for s in complete], axis=0)
     width, depth = _averaging(moved)
     # Steps at a regular pace have notches too.
@@ -122,7 +122,7 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
             yield Finding("warning", "lag", text, (), values)
 
 
-def _drift(surveys: list[Survey], shifts: Array) -> Iterator[Finding]:
+def _drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterator[Finding]:
     """Find a clock drift from the shifts (recordings, parts) s of the parts of each recording."""
     duration = np.array([s.response.duration for s in surveys])
     long = duration >= MIN_DRIFT_DURATION_S  # in shorter recordings friction changes the shift
@@ -135,7 +135,7 @@ def _drift(surveys: list[Survey], shifts: Array) -> Iterator[Finding]:
     drift = float(np.median(slope))
     resolution = 2e-3 / float(between.max()) / np.sqrt(len(slope))
     error = max(MOTION_SHARE * _standard_error(slope - drift), _standard_error(curvature), resolution)
-    if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error):
+    if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error, unknown / float(between.max())):
         text = (
             f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
             f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; log them with one"
