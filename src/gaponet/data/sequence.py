@@ -247,12 +247,11 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
         "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
     }
     if not regular:
-        notes["why_resampled"] = (
-            "its channels have clocks of their own" if not shared
-            else "no even period fits its rows" if even
-            else f"its rows lie {1e3 * period.min():.1f} to {1e3 * period.max():.1f} ms apart, and shorter delays are "
-            "not known"
-        )  # fmt: skip
+        span = f"{1e3 * period.min():.1f} to {1e3 * period.max():.1f} ms"
+        uneven = (
+            "no even period fits its rows" if even else f"its rows lie {span} apart, and shorter delays are not known"
+        )
+        notes["why_resampled"] = uneven if shared else "its channels have clocks of their own"
     posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
     absent = [name for name in robot.joint_names if name not in log.joint_names and name not in posture]
     notes |= ({"posture": posture} if posture else {}) | ({"held_at_home": absent} if absent else {})
@@ -262,8 +261,8 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     origins = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
     notes["gains"] = origins[0] if origins[0] == origins[1] else f"kp {origins[0]}, kd {origins[1]}"
     if FEEDFORWARD in arrays:
-        kp, assumed = np.array(gains["kp"]), origins[0] == ASSUMED
-        further = _feedforward_position(arrays.pop(FEEDFORWARD), kp, assumed, log, robot)
+        assumed = origins[0] == ASSUMED
+        further = _feedforward_position(arrays.pop(FEEDFORWARD), np.array(gains["kp"]), assumed, log, robot)
         arrays["ctrl"] = arrays["ctrl"] + further
         largest = {j: round(float(x), 4) for j, x in zip(robot.joint_names, abs(further).max(axis=0), strict=True) if x}
         notes |= {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}} if largest else {}
@@ -360,21 +359,14 @@ def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
 def _feedforward_position(torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec) -> Array:
     """Return by how much a PD controller with a feed-forward torque is commanded further, (T, n) rad: torque / kp.
 
-    kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇.
-
-    Args:
-        assumed: kp is that of the robot's file, since neither the log nor the user states it.
+    kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇. `assumed`: nobody stated kp.
     """
-    fed = np.abs(torque).max(axis=0) > 0  # (n,)
-    if fed.any() and assumed:
+    lacking = masked_names(robot, (np.abs(torque).max(axis=0) > 0) & (assumed | (kp == 0)))
+    if lacking:
         raise LogError(
-            f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and nothing states the kp of the "
-            "recording; give kp in logs.toml, or --kp"
-        )
-    if (fed & (kp == 0)).any():
-        raise LogError(
-            f"{log.source}: {', '.join(masked_names(robot, fed & (kp == 0)))} had kp 0 and a {FEEDFORWARD}: driven by "
-            "torque, without a position command; leave these joints out with ignore in logs.toml"
+            f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and kp of {', '.join(lacking)} is "
+            f"{'not stated' if assumed else '0'}; give it in logs.toml (kp), or --kp; leave joints that torque alone "
+            "drives out with ignore"
         )
     return torque / np.where(kp > 0, kp, 1.0)
 

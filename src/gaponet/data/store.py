@@ -38,7 +38,7 @@ from gaponet.base.structure import Name, read_format
 from gaponet.data.fingerprint import fingerprint
 from gaponet.data.journal import FILE as JOURNAL
 from gaponet.data.journal import Entry, EntryHeader, Findings, Journal
-from gaponet.data.log import FEEDFORWARD, UNITS
+from gaponet.data.log import UNITS
 from gaponet.data.pair import Pair, SimulatedReplay
 from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta
 from gaponet.data.sequence_file import HINT, read_arrays, write_arrays
@@ -118,7 +118,7 @@ class Dataset:
         path = Path(path)
         with lock_folder(path, KIND):
             if not (path / "dataset.json").is_file():
-                units = {channel: unit for channel, unit in UNITS.items() if channel != FEEDFORWARD}
+                units = {channel: UNITS[channel] for channel in ("time", *ARRAYS)}
                 header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": units}
                 write_json(path / "dataset.json", header)
             if not has_stored_robot(path):

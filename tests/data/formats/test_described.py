@@ -281,8 +281,11 @@ def test_a_simulated_pd_servo_does_the_same_with_the_torque_as_with_the_equivale
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        ('feedforward_torque = "tau_ff_{joint}"\n', "nothing states the kp of the recording; give kp in logs.toml"),
-        ('feedforward_torque = "tau_ff_{joint}"\nkp = { shoulder = 5.0, elbow = 0.0 }\n', "elbow had kp 0"),
+        ('feedforward_torque = "tau_ff_{joint}"\n', "kp of shoulder, elbow is not stated; give it in logs.toml"),
+        (
+            'feedforward_torque = "tau_ff_{joint}"\nkp = { shoulder = 5.0, elbow = 0.0 }\n',
+            "kp of elbow is 0; give it in logs.toml",
+        ),
         ('feedforward_torque = "tau_{joint}_ff"\nkp = 5.0\n', "no column holds feedforward_torque; there are: t, "),
     ],
 )

@@ -1,15 +1,13 @@
 """Does the command alone hold the robot up, or a torque beside it: gravity compensation, inverse dynamics?
 
-A PD controller's torque is kp (command − position) at rest. With a feed-forward torque it is that and a share of the
-weight, and the joint sags less than kp says. Recorded torque at rest is fitted to both. Backlash hides the command from
-the motor, and a sensor behind the gears measures no friction: their joints seem to have the whole weight fed forward,
-but sag as kp says.
+A PD controller's torque is kp (command − position) at rest; with a feed-forward torque it is that and a share of the
+weight, and the joint sags less than kp says. Recorded torque at rest is fitted to both. Behind backlash, or in a sensor
+behind the gears, the torque seems to be the weight alone, but the joint sags as kp says.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,46 +27,38 @@ MAX_SAG = (0.25, 2.5)  # of the sag that kp and the weight give: at a share of 1
 MIN_JOINTS_SHARE = 1 / 3  # of the joints that are judged
 
 
-class _Fit(NamedTuple):
-    """Shares of a joint: of its weight in the torque beside PD, of its torque explained by PD alone and by both."""
-
-    share: float
-    pd_alone: float
-    both: float
-    found: bool
-
-
 def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
     """Is a torque fed forward beside the position command?"""
     recorded = [(s, s.torque) for s in surveys if s.torque is not None]
     if not recorded or unsigned_torque(recorded, robot):
         return
-    fits = {name: fit for j, name in enumerate(robot.joint_names) if (fit := _fit(surveys, robot, model, j))}
-    fed = {name: fit for name, fit in fits.items() if fit.found}
-    if not fits or len(fed) < MIN_JOINTS_SHARE * len(fits):
-        what = "no torque beside the commands is seen at rest" if fits else "too few rests with torque to tell"
+    shares = {name: x for j, name in enumerate(robot.joint_names) if (x := _shares(surveys, robot, model, j))}
+    fed = {name: x for name, x in shares.items() if x[0] > 0}
+    if not shares or len(fed) < MIN_JOINTS_SHARE * len(shares):
+        what = "no torque beside the commands is seen at rest" if shares else "too few rests with torque to tell"
         yield Finding("ok", "feed-forward", what)
         return
-    share, alone, both = np.median([fit[:3] for fit in fed.values()], axis=0)
+    share, alone, both = np.clip(np.median(list(fed.values()), axis=0), 0, 1)
     text = (
-        f"at rest the commands of {abbreviate(list(fed))} hold only {max(1 - share, 0):.0%} of the weight: kp times "
-        f"their distance explains {max(alone, 0):.0%} of the torque, with the rest of the weight {both:.0%} "
-        "(recordings that were not fitted). A torque is fed forward beside the command, such as gravity compensation, "
-        "or an integral term holds the joint. Name its column in logs.toml (feedforward_torque); without it, gaponet "
-        "identify takes the missing sag for stiffer motors, and a simulator needs the same torque"
+        f"at rest the commands of {abbreviate(list(fed))} hold only {1 - share:.0%} of the weight: kp times their "
+        f"distance explains {alone:.0%} of the torque, with the rest of the weight {both:.0%} (recordings not "
+        "fitted). A torque is fed forward beside the command, such as gravity compensation, or an integral term holds "
+        "the joint. Name its column in logs.toml (feedforward_torque); without it, gaponet identify takes the missing "
+        "sag for stiffer motors, and a simulator needs the same torque"
     )
-    yield Finding("warning", "feed-forward", text, tuple(fed), {name: fit.share for name, fit in fed.items()})
+    yield Finding("warning", "feed-forward", text, tuple(fed), {name: x[0] for name, x in fed.items()})
 
 
-def _fit(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int) -> _Fit | None:
-    """Fit the torque of a joint; None with too few holds, or without a weight that changes."""
+def _shares(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int) -> tuple[float, float, float] | None:
+    """Return the share of a joint's weight that is fed forward (0 if it may be none), and the shares of its torque that
+    PD alone and both explain; None with too few holds, or without a weight that changes."""
     parts = [np.zeros((0, 5))]
     for number, s in enumerate(surveys):
-        own = s.holds.of_joint(joint) if s.holds else None
-        if own is not None and len(own.tau):
+        own = s.holds[s.holds[:, 0] == joint] if s.holds is not None else ()
+        if len(own):
             meta, kp = s.entry.meta, max(float(robot.with_gains(*s.entry.meta.recorded_gains).kp[joint]), 1e-9)
-            weight = model(own.qpos, meta.payload_mass, meta.payload_side)[:, joint]
-            columns = (np.full(len(weight), number), own.tau / kp, weight / kp, own.error, own.qpos[:, joint])
+            weight = model(own[:, 3:], meta.payload_mass, meta.payload_side)[:, joint]
+            columns = (np.full(len(own), number), own[:, 2] / kp, weight / kp, own[:, 1], own[:, 3 + joint])
             parts.append(np.stack(columns, axis=1))
     recording, torque, weight, error, qpos = np.concatenate(parts).T  # (k,); torques over kp, rad
     numbers, fold = np.unique(recording, return_inverse=True)
@@ -79,12 +69,9 @@ def _fit(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int) ->
     sag, _, _ = _explained(error, fold, weight)
     _, _, alone = _explained(torque, fold, error, qpos)  # qpos: command and state may differ in scale
     share, std, both = _explained(torque, fold, weight, error, qpos)
-    found = (
-        share > max(MIN_SHARE, SIGNIFICANCE * std)
-        and 1 - alone > max(MIN_UNEXPLAINED, MIN_IMPROVEMENT * (1 - both))
-        and sag < MAX_SAG[0] + MAX_SAG[1] * max(1 - share, 0.0)
-    )
-    return _Fit(share, alone, both, found)
+    significant = share > max(MIN_SHARE, SIGNIFICANCE * std) and sag < MAX_SAG[0] + MAX_SAG[1] * max(1 - share, 0.0)
+    better = 1 - alone > max(MIN_UNEXPLAINED, MIN_IMPROVEMENT * (1 - both))
+    return (share if significant and better else 0.0), alone, both
 
 
 def _explained(values: Array, fold: Array, *columns: Array) -> tuple[float, float, float]:

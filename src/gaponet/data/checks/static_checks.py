@@ -100,14 +100,14 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
         fit = _fit(own)
         findings += _offset_and_scale(name, fit)
         sag, soft = float(np.sqrt(np.mean(own.columns[:, SOFTNESS] ** 2))), float(fit.x[SOFTNESS])
-        if sag > MIN_SAG_RAD and fit.significant[SOFTNESS] and soft > 0:
+        if sag > MIN_SAG_RAD and fit.significant[SOFTNESS] and soft > -SOFTNESS_BOUNDS[0]:
             softness |= {} if SOFTNESS_BOUNDS[0] < soft < SOFTNESS_BOUNDS[1] else {name: soft}
     if softness:
-        median = float(np.median(list(softness.values())))
+        median = max(float(np.median(list(softness.values()))), 0.0)
         text = (
             f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: were these logs "
-            "recorded at "
-            "other gains, or with another payload than their label? Import again with --kp or --payload-mass"
+            "recorded at other gains, with another payload than their label, or a torque fed forward? Import again "
+            "with --kp, --payload-mass, or feedforward_torque in logs.toml"
         )
         findings.append(Finding("warning", "gains", text, tuple(softness), {"softness": softness}))
     yield from findings or [Finding("ok", "rests", "rests agree with gravity, gains and payload labels")]
@@ -231,8 +231,8 @@ def _two_units(
     motions = [[surveys[i].motion for i in known if (i in best[3]) == side] for side in (True, False)]
     text = (
         f"{abbreviate(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where {abbreviate(motions[1])} do "
-        f"({abbreviate(best[2])}): "
-        "two robots under one name, or zeros set in between? Import one part with another --unit-id"
+        f"({abbreviate(best[2])}): two robots under one name, or zeros set in between? Import one part with another "
+        "--unit-id"
     )
     return [Finding("warning", "unit_id", text, tuple(best[2]), {"apart": best[1], "motions": motions[0]})]
 

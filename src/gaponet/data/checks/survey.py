@@ -26,6 +26,7 @@ from gaponet.data.signals import (
     estimate_delay,
     fast_speed,
     lowpass,
+    range_before,
 )  # fmt: skip
 from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import Dataset, Entry
@@ -61,19 +62,6 @@ class Torque(NamedTuple):
     over_limit: Array  # rows above the torque limit
     spikes: Array  # rows far above the rows around
     flat: Array  # rows at exactly the greatest magnitude
-
-
-class Holds(NamedTuple):
-    """Means over stretches in which one joint rests under a constant command, k of all joints."""
-
-    joint: Array  # index, (k)
-    qpos: Array  # of all joints, (k, n) rad
-    error: Array  # command − position of the joint, (k) rad
-    tau: Array  # of the joint, (k) N·m
-
-    def of_joint(self, joint: int) -> Holds:
-        """Return those of a joint."""
-        return Holds(*(values[self.joint == joint] for values in self))
 
 
 @dataclass(frozen=True)
@@ -117,7 +105,8 @@ class Survey:
     velocity_correlation: Array  # of the command with the measured velocity, (n)
     torque_correlation: Array  # of the command with the measured torque, (n)
     gravity_samples: Array | None  # positions and torques in slow rows, (2, k, n); None if no torque was recorded
-    holds: Holds | None
+    holds: Array | None  # of single joints that rest under a constant command: joint, command − position (rad), torque,
+    # and positions of all joints, (k, 3 + n); None if no torque was recorded
 
     @property
     def motion(self) -> str:
@@ -328,29 +317,17 @@ def _gravity_samples(sequence: Sequence) -> Array | None:
     return np.stack([sequence.qpos[rows], sequence.tau[rows]])
 
 
-def _holds(sequence: Sequence) -> Holds | None:
+def _holds(sequence: Sequence) -> Array | None:
     if sequence.tau is None:
         return None
-    spans = ((sequence.ctrl, HOLD_S, HELD_COMMAND_RAD), (sequence.qpos, HOLD_S / 4, STANDSTILL_RAD))
-    rests = np.logical_and(*(_range_before(x, max(2, round(s / sequence.dt))) < most for x, s, most in spans))
-    rests[: round(HOLD_S / sequence.dt)] = False
-    least = HOLD_S / 2 / sequence.dt
+    rows, least = max(2, round(HOLD_S / sequence.dt)), HOLD_S / 2 / sequence.dt
+    rests = range_before(sequence.ctrl, rows) < HELD_COMMAND_RAD
+    rests &= range_before(sequence.qpos, max(2, rows // 4)) < STANDSTILL_RAD
+    rests[:rows] = False
     stretches = [(j, run) for j, mask in enumerate(rests.T) for run in _runs(mask) if run.stop - run.start > least]
-    joint = np.array([j for j, _ in stretches], int)
-    ctrl, qpos, tau = (
-        np.reshape([x[run].mean(axis=0, dtype=float) for _, run in stretches], (-1, rests.shape[1]))
-        for x in (sequence.ctrl, sequence.qpos, sequence.tau)
-    )
-    at = np.arange(len(joint)), joint
-    return Holds(joint, qpos, ctrl[at] - qpos[at], tau[at])
-
-
-def _range_before(values: Array, rows: int) -> Array:
-    """Return greatest less least value of each row and those before it, `rows` in all, (T, n)."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d
-
-    most, least = (f(values, rows, axis=0, origin=(rows - 1) // 2) for f in (maximum_filter1d, minimum_filter1d))
-    return np.asarray(most - least)
+    means = [[x[run].mean(axis=0) for x in (sequence.ctrl, sequence.qpos, sequence.tau)] for _, run in stretches]
+    holds = [[j, ctrl[j] - qpos[j], tau[j], *qpos] for (j, _), (ctrl, qpos, tau) in zip(stretches, means, strict=True)]
+    return np.reshape(holds, (-1, 3 + rests.shape[1])).astype(float)
 
 
 def _qvel_ratio(sequence: Sequence) -> Array:

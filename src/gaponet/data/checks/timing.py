@@ -114,9 +114,8 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
             by = f"{ms[0]:.0f} ms" if single else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
             text = (
                 f"{abbreviate(labels)} {'follows its' if single else 'follow their'} commands {by} {word} than the "
-                "other "
-                "recordings: clocks of command and state that are apart, another servo, or friction in slow motions; "
-                "leave them out if it is the clocks"
+                "other recordings: clocks of command and state that are apart, another servo, or friction in slow "
+                "motions; leave them out if it is the clocks"
             )
             values = {"recordings": [s.entry.id for s, _ in part], "late_s": [late for _, late in part]}
             yield Finding("warning", "lag", text, (), values)
