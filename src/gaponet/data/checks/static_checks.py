@@ -104,10 +104,10 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
             softness |= {} if SOFTNESS_BOUNDS[0] < soft < SOFTNESS_BOUNDS[1] else {name: soft}
     if softness:
         median = max(float(np.median(list(softness.values()))), 0.0)
+        fed = "" if median > 1 else ", or was a torque fed forward (feedforward_torque in logs.toml)"
         text = (
-            f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: were these logs "
-            "recorded at other gains, with another payload than their label, or a torque fed forward? Import again "
-            "with --kp, --payload-mass, or feedforward_torque in logs.toml"
+            f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: were these logs made "
+            f"at other gains, or with another payload than their label{fed}? Import again with --kp or --payload-mass"
         )
         findings.append(Finding("warning", "gains", text, tuple(softness), {"softness": softness}))
     yield from findings or [Finding("ok", "rests", "rests agree with gravity, gains and payload labels")]
