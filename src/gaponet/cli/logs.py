@@ -139,7 +139,6 @@ def _show_formats(out: Out) -> None:
 def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
     """Return lines about recordings that were cut, implausible rows, and operated joints that the logs lack."""
     cuts, implausible = defaultdict[str, list[str]](list), defaultdict[str, list[tuple[str, dict[str, Any]]]](list)
-    uneven = [e for e in entries if "resampled" in str(e.meta.notes.get("rows", ""))]
     for entry in entries:
         if cut := entry.meta.notes.get("cut"):
             cuts[cut].append(entry.meta.motion)
@@ -152,11 +151,9 @@ def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
         f"{', '.join(dict.fromkeys(rows['done'] for _, rows in counts))}; --strict refuses them"
         for channel, counts in implausible.items()
     ]
-    if uneven:
-        notes = max(uneven, key=lambda e: float(e.meta.notes.get("uneven_ms", 0.0))).meta.notes
-        lines.append(
-            f"{abbreviate([e.meta.motion for e in uneven])}: {notes['rows']}; {notes.get('why_resampled', '')}"
-        )
+    if uneven := [e.meta for e in entries if "why_resampled" in e.meta.notes]:
+        why = f"{uneven[0].notes['rows']}; {uneven[0].notes['why_resampled']}"
+        lines.append(f"{abbreviate([meta.motion for meta in uneven])}: {why}")
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
     where = "not in every recording, taken to stand at home there; [posture] in logs.toml says where"
     return [*lines, f"{abbreviate(lacking)}: {where}"] if lacking else lines

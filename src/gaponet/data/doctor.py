@@ -12,10 +12,9 @@ import numpy as np
 from gaponet.base.executor import LOCAL
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.checks import CHECKS
-from gaponet.data.checks.feedforward import feedforward
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
-from gaponet.data.checks.static_checks import static_checks
+from gaponet.data.checks.static_checks import feedforward, static_checks
 from gaponet.data.checks.survey import Survey, survey_all
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset

@@ -357,12 +357,9 @@ def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
 
 
 def _feedforward_position(torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec) -> Array:
-    """Return by how much a PD controller with a feed-forward torque is commanded further, (T, n) rad: torque / kp.
-
-    kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇. `assumed`: nobody stated kp.
-    """
-    lacking = masked_names(robot, (np.abs(torque).max(axis=0) > 0) & (assumed | (kp == 0)))
-    if lacking:
+    """Return the distance of the command, (T, n) rad, that has the effect of a torque on a PD controller: torque / kp,
+    as kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇. `assumed`: nobody stated kp."""
+    if lacking := masked_names(robot, torque.any(axis=0) & (assumed | (kp == 0))):
         raise LogError(
             f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and kp of {', '.join(lacking)} is "
             f"{'not stated' if assumed else '0'}; give it in logs.toml (kp), or --kp; leave joints that torque alone "
