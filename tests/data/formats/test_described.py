@@ -310,3 +310,18 @@ def test_the_guess_sees_a_feedforward_torque_and_not_the_measured_one(tmp_path, 
     (folder / "logs.toml").write_text(text)
     ((_, log),) = read_logs(folder, arm)
     assert np.array_equal(log.channels["feedforward_torque"].values, TORQUES)
+
+
+def test_a_feedforward_torque_in_the_file_of_the_commands_has_their_clock(tmp_path, arm):
+    columns = theirs()
+    states = {name: columns[name] for name in ("t", "shoulder_pos", "elbow_pos")}
+    commands = {"t": columns["t"] + 0.01} | {name: FED[name] for name in FED if "_des" in name or "_ff_" in name}
+    folder = write(
+        tmp_path / "logs",
+        NAMES + 'command_file = "{name}_cmd.csv"\nfeedforward_torque = "tau_ff_{joint}"\n',
+        columns=states,
+    )
+    (folder / "wave_cmd.csv").write_text(table_text(commands))
+    ((_, log),) = read_logs(folder, arm)
+    assert np.array_equal(log.channels["feedforward_torque"].values, TORQUES)
+    assert np.array_equal(log.channels["feedforward_torque"].time, log.channels["ctrl"].time)

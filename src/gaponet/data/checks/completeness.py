@@ -48,9 +48,7 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     where = f" ({worst.motion})" if worst.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
     if level == "warning" and (unknown := 2 * max(s.uneven_ms for s in surveys)):
-        text += (
-            f". Times shorter than {unknown:.0f} ms, delays too, cannot be told between such rows; log at an even rate"
-        )
+        text += f". Delays shorter than {unknown:.0f} ms cannot be told between such rows; log at an even rate"
     yield Finding(level, "jitter", text, values={"jitter_ms": worst.jitter_ms})
     longest = max(surveys, key=lambda s: s.longest_gap_ms)
     gaps = [s for s in surveys if s.missing_samples]
