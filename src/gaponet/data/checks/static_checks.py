@@ -339,8 +339,8 @@ def _shares(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int)
     PD alone and both explain; None with too few holds, or without a weight that changes."""
     parts = [np.zeros((0, 5))]
     for number, s in enumerate(surveys):
-        own = s.holds[s.holds[:, 0] == joint] if s.holds is not None else ()
-        if len(own):
+        if s.holds is not None and (s.holds[:, 0] == joint).any():
+            own = s.holds[s.holds[:, 0] == joint]
             meta, kp = s.entry.meta, max(float(robot.with_gains(*s.entry.meta.recorded_gains).kp[joint]), 1e-9)
             weight = model(own[:, 3:], meta.payload_mass, meta.payload_side)[:, joint]
             columns = (np.full(len(own), number), own[:, 2] / kp, weight / kp, own[:, 1], own[:, 3 + joint])
