@@ -15,7 +15,6 @@ from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import Json
 from gaponet.data.log import COMMANDS, FEEDFORWARD, Log
 from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
-from gaponet.robot.finding import masked_names
 from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
@@ -359,7 +358,8 @@ def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
 def _feedforward_position(torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec) -> Array:
     """Return the distance of the command, (T, n) rad, that has the effect of a torque on a PD controller: torque / kp,
     as kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇. `assumed`: nobody stated kp."""
-    if lacking := masked_names(robot, torque.any(axis=0) & (assumed | (kp == 0))):
+    without = torque.any(axis=0) & (assumed | (kp == 0))
+    if lacking := [name for name, x in zip(robot.joint_names, without, strict=True) if x]:
         raise LogError(
             f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and kp of {', '.join(lacking)} is "
             f"{'not stated' if assumed else '0'}; give it in logs.toml (kp), or --kp; leave joints that torque alone "
