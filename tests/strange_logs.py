@@ -92,6 +92,7 @@ def write_bag(
     twice: bool = False,
     rows: int = ROWS,
     with_command: bool = True,
+    tau: float = 0.0,
 ) -> Path:
     """States at 50 Hz and commands at 25 Hz, on two topics.
 
@@ -99,6 +100,7 @@ def write_bag(
         command: What kind of message: state, trajectory, array, controller, custom, unitree.
         drift, away: Of the command's clock against the recorder's, s/s and s.
         twice: Every state is recorded two times.
+        tau: Torque that Unitree's command feeds forward, N·m.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -128,7 +130,7 @@ def write_bag(
                     effort=none, time_from_start=zero)  # fmt: skip
 
     def motors(kind: str, x: np.ndarray) -> list[object]:
-        rest = {"mode": 1, "reserve": 0, "tau": 0.0, "kp": 20.0, "kd": 1.0} if kind.endswith("Cmd") else {
+        rest = {"mode": 1, "reserve": 0, "tau": tau, "kp": 20.0, "kd": 1.0} if kind.endswith("Cmd") else {
             "mode": 1, "ddq": 0.0, "tau_est": 0.0, "temperature": np.zeros(2, np.int16), "vol": 0.0, "motorstate": 0,
             "sensor": np.zeros(2, np.uint32), "reserve": np.zeros(4, np.uint32)}  # fmt: skip
         return [make(kind, q=float(x[i]) if i < 2 else 0.0, dq=0.0, **rest) for i in range(35)]

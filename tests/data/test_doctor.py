@@ -8,14 +8,16 @@ from dataclasses import replace
 from multiprocessing import get_context
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
-from arm import recordings
-from logs import arm_sequence, late, wave
+from arm import recordings, write_dataset
+from logs import arm_sequence, late, table_text, wave
 
 from gaponet.base.errors import DatasetError, WorkerError
 from gaponet.data.checks.timing import MIN_EARLY_RATIO, _drift
 from gaponet.data.doctor import Diagnosis
+from gaponet.data.importer import import_logs
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import Response, lowpass
 from gaponet.data.store import Dataset
@@ -242,6 +244,80 @@ def test_a_sign_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_pa
     wrong = replace(s, ctrl=s.ctrl * sign, qpos=s.qpos * sign, qvel=s.qvel * sign)
     finding = found(weigh(arm, tmp_path, wrong), "gravity", "warning")
     assert finding.message.startswith("with its angle mirrored at")
+
+
+def standing(arm, seed: int, share: float, behind_gears: bool = False) -> Sequence:
+    """The simulated arm moved from hold to hold, with a share of its weight fed forward, and the motors' torque.
+
+    Args:
+        behind_gears: The torque is measured behind the friction.
+    """
+    model, rng = build_model(arm), np.random.default_rng(seed)
+    data, rows = mujoco.MjData(model), []
+    for ctrl in lowpass(np.repeat(rng.uniform(-1.2, 1.2, (8, 2)), 75, axis=0), 0.02, 4.0).round(3):
+        fed = share * data.qfrc_bias
+        data.ctrl[:], data.qfrc_applied[:] = ctrl, fed
+        friction = data.qfrc_constraint if behind_gears else 0.0
+        rows.append((ctrl, data.qpos.copy(), data.actuator_force + fed + friction))
+        mujoco.mj_step(model, data, arm.decimation)
+    ctrl, qpos, tau = np.array(rows).swapaxes(0, 1)
+    noise = 3e-4 * rng.standard_normal((2, *qpos.shape))
+    return arm_sequence(arm, ctrl, qpos + noise[0], f"m{seed}", tau=tau + 10 * noise[1])
+
+
+@pytest.mark.parametrize(
+    ("share", "behind_gears", "level"),
+    [(0.0, False, "ok"), (0.0, True, "ok"), (0.5, False, "warning"), (1.0, False, "warning")],
+)
+def test_a_torque_fed_forward_beside_the_command_is_told_from_a_servo_that_sags(
+    arm, tmp_path, share, behind_gears, level
+):
+    data = write_dataset(tmp_path / "data", arm, [standing(arm, seed, share, behind_gears) for seed in range(4)])
+    diagnosis = Diagnosis.of(data, arm, gravity_model=gravity_of(arm))
+    finding = found(diagnosis, "feed-forward", level)
+    if level == "ok":
+        assert finding.message == "no torque beside the commands is seen at rest"
+        return
+    assert finding.joints == arm.joint_names
+    assert list(finding.values.values()) == pytest.approx([share, share], abs=0.05)
+    assert not any(f.check in ("rests", "gains", "offset") for f in diagnosis.findings)  # the missing sag is its effect
+
+
+def test_a_few_rests_do_not_tell_what_holds_the_arm(arm, tmp_path):
+    data = write_dataset(tmp_path / "data", arm, [standing(arm, 0, 1.0)])
+    finding = found(Diagnosis.of(data, arm, gravity_model=gravity_of(arm)), "feed-forward", "ok")
+    assert "too few rests with torque" in finding.message
+
+
+def test_a_motor_too_weak_for_its_load_is_no_error_of_the_commands(arm, tmp_path):
+    """Servos that move with their commands, far from them: those of four pendulums on an XL330 did."""
+    ctrl, _ = good()
+    weak = late(0.3 * ctrl, 3) - 0.5
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, weak)), "command", "warning")
+    assert "though they move with them: motors too weak for their load" in finding.message
+
+
+@pytest.mark.parametrize("rows", ["uniform 12 to 40 Hz", "slower and slower"])
+def test_rows_at_12_to_40_hz_are_no_error_of_clocks_and_say_which_times_are_not_known(arm, tmp_path, rows):
+    even = rows.startswith("uniform")
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        time = np.cumsum(1 / (rng.uniform(12, 40, 700) if even else np.linspace(40, 12, 700)))
+        clock, ctrl = 0.005 * np.arange(8000), lowpass(np.repeat(rng.uniform(-1, 1, (40, 2)), 200, axis=0), 0.005, 0.8)
+        at = lambda x, t, clock=clock: np.stack([np.interp(t, clock, c) for c in x.T], axis=1)  # noqa: E731
+        held, state = at(ctrl, np.floor(time / 0.02) * 0.02), at(ctrl, time - 0.06)
+        names = [f"{c}.{j}" for c in ("ctrl", "qpos") for j in arm.joint_names]
+        columns = dict(zip(names, np.concatenate([held, state], axis=1).T, strict=True))
+        (folder / f"m{seed}.csv").write_text(table_text({"time": time} | columns))
+    data = import_logs(folder, arm, "a", 0.0, tmp_path / "data", position_unit="rad", time_unit="s").dataset
+    assert "apart, and shorter delays are not known" in data.entries[0].meta.notes["why_resampled"]
+    diagnosis = Diagnosis.of(data, arm)
+    assert [f.message for f in diagnosis.findings if f.level == "error" or f.check in ("copied", "averaged")] == [
+        "commands come before states"
+    ]
+    assert "cannot be told between such rows" in found(diagnosis, "jitter", "warning").message
 
 
 def test_a_load_that_sags_far_is_not_taken_for_a_stop(arm, tmp_path):

@@ -151,6 +151,9 @@ def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
         f"{', '.join(dict.fromkeys(rows['done'] for _, rows in counts))}; --strict refuses them"
         for channel, counts in implausible.items()
     ]
+    if uneven := [e.meta for e in entries if "why_resampled" in e.meta.notes]:
+        why = f"{uneven[0].notes['rows']}; {uneven[0].notes['why_resampled']}"
+        lines.append(f"{abbreviate([meta.motion for meta in uneven])}: {why}")
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
     where = "not in every recording, taken to stand at home there; [posture] in logs.toml says where"
     return [*lines, f"{abbreviate(lacking)}: {where}"] if lacking else lines

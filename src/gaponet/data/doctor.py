@@ -14,7 +14,7 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.data.checks import CHECKS
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
-from gaponet.data.checks.static_checks import static_checks
+from gaponet.data.checks.static_checks import feedforward, static_checks
 from gaponet.data.checks.survey import Survey, survey_all
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
@@ -98,8 +98,12 @@ def _examine_loads(findings: list[Finding], surveys: list[Survey], robot: RobotS
     if errors:
         text = f"zeros, offsets, gains and payloads are judged by gravity once this is mended: {', '.join(set(errors))}"
         return [Finding("ok", "gravity", text)]
-    result = [*gravity(surveys, robot, model)]
-    return result if any(f.level == "warning" for f in result) else [*result, *static_checks(surveys, robot, model)]
+    result = list[Finding]()
+    for check in (gravity, feedforward, static_checks):
+        result += check(surveys, robot, model)
+        if any(f.level == "warning" for f in result):  # it would cause findings of the next
+            break
+    return result
 
 
 def _sequence_row(s: Survey, robot: RobotSpec) -> dict[str, Any]:

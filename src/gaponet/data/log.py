@@ -13,8 +13,10 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 
+FEEDFORWARD = "feedforward_torque"  # that a controller adds to its PD torque; data.sequence makes it a position
+COMMANDS = ("ctrl", FEEDFORWARD)  # channels that are held between their rows
 # Channel names and their SI units. ctrl is the commanded joint position.
-CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C"}
+CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C", FEEDFORWARD: "N·m"}
 # What others computed from these; kept where a format states it (an exported dataset), never looked for elsewhere.
 DERIVED = {"qacc": "rad/s²", "tau_eq": "N·m"}
 UNITS = {"time": "s"} | CHANNELS | DERIVED
@@ -113,7 +115,8 @@ class Log:
         if back.size:
             raise LogError(
                 f"{self.row(name, int(back[0]) + 1)}: time does not increase in channel {name} "
-                f"({time[back[0]]:.6f} s, then {time[back[0] + 1]:.6f} s); sort the rows or cut the log there"
+                f"({time[back[0]]:.6f} s, then {time[back[0] + 1]:.6f} s); sort the rows or cut the log there "
+                "(--skip-bad does)"
             )
 
     def row(self, name: str, index: int) -> str:

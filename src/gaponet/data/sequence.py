@@ -13,7 +13,7 @@ from annotated_types import Interval
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import Json
-from gaponet.data.log import Log
+from gaponet.data.log import COMMANDS, FEEDFORWARD, Log
 from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
 from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
@@ -241,9 +241,16 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
         "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated",
         "rate_hz": round(1 / median, 3),
         "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
+        "uneven_ms": round(float(np.percentile(np.abs(period - median), 95)) * 1e3, 3),
         "longest_gap_ms": round(float(period.max()) * 1e3, 3),
         "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
     }
+    if not regular:
+        span = f"{1e3 * period.min():.1f} to {1e3 * period.max():.1f} ms"
+        uneven = (
+            "no even period fits its rows" if even else f"its rows lie {span} apart, and shorter delays are not known"
+        )
+        notes["why_resampled"] = uneven if shared else "its channels have clocks of their own"
     posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
     absent = [name for name in robot.joint_names if name not in log.joint_names and name not in posture]
     notes |= ({"posture": posture} if posture else {}) | ({"held_at_home": absent} if absent else {})
@@ -252,6 +259,12 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
     origins = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
     notes["gains"] = origins[0] if origins[0] == origins[1] else f"kp {origins[0]}, kd {origins[1]}"
+    if FEEDFORWARD in arrays:
+        assumed = origins[0] == ASSUMED
+        further = _feedforward_position(arrays.pop(FEEDFORWARD), np.array(gains["kp"]), assumed, log, robot)
+        arrays["ctrl"] = arrays["ctrl"] + further
+        largest = {j: round(float(x), 4) for j, x in zip(robot.joint_names, abs(further).max(axis=0), strict=True) if x}
+        notes |= {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}} if largest else {}
     return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
 
 
@@ -290,7 +303,8 @@ def _median_period(log: Log) -> float:
     if time[-1] - time[0] > MAX_GROWTH * median * len(time):
         raise LogError(
             f"{log.source}: {len(time)} rows lie in bursts over {time[-1] - time[0]:.4g} s: at their median period of "
-            f"{median * 1e3:.3g} ms there would be {(time[-1] - time[0]) / median:.0f}; mend the timestamps"
+            f"{median * 1e3:.3g} ms there would be {(time[-1] - time[0]) / median:.0f}; mend the timestamps, or give "
+            "the rate of even rows (rate in logs.toml, --rate), which replaces the clock"
         )
     stated = log.meta.get("dt", median)
     if abs(stated - median) > 0.1 * stated:
@@ -335,9 +349,23 @@ def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
         grid, near = begin + dt * np.arange(round((stop - begin) / dt) + 1), 0.5
     grid = np.clip(grid, start, stop)
     return {
-        name: resample_zoh(c.time, c.values, grid, near) if name == "ctrl" else resample_linear(c.time, c.values, grid)
+        name: (resample_zoh(c.time, c.values, grid, near) if name in COMMANDS
+               else resample_linear(c.time, c.values, grid))
         for name, c in log.channels.items()
-    }
+    }  # fmt: skip
+
+
+def _feedforward_position(torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec) -> Array:
+    """Return the distance of the command, (T, n) rad, that has the effect of a torque on a PD controller: torque / kp,
+    as kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇. `assumed`: nobody stated kp."""
+    without = torque.any(axis=0) & (assumed | (kp == 0))
+    if lacking := [name for name, x in zip(robot.joint_names, without, strict=True) if x]:
+        raise LogError(
+            f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and kp of {', '.join(lacking)} is "
+            f"{'not stated' if assumed else '0'}; give it in logs.toml (kp), or --kp; leave joints that torque alone "
+            "drives out with ignore"
+        )
+    return torque / np.where(kp > 0, kp, 1.0)
 
 
 def _to_robot(name: str, values: Array, log: Log, robot: RobotSpec) -> Array:

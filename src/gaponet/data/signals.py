@@ -102,6 +102,14 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
     return delay
 
 
+def range_before(values: Array, rows: int) -> Array:
+    """Return the greatest less the least value of each row and those before it, `rows` in all, (T, n)."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    most, least = (f(values, rows, axis=0, origin=(rows - 1) // 2) for f in (maximum_filter1d, minimum_filter1d))
+    return np.asarray(most - least)
+
+
 def fast_speed(ctrl: Array, dt: float) -> Array:
     """Return the 95th percentile of the commanded speed, (T, n) → (n), rad/s."""
     return np.percentile(np.abs(differentiate(ctrl, dt)), 95, axis=0)

@@ -14,6 +14,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
+from gaponet.data.signals import range_before
 
 WINDOW_S = 0.5  # command and state must stand still for this time
 MAX_CTRL_RANGE_RAD = 1e-3  # of the command in the window
@@ -109,16 +110,11 @@ def _window_rows(sequence: Sequence) -> int:
 
 def _ends_of_rest(sequence: Sequence, joints: Array) -> Array:
     """Return the last row of each stretch at rest. Time and memory grow with the rows only, not with the window."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d
-
     w = _window_rows(sequence)
     if len(sequence) < 2 * w:
         return np.zeros(0, int)
     ctrl, state = sequence.ctrl[:, joints], sequence.qpos[:, joints].astype(float)
-    half = w // 2
-    ctrl_range = (maximum_filter1d(ctrl, w, axis=0) - minimum_filter1d(ctrl, w, axis=0))[
-        half : half + len(ctrl) - w + 1
-    ]
+    half, ctrl_range = w // 2, range_before(ctrl, w)[w - 1 :]
     mean = _moving_mean(state, w)  # (T − w + 1, k), of the window that starts at the row
     noise = np.sqrt(np.maximum(_moving_mean(state**2, w) - mean**2, 0))
     halves = _moving_mean(state, half)

@@ -118,7 +118,8 @@ class Dataset:
         path = Path(path)
         with lock_folder(path, KIND):
             if not (path / "dataset.json").is_file():
-                header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": UNITS}
+                units = {channel: UNITS[channel] for channel in ("time", *ARRAYS)}
+                header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": units}
                 write_json(path / "dataset.json", header)
             if not has_stored_robot(path):
                 save_robot(robot.nominal or robot, path / STORED_ROBOT)

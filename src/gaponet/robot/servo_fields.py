@@ -90,7 +90,7 @@ SERVO_FIELDS: dict[str, ServoField] = {
     field.name: field
     for field in (
         ServoField("kp", "N·m/rad", "kp, N·m/rad", default=None, axis="log", prior_std=0.5,
-                   advice="check its unit (N·m/rad) and the stated payload"),
+                   advice="check its unit (N·m/rad), the stated payload, and torques fed forward"),
         ServoField("kd", "N·m·s/rad", "kd, N·m·s/rad", default=None),
         ServoField("damping", "N·m·s/rad", "damping, N·m·s/rad", default=math.nan, axis="over kp",
                    bounds=(0.0, 1.0, 0.015), prior_std=0.05,

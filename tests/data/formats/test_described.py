@@ -1,7 +1,9 @@
 """logs.toml: patterns, units, signs, clocks, names of recordings, sheets; and the one that --guess writes."""
 
 import json
+import re
 
+import mujoco
 import numpy as np
 import pytest
 from logs import arm_columns, table_text, wave
@@ -11,8 +13,10 @@ from gaponet.cli.main import main
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.describe.joints import resolve_all
 from gaponet.data.formats import detect, look, read_logs
+from gaponet.data.importer import import_logs
 from gaponet.data.log import skip_bad_rows
 from gaponet.data.store import Dataset
+from gaponet.sim.model import build_model
 
 UNITS = 'time_unit = "s"\nposition_unit = "rad"\n'
 
@@ -231,3 +235,93 @@ def test_a_channel_may_have_a_clock_of_its_own(tmp_path, arm):
     folder = write(tmp_path / "logs", NAMES + '[clock]\nctrl = "t_cmd"\n', columns=columns)
     ((_, log),) = read_logs(folder, arm)
     assert log.channels["ctrl"].time[0] - log.channels["qpos"].time[0] == pytest.approx(0.007)
+
+
+TORQUES = np.stack([np.linspace(0, 3, 60), np.full(60, -1.0)], axis=1)  # N·m fed forward to shoulder and elbow
+FED = theirs() | {"tau_ff_shoulder": TORQUES[:, 0], "tau_ff_elbow": TORQUES[:, 1]}
+
+
+def fed_command(folder, arm, toml, **stated):
+    """The command of a recording with TORQUES, (60, 2)."""
+    folder = write(folder, NAMES + toml, columns=FED)
+    made = import_logs(folder, arm, "a", 0.0, folder.parent / f"{folder.name}_data", **stated)
+    return made.dataset.read(made.dataset.entries[0]), np.stack([FED["shoulder_des"], FED["elbow_des"]], axis=1)
+
+
+@pytest.mark.parametrize(
+    "toml",
+    [
+        'feedforward_torque = "tau_ff_{joint}"\n',
+        "[columns]\n" + "".join(f'"feedforward_torque.{j}" = "tau_ff_{j}"\n' for j in ("shoulder", "elbow")),
+    ],
+)
+def test_a_feedforward_torque_is_the_position_command_by_which_a_pd_servo_gives_it(tmp_path, arm, toml):
+    sequence, command = fed_command(tmp_path / "logs", arm, "kp = 10.0\n" + toml)
+    assert np.allclose(sequence.ctrl, command + TORQUES / 10, atol=1e-6)
+    assert sequence.meta.notes["feedforward_torque"]["largest_rad"] == {"shoulder": 0.3, "elbow": 0.1}
+    sequence, _ = fed_command(tmp_path / "unused", arm, "kp = 10.0\n")
+    assert np.allclose(sequence.ctrl, command, atol=1e-6)
+    assert "feedforward_torque" not in sequence.meta.notes
+
+
+def test_a_simulated_pd_servo_does_the_same_with_the_torque_as_with_the_equivalent_command(arm):
+    model, rows = build_model(arm), 300
+    torque, states = np.array([0.8, -0.3]), []
+    for further, force in ((torque / arm.kp, 0.0), (0.0, torque)):
+        data = mujoco.MjData(model)
+        data.qfrc_applied[:] = force
+        for t in range(rows):
+            data.ctrl[:] = further + 0.3 * np.sin(0.03 * t)
+            mujoco.mj_step(model, data)
+        states.append(data.qpos.copy())
+    assert np.allclose(*states, atol=1e-9)
+    assert abs(states[0]).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        ('feedforward_torque = "tau_ff_{joint}"\n', "kp of shoulder, elbow is not stated; give it in logs.toml"),
+        (
+            'feedforward_torque = "tau_ff_{joint}"\nkp = { shoulder = 5.0, elbow = 0.0 }\n',
+            "kp of elbow is 0; give it in logs.toml",
+        ),
+        ('feedforward_torque = "tau_{joint}_ff"\nkp = 5.0\n', "no column holds feedforward_torque; there are: t, "),
+    ],
+)
+def test_a_feedforward_torque_without_gain_or_column_is_refused(tmp_path, arm, toml, message):
+    with pytest.raises(LogError, match=re.escape(message)):
+        fed_command(tmp_path / "logs", arm, toml)
+
+
+def test_a_feedforward_torque_of_zero_needs_no_gain(tmp_path, arm):
+    columns = theirs() | {f"feedforward_torque.{j}": np.zeros(60) for j in arm.joint_names}
+    made = import_logs(write(tmp_path / "logs", NAMES, columns=columns), arm, "a", 0.0, tmp_path / "data")
+    assert np.allclose(made.dataset.read(made.dataset.entries[0]).ctrl[:, 1], columns["elbow_des"], atol=1e-6)
+
+
+def test_the_guess_sees_a_feedforward_torque_and_not_the_measured_one(tmp_path, arm):
+    folder = write(tmp_path / "logs", "", columns=FED | {"tau_shoulder": TORQUES[:, 0], "tau_elbow": TORQUES[:, 1]})
+    (folder / "logs.toml").unlink()
+    fmt, logs, recordings = look(folder)
+    text = guess_logs(recordings, arm, fmt, dict(logs))
+    assert 'feedforward_torque = "tau_ff_{joint}"' in text
+    assert 'tau = "tau_{joint}"' in text
+    (folder / "logs.toml").write_text(text)
+    ((_, log),) = read_logs(folder, arm)
+    assert np.array_equal(log.channels["feedforward_torque"].values, TORQUES)
+
+
+def test_a_feedforward_torque_in_the_file_of_the_commands_has_their_clock(tmp_path, arm):
+    columns = theirs()
+    states = {name: columns[name] for name in ("t", "shoulder_pos", "elbow_pos")}
+    commands = {"t": columns["t"] + 0.01} | {name: FED[name] for name in FED if "_des" in name or "_ff_" in name}
+    folder = write(
+        tmp_path / "logs",
+        NAMES + 'command_file = "{name}_cmd.csv"\nfeedforward_torque = "tau_ff_{joint}"\n',
+        columns=states,
+    )
+    (folder / "wave_cmd.csv").write_text(table_text(commands))
+    ((_, log),) = read_logs(folder, arm)
+    assert np.array_equal(log.channels["feedforward_torque"].values, TORQUES)
+    assert np.array_equal(log.channels["feedforward_torque"].time, log.channels["ctrl"].time)

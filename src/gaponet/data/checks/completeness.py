@@ -47,6 +47,8 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     level = "ok" if max(jitter) <= MAX_JITTER[0] else "note" if max(jitter) <= MAX_JITTER[1] else "warning"
     where = f" ({worst.motion})" if worst.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
+    if level == "warning" and (unknown := 2 * max(s.uneven_ms for s in surveys)):
+        text += f". Delays shorter than {unknown:.0f} ms cannot be told between such rows; log at an even rate"
     yield Finding(level, "jitter", text, values={"jitter_ms": worst.jitter_ms})
     longest = max(surveys, key=lambda s: s.longest_gap_ms)
     gaps = [s for s in surveys if s.missing_samples]
@@ -145,8 +147,7 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     rows = sum(int(t.over_limit.sum()) for _, t in over)
     text = (
         f"torque beyond the limit of robot.toml in {rows} rows of {_motions([s for s, _ in over])}; worst "
-        f"{worst[i]:.2f} N·m on {robot.joint_names[i]} (limit {robot.effort_limit[i]:.2f}): a collision, a spike or a "
-        "wrong limit"
+        f"{worst[i]:.2f} N·m on {robot.joint_names[i]} (limit {robot.effort_limit[i]:.2f}): a collision, a spike?"
     )
     yield Finding("warning", "saturation", text, (robot.joint_names[i],), {"rows": rows, "worst": float(worst[i])})
 
@@ -160,8 +161,7 @@ def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Ite
         if top > MIN_FLAT_SHARE * robot.effort_limit[i] and rows >= MIN_FLAT_ROWS:
             text = (
                 f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of {_motions([s for s, _ in near])}:"
-                f" the motor or its driver gives no more. Write effort_limit = {top:.3g} in robot.toml, or leave these "
-                "out"
+                f" the motor or its driver gives no more. Write effort_limit = {top:.3g} in robot.toml, or cut these"
             )
             yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
 
@@ -181,9 +181,8 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     worst, name = max(coarse)
     text = (
         f"positions of {abbreviate([name for _, name in coarse])} come in steps of up to {worst * 1e3:.1f} mrad "
-        f"({name}): "
-        "rounded when logged, or a coarse encoder (12 bits: 1.5 mrad). No error below half of that can be seen; log "
-        "more digits"
+        f"({name}): rounded when logged, or a coarse encoder (12 bits: 1.5 mrad). No error below half of that can be "
+        "seen; log more digits"
     )
     level = "warning" if worst > 2 * MAX_RESOLUTION_RAD else "note"
     yield Finding(level, "resolution", text, tuple(name for _, name in coarse), {"step": worst})

@@ -126,10 +126,7 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         text = f"torque of {', '.join(constant)} never changes; ignore it"
         yield Finding("warning", "torque", text, constant)
     if unsigned:
-        text = (
-            "torque is unsigned (never negative, though joints move both ways): a magnitude of the current, not a "
-            "torque; do not fit it"
-        )
+        text = "torque is unsigned (never negative, though joints move both ways): a current's magnitude; do not fit it"
         yield Finding("warning", "torque", text, unsigned)
     if spiky := [(s, t) for s, t in recorded if t.spikes.any()]:
         height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])  # (sequences, n) N·m

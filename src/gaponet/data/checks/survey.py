@@ -26,6 +26,7 @@ from gaponet.data.signals import (
     estimate_delay,
     fast_speed,
     lowpass,
+    range_before,
 )  # fmt: skip
 from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import Dataset, Entry
@@ -39,6 +40,7 @@ REPEATED_COMMAND_RAD = 0.1  # the command must move by this while the state repe
 SLOPE_MIN_RANGE_RAD = 0.2  # of the command; below, sag and stiction decide the slope
 SLOW_HZ = 0.3  # faster, a servo's resonance changes the slope
 GRAVITY_SAMPLES, SLOW_RAD_S = 60, 0.5  # rows in which torque is compared with gravity, and the highest speed there
+HOLD_S, HELD_COMMAND_RAD = 0.4, 2e-3  # time and range of a command that stands still
 TORQUE_TOLERANCE = 0.05  # share of the torque limit by which a reading may exceed it
 EQUAL_RAD = 1e-5  # command and state that differ by less are one signal
 JUMP_RAD, JUMP_RAD_S2 = 0.1, 1000.0  # distance from the line between the neighbouring rows that no joint reaches
@@ -72,8 +74,9 @@ class Survey:
 
     entry: Entry
     samples: str  # hash of command and state alone, without unit and payload
-    rate_hz: float  # from the state's timestamps, like the two below
+    rate_hz: float  # from the state's timestamps, like the three below
     jitter_ms: float  # largest deviation of a period from the median
+    uneven_ms: float  # 95th percentile of these deviations
     longest_gap_ms: float
     ctrl_limits: Array  # least and greatest, (n, 2) rad
     qpos_limits: Array
@@ -102,6 +105,8 @@ class Survey:
     velocity_correlation: Array  # of the command with the measured velocity, (n)
     torque_correlation: Array  # of the command with the measured torque, (n)
     gravity_samples: Array | None  # positions and torques in slow rows, (2, k, n); None if no torque was recorded
+    holds: Array | None  # of single joints that rest under a constant command: joint, command − position (rad), torque,
+    # and positions of all joints, (k, 3 + n); None if no torque was recorded
 
     @property
     def motion(self) -> str:
@@ -135,6 +140,7 @@ class Survey:
             samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
             rate_hz=float(notes.get("rate_hz", 1 / dt)),
             jitter_ms=float(notes.get("jitter_ms", 0.0)),
+            uneven_ms=float(notes.get("uneven_ms", 0.0)),
             longest_gap_ms=float(notes.get("longest_gap_ms", dt * 1e3)),
             ctrl_limits=np.stack([ctrl.min(axis=0), ctrl.max(axis=0)], axis=1),
             qpos_limits=np.stack([qpos.min(axis=0), qpos.max(axis=0)], axis=1),
@@ -160,6 +166,7 @@ class Survey:
             spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]).astype(np.float32),
             **_kind_of_command(sequence),
             gravity_samples=_gravity_samples(sequence),
+            holds=_holds(sequence),
         )
 
 
@@ -308,6 +315,19 @@ def _gravity_samples(sequence: Sequence) -> Array | None:
     slow = np.flatnonzero((np.abs(sequence.qvel) < SLOW_RAD_S).all(axis=1))
     rows = slow[:: max(1, len(slow) // GRAVITY_SAMPLES)]
     return np.stack([sequence.qpos[rows], sequence.tau[rows]])
+
+
+def _holds(sequence: Sequence) -> Array | None:
+    if sequence.tau is None:
+        return None
+    rows, least = max(2, round(HOLD_S / sequence.dt)), HOLD_S / 2 / sequence.dt
+    rests = range_before(sequence.ctrl, rows) < HELD_COMMAND_RAD
+    rests &= range_before(sequence.qpos, max(2, rows // 4)) < STANDSTILL_RAD
+    rests[:rows] = False
+    stretches = [(j, run) for j, mask in enumerate(rests.T) for run in _runs(mask) if run.stop - run.start > least]
+    means = [[x[run].mean(axis=0) for x in (sequence.ctrl, sequence.qpos, sequence.tau)] for _, run in stretches]
+    holds = [[j, ctrl[j] - qpos[j], tau[j], *qpos] for (j, _), (ctrl, qpos, tau) in zip(stretches, means, strict=True)]
+    return np.reshape(holds, (-1, 3 + rests.shape[1])).astype(float)
 
 
 def _qvel_ratio(sequence: Sequence) -> Array:

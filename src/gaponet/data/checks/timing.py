@@ -17,6 +17,7 @@ from gaponet.robot.spec import RobotSpec
 MAX_ITERATIONS = 6  # of estimating shifts and the common response in turn
 MIN_RECORDINGS = 4  # from which one of them can be compared with the others
 MIN_SHIFT_S, SHIFT_SCATTERS = 0.012, 4.0  # by which a recording follows later than the others; times their scatter
+UNEVEN_ROWS_SHARE = 2.0  # of the unevenness of rows: a command may be that late, and an interpolated state that early
 MIN_LEAD_S = 0.015  # by which joints begin to move before their commands
 MIN_EARLY_RATIO = 1.08  # unexplained motion without future commands over that with them, if joints move before them
 MAX_DEAD_TIME_S, MAX_EXTRA_LAG_S = 0.1, 0.05  # of all joints; of one joint beyond the others
@@ -36,7 +37,8 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     comparable = [s for s in surveys if s.response.step == step]
     # Across a gap states are interpolated: they begin to move before anything was measured.
     complete = [s for s in comparable if not s.missing_samples] or comparable
-    findings = [*_late_recordings(comparable)]
+    unknown = max(s.uneven_ms for s in complete) * UNEVEN_ROWS_SHARE / 1e3  # s
+    findings = [*_late_recordings(comparable, unknown)]
     odd = {recording for f in findings for recording in f.values["recordings"]}
     common = Response.common([s.response for s in complete], [s.entry.id not in odd for s in complete])
     known = np.isfinite(common.onset)
@@ -44,7 +46,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if known.any() and np.median(common.early[known]) < MIN_EARLY_RATIO:
         onset = max(onset, 0.0)
     error = MIN_DRIFT_ERRORS * _standard_error(common.onset - onset)
-    if onset < -MIN_LEAD_S - step or onset < -max(MIN_LEAD_S / 3, step, error):
+    if onset < -unknown - MIN_LEAD_S - step or onset < -unknown - max(MIN_LEAD_S / 3, step, error):
         text = (
             f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and state swapped, or are "
             "their clocks apart? Shift one of them at import"
@@ -61,11 +63,11 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
             )
             findings.append(Finding("warning", "lag", text, (name,), {"extra_s": float(extra)}))
-    findings += _drift(complete, common.shifts)
+    findings += _drift(complete, common.shifts, unknown)
     commanded, moved = np.mean([s.spectra for s in complete], axis=0)
     width, depth = _averaging(moved)
     # Steps at a regular pace have notches too.
-    if depth > MIN_NOTCH_DEPTH and _averaging(commanded, np.array([width]))[1] < depth / 3:
+    if depth > MIN_NOTCH_DEPTH and unknown < step and _averaging(commanded, np.array([width]))[1] < depth / 3:
         text = (
             f"states never move at the multiples of {1 / width:.1f} Hz, as averages over {width * 1e3:.0f} ms: log the "
             "encoder itself; what is averaged is late, and fast motions are lost"
@@ -96,13 +98,13 @@ def _shifts(responses: list[Response]) -> Array:
     return shifts + np.nan_to_num(more)
 
 
-def _late_recordings(surveys: list[Survey]) -> Iterator[Finding]:
+def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]:
     shifts = _shifts([s.response for s in surveys])
     if np.isfinite(shifts).sum() < MIN_RECORDINGS:
         return
     shifts = shifts - np.nanmedian(shifts)
     scatter = max(1.48 * float(np.nanmedian(np.abs(shifts))), 1e-3)
-    limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter)
+    limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter, unknown)
     far = [(s, late) for s, late in zip(surveys, shifts.tolist(), strict=True) if abs(late) > limit]
     for word, group in (("later", [f for f in far if f[1] > 0]), ("sooner", [f for f in far if f[1] < 0])):
         single = len(group) < MIN_RECORDINGS
@@ -112,15 +114,14 @@ def _late_recordings(surveys: list[Survey]) -> Iterator[Finding]:
             by = f"{ms[0]:.0f} ms" if single else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
             text = (
                 f"{abbreviate(labels)} {'follows its' if single else 'follow their'} commands {by} {word} than the "
-                "other "
-                "recordings: clocks of command and state that are apart, another servo, or friction in slow motions; "
-                "leave them out if it is the clocks"
+                "other recordings: clocks of command and state that are apart, another servo, or friction in slow "
+                "motions; leave them out if it is the clocks"
             )
             values = {"recordings": [s.entry.id for s, _ in part], "late_s": [late for _, late in part]}
             yield Finding("warning", "lag", text, (), values)
 
 
-def _drift(surveys: list[Survey], shifts: Array) -> Iterator[Finding]:
+def _drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterator[Finding]:
     """Find a clock drift from the shifts (recordings, parts) s of the parts of each recording."""
     duration = np.array([s.response.duration for s in surveys])
     long = duration >= MIN_DRIFT_DURATION_S  # in shorter recordings friction changes the shift
@@ -133,7 +134,7 @@ def _drift(surveys: list[Survey], shifts: Array) -> Iterator[Finding]:
     drift = float(np.median(slope))
     resolution = 2e-3 / float(between.max()) / np.sqrt(len(slope))
     error = max(MOTION_SHARE * _standard_error(slope - drift), _standard_error(curvature), resolution)
-    if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error):
+    if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error, unknown / float(between.max())):
         text = (
             f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
             f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; log them with one"

@@ -18,6 +18,7 @@ SLOPE_BOUNDS = (0.5, 1.25)  # a loaded joint falls short of its command, or pass
 MAX_OWN_CORRELATION, MIN_OTHER_CORRELATION, MIN_MOTIONS = 0.8, 0.95, 3  # of a swap that shows in several motions
 MAX_DISTANCE = 0.7  # of positions from position commands, in standard deviations of the positions
 MIN_KIND_CORRELATION = 0.7  # of the command with what else it may be
+MIN_FOLLOWING = 0.75  # correlation of velocities, from which commands are positions that a weak motor does not reach
 RATIO_BOUNDS = (0.03, 10.0)  # measured over commanded range; between 0.03 and 0.1 a joint may be stuck
 QVEL_RATIO_BOUNDS = (0.5, 2.0)
 MIN_WIDEST_COMMAND_RAD = 0.12
@@ -84,10 +85,16 @@ def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     best = max(correlation, key=lambda kind: np.nan_to_num(correlation[kind]))
     kind = f"they are most like {best} (correlation {correlation[best]:.2f})"
     kind = kind if correlation[best] > MIN_KIND_CORRELATION else "are they torques?"
-    text = (
-        f"states are {np.median(distance[judged]):.2f} times as far from their commands as from their own mean: these "
-        f"are no position targets; {kind}. Log the targets of the position controller"
-    )
+    text = f"states are {np.median(distance[judged]):.2f} times as far from their commands as from their own mean"
+    follows = np.stack([np.diag(s.follows) for s in surveys])[:, robot.operated_index]
+    if (
+        max(np.nan_to_num(list(correlation.values()))) < MIN_KIND_CORRELATION
+        and np.median(follows[judged]) > MIN_FOLLOWING
+    ):
+        text += ", though they move with them: motors too weak for their load, or a wrong kp; check payload and kp"
+        yield Finding("warning", "command", text, (), correlation)
+        return
+    text += f": these are no position targets; {kind}. Log the targets of the position controller"
     yield Finding("error", "command", text, (), correlation)
 
 

@@ -12,10 +12,12 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError
 from gaponet.data.describe.raw_recording import SECONDS, RawRecording
+from gaponet.data.log import FEEDFORWARD
 from gaponet.robot.spec import RobotSpec
 
 # Words by which the world calls them; a name with a word of an earlier line is not looked for in a later one.
 WORDS = {
+    FEEDFORWARD: ("ff", "feedforward", "ffwd"),
     "ctrl": ("ctrl", "cmd", "command", "commanded", "des", "desired", "target", "goal", "ref", "reference", "action",
              "setpoint", "sp"),
     "qvel": ("qvel", "vel", "velocity", "velocities", "dq", "qd", "speed", "dof_vel"),
@@ -72,8 +74,9 @@ def _tokens(name: str) -> list[str]:
 def _kind(name: str) -> str | None:
     """Which channel a name speaks of; of a command's, positions only."""
     matches = [channel for channel, words in WORDS.items() if any(w in words for w in _tokens(name))]
-    if matches and matches[0] == "ctrl" and any(c in matches for c in NOT_POSITIONS):
-        return None  # a commanded velocity or torque
+    excluded = {"ctrl": NOT_POSITIONS, FEEDFORWARD: ("qpos", "qvel", "temperature")}.get(matches[0] if matches else "")
+    if excluded and any(c in matches for c in excluded):
+        return None  # a commanded velocity or torque; a feed-forward of something else
     return matches[0] if matches else None
 
 
@@ -158,11 +161,12 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     if clock is None:
         own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
         return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
-    period = float(np.median(np.diff(recording.load([clock])[clock].values[:ROWS])))
+    low, period, high = np.percentile(np.diff(recording.load([clock])[clock].values[:ROWS]), [5, 50, 95])
     units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
     unit = units[0] if units else "s"
     lines = [] if clock == "time" else [f"time = {_text(clock)}"]
-    return [*lines, f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s']
+    uneven = f"; uneven: {low * SECONDS[unit]:.3g} to {high * SECONDS[unit]:.3g} s" if high - low > 0.2 * period else ""
+    return [*lines, f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s{uneven}']
 
 
 def _values(recording: RawRecording, pattern: str) -> Array | None:

@@ -57,6 +57,7 @@ class LogsFile(TypedDict, total=False):
     qvel: Text
     tau: Text
     temperature: Text
+    feedforward_torque: Text  # N·m that the controller added to its PD torque
     command_file: Text  # where commands lie in a file beside the state's: "{name}_cmd.csv"
     header: Annotated[list[str], Len(1, 2000)]  # names of the columns of a table that has none
     joints: Annotated[list[str], Len(1, 500)]  # of the columns of an array that does not name them, in its order

@@ -10,7 +10,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
-from gaponet.data.log import UNITS, Channel, Log
+from gaponet.data.log import FEEDFORWARD, UNITS, Channel, Log
 from gaponet.robot.spec import RobotSpec
 
 # Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics make of noise.
@@ -64,7 +64,7 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
             require_radians(values, log.joint_names, robot, partial(_place, log, name))
             continue
         wrong = _nonsense(name, log, robot)
-        if strict and wrong.any():
+        if (strict or name == FEEDFORWARD) and wrong.any():  # commands are never made up
             row, column = np.argwhere(wrong)[0]
             raise LogError(
                 f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is {values[row, column]:.4g} "
@@ -90,7 +90,7 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
 def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
     """Where a channel holds what no joint does, (k, n)."""
     values = np.abs(log.channels[name].values)
-    if name == "tau":
+    if name in ("tau", FEEDFORWARD):
         return np.asarray(values > np.maximum(20 * robot.effort_limit[robot.index(log.joint_names)], 100.0))
     if name != "qvel":
         return values > MOST[name]

@@ -18,7 +18,7 @@ from gaponet.base.structure import validated
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
-from gaponet.data.log import CHANNELS, DERIVED, REQUIRED, Channel, Log
+from gaponet.data.log import CHANNELS, COMMANDS, DERIVED, FEEDFORWARD, REQUIRED, Channel, Log
 from gaponet.data.sequence import SequenceMeta
 from gaponet.robot.spec import LOG_UNITS, RobotSpec
 
@@ -117,8 +117,10 @@ class RawRecording:
 
     def to_log(self, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None) -> Log:
         """The columns that `specified` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
-        specified = self.default | specified
+        given, specified = specified, self.default | specified
         chosen = _choose(self, robot, specified, joint_map)
+        if FEEDFORWARD in given and FEEDFORWARD not in chosen:
+            raise LogError(f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: {self.shown()}")
         units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
         clocks = {channel: specified.get("clock", {}).get(channel) or specified.get("time") for channel in chosen}
         gains = {name: _gain_columns(self, specified, name, chosen["ctrl"]) for name in ("kp", "kd")}
@@ -247,7 +249,7 @@ def _matching(recording: RawRecording, specified: LogsFile, channel: str, taken:
     return [
         (m["joint"], column)
         for column in recording.columns
-        if column not in taken and (m := mine.fullmatch(column)) and column.startswith(COMMAND) <= (channel == "ctrl")
+        if column not in taken and (m := mine.fullmatch(column)) and column.startswith(COMMAND) <= (channel in COMMANDS)
         and not any(other.fullmatch(column) for other in others)
     ]  # fmt: skip
 

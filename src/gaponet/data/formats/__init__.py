@@ -38,7 +38,7 @@ from gaponet.base.errors import LogError, UsageError
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.plausibility import require_plausible
 from gaponet.data.describe.raw_recording import COMMAND, RawRecording
-from gaponet.data.log import Channel, Log, skipped_rows
+from gaponet.data.log import COMMANDS, Channel, Log, skipped_rows
 from gaponet.plugins import attempt
 from gaponet.robot.spec import RobotSpec
 
@@ -223,7 +223,8 @@ def _loaders(
     recordings = _recordings(reader, path, specified)
     if "command_file" in specified:
         full = _defaults(reader) | specified
-        specified = cast("LogsFile", specified | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
+        beside = {c: COMMAND + str(full.get(c, "")) for c in COMMANDS if c == "ctrl" or c in specified}
+        specified = cast("LogsFile", specified | beside | {"clock": _beside_clock(full, tuple(beside))})
         recordings = _with_commands(list(recordings), specified["command_file"])
     for recording in recordings:
         yield recording.name, partial(recording.to_log, robot, specified, names or None)
@@ -251,11 +252,11 @@ def _with_commands(recordings: list[RawRecording], pattern: str) -> Iterator[Raw
         yield recording.beside(by_file[wanted[recording.source]])
 
 
-def _beside_clock(specified: LogsFile) -> dict[str, str]:
+def _beside_clock(specified: LogsFile, commands: tuple[str, ...]) -> dict[str, str]:
     """Commands in a file of their own have the clock of that file."""
     clock = specified.get("clock", {})
     mine = clock.get("ctrl") or specified.get("time")
-    return clock | ({"ctrl": COMMAND + mine} if mine else {})
+    return clock | (dict.fromkeys(commands, COMMAND + mine) if mine else {})
 
 
 def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str, str]) -> Log:

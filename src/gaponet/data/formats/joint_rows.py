@@ -53,7 +53,7 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> RawRe
         counts = ", ".join(f"{name} {len(rows)}" for name, rows in zip(joints, order, strict=True))
         raise LogError(f"{file}: joints have different times ({counts} rows); write every joint at every time")
     used = {n for n in names if n in logs.values() or not table.column(n).null_count} - {joint, time}
-    numbers = [n for n in names if n in used and _is_number(table.column(n).type)]
+    numbers = [n for n in names if n in used and is_number(table.column(n).type)]
     arrays = {n: np.stack([_numbers(file, table, n)[rows] for rows in order], axis=1) for n in numbers}
     recording = RawRecording.of_arrays(file, {time: stamps[order[0]]} | arrays, joints, default={"time": time})
     return replace(recording, where=f"{file}:1")
@@ -76,7 +76,8 @@ def _table(file: Path, names: list[str]) -> pa.Table:
         raise LogError(f"{file}: not a readable CSV file ({error}); export it again") from None
 
 
-def _is_number(kind: pa.DataType) -> bool:
+def is_number(kind: pa.DataType) -> bool:
+    """Return True for integers and floating-point numbers."""
     import pyarrow as pa
 
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
@@ -84,6 +85,6 @@ def _is_number(kind: pa.DataType) -> bool:
 
 def _numbers(file: Path, table: pa.Table, name: str) -> Array:
     column = table.column(name)
-    if not _is_number(column.type) or column.null_count:
+    if not is_number(column.type) or column.null_count:
         raise LogError(f"{file}: column '{name}' holds cells that are no numbers; repair or cut these rows")
     return np.asarray(column.to_numpy(), float)

@@ -95,6 +95,7 @@ def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
         gain = commands[0].rpartition(".")[0]
         if f"{gain}.kp" in signals:
             specified["kp"], specified["kd"] = f"{gain}.kp", f"{gain}.kd"
+            specified |= {"feedforward_torque": f"{gain}.tau"} if f"{gain}.tau" in signals else {}
     return specified
 
 

@@ -189,13 +189,11 @@ def _parquet_header(file: Path) -> list[str]:
 
 def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
     """{column: (k,)}; an empty cell is refused with its row, counted from 1."""
-    import pyarrow as pa
-
     table = parquet.read(file, wanted)
     data: dict[str, Signal] = {}
     for name in wanted:
         column = table.column(name)
-        if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+        if not joint_rows.is_number(column.type):
             raise LogError(f"{file}: column '{name}' is {column.type}, not numbers; export it as float64")
         if column.null_count and skipped_rows() is None:
             row = int(column.is_null().to_numpy().argmax()) + 1
