@@ -338,9 +338,7 @@ def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoT
     types = {servo.name: servo for servo in (*servo_table().servo, *own)}
     if name not in types:
         near = " or ".join(difflib.get_close_matches(name, types, n=MAX_SUGGESTIONS, cutoff=0.0))
-        raise RobotError(
-            f"{where}: servo '{name}' is no servo type; nearest: {near}; see gaponet robot servos, or add a [[servo]]"
-        )
+        raise RobotError(f"{where}: servo '{name}' is no [[servo]], nor in gaponet robot servos; nearest: {near}")
     return types[name]
 
 

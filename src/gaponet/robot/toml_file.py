@@ -41,15 +41,9 @@ class Spread:
             raise RobotError(f"value {self.value:g} must lie from low {self.low:g} to high {self.high:g}")
 
 
-Measured = Spread | Gain | None
-
-
 @dataclass(frozen=True)
 class ServoType:
-    """[[servo]]: servo type that joints refer to; in servos.toml, or in a robot.toml, whose types come first.
-
-    Damping is what a joint has beside the kd that its controller states; below zero the servo acts with less kd.
-    """
+    """[[servo]]: servo type that joints refer to; in servos.toml, or in a robot.toml, whose types come first."""
 
     name: Name
     variant: str = ""  # gear, supply, place
@@ -63,12 +57,12 @@ class ServoType:
     effort_limit: Gain | None = None  # N·m
     speed_limit: Gain | None = None  # rad/s
     limit_source: str = ""
-    damping: Measured = None  # N·m·s/rad
-    frictionloss: Measured = None  # N·m
-    armature: Measured = None  # kg·m²
-    stribeck: Measured = None  # N·m
-    stribeck_speed: Measured = None  # rad/s
-    friction_motor: Measured = None  # N·m per N·m of the motor
+    damping: Spread | Gain | None = None  # N·m·s/rad beside the stated kd; below 0 the servo acts with less kd
+    frictionloss: Spread | Gain | None = None  # N·m
+    armature: Spread | Gain | None = None  # kg·m²
+    stribeck: Spread | Gain | None = None  # N·m
+    stribeck_speed: Spread | Gain | None = None  # rad/s
+    friction_motor: Spread | Gain | None = None  # N·m per N·m of the motor
 
     @property
     def measured(self) -> dict[str, Spread]:

@@ -111,8 +111,8 @@ def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list
         same = [joint for joint in joints if joint[0].name == servo.name]
         spreads = {f: _spread(f, [values[f] for *_, values in same if f in values]) for f in MEASURED_FIELDS}
         count = len(set().union(*(units for _, units, _ in same)))
-        own = replace(servo, source=source, licence=licence, gaponet=__version__, robots=count, joints=len(same))
-        types.append(replace(own, **spreads))
+        origin = {"source": source, "licence": licence, "gaponet": __version__, "robots": count, "joints": len(same)}
+        types.append(replace(servo, **origin, **spreads))
     return types
 
 
