@@ -1,4 +1,4 @@
-"""gaponet robot new, check, list, link, show."""
+"""gaponet robot new, check, list, link, show, servos."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Sequence as ListOf
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -109,10 +110,10 @@ def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list
     types = []
     for servo in {servo.name: servo for servo, *_ in joints}.values():
         same = [joint for joint in joints if joint[0].name == servo.name]
-        spreads = {f: _spread(f, [values[f] for *_, values in same if f in values]) for f in MEASURED_FIELDS}
-        count = len(set().union(*(units for _, units, _ in same)))
-        origin = {"source": source, "licence": licence, "gaponet": __version__, "robots": count, "joints": len(same)}
-        types.append(replace(servo, **origin, **spreads))
+        estimates = {f: [values[f] for *_, values in same if f in values] for f in MEASURED_FIELDS}
+        new: dict[str, Any] = {f: _spread(f, values) for f, values in estimates.items()}
+        new |= {"source": source, "licence": licence, "gaponet": __version__, "joints": len(same)}
+        types.append(replace(servo, **new, robots=len(set().union(*(units for _, units, _ in same)))))
     return types
 
 
