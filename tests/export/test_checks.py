@@ -64,22 +64,22 @@ def test_late_servos_with_a_law_move_there_as_here_in_worlds_that_begin_anew_by_
         assert abs(float(there) - float(here)) <= 0.05 * float(here) + 0.05
 
 
-def test_a_drawn_unit_moves_in_mjlab_as_in_gaponet(exported: Path, tmp_path: Path) -> None:
-    check, rng = Check(exported / "mjlab"), np.random.default_rng(0)
-    joints, facts = check.facts["corrected"], check.facts["joints"]
-    fields = ("kp", "damping", "frictionloss", "armature", "offset", "effort_limit", *SERVO_TERMS)
-    now = {f: np.array([facts[j][f] for j in joints]) for f in fields}
+@pytest.mark.parametrize("name", ["mjlab-1.6", "isaaclab-3"])
+def test_a_drawn_unit_moves_in_an_engine_as_in_gaponet(exported: Path, tmp_path: Path, name: str) -> None:
+    to, script, version, packages = ENGINES[name]
+    check, rng = Check(exported / to), np.random.default_rng(0)
+    joints, servos = check.facts["corrected"], check.facts["joints" if to == "mjlab" else "plain"]
+    fields = ("kp", "damping", "frictionloss", "armature", "offset", "effort_limit", "delay", *SERVO_TERMS)
+    now = {f: np.array([servos[j][f] for j in joints]) for f in fields if f in servos[joints[0]]}
     units = {f: (x * rng.uniform(0.6, 1.6, (3, len(joints)))).tolist() for f, x in now.items()}
+    if to == "mjlab":  # it keeps the delays
+        units["delay"] = [now["delay"].tolist()] * 3
     file = tmp_path / "randomization.json"
     file.write_text(json.dumps({"joints": joints, "units": units}))
-    name = "mjlab-1.6"
-    _, script, version, packages = ENGINES[name]
     python = environment(name, version, *((package,) for package in packages))
     command = [python, script, str(file), "2"]
-    said = subprocess.run(command, cwd=exported / "mjlab", capture_output=True, text=True, check=True).stdout
-    unit = load_robot("so101").with_servos({
-        j: {f: units[f][2][i] for f in fields} | {"delay": facts[j]["delay"]} for i, j in enumerate(joints)
-    })  # fmt: skip
+    said = subprocess.run(command, cwd=exported / to, capture_output=True, text=True, check=True).stdout
+    unit = load_robot("so101").with_servos({j: {f: x[2][i] for f, x in units.items()} for i, j in enumerate(joints)})
     meta = SequenceMeta(unit.name, "itself", "m", 0.0, virtual=True)
     motions = [Sequence(meta, unit.joint_names, float(m["dt"]), m["ctrl"], m["qpos"], m["qvel"]) for m in check.motions]
     here = 1e3 * rollout_error(motions, unit)

@@ -312,7 +312,7 @@ def test_isaac_labs_classes_are_found_by_name_as_hydra_looks_for_them(place, mon
 
 def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_rest():
     class Engine:
-        num_envs, device, servo_offset = 2, "cpu", torch.tensor([0.1, 0.0])
+        num_envs, device, servo_offset, _env = 2, "cpu", torch.tensor([0.1, 0.0]), SimpleNamespace(physics_dt=0.005)
         aligner = SimpleNamespace(past=SimpleNamespace(fresh=torch.tensor([True, True])))
 
         def apply_actions(self):
@@ -322,7 +322,7 @@ def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_
         pass
 
     term = Late()
-    term.set_delays([0.007, 0.0], 0.005)
+    term.set_delays([[0.007, 0.0]])
     term.restart(torch.ones(2, 2), torch.zeros(2, 2))
     term.aligner.past.fresh = torch.tensor([False, False])
     term._processed_actions = torch.ones(2, 2)
@@ -351,6 +351,7 @@ def test_friction_is_made_to_hold_in_every_world_of_a_model_that_they_share(plac
 def test_the_command_writes_a_folder_that_needs_no_gaponet(place, capsys):
     files = {f.name for f in (place / "torch").iterdir()}
     shared = {"facts.json", "robot.xml", "gaponet_action.py", "servo_law.py", "mujoco_servos.py", "scene_facts.py"}
+    shared |= {"unit_events.py"}
     assert files == shared | {".gaponet", "delta.pt2", "robot_without_servos.xml"}
     assert not [f for f in (place / "torch").glob("*.py") if re.search(r"^(from|import) gaponet", f.read_text(), re.M)]
     assert mujoco.MjModel.from_xml_path(str(place / "torch/robot_without_servos.xml")).nu == 0

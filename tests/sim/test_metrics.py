@@ -5,7 +5,7 @@ import pytest
 from arm import write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.sim.metrics import metrics, runs, summary
+from gaponet.sim.metrics import mean_reduction, metrics, runs, summary
 
 
 def sequence(robot, qpos, motion="m", payload=0.0):
@@ -45,6 +45,20 @@ def test_a_motion_counts_once_whatever_its_length(robot):
     assert result["by_motion"]["short"]["mpjae"] == pytest.approx(1.0)
     assert result["by_payload"]["1"]["mpjae"] == 0.0
     assert list(result["by_joint"]) == ["shoulder", "elbow"]
+
+
+def test_pieces_of_one_recording_are_one_motion():
+    def meta(motion, **notes):
+        return SequenceMeta("arm", "a", motion, 0.0, notes=notes)
+
+    pieces = [meta(f"chirp@{start}", from_s=start) for start in (0.0, 3.0)]
+    before, after = np.array([5.0, 5.0, 6.0]), np.array([4.0, 2.0, 1.0])
+    mean, error = mean_reduction(pieces, before[:2], after[:2])
+    assert mean == 2.0
+    assert np.isnan(error)
+    mean, error = mean_reduction([*pieces, meta("walk@3.0")], before, after)
+    assert mean == 3.0  # over recordings
+    assert error == pytest.approx(np.std([2, 5], ddof=1) / np.sqrt(2))  # over motions
 
 
 def test_horizons_longer_than_the_motion_are_left_out(robot):

@@ -111,7 +111,7 @@ def randomization(
     Args:
         robot: Robot folder that `identify` or `adapt_robot` wrote, or run folder.
         out: Folder.
-        engine: Engine whose terms are used, beside sampled units (randomization.json).
+        engine: Engine whose file is written, which applies a unit of randomization.json.
         scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot: over its type.
         units: For any-robot: robot folders of the type.
         data: Dataset whose motions choose and judge the units; default: the dataset of the identification.

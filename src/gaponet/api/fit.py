@@ -216,9 +216,9 @@ def train(
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         config: Everything else; default `TrainConfig()`.
-        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp. auto: gaponet,
-            shared_mlp and mlp get a fifth of the budget each, and the best on validation gets the rest. Default: that
-            of the config.
+        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, trees. auto: gaponet,
+            shared_mlp, mlp and, with scikit-learn, trees get a fifth of the budget each. The best network on validation
+            gets the rest, and trees are chosen if they are still better. Default: that of the config.
         robot: Another robot than the one that the dataset keeps, e.g. the folder that `identify` wrote.
         holdout_units: Units never trained on; their test motions stay in the test split.
         resume: Continue the run in `out`.

@@ -49,11 +49,11 @@ def export(
             that needs no gaponet; urdf (damping, friction, effort limits); json (the numbers). Network of a
             run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac
             Lab), actuator-net (one network per joint; its inputs are past target − position and speed, its output is
-            the torque). randomization: ranges of a robot's parameters for training. lerobot: add the correction to the
-            LeRobot policy in --into; LeRobot finds it through the plug-in lerobot_robot_gaponet.
+            the torque). randomization: sets of a robot's parameters ("units") for training. lerobot: add the correction
+            to the LeRobot policy in --into; LeRobot finds it through the plug-in lerobot_robot_gaponet.
         into: For mjcf and urdf: a file of your own; an edited copy is written (mjcf: default the robot's). For lerobot:
             folder of a policy (pretrained_model) that holds policy_postprocessor.json.
-        engine: The engine whose terms the ranges are written in, beside sampled units (randomization.json).
+        engine: For randomization: engine for which a file is written that applies units of randomization.json.
         scope: today: this robot as last fitted. any-day: sessions on several days. any-robot: all robots of its type.
         units: For any-robot: robot folders of the type.
         dynamics: For lerobot: feed forward inertia and damping too; use it for smooth targets only.
@@ -96,27 +96,30 @@ def export(
 def _show_ranges(
     screen: Out, robot: Path, out: Path, engine: Engine, scope: Scope, units: tuple[Path, ...], data: str | None
 ) -> None:
-    from gaponet.export.randomization import table_rows
+    from gaponet.export.randomization import FILE, table_rows
 
     with progress_bar("drawing") as update:
         file, made = api.randomization(
             robot, out=out, engine=engine, scope=scope, units=units, data=data, progress=update
         )  # fmt: skip
-    screen.table(f"{made.robot}, {scope}: 9 of 10 units lie within", *table_rows(made))
-    forms = {"servo model": made.judged} | ({} if made.plain is made.judged else {"without it": made.plain})
+    screen.table(f"{made.robot}, {scope}: range of 9 of 10 units", *table_rows(made))
+    forms = {"with the servo model": made.judged, "without it": made.plain}
+    if made.plain is made.judged:
+        forms = {"identified": made.judged}
     rows = [
         [form, *(mrad(judged.errors[name]) for name in ("exported", "units", "one by one", "by hand"))]
         for form, judged in forms.items() if judged is not None
     ]  # fmt: skip
     if rows:
-        heading = ["form", "exported", "units", "numbers one by one", "± 20 % by hand"]
-        screen.table("Error on validation motions, mrad", heading, rows)
+        heading = ["robot", "exported", "units", "single numbers of the ranges", "± 20 % by hand"]
+        screen.table("Mean error on validation motions, mrad", heading, rows)
     for note in made.notes:
         screen.say(f"  {note}", "note", "cyan")
     if made.unknown:
         names = "; ".join(made.unknown)
         screen.say(f"  no log determines these, drawn from the prior range: {names}", "warning", "yellow")
-    screen.say(f"{file}: {len(next(iter(made.units.values())))} units in {file.parent / 'randomization.json'}")
+    use = "" if engine == "json" else f"; {file.name} applies them in {engine}"
+    screen.say(f"{file.parent / FILE}: {len(next(iter(made.units.values())))} units{use}")
     screen.result({"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown})
 
 

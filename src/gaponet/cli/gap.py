@@ -50,15 +50,17 @@ def _show_steps(out: Out, result: Mapping[str, Any]) -> None:
     kind = "held-out recordings" if result["unseen"] else "recordings, some of them used in training"
     joints, loads, ends = result["by_joint"], result["by_payload"], ("floor", "unexplained")
     rest = lambda part: (part["floor"]["both"], part["unexplained"])  # noqa: E731
+    removed = {s: [*map(mrad, result["removed"].get(s, ()))] or ["", ""] for s in result["left"]}
+    one = list(removed.values())[-1][1] == mrad(None)  # motion: no standard error
+    columns = ["removed"] if one else ["removed", "± over motions"]
     rows = [
-        [title(s), mrad(left), *map(mrad, result["removed"].get(s, ())), *[""] * (0 if s in result["removed"] else 2),
-         *(mrad(p[s]) for p in loads.values())]
+        [title(s), mrad(left), *removed[s][: len(columns)], *(mrad(p[s]) for p in loads.values())]
         for s, left in result["left"].items()
-    ]  # fmt: skip
-    rows += [[end, mrad(of), *[""] * (2 + len(loads))] for end, of in zip(ends, rest(result), strict=True)]
+    ]
+    rows += [[end, mrad(of), *[""] * (len(columns) + len(loads))] for end, of in zip(ends, rest(result), strict=True)]
     out.table(
-        f"Mean |error| left after each step, mrad: {result['sequences']} {kind} of a {who}",
-        ["step", "left", "removed", "± over motions", *(f"{p} kg" for p in loads)],
+        f"Mean |error| left after each step, mrad: {result['sequences']} {kind} of a {who}{', one motion' * one}",
+        ["step", "left", *columns, *(f"{p} kg" for p in loads)],
         rows,
     )
     steps = list(result["left"])

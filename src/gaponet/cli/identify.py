@@ -13,7 +13,7 @@ from gaponet.base.text import format_uncertainty
 from gaponet.cli import options
 from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import Out, writes
-from gaponet.report.tables import mrad
+from gaponet.report.tables import mrad, mrad_with_error
 from gaponet.robot.servo_fields import PASSIVE_FIELDS, SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument
 from gaponet.robot.toml_file import MEASURED_FIELDS
@@ -79,9 +79,9 @@ def identify(
 def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     """Print the verdict, the servos as a table, and what each term gave."""
     fit, errors, values = made.fit, made.errors, made.values()
-    nominal, left = (f"{mrad(e.mean())} ± {mrad(standard_error(e))}" for e in errors.values())
+    nominal, left = (mrad_with_error(e.mean(), standard_error(e)) for e in errors.values())
     ratio, count, folds = errors["identified"].mean() / errors["nominal"].mean(), len(errors["nominal"]), fit.held_out
-    screen.say(f"nominal {nominal} → identified {left} mrad ({ratio:.2f} of nominal); independent motions: {count}")
+    screen.say(f"nominal {nominal} → identified {left} ({ratio:.2f} of nominal); independent motions: {count}")
     if len(folds) > 1:
         screen.say(
             f"These are errors of {len(folds)}-fold cross-validation, since few motions validate. "
@@ -100,10 +100,10 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in shown)]
     screen.wide_table("Identified servos, ± standard error", columns, rows)
     for term in fit.comparisons:
-        fell, error = (mrad(x) for x in term.gain)
         judges = "motions" if term.name == "torque" else "recordings"
-        verdict = f"{len(term.before)} {judges}; {'not ' * (not term.accepted)}kept"
-        screen.say(f"{term.name}: validation error falls by {fell} ± {error} mrad over {verdict}")
+        count = f" over {len(term.before)} {judges}" * (len(term.before) > 1)
+        verdict = f"{count}; {'not ' * (not term.accepted)}kept"
+        screen.say(f"{term.name}: validation error falls by {mrad_with_error(*term.gain)}{verdict}")
     if fit.chosen == "torque":
         for m in fit.robot.payload_mounts:
             screen.say(

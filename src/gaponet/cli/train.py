@@ -62,27 +62,24 @@ def train(
     card, kind = trained.card, title(trained.card["model"]["kind"])
     val = card["val_mpjae"]
     if trained.candidates:
-        screen.say(
-            "validation error after a fifth of the budget, mrad: "
-            + ", ".join(f"{title(name)} {mrad(error)}" for name, error in trained.candidates.items())
-            + f"; without a network {mrad(val['start'])}. {kind} got the rest of the budget"
-        )
+        rows = {"without a network": val["start"]} | {title(name): e for name, e in trained.candidates.items()}
+        rows[f"{kind}, at the end"] = val["model"]
+        heading = "Validation error, mrad; each with a fifth of the budget"
+        screen.table(heading, ["candidate", "MPJAE"], [[name, mrad(error)] for name, error in rows.items()])
+        if "trees" not in trained.candidates:
+            screen.say("boosted trees were not tried: pip install 'gaponet[trees]'")
     screen.say(
         f"best on validation: {mrad(val['model'])} mrad, without the network {mrad(val['start'])}, nominal "
         f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "
         f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
     gain = NetworkGain("identified", val["added"], val.get("error", math.nan), val["start"])
-    scatter = "" if math.isnan(gain.standard_error) else f" ± {mrad(gain.standard_error)}"
-    screen.say(
-        f"{kind} reduces the error by {mrad(gain.reduction)}{scatter} mrad on "
-        + ("validation motions (paired)" if scatter else "the one validation motion")
-    )
+    screen.say(f"{kind} reduces the error of validation motions by {gain.text}")
     step = f"gaponet eval {out} {quote(dataset)}"
     if not gain.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"
         screen.say("that is within what motions scatter, or less than 2 %: the identified robot is as good without it")
-    screen.say(f"model in {trained.model.path}; next: {step}")
+    screen.say(f"{kind} in {trained.model.path}; next: {step}")
     screen.result(trained.to_dict())
 
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 
 import numpy as np
-from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import NoGainError
@@ -23,6 +22,7 @@ from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.uncertainty import from_axes, to_axes
 
+RANGE_PERCENT = 5, 95
 Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
 
 CACHES = "drawn_robots.json", "drawn_plain_robots.json"  # in the robot folder: with the servo model, without it
@@ -30,18 +30,8 @@ CACHES = "drawn_robots.json", "drawn_plain_robots.json"  # in the robot folder: 
 DRAWN, KEPT_SHARE = 128, 0.25  # number of units, and the share that is retained
 NEAR = 0.5  # every second unit deviates by this share of what was drawn
 WINDOWS, WINDOW_S = 8, 8.0  # rollouts that choose
-JUDGED = 12  # units whose error on validation motions is stated
+JUDGED = 20  # robots of each kind whose error on validation motions is stated
 BY_HAND, BY_HAND_FIELDS = 0.2, ("kp", "damping", "frictionloss", "armature")  # the usual randomisation: ± 20 %
-NARROWINGS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)  # of ranges from which numbers are drawn one by one
-
-
-class _Drawn(TypedDict):
-    """A `DrawnRobots` as it is stored, without its robot."""
-
-    units: dict[str, list[list[float]]]
-    errors: dict[str, float]
-    ranges: dict[str, dict[str, tuple[float, float]]]
-    narrowing: float
 
 
 @dataclass(frozen=True)
@@ -49,18 +39,13 @@ class DrawnRobots:
     """Units of one form of a robot: with its servo model, or fitted without it.
 
     Attributes:
-        robot: The robot of this form.
-        units: The retained units.
-        errors: "exported", "units", "by hand" and "one by one" → mean |error| on validation motions, rad.
-        ranges: Joint → field → (low, high) for engines that draw numbers one by one.
-        narrowing: Share of the 90 % range that `ranges` has.
+        units: Field → (retained units, n) in SI units; a row is one unit.
+        errors: "exported", "units", "one by one" (each number from the range of 9 of 10 units) and "by hand" → mean
+            |error| on validation motions, rad.
     """
 
-    robot: RobotSpec
-    units: Units
+    units: dict[str, list[list[float]]]
     errors: dict[str, float]
-    ranges: dict[str, dict[str, tuple[float, float]]]
-    narrowing: float
 
     def require_better_than_by_hand(self) -> None:
         """Refuse units that follow the recordings worse than the robot with ± 20 % on each number.
@@ -96,50 +81,39 @@ def draw_robots(
         progress: Called with done, total and a note.
     """
     train, validation = recordings
+    note = ", without the servo model" * plain
     base = fit_plain_servos(robot, train, progress=progress) if plain else robot
     first = {f: v[:DRAWN] for f, v in drawn.items()}
 
-    def draw() -> _Drawn:
-        return _draw(base, _moved(robot, base, first), train, validation, progress)
+    def draw() -> DrawnRobots:
+        return _draw(base, _moved(robot, base, first), train, validation, lambda i, n, s: progress(i, n, s + note))
 
     inputs = *first.values(), np.array([len(train), len(validation)])
-    result = stored_result(robot.folder / CACHES[plain], _Drawn, draw, robot, [*train, *validation], *inputs)
-    units = {f: np.array(v) for f, v in result["units"].items()}
-    return DrawnRobots(base, units, result["errors"], result["ranges"], result["narrowing"])
+    return stored_result(robot.folder / CACHES[plain], DrawnRobots, draw, robot, [*train, *validation], *inputs)
 
 
 def _draw(
     base: RobotSpec, drawn: Units, train: ListOf[Sequence], validation: ListOf[Sequence], progress: Progress
-) -> _Drawn:
-    every, windows = robots_of(base, drawn), _windows(train)
-    costs = []
-    for i, one in enumerate(every):
-        costs.append(rollout_error(windows, one))
-        progress(i + 1, len(every), "units on training motions")
-    best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(every)), 1)])
-    units = {field: values[best] for field, values in drawn.items()}
-    rng = np.random.default_rng(0)
+) -> DrawnRobots:
+    def errors_of(motions: ListOf[Sequence], robots: ListOf[RobotSpec], what: str) -> list[float]:
+        errors = []
+        for i, one in enumerate(robots):
+            errors.append(rollout_error(motions, one))
+            progress(i + 1, len(robots), what)
+        return errors
 
-    def error(robots: ListOf[RobotSpec]) -> float:
-        return float(np.mean([rollout_error(validation, one) for one in robots]))
-
-    progress(0, 1, "units on validation motions")
-    errors = {"exported": error([base]), "units": error(robots_of(base, units)[:JUDGED])}
-    errors["by hand"] = error(_by_hand(base, rng))
-    center = _values(base, tuple(units))
-    low, high = ({f: np.percentile(v, side, axis=0) for f, v in units.items()} for side in (5, 95))
-    limit = max(errors["by hand"], errors["units"])
-    for narrowing in NARROWINGS:
-        ends = [{f: center[f] + narrowing * (side[f] - center[f]) for f in units} for side in (low, high)]
-        alone = {f: rng.uniform(ends[0][f], ends[1][f], (JUDGED, len(center[f]))) for f in units}
-        errors["one by one"] = error(robots_of(base, alone))
-        if errors["one by one"] <= limit:
-            break
-    ranges = {
-        joint: {f: (float(ends[0][f][i]), float(ends[1][f][i])) for f in units} for i, joint in enumerate(base.operated)
-    }
-    stored = {field: values.tolist() for field, values in units.items()}
-    return {"units": stored, "errors": errors, "ranges": ranges, "narrowing": narrowing}
+    costs = errors_of(_windows(train), robots_of(base, drawn), "units on training motions")
+    best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(costs)), 1)])
+    units, rng = {field: values[best] for field, values in drawn.items()}, np.random.default_rng(0)
+    low, high = (np.array([np.percentile(v, side, axis=0) for v in units.values()]) for side in RANGE_PERCENT)
+    alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
+    robots = {
+        "exported": [base], "units": robots_of(base, units)[:JUDGED],
+        "one by one": robots_of(base, dict(zip(units, alone, strict=True))), "by hand": _by_hand(base, rng),
+    }  # fmt: skip
+    judged = iter(errors_of(validation, [r for kind in robots.values() for r in kind], "robots on validation motions"))
+    errors = {kind: float(np.mean([next(judged) for _ in several])) for kind, several in robots.items()}
+    return DrawnRobots({field: values.tolist() for field, values in units.items()}, errors)
 
 
 def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
@@ -149,10 +123,6 @@ def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
         base.with_servos({j: {f: float(v[k, i]) for f, v in units.items()} for i, j in enumerate(base.operated)})
         for k in range(count)
     ]
-
-
-def _values(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:
-    return {f: np.asarray(getattr(robot, f)[robot.operated_index], float) for f in fields}
 
 
 def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
@@ -170,7 +140,7 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
 
 
 def _by_hand(base: RobotSpec, rng: np.random.Generator) -> list[RobotSpec]:
-    values = _values(base, BY_HAND_FIELDS)
+    values = {f: getattr(base, f)[base.operated_index] for f in BY_HAND_FIELDS}
     return robots_of(base, {f: v * rng.uniform(1 - BY_HAND, 1 + BY_HAND, (JUDGED, len(v))) for f, v in values.items()})
 
 

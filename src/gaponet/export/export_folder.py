@@ -40,7 +40,7 @@ from gaponet.sim import servo
 FOLDER_KIND = "engine"
 FACTS, ROBOT, CHECK = "facts.json", "robot.xml", "check.npz"
 SHIPPED = Path(__file__).parent / "shipped"
-ACTION_TERM = {"scene_facts.py": "scene_facts.py", "gaponet_action.py": "gaponet_action.py"}
+ACTION_TERM = {name: name for name in ("scene_facts.py", "unit_events.py", "gaponet_action.py")}
 # Engine → name in the export folder → file in SHIPPED; beside mujoco_servos.py and servo_law.py.
 CHECK_FILES: dict[str, dict[str, str]] = {
     "mjcf": {"check.py": "check_mjcf.py", "check_mjx.py": "check_mjx.py"},
@@ -69,7 +69,7 @@ SERVO_MODEL: tuple[Callable[..., Any], ...] = (
     array_module, servo.present, servo.exp, servo.passing_friction, servo.resting_friction, servo.friction_limit,
     servo.servo_torque,
 )  # fmt: skip
-OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts) import")
+OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts|unit_events) import")
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 DELAY_NOTES = {
     "newton": "Newton has no delays: check.py has a buffer of five lines",

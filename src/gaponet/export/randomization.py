@@ -8,11 +8,9 @@ torques over kp: if kp of a unit is wrong, its torque limit is wrong by the same
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
-from string import Template
 from typing import Any, Literal
 
 import numpy as np
@@ -22,9 +20,8 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
-from gaponet.export.drawn_robots import DrawnRobots, draw_robots
+from gaponet.export.drawn_robots import RANGE_PERCENT, DrawnRobots, draw_robots
 from gaponet.export.plain_servos import comparable
-from gaponet.export.shipped import mujoco_randomization
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, prior_std, to_axes
@@ -34,7 +31,8 @@ Engine = Literal["json", "mujoco", "mjlab", "isaaclab"]
 
 FOLDER_KIND = "engine"
 FILE = "randomization.json"
-RANGE_SAMPLES, RANGE_PERCENT = 4096, (5, 95)
+SHIPPED = Path(__file__).parent / "shipped"
+RANGE_SAMPLES = 4096
 UNDETERMINED_STD = 0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
 MIN_ROBOTS = 3  # of a type
 
@@ -59,10 +57,6 @@ class Randomization:
     notes: tuple[str, ...]
     judged: DrawnRobots | None = None
     plain: DrawnRobots | None = None
-
-    def for_engine(self, engine: Engine) -> DrawnRobots | None:
-        """Return the judged units in the form that an engine's file has."""
-        return self.judged if engine == "json" else self.plain
 
 
 def sample_units(
@@ -133,12 +127,13 @@ def judge_units(
     judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
     if robot.has_servo_model:
         plain = draw_robots(robot, made.units, (train, validation), plain=True, progress=progress)
-    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in judged.units.items()}
+    units = {f: np.array(v) for f, v in judged.units.items()}
+    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items()}
     ranges = {
         joint: {f: (float(ends[f][0, i]), value, float(ends[f][1, i])) for f, (_, value, _) in by_field.items()}
         for i, (joint, by_field) in enumerate(made.ranges.items())
     }
-    return replace(made, units=judged.units, ranges=ranges, judged=judged, plain=plain)
+    return replace(made, units=units, ranges=ranges, judged=judged, plain=plain)
 
 
 def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
@@ -200,8 +195,8 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
     Raises:
         NoGainError: Units of the engine's form follow the recordings worse than ± 20 % on each number.
     """
-    if (judged := made.for_engine(engine)) is not None:
-        judged.require_better_than_by_hand()
+    if (runs := made.plain if engine in ("mujoco", "isaaclab") else made.judged) is not None:
+        runs.require_better_than_by_hand()
     content: dict[str, Any] = {
         "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
         "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}
@@ -219,71 +214,9 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         if engine == "json":
             return folder / FILE
         file = folder / f"{engine}_randomization.py"
-        write_text(file, inspect.getsource(mujoco_randomization) if engine == "mujoco" else _events(made, engine))
+        shipped = "mujoco_randomization.py" if engine == "mujoco" else "unit_events.py"
+        write_text(file, (SHIPPED / shipped).read_text(encoding="utf-8"))
     return file
-
-
-HEAD = Template('''"""Ranges of $robot ($scope) for $engine$narrowing.
-
-Whole units, in which numbers go together, are in randomization.json."""
-
-$imports
-
-EVENTS = {  # $place
-$terms}
-$note# s: delays of the actuators; rad: what a servo adds to its target
-DELAYS = $delay
-OFFSETS = $offset
-''')
-MJLAB_JOINT = Template("""\
-    "${joint}_damping": EventTermCfg(mode="startup", func=dr.dof_damping, params={"ranges": $damping, $joint_cfg}),
-    "${joint}_frictionloss": EventTermCfg(mode="startup", func=dr.dof_frictionloss, params={
-        "ranges": $frictionloss, $joint_cfg}),
-    "${joint}_armature": EventTermCfg(mode="startup", func=dr.dof_armature, params={"ranges": $armature, $joint_cfg}),
-    "${joint}_kp": EventTermCfg(mode="startup", func=dr.pd_gains, params={"kp_range": $kp, "kd_range": (1.0, 1.0),
-        "asset_cfg": SceneEntityCfg("robot", actuator_names=("$joint",))}),
-""")
-ISAACLAB_JOINT = Template("""\
-    "${joint}_gains": EventTermCfg(mode="startup", func=mdp.randomize_actuator_gains, params={
-        "stiffness_distribution_params": $kp, $joint_cfg}),
-    "${joint}_joint": EventTermCfg(mode="startup", func=mdp.randomize_joint_parameters, params={
-        "friction_distribution_params": $frictionloss, "armature_distribution_params": $armature, $joint_cfg}),
-""")
-
-
-def _events(made: Randomization, engine: Engine) -> str:
-    """Return event terms of mjlab 1.6, or of Isaac Lab 2 and 3, for each joint."""
-    mjlab, narrowing, all_ranges = engine == "mjlab", ", 9 of 10 units inside", made.ranges
-    if (plain := made.plain) is not None:
-        narrowing = f": {plain.narrowing:.0%} of the width of 9 of 10 units, because numbers are drawn one by one"
-        kp = dict(zip(plain.robot.operated, plain.robot.kp[plain.robot.operated_index].tolist(), strict=True))
-        all_ranges = {j: {f: (low, kp[j], high) for f, (low, high) in by.items()} for j, by in plain.ranges.items()}
-    terms, columns = "", {field: dict[str, tuple[float, float]]() for field in ("damping", "delay", "offset")}
-    for joint, by_field in all_ranges.items():
-        ranges = {f: _rounded(*by_field.get(f, (0.0, 0.0, 0.0))) for f in (*columns, "frictionloss", "armature", "kp")}
-        for field, values in columns.items():
-            values[joint] = ranges[field]
-        if mjlab:  # its gains are randomised by a factor
-            low, high = (x / by_field["kp"][1] for x in ranges["kp"])
-            ranges["kp"] = round(low, 5), round(high, 5)
-        names = f'("{joint}",)' if mjlab else f'["{joint}"]'
-        cfg = f'"operation": "abs", "asset_cfg": SceneEntityCfg("robot", joint_names={names})'
-        terms += (MJLAB_JOINT if mjlab else ISAACLAB_JOINT).substitute(ranges, joint=joint, joint_cfg=cfg)
-    managers = "from mjlab.managers" if mjlab else "from isaaclab.managers"
-    functions = "from mjlab.envs.mdp import dr" if mjlab else "import isaaclab.envs.mdp as mdp"
-    note = f"# N·m·s/rad, viscous: no term of Isaac Lab randomises it alone\nDAMPING = {columns['damping']!r}\n"
-    text = {
-        "engine": "mjlab 1.6" if mjlab else "Isaac Lab",
-        "place": "of ManagerBasedRlEnvCfg(events=…)" if mjlab else "attributes of your EventCfg",
-        "imports": f"{functions}\n{managers} import EventTermCfg, SceneEntityCfg",
-        "note": "" if mjlab else note,
-        "narrowing": narrowing,
-    }
-    return HEAD.substitute(columns, robot=made.robot, scope=made.scope, terms=terms, **text)
-
-
-def _rounded(low: float, value: float, high: float) -> tuple[float, float]:
-    return float(f"{low:.6g}"), float(f"{high:.6g}")
 
 
 def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:

@@ -9,7 +9,7 @@ from annotated_types import Interval, Len
 
 from gaponet.base.errors import UsageError
 
-ModelKind = Literal["gaponet", "paper", "shared_mlp", "mlp"]
+ModelKind = Literal["gaponet", "paper", "shared_mlp", "mlp", "trees"]
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max")
@@ -26,7 +26,8 @@ class ModelConfig:
     kind: ModelKind = "gaponet"
     """gaponet: the operator. paper: the network of the paper in its literal form, with the paper's layer widths
     (nn/paper.py). shared_mlp: one plain network for all joints, with the inputs of the operator and as many weights as
-    branch and trunk. mlp: a plain network on [observation, action], the form of ASAP."""
+    branch and trunk. mlp: a plain network on [observation, action], the form of ASAP. trees: gradient-boosted trees,
+    without history and PPO (nn/trees.py); they need scikit-learn."""
     history: Annotated[int, Interval(ge=1, le=1000)] = 4
     """H, number of past frames in the observation. They must be longer than the robot's lag."""
     stride: Annotated[int, Interval(ge=1, le=1000)] = 1

@@ -139,7 +139,7 @@ class DeltaNet(nn.Module):
         super().__init__()
         self.config, self.n = config, n
         self.features = Features(config, n)
-        self.bounded = BoundedOutput(config.delta_max, hard=config.kind == "paper")
+        self.bounded = BoundedOutput(config.delta_max, hard=config.kind in ("paper", "trees"))
         self.predictor = None
 
     def fit_inputs(self, x: Tensor) -> None:

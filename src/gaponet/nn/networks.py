@@ -15,6 +15,7 @@ from gaponet.nn.config import ModelConfig, ModelKind
 from gaponet.nn.layers import DeltaNet, dense, num_parameters
 from gaponet.nn.observation import Layout
 from gaponet.nn.paper import PaperNet, SensorPredictor
+from gaponet.nn.trees import TreesNet
 
 
 class OperatorNet(DeltaNet):
@@ -132,7 +133,7 @@ class SharedMLP(OperatorNet):
 
 
 NETWORKS: dict[ModelKind, Callable[[ModelConfig, int], DeltaNet]] = {
-    "gaponet": OperatorNet, "paper": PaperNet, "shared_mlp": SharedMLP, "mlp": DeltaMLP,
+    "gaponet": OperatorNet, "paper": PaperNet, "shared_mlp": SharedMLP, "mlp": DeltaMLP, "trees": TreesNet,
 }  # fmt: skip
 
 

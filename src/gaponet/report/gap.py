@@ -22,7 +22,7 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.report.candidate import Candidate, select_entries
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.metrics import Run, metrics, runs, standard_error
+from gaponet.sim.metrics import Run, mean_reduction, metrics, runs
 from gaponet.sim.metrics import summary as errors_of
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
@@ -40,8 +40,8 @@ def gap_by_step(
 
     Steps: nominal; of a run, delay (fitted on the training motions) and offset (delay and offset); of an identified
     simulator its CAUSES, one after the other, and static friction that holds ("creep": with the step "friction" alone,
-    friction creeps as MuJoCo's does); of a run, its model. Standard errors are over motions, of paired reductions. The
-    reduction by a cause depends on the order of causes. "unexplained" is the error above the floor.
+    friction creeps as MuJoCo's does); of a run, its model. Standard errors are over independent motions, of paired
+    reductions. The reduction by a cause depends on the order of causes. "unexplained" is the error above the floor.
 
     Args:
         candidate: An identified robot, or a run; its recordings, baseline, simulator and model are used.
@@ -140,12 +140,12 @@ def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
 
 
 def reductions(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
-    """Return the reduction of the error by each step and its standard error over motions, rad."""
-    held = {name: [(r, c) for r in part if (c := r.holds(columns))] for name, part in done.items()}
-    errors = {name: np.array([np.abs(r.error[:, c]).mean() for r, c in part])
-              for name, part in held.items()}  # fmt: skip
-    less = {after: errors[before] - errors[after] for before, after in pairwise(errors)}
-    return {name: [float(x.mean()), standard_error(x)] for name, x in less.items()}
+    """Return the reduction of the error by each step and its standard error over independent motions, rad."""
+    held = {name: [r for r in part if r.holds(columns)] for name, part in done.items()}
+    errors = {name: np.array([r.mean_error(columns) for r in part]) for name, part in held.items()}
+    metas = [r.meta for r in next(iter(held.values()))]
+    pairs = pairwise(errors)
+    return {after: list(mean_reduction(metas, errors[before], errors[after])) for before, after in pairs}
 
 
 def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:

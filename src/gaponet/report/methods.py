@@ -20,6 +20,7 @@ METHODS = {  # title, colour
     "identified": ("identification", "#2a9d6f"),
     "shared_mlp": ("MLP", "#3b7dd8"),
     "mlp": ("MLP, full coupling", "#7a8fe0"),
+    "trees": ("boosted trees", "#8a6d3b"),
     "gaponet": ("GAPONet", "#c8102e"),
     "paper": ("GAPONet, the paper's form", "#8e1b3a"),
     "adapted": ("adapted to the unit", "#6a1b9a"),

@@ -16,7 +16,7 @@ from gaponet.report.methods import IDENTIFIED, METHODS
 
 REPAIR_HINT = "give a complete run folder of gaponet train, or evaluate again"
 Method = Annotated[str, Predicate(lambda name: name.removeprefix(IDENTIFIED) in METHODS)]
-GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion")
+GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion", "by_independent_motion")
 FORMER_METHODS = {"calibrated": "adapted"}  # former name in metrics.json → name
 FORMER_STAGES = {"warm start": "pretraining"}  # former name in progress.jsonl → name
 
@@ -51,6 +51,7 @@ Scores = TypedDict(  # metrics of one method, in total and by group
         "mpjae": Number, "rmse": Number, "q_dis": Number, "static": Number, "dynamic": Number, "large_0.05": Number,
         "large_0.1": Number, "correlation": Number, "by_joint": Joints, "by_payload": Payloads,
         "by_horizon": Annotated[Horizons, Len(1)], "by_motion": Motions,
+        "by_independent_motion": NotRequired[Motions],
     },
 )  # fmt: skip
 
@@ -151,7 +152,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
         raise ModelError(f"{file}: methods: nominal is missing, or a method has no ratio to it; {REPAIR_HINT}")
     for name, scores in methods.items():
         for group in GROUPS:
-            if set(scores[group]) != set(methods["nominal"][group]):
+            if set(scores.get(group, ())) != set(methods["nominal"].get(group, ())):
                 raise ModelError(f"{file}: methods.{name}.{group}: should have what nominal has; {REPAIR_HINT}")
         if "whole" not in scores["by_horizon"]:
             raise ModelError(f"{file}: methods.{name}.by_horizon.whole: is missing; {REPAIR_HINT}")

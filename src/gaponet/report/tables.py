@@ -13,7 +13,13 @@ from gaponet.report.methods import title
 
 def mrad(value: float | None) -> str:
     """Format an angle in rad as milliradian; a dash if there is none, such as the standard error over one motion."""
-    return "–" if value is None or value != value else f"{value * 1e3:.2f}"
+    return "–" if value is None or value != value else f"{round(value * 1e3, 2) + 0.0:.2f}"  # no −0.00
+
+
+def mrad_with_error(value: float, standard_error: float) -> str:
+    """Format an angle in rad with its standard error over independent motions, which is NaN if there is one."""
+    one = standard_error != standard_error
+    return f"{mrad(value)} mrad (one motion)" if one else f"{mrad(value)} ± {mrad(standard_error)} mrad"
 
 
 def mrad_and_degrees(value: float) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gaponet.nn.config import ModelKind
 from gaponet.report.methods import IDENTIFIED, title
+from gaponet.report.tables import mrad, mrad_with_error
 from gaponet.robot.folder import STORED_ROBOT
 from gaponet.sim.metrics import standard_error
 
@@ -25,8 +26,8 @@ class NetworkGain(NamedTuple):
 
     Attributes:
         base: The best method without a network.
-        reduction: Mean over motions; negative if the network is worse.
-        standard_error: Standard error of the reduction over motions (paired); NaN for one motion.
+        reduction: Mean over recordings; negative if the network is worse.
+        standard_error: Standard error of the reduction over independent motions (paired); NaN for one motion.
         base_error: Error of the base.
     """
 
@@ -34,6 +35,11 @@ class NetworkGain(NamedTuple):
     reduction: float
     standard_error: float
     base_error: float
+
+    @property
+    def text(self) -> str:
+        """The reduction and its standard error, mrad."""
+        return mrad_with_error(self.reduction, self.standard_error)
 
     @property
     def helps(self) -> bool:
@@ -47,9 +53,13 @@ def network_gain(methods: Scores, own: str) -> NetworkGain:
         (name for name in WITHOUT_NETWORK if name in methods), key=lambda name: methods[name]["mpjae"]
     )  # fmt: skip
     before, after = (methods[name] for name in (base, own))
-    paired = [before["by_motion"][m]["mpjae"] - after["by_motion"][m]["mpjae"] for m in before["by_motion"]]
-    error = standard_error(np.array(paired))
-    return NetworkGain(base, before["mpjae"] - after["mpjae"], error, before["mpjae"])
+    paired = [m["mpjae"] - _by_independent_motion(after)[name]["mpjae"]
+              for name, m in _by_independent_motion(before).items()]  # fmt: skip
+    return NetworkGain(base, before["mpjae"] - after["mpjae"], standard_error(paired), before["mpjae"])
+
+
+def _by_independent_motion(scores: Scores) -> Scores:
+    return scores.get("by_independent_motion", scores["by_motion"])  # files of earlier versions lack the first
 
 
 def verdict(methods: Scores) -> list[str]:
@@ -58,25 +68,24 @@ def verdict(methods: Scores) -> list[str]:
     by_joint = methods["nominal"]["by_joint"]
     worst = max(by_joint, key=lambda joint: by_joint[joint]["mpjae"])
     sentences = [
-        f"The nominal simulator is {_mrad(nominal)} mrad ({np.degrees(nominal):.2f}°) from the robot, most at {worst} "
-        f"({_mrad(by_joint[worst]['mpjae'])})."
+        f"The nominal simulator is {mrad(nominal)} mrad ({np.degrees(nominal):.2f}°) from the robot, most at {worst} "
+        f"({mrad(by_joint[worst]['mpjae'])})."
     ]
     if "identified" in methods:
         error = methods["identified"]["mpjae"]
         change = f"{100 * abs(1 - error / nominal):.0f} % {'less' if error <= nominal else 'MORE'}"
         end = "." if error < nominal else ": identify again, on logs like these."
-        motions = len({name.partition("@")[0] for name in methods["identified"]["by_motion"]})  # pieces are one
+        motions = len(_by_independent_motion(methods["identified"]))
         count = f"{motions} independent motion{'s' * (motions != 1)}"
-        sentences.append(f"After identification the error is {_mrad(error)} mrad, {change}, on {count}{end}")
+        sentences.append(f"After identification the error is {mrad(error)} mrad, {change}, on {count}{end}")
     return sentences + [_about_network(methods, own) for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
 
 
 def _about_network(methods: Scores, own: str) -> str:
     gain, error = network_gain(methods, own), methods[own]["mpjae"]
-    uncertainty = "" if np.isnan(gain.standard_error) else f" ± {_mrad(gain.standard_error)}"
     text = (
-        f"With {title(own)} the error is {_mrad(error)} mrad: its network reduces the error of {title(gain.base)} by "
-        f"{_mrad(gain.reduction)}{uncertainty} mrad"
+        f"With {title(own)} the error is {mrad(error)} mrad: its network reduces the error of {title(gain.base)} by "
+        f"{gain.text}"
     )
     return (
         f"{text}, {100 * gain.reduction / gain.base_error:.0f} %." if gain.helps else f"{text}: leave the network out."
@@ -98,7 +107,3 @@ def next_step(methods: Scores, dataset: str, folder: Path | None = None, reporte
     if "identified" not in methods or folder is None:
         return shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
     return shlex.join(["gaponet", "export", str(folder / STORED_ROBOT if networks else folder), "--to", "mjcf"])
-
-
-def _mrad(value: float) -> str:
-    return f"{round(1e3 * value, 2) + 0.0:.2f}"  # no −0.00

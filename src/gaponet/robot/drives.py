@@ -48,9 +48,8 @@ class Drive:
     @property
     def passive_source(self) -> str:
         """Source of these values."""
-        return (
-            f"servo {self.servo.name} ({', '.join(self.passive)}: {self.servo.source})" if self.servo else "the model"
-        )
+        values = ", ".join(self.passive) or "no values"
+        return f"servo {self.servo.name} ({values}: {self.servo.source})" if self.servo else "the model"
 
 
 def drives(

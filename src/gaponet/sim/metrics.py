@@ -26,10 +26,17 @@ CONFIDENCE = 0.84  # one-sided level of Student's t: one standard error where mo
 _Row = dict[str, float]  # metrics of a sequence, or their means
 
 
-def standard_error(values: Array) -> float:
+def standard_error(values: Array | ListOf[float]) -> float:
     """Return the standard error of the mean of values by motion, or of paired differences; nan for a single one."""
     values = np.asarray(values)
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
+
+
+def mean_reduction(metas: Iterable[SequenceMeta], before: Array, after: Array) -> tuple[float, float]:
+    """Return the mean of before − after, (recordings,) each, and its standard error over independent motions."""
+    motions = np.array([m.independent_motion for m in metas])
+    reduction = before - after
+    return float(reduction.mean()), standard_error([reduction[motions == m].mean() for m in sorted({*motions})])
 
 
 def confidence_factor(freedom: int) -> float:
@@ -107,6 +114,10 @@ class Run:
         """Return the columns, out of these (None: all), that the recording holds."""
         return [i for i in self.recorded if columns is None or i in columns]
 
+    def mean_error(self, columns: list[int] | None = None) -> float:
+        """Return the mean |e| over the columns, out of these (None: all), that the recording holds, rad."""
+        return float(np.abs(self.error[:, self.holds(columns)].astype(float)).mean())
+
 
 def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec) -> list[Run]:
     """Put recordings and simulated positions (T, n_all) together, operated joints only."""
@@ -126,7 +137,8 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
         whole = _row(run)
         for row, arm in zip(whole, _row(run, no_wrist), strict=False):
             row["mpjae_no_wrist"] = arm["mpjae"]
-        names = {"": "", "motion": meta.motion, "payload": f"{meta.payload_mass:g}", "unit": meta.unit_id}
+        names = {"": "", "motion": meta.motion, "independent_motion": meta.independent_motion}
+        names |= {"payload": f"{meta.payload_mass:g}", "unit": meta.unit_id}
         for group, name in names.items():
             rows[group][name] += whole
         for j, column in joints.items():
@@ -134,7 +146,7 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
         for horizon, error in _horizons(run).items():
             rows["horizon"][horizon].append({"mpjae": error})
     held = [j for j in joints if rows["joint"][j]]
-    order = {"joint": held, **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
+    order = {"joint": held, **{g: sorted(rows[g]) for g in ("motion", "independent_motion", "payload", "unit")}}
     order["horizon"] = [h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]]
     total = {"mpjae_no_wrist": float("nan")} | _mean(rows[""][""])
     return total | {f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()}
@@ -165,7 +177,7 @@ def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
     low, high = np.percentile(size, [25, 75], axis=0)
     bias = np.median(error, axis=0)
     out = {
-        "mpjae": size.mean(),
+        "mpjae": run.mean_error(columns),
         "rmse": np.sqrt((error**2).mean(axis=0)).mean(),
         "q_dis": (size.sum(axis=0) * run.dt).mean(),
         "static": np.abs(bias).mean(),

@@ -20,6 +20,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.metrics import runs
 from gaponet.sim.model import LOOSE_IMPEDANCE, STIFF_MOBILITY, idle_joints, model_hash
 
 CHUNK = 256  # simulations side by side
@@ -79,11 +80,12 @@ def replay(
     return [replays[i] for i in range(len(sequences))]
 
 
-def rollout_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> Array:
+def rollout_errors(
+    sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, corrector: Corrector | None = None
+) -> Array:
     """Return the mean |error| of each sequence's rollout, of the operated joints that it holds, (sequences,) rad."""
-    replays = replay(sequences, robot, nthread=nthread, lock_idle=True)
-    held = [[i for i in robot.operated_index if robot.joint_names[i] not in s.meta.unrecorded] for s in sequences]
-    errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t, op in zip(sequences, replays, held, strict=True)]
+    replays = replay(sequences, robot, corrector, nthread, lock_idle=True)
+    errors = [run.mean_error() for run in runs(sequences, [r.qpos for r in replays], robot)]
     return np.nan_to_num(np.array(errors), nan=np.pi)
 
 

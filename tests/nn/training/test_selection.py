@@ -7,23 +7,31 @@ import pytest
 
 from gaponet.base.errors import UsageError
 from gaponet.nn.artifact import GapModel
+from gaponet.nn.training import selection
 from gaponet.nn.training.selection import candidate_errors, train_best
 
 ERRORS = {"gaponet": 3.0, "shared_mlp": 1.0, "mlp": 2.0}
 
 
+@pytest.fixture(autouse=True)
+def without_trees(monkeypatch):
+    monkeypatch.setattr(selection, "trees_available", lambda: False)
+
+
 class Trainings:
     """Writes a run folder per call; ends early for one kind."""
 
-    def __init__(self, interrupted=""):
-        self.calls, self.interrupted = [], interrupted
+    def __init__(self, interrupted="", later=None, **errors):
+        """later: Error of a network after the rest of the budget."""
+        self.calls, self.interrupted, self.later, self.errors = [], interrupted, later, ERRORS | errors
 
     def __call__(self, kind, run, share, spent, resume):
         self.calls.append((kind, run.name, round(share, 6), round(spent, 6), resume))
         run.mkdir(parents=True, exist_ok=True)
         (run / "checkpoint.pt").write_text(kind)
         (run / "config.json").write_text(json.dumps({"model": {"kind": kind}}))
-        card = {"interrupted": kind == self.interrupted, "val_mpjae": {"model": ERRORS[kind]}}
+        error = self.later if resume and self.later is not None else self.errors[kind]
+        card = {"interrupted": kind == self.interrupted, "val_mpjae": {"model": error}}
         return SimpleNamespace(card=card)
 
 
@@ -65,3 +73,18 @@ def test_a_run_of_one_kind_is_resumed_with_its_kind(tmp_path):
     first("mlp", tmp_path / "run", 1.0, 0.0, False)
     train_best(tmp_path / "run", True, train)
     assert train.calls == [("mlp", "run", 1.0, 0.0, True)]
+
+
+@pytest.mark.parametrize(("later", "chosen"), [(0.6, "trees"), (0.4, "shared_mlp")])
+def test_trees_win_if_the_best_network_does_not_pass_them_with_the_rest_of_the_budget(
+    tmp_path, monkeypatch, later, chosen
+):
+    monkeypatch.setattr(selection, "trees_available", lambda: True)
+    monkeypatch.setattr(GapModel, "load", classmethod(lambda cls, run: run))
+    train = Trainings(trees=0.5, later=later)
+    train_best(tmp_path / "run", False, train)
+    assert train.calls[3:] == [
+        ("trees", "trees", 0.2, 0.6, False),
+        ("shared_mlp", "shared_mlp", 0.4, 0.6, True),
+    ]
+    assert (tmp_path / "run/checkpoint.pt").read_text() == chosen

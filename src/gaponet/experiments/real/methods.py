@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from gaponet.nn.training.config import Budget, PretrainingConfig, TrainConfig
 from gaponet.report.verdict import NetworkGain
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.metrics import runs
 from gaponet.sim.replay import Corrector, replay
 from gaponet.sysid.adapt import adapt
 from gaponet.sysid.identify import identify
@@ -53,11 +55,7 @@ class FittedSim:
 
     def errors(self, sequences: list[Sequence]) -> list[float]:
         """Return the mean |error| of each rollout over the recorded joints, rad."""
-        positions = self.positions(sequences)
-        return [
-            float(np.abs((q - s.qpos)[1:, recorded_joints(s, self.robot)]).mean())
-            for s, q in zip(sequences, positions, strict=True)
-        ]
+        return [run.mean_error() for run in runs(sequences, self.positions(sequences), self.robot)]
 
 
 Method = Callable[[Question], FittedSim]
@@ -147,7 +145,7 @@ def _identify(question: Question) -> RobotSpec:
 
 
 BASES = {"": nominal, "identification + ": identified}
-TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
+TITLES = {"shared_mlp": "shared MLP", "gaponet": "GAPONet", "trees": "trees"}
 FULL_RECIPE_STEPS = 600_000  # control steps from which the recipe is that of gaponet train
 # Fewer steps are one round of supervised pre-training.
 ONE_ROUND = PretrainingConfig(rounds=1, num_envs=256, gradient_steps=200, sensor_states=512)
@@ -157,7 +155,7 @@ def network_methods(steps: int) -> dict[str, tuple[str, Method]]:
     """Return methods that train a network for this number of control steps: name → title and method."""
     return {
         f"{base}{TITLES[kind]} {steps}": (base + TITLES[kind], partial(_train, base=base, kind=kind, steps=steps))
-        for base in BASES for kind in ("shared_mlp", "gaponet")
+        for base in BASES for kind in TITLES if kind != "trees" or find_spec("sklearn")
     }  # fmt: skip
 
 

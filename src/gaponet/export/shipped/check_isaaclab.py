@@ -1,7 +1,10 @@
 """Play the motions of check.npz in Isaac Lab 3 on Newton's MuJoCo-Warp, in a few worlds, and print the error beside
 gaponet's: python check.py. The USD is made by mujoco-usd-converter.
+
+python check.py randomization.json ROW     # the same with a unit of gaponet export ROBOT --to randomization
 """
 
+import sys
 from pathlib import Path
 
 import gaponet_action as gaponet
@@ -9,12 +12,13 @@ import isaaclab.sim as sim_utils
 import mujoco_usd_converter
 from isaaclab.assets import ArticulationCfg
 from isaaclab.envs import ManagerBasedEnv, ManagerBasedEnvCfg, mdp
-from isaaclab.managers import EventTermCfg, ObservationGroupCfg, ObservationTermCfg
+from isaaclab.managers import EventTermCfg, ObservationGroupCfg, ObservationTermCfg, SceneEntityCfg
 from isaaclab.scene import InteractiveSceneCfg
 from isaaclab.utils import configclass
 from isaaclab_newton.physics import MJWarpSolverCfg, NewtonCfg
 
 from gaponet.export.shipped.mujoco_servos import Check
+from gaponet.export.shipped.unit_events import apply_units
 
 HERE = Path(__file__).parent
 check = Check(HERE)
@@ -50,8 +54,13 @@ class Actions:
 @configclass
 class Events:
     start = EventTermCfg(func=reset, mode="reset")
+    unit: EventTermCfg | None = None
 
 
+events = Events()
+if sys.argv[1:]:
+    unit = {"file": sys.argv[1], "rows": [int(sys.argv[2])] * check.worlds, "asset_cfg": SceneEntityCfg("robot")}
+    events.unit = EventTermCfg(func=apply_units, mode="reset", params=unit)
 fields = ("integrator", "tolerance", "iterations", "ls_iterations")
 solver = MJWarpSolverCfg(disable_contacts=True, **{field: check.facts["options"][field] for field in fields})
 cfg = ManagerBasedEnvCfg(
@@ -59,7 +68,7 @@ cfg = ManagerBasedEnvCfg(
     sim=sim_utils.SimulationCfg(
         dt=check.step, use_newton_actuators=False, device="cpu", physics=NewtonCfg(solver_cfg=solver)
     ),
-    observations=Observations(), actions=Actions(), events=Events(),
+    observations=Observations(), actions=Actions(), events=events,
 )  # fmt: skip
 env = ManagerBasedEnv(cfg)
 check.report("Isaac Lab", player.run(env, env.action_manager.get_term("joint_pos")._joint_names))

@@ -18,7 +18,6 @@ simulator move like the robot. Options are those of JointPositionActionCfg.
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaponet.export.shipped.mujoco_servos import Check, delay_weights, read
+from gaponet.export.shipped.mujoco_servos import Check, read
 from gaponet.export.shipped.scene_facts import require_scene
+from gaponet.export.shipped.unit_events import columns_of, write_model
+from gaponet.export.shipped.unit_events import mjlab_units as mjlab_units
 from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque
 
 PROGRAM, FACTS, ROBOT = "delta.pt2", "facts.json", "robot.xml"
@@ -260,36 +261,6 @@ def mjlab_options(folder: str | Path) -> tuple[Any, int]:
     return MujocoCfg(**{k: v for k, v in facts["options"].items() if k in fields}), facts["decimation"]
 
 
-UNIT_FIELDS = (
-    "dof_armature", "dof_frictionloss", "dof_damping", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
-)  # fmt: skip
-
-
-def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> Any:
-    """Return the function of an event term that gives each world a unit of randomization.json, with the servo model.
-
-    EventTermCfg(func=mjlab_units("randomization.json"), mode="reset") draws a unit for each episode.
-
-    Args:
-        term: Action term of `mjlab_action`.
-        rows: Row for each world instead of a random one, (num_envs,).
-    """
-    from mjlab.managers.event_manager import requires_model_fields
-
-    drawn = json.loads(Path(file).read_text(encoding="utf-8"))
-    units = {field: torch.tensor(values) for field, values in drawn["units"].items()}
-
-    @requires_model_fields(*UNIT_FIELDS)
-    def use_units(env: Any, env_ids: Any) -> None:
-        servos = env.action_manager.get_term(term).terms
-        ids = torch.arange(env.num_envs) if env_ids is None else torch.as_tensor(env_ids)
-        row = torch.randint(len(units["kp"]), (len(ids),)) if rows is None else torch.as_tensor(rows)[ids.cpu()]
-        device = servos.kp.device
-        servos.set_units(ids.to(device), drawn["joints"], {f: x[row].to(device).float() for f, x in units.items()})
-
-    return use_units
-
-
 def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
     """Make joint friction as stiff as in training, which no MJCF can express.
 
@@ -357,22 +328,17 @@ class ServoModel:
 
     def set_units(self, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]) -> None:
         """Give worlds the numbers of units: field → (len(env_ids), joints). Delays stay as exported."""
-        columns = torch.tensor([self.joints.index(name) for name in joints], device=env_ids.device)
-        model, at, dof, servo = self.sim.model, env_ids[:, None], self.dof[columns], self.servo[columns]
-        kp, bias, limit = units["kp"], units["kp"] * units["offset"], units["effort_limit"]
-        model.dof_armature[at, dof], model.dof_frictionloss[at, dof] = units["armature"], units["frictionloss"]
-        damping = model.dof_damping  # MuJoCo's versions differ in whether it has powers of the speed
-        damping[(at, dof, 0) if damping.ndim == 3 else (at, dof)] = units["damping"]
-        model.actuator_gainprm[at, servo, 0] = kp
-        model.actuator_biasprm[at, servo, 0], model.actuator_biasprm[at, servo, 1] = bias, -kp
-        model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
+        columns = torch.tensor(columns_of(joints, self.joints, "the action term"), device=env_ids.device)
+        write_model(self.sim.model, env_ids, self.dof[columns], self.servo[columns], units)
+        at = env_ids[:, None]
 
         def of_worlds(column: Tensor, values: Tensor) -> Tensor:
             column = column.expand(self.sim.num_envs, -1).clone()
             column[at, columns] = values.to(column.dtype)
             return column
 
-        self.kp, self.bias = of_worlds(self.kp, kp), of_worlds(self.bias, bias)
+        self.kp = of_worlds(self.kp, units["kp"])
+        self.bias = of_worlds(self.bias, units["kp"] * units["offset"])
         self.frictionloss = of_worlds(self.frictionloss, units["frictionloss"])
         self.terms = {name: of_worlds(column, units[name]) for name, column in self.terms.items()}
 
@@ -399,11 +365,25 @@ class ServoModel:
 class DelayedAction:
     """Mix-in that delays commands in the action term: worlds start at rest, and no delay is rounded to a step."""
 
-    def set_delays(self, delay: list[float], step: float) -> None:
-        """Set the delays of the term's joints, s, for a physics step, s."""
+    def set_delays(self, delay: Any) -> None:
+        """Set the delays of the term's joints, s, (num_envs, n) or (1, n)."""
         me: Any = self
-        self.weights = torch.tensor(delay_weights(delay, step), device=me.device, dtype=torch.float)[:, None]
-        self.commands = torch.zeros(len(self.weights), me.num_envs, len(delay), device=me.device)  # newest first
+        self.delay = torch.as_tensor(delay, device=me.device, dtype=torch.float)
+        steps = self.delay / me._env.physics_dt
+        age = torch.arange(int(torch.ceil(steps.max() - 1e-5)) + 1, device=me.device)[:, None, None]
+        if len(age) > 1 and getattr(me._env, "_physics_handles_decimation", False):
+            raise ValueError("servos are late by parts of a control period: cfg.sim.use_newton_actuators = False")
+        self.weights = (1 - (age - steps).abs()).clamp(min=0)
+        past = getattr(self, "commands", torch.zeros(1, me.num_envs, self.delay.shape[1], device=me.device))
+        self.commands = past[age[:, 0, 0].clamp(max=len(past) - 1)]  # newest first
+
+    def set_units(self, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]) -> None:
+        """Give worlds the delays and offsets of units: field → (len(env_ids), joints)."""
+        me: Any = self
+        columns = torch.tensor(columns_of(joints, me._joint_names, "the action term"), device=me.device)
+        delay, me.servo_offset = (x.expand(me.num_envs, -1).clone() for x in (self.delay, me.servo_offset))
+        delay[env_ids[:, None], columns], me.servo_offset[env_ids[:, None], columns] = units["delay"], units["offset"]
+        self.set_delays(delay)
 
     def restart(self, qpos: Tensor, command: Tensor) -> None:
         """Fill the buffers of fresh worlds with a command, (num_envs, joints) rad."""
@@ -457,9 +437,7 @@ def _isaaclab_term() -> Any:
                 )
             self.align(self._asset, self._joint_ids, self._joint_names, offset=1.0, form=_isaaclab_form(facts))
             servos = facts[_isaaclab_form(facts)]
-            self.set_delays([servos[name]["delay"] for name in self._joint_names], env.physics_dt)
-            if len(self.weights) > 1 and getattr(env, "_physics_handles_decimation", False):
-                raise ValueError("servos are late by parts of a control period: cfg.sim.use_newton_actuators = False")
+            self.set_delays([[servos[name]["delay"] for name in self._joint_names]])
 
     return IsaacLabTerm
 

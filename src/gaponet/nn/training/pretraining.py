@@ -29,6 +29,7 @@ from gaponet.nn.training import ranks
 from gaponet.nn.training.config import PretrainingConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.sensor_fit import SensorReport, fit_inputs
+from gaponet.nn.trees import TreesNet
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
 from gaponet.sysid.table_contact import tip_heights
@@ -169,7 +170,7 @@ class Pretraining:
         before = {"net": {k: x.clone() for k, x in self.net.state_dict().items()}, "rng": self.env.rng_state}
         self._extend_pool(follow_labels=self.rounds_done == 0)
         self.rollout_states.append(before)
-        squares = self._fit(tick)
+        squares = self._fit_trees(self.net) if isinstance(self.net, TreesNet) else self._fit(tick)
         quarter = max(len(squares) // 4, 1)
         last, earlier = squares[-quarter:], squares[-2 * quarter : -quarter]
         return {"label_rmse": _rms(last), "label_rmse_before": _rms(earlier)}
@@ -178,6 +179,12 @@ class Pretraining:
         x, labels = self.rollout(follow_labels)
         # One tensor each: the pool is in memory once.
         self.pool_x, self.pool_labels = [torch.cat([*self.pool_x, x])], [torch.cat([*self.pool_labels, labels])]
+
+    def _fit_trees(self, net: TreesNet) -> Array:
+        """Fit trees to the first rank's pool; return the mean squared label error, (1,) rad²."""
+        squares = ranks.once(lambda: net.fit(self.pool_x[0], self.pool_labels[0], self.seed))
+        ranks.broadcast(net)
+        return squares
 
     def _fit(self, tick: Callable[[], object]) -> Array:
         """Fit the network to the pool; return the mean squared label error of each gradient step, rad²."""

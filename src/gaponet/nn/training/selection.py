@@ -1,4 +1,7 @@
-"""Choice of the network by validation: each kind is trained with a part of the budget, and the best gets the rest."""
+"""Choice of the network by validation: each kind is trained with a part of the budget, and the best gets the rest.
+
+Trees need no more than their part. If they are best, the best network gets the rest, and validation decides again.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,9 @@ from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelKind
 from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import CHECKPOINT
+from gaponet.nn.trees import trees_available
 
-CANDIDATES: tuple[ModelKind, ...] = ("gaponet", "shared_mlp", "mlp")
+CANDIDATES: tuple[ModelKind, ...] = ("gaponet", "shared_mlp", "mlp", "trees")  # trees if scikit-learn is installed
 SHARE = 0.2  # of the budget, for each candidate
 FOLDER, ERRORS = "candidates", "candidates.json"
 Train = Callable[[ModelKind, Path, float, float, bool], GapModel]  # kind, run, share of the budget, share spent, resume
@@ -36,7 +40,8 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
         problem = "nothing to resume; train without --resume" if resume else "holds a run already; add --resume"
         raise UsageError(f"{out}: {problem}, or choose another --out")
     errors = ranks.once(lambda: candidate_errors(out))
-    for i, kind in enumerate(CANDIDATES):
+    kinds = [kind for kind in CANDIDATES if kind != "trees" or trees_available()]
+    for i, kind in enumerate(kinds):
         if kind in errors:
             continue
         run = out / FOLDER / kind
@@ -50,8 +55,14 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     best = min(errors, key=errors.__getitem__)
     if ranks.once(lambda: _kind(out)) != best:
         _copy(out, best)
-    spent = SHARE * (len(CANDIDATES) - 1)
-    return train(best, out, 1 - spent, spent, True)
+    spent = SHARE * (len(kinds) - 1)
+    if best != "trees":
+        return train(best, out, 1 - spent, spent, True)
+    network = min(errors.keys() - {"trees"}, key=errors.__getitem__)
+    model = train(network, out / FOLDER / network, 1 - spent, spent, True)
+    if model.card["val_mpjae"]["model"] < errors["trees"]:
+        _copy(out, network)
+    return GapModel.load(out)
 
 
 def candidate_errors(run: Path) -> dict[ModelKind, float]:

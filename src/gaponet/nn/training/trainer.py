@@ -183,7 +183,7 @@ class Trainer:
 
     def _ppo(self) -> None:
         config, state = self.rank_config.ppo, self.state
-        if self._spent() >= 1:
+        if self._spent() >= 1 or self.config.model.kind == "trees":
             return
         self.stage = "ppo"
         episode_steps = round(self.config.episode_s / self.data.train[0].dt)

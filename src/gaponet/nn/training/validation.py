@@ -12,8 +12,6 @@ import hashlib
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 
-import numpy as np
-
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.nn.config import ModelConfig
@@ -23,8 +21,8 @@ from gaponet.nn.onnx_export import onnx_content
 from gaponet.nn.onnx_network import OnnxNetwork
 from gaponet.nn.training import ranks
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.metrics import standard_error
-from gaponet.sim.replay import replay
+from gaponet.sim.metrics import mean_reduction
+from gaponet.sim.replay import rollout_errors
 
 GAINS = (0.75, 0.5, 0.25)  # candidates below 1
 
@@ -38,7 +36,7 @@ class Validator:
         self._cache: dict[bytes, Array] = {}
 
     def errors(self, net: DeltaNet | None, robot: RobotSpec | None = None) -> Array:
-        """Return the mean position error of a rollout of each recording, (k,) rad.
+        """Return the mean position error of a rollout of each recording over the joints that it holds, (k,) rad.
 
         Args:
             net: The network; None for the simulator without correction.
@@ -50,8 +48,8 @@ class Validator:
         return self._cache[key]
 
     def improvement(self, net: DeltaNet) -> tuple[float, float]:
-        """Return the error reduction by a network, rad: mean and standard error over motions."""
-        return error_reduction(self.sequences, self.errors(None), self.errors(net))
+        """Return the error reduction by a network, rad: mean and standard error over independent motions."""
+        return mean_reduction((s.meta for s in self.sequences), self.errors(None), self.errors(net))
 
     @staticmethod
     def _key(net: DeltaNet | None, robot: RobotSpec | None = None) -> bytes:
@@ -63,17 +61,7 @@ class Validator:
         if net is not None:  # on onnxruntime, as it ships; torch needs twice the time
             network = OnnxNetwork(onnx_content(copy.deepcopy(net).cpu().eval()))
             corrector = DeltaCorrector(network, self.config, robot)
-        rollouts = replay(sequences, robot, corrector, self.nthread, lock_idle=True)
-        operated = robot.operated_index
-        pairs = zip(sequences, rollouts, strict=True)
-        return np.array([np.abs(rollout.qpos - s.qpos)[1:, operated].mean() for s, rollout in pairs], float)
-
-
-def error_reduction(sequences: ListOf[Sequence], before: Array, after: Array) -> tuple[float, float]:
-    """Return before − after, (k,) rad each, as mean and standard error over motions (paired)."""
-    motions = np.array([s.meta.motion for s in sequences])
-    reduction = np.array([(before - after)[motions == m].mean() for m in sorted(set(motions.tolist()))])
-    return float(reduction.mean()), standard_error(reduction)
+        return rollout_errors(sequences, robot, self.nthread, corrector)
 
 
 def choose_gain(net: DeltaNet, error: Callable[[], float], full_error: float) -> float:

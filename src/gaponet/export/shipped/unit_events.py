@@ -1,0 +1,167 @@
+"""Event terms of mjlab and Isaac Lab that give each world one whole unit of randomization.json.
+
+This file is copied into exports; it needs torch, not gaponet. A unit is a row of the file.
+
+mjlab:      EventTermCfg(func=mjlab_units(FILE), mode="reset")
+Isaac Lab:  EventTermCfg(func=apply_units, mode="reset", params={"asset_cfg": SceneEntityCfg("robot"), "file": FILE})
+
+FILE is the path of randomization.json. Mode "reset" draws a unit for each episode, "startup" one for each world.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+MODEL_FIELDS = (
+    "dof_armature", "dof_frictionloss", "dof_damping", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
+)  # fmt: skip
+DELAY_BUFFERS = "positions_delay_buffer", "velocities_delay_buffer", "efforts_delay_buffer"
+Units = dict[str, Tensor]  # field → (worlds, joints), SI units
+
+
+@cache
+def read_units(file: str | Path, form: str) -> tuple[list[str], Units]:
+    """Return joints and all units, (units, joints). A robot without a servo model has one form of them."""
+    drawn = json.loads(Path(file).read_text(encoding="utf-8"))
+    return drawn["joints"], {field: torch.tensor(x) for field, x in drawn.get(form, drawn["units"]).items()}
+
+
+def draw_units(file: str | Path, form: str, env: Any, env_ids: Any, rows: Any) -> tuple[Tensor, list[str], Units]:
+    """Draw a unit for each of the worlds `env_ids` (indices, a slice; None for all).
+
+    Args:
+        form: "units", with the servo model, or "plain_units", without it.
+        rows: Row for each world instead of a random one, (num_envs,).
+
+    Returns:
+        Indices of the worlds, joints, and the units' numbers.
+    """
+    joints, units = read_units(file, form)
+    ids = torch.arange(env.num_envs, device=env.device)[slice(None) if env_ids is None else env_ids]
+    row = torch.randint(len(units["kp"]), (len(ids),)) if rows is None else torch.as_tensor(rows)[ids.cpu()]
+    return ids, joints, {field: x[row].to(env.device) for field, x in units.items()}
+
+
+def columns_of(joints: Iterable[str], names: Iterable[str], what: str) -> list[int]:
+    """Return the places of joints among names; a joint that is missing is an error."""
+    if missing := [name for name in joints if name not in names]:
+        raise ValueError(f"randomization.json has joint '{missing[0]}'; {what}: {', '.join(names)}")
+    return [list(names).index(name) for name in joints]
+
+
+# ---- mjlab
+
+
+def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> Any:
+    """Return the function of an event term for mjlab. Delays stay as they are.
+
+    With the action of `mjlab_action`, units have the servo model. With another action on position servos they have not.
+
+    Args:
+        term: Action term of the robot.
+        rows: As in `draw_units`.
+    """
+    from mjlab.managers.event_manager import requires_model_fields
+
+    @requires_model_fields(*MODEL_FIELDS)
+    def use_units(env: Any, env_ids: Any) -> None:
+        action = env.action_manager.get_term(term)
+        if servos := getattr(action, "terms", None):
+            return servos.set_units(*draw_units(file, "units", env, env_ids, rows))
+        ids, joints, units = draw_units(file, "plain_units", env, env_ids, rows)
+        model, joints = env.sim.mj_model, [f"{action.cfg.entity_name}/{name}" for name in joints]
+        driven = {model.joint(joint).name: servo for servo, joint in enumerate(model.actuator_trnid[:, 0])
+                  if (model.actuator_trntype[servo], model.actuator_biastype[servo]) == (0, 1)}  # fmt: skip
+        columns_of(joints, driven, "joints with position servos")
+        at = [[driven[name] for name in joints], [model.joint(name).dofadr[0] for name in joints]]
+        servo, dof = torch.tensor(at, device=env.device)
+        write_model(env.sim.model, ids, dof, servo, units)
+
+    return use_units
+
+
+def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: Units) -> None:
+    """Write units to a model of mjlab, at the addresses of the joints."""
+    at, kp, limit = env_ids[:, None], units["kp"], units["effort_limit"]
+    model.dof_armature[at, dof], model.dof_frictionloss[at, dof] = units["armature"], units["frictionloss"]
+    damping = model.dof_damping  # MuJoCo's versions differ in whether it has powers of the speed
+    damping[(at, dof, 0) if damping.ndim == 3 else (at, dof)] = units["damping"]
+    model.actuator_gainprm[at, servo, 0] = kp
+    model.actuator_biasprm[at, servo, 0], model.actuator_biasprm[at, servo, 1] = kp * units["offset"], -kp
+    model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
+
+
+# ---- Isaac Lab
+
+
+def apply_units(
+    env: Any, env_ids: Any, asset_cfg: Any, file: str, term: str | None = "joint_pos", rows: Any = None
+) -> None:
+    """Event term of Isaac Lab 2.3 and 3. Units are without the servo model; kd stays as it is.
+
+    Args:
+        asset_cfg: SceneEntityCfg of the robot. All joints of the file are set.
+        term: Action term of `isaaclab_action`, which applies delays and offsets. None: DelayedPDActuators apply delays
+            in whole physics steps, in mode "reset" only, and offsets are not applied.
+        rows: As in `draw_units`.
+
+    Raises:
+        ValueError: The scene cannot have a number of a unit; the message says which.
+    """
+    robot = env.scene[asset_cfg.name]
+    ids, joints, units = draw_units(file, "plain_units", env, env_ids, rows)
+    columns = columns_of(joints, robot.joint_names, "joints of the articulation")
+    groups = {joint: group for group in robot.actuators.values() if not hasattr(group, "network")
+              for joint in getattr(group, "joint_names", ())}  # fmt: skip
+    columns_of(joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)")
+    if term is None:
+        _delay(joints, groups, units["delay"] / env.physics_dt, ids)
+    elif hasattr(action := env.action_manager.get_term(term), "set_units"):
+        action.set_units(ids, joints, units)
+    else:
+        raise ValueError(f"action term '{term}' has no delays and offsets; use isaaclab_action, or term=None")
+    _write(robot, "armature", columns, ids, units["armature"])
+    both = any(name.startswith("write_joint_dynamic_friction") for name in dir(robot))  # PhysX, where rest ≥ motion
+    friction = units["frictionloss"], units["frictionloss"] if both else None, units["damping"]
+    _write(robot, "friction_coefficient", columns, ids, *friction)
+    implicit = [i for i, joint in enumerate(joints) if getattr(groups[joint], "is_implicit_model", False)]
+    for what, field in (("stiffness", "kp"), ("effort_limit", "effort_limit")):
+        for i, joint in enumerate(joints):  # simulations have gains of implicit actuators only
+            group = groups[joint]
+            values = getattr(group, f"actuator_{what}", None)  # Isaac Lab 3 renamed the limit
+            values = getattr(group, what) if values is None else values
+            getattr(values, "torch", values)[ids, list(group.joint_names).index(joint)] = units[field][:, i]
+        if implicit:
+            _write(robot, what, [columns[i] for i in implicit], ids, units[field][:, implicit])
+
+
+def _write(robot: Any, what: str, columns: list[int], ids: Tensor, *values: Tensor | None) -> None:
+    """Call a writer of Isaac Lab 3 or 2, whose first parameters are the values, (worlds, joints)."""
+    names = f"write_joint_{what}_to_sim_index", f"write_joint_{what}_to_sim"
+    write = getattr(robot, names[0], getattr(robot, names[1], None))
+    places = [] if write is None else [name for name in inspect.signature(write).parameters if name[-4:] != "_ids"]
+    if write is None or len(places) < len(values):
+        raise ValueError(f"{names[1]} is missing or lacks parameters: take Isaac Lab 2.3 or 3")
+    write(**dict(zip(places, values, strict=False)), joint_ids=columns, env_ids=ids)
+
+
+def _delay(joints: list[str], groups: dict[str, Any], steps: Tensor, ids: Tensor) -> None:
+    """Set the delays of DelayedPDActuators, physics steps (worlds, joints); a group has one delay for all joints."""
+    lags = dict[int, Tensor]()
+    for joint, lag in zip(joints, steps.round().int().T, strict=True):
+        group = groups[joint]
+        if (lags.setdefault(id(group), lag) != lag).any():
+            raise ValueError(f"joint '{joint}' needs a delay of its own: make an actuator group for each joint")
+        buffers = [getattr(group, name) for name in DELAY_BUFFERS if hasattr(group, name)]
+        if lag.any() and not buffers:
+            raise ValueError(f"joint '{joint}' needs a delay: take DelayedPDActuatorCfg, or isaaclab_action")
+        for buffer in buffers:
+            buffer.set_time_lag(lag, ids)

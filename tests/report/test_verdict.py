@@ -1,0 +1,33 @@
+"""Sentences about the errors of methods."""
+
+import numpy as np
+import pytest
+
+from gaponet.report.verdict import network_gain, verdict
+
+
+def scores(*errors, motions):
+    by_motion = {f"chirp@{i}": {"mpjae": e} for i, e in enumerate(errors)}
+    grouped = np.array_split(errors, motions)
+    return {
+        "mpjae": float(np.mean(errors)), "by_joint": {"elbow": {"mpjae": 1.0}}, "by_motion": by_motion,
+        "by_independent_motion": {f"chirp{i}": {"mpjae": float(np.mean(e))} for i, e in enumerate(grouped)},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("motions", "words"), [(1, "1.00 mrad (one motion)"), (2, "1.00 ± 0.50 mrad")])
+def test_pieces_of_one_motion_have_no_standard_error(motions, words):
+    before, after = (
+        scores(5e-3, 5e-3, 6e-3, 6e-3, motions=motions),
+        scores(4.5e-3, 4.5e-3, 4.5e-3, 4.5e-3, motions=motions),
+    )
+    methods = {"nominal": before, "identified": before, "identified+mlp": after}
+    assert network_gain(methods, "identified+mlp").reduction == pytest.approx(1e-3)
+    assert words in verdict(methods)[-1]
+    assert f"{motions} independent motion" in verdict(methods)[1]
+
+
+def test_files_of_earlier_versions_have_motions_only():
+    old = {k: v for k, v in scores(5e-3, 7e-3, motions=1).items() if k != "by_independent_motion"}
+    gain = network_gain({"nominal": old, "mlp": old}, "mlp")
+    assert (gain.reduction, gain.standard_error) == (0.0, 0.0)
