@@ -21,6 +21,15 @@ def test_the_packages_robots_are_listed_and_right(name, capsys):
     assert result["joints"][0].keys() >= {"kp", "kd", "effort_limit", "range", "operated"}
 
 
+def test_servo_types_are_printed_with_intervals_and_sources(capsys):
+    assert main(["robot", "servos", "sts3215"]) == 0
+    text = capsys.readouterr().out
+    assert "1.4 (0.48…2.7)" in text
+    assert "isaac-sim2real/sage" in text
+    assert "GO-M8010-6" not in text
+    assert main(["robot", "servos", "no such"]) == 2
+
+
 def test_a_users_folder_is_checked_and_shown(tmp_path, capsys):
     write_arm(tmp_path / "arm")
     assert main(["robot", "check", str(tmp_path / "arm")]) == 0

@@ -11,6 +11,7 @@ from vendors import MJCF, URDF, write_mjcf, write_urdf
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.robot.mjcf import read_mjcf
 from gaponet.robot.new import NewRobot, RobotOptions, new_robot
+from gaponet.robot.spec import servo_type
 from gaponet.sim.model import build_model
 from gaponet.sim.robot_check import check_robot
 
@@ -250,3 +251,16 @@ def test_broken_models_are_refused_with_their_file(tmp_path, name, text, words):
         make(tmp_path, tmp_path / name)
     with pytest.raises(RobotError, match="is a folder; name the model in it"):
         make(tmp_path, tmp_path)
+
+
+def test_a_named_servo_type_fills_damping_friction_armature_and_torque_limit(tmp_path):
+    made = make(tmp_path, joints=ARM, servo=("STS3215", "roll=XL330-M288-T"), effort_limit=("elbow=1",))
+    for joint, name in (("shoulder", "STS3215"), ("elbow", "STS3215"), ("roll", "XL330-M288-T")):
+        servo, spec = servo_type(name, ""), read_mjcf(made.robot.mjcf).joint(joint)
+        for field in ("damping", "frictionloss", "armature"):
+            assert np.ravel(getattr(spec, field))[0] == pytest.approx(servo.measured[field].value)
+        assert written(made)[joint]["servo"] == name
+        assert written(made)[joint]["effort_limit"] == (1.0 if joint == "elbow" else servo.effort_limit)
+    assert made.drives[0].passive_source.startswith("servo STS3215 (armature, damping, frictionloss: isaac-sim2real")
+    with pytest.raises(RobotError, match=r"--servo STS3216: servo .STS3216. is no .*; nearest: STS3215"):
+        make(tmp_path / "other", servo=("STS3216",))

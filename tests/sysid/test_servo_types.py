@@ -1,10 +1,17 @@
-"""Servos of one type: published values, and values taken over from another robot."""
+"""Servo types: the package's table, entries from identified robots, and values taken over from another robot."""
+
+import json
 
 import pytest
 from arm import TOML, write_arm
 
 from gaponet.base.errors import RobotError, UsageError
-from gaponet.sysid.servo_types import far_from_published, mirrored, servos_like
+from gaponet.cli.main import main
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot, servo_table
+from gaponet.robot.toml_file import Spread
+from gaponet.sysid.servo_types import far_from_servo_type, measured_types, mirrored, servos_like
+from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, to_axes
 
 SERVO = '[[servo]]\nname = "S1"\nsource = "a bench"\narmature = 0.02\ndamping = 0.5\n'
 TWO = (
@@ -17,9 +24,62 @@ TWO = (
 
 def test_a_value_an_order_of_magnitude_off_is_named(tmp_path):
     robot = write_arm(tmp_path, TWO)
-    assert far_from_published(robot) == []
+    assert far_from_servo_type(robot) == []
     odd = robot.with_servos({"elbow": {"armature": 0.25, "damping": 0.4}})
-    assert far_from_published(odd) == ["elbow: armature 0.25 is 12 times the 0.02 published for the S1 (a bench)"]
+    assert far_from_servo_type(odd) == ["elbow: armature 0.25 is 12 times the 0.02 of the S1 (a bench)"]
+
+
+def test_every_type_of_the_table_has_source_licence_and_ordered_values():
+    table = servo_table()
+    assert len({servo.name for servo in table.servo}) == len(table.servo)
+    for servo in table.servo:
+        assert servo.source
+        assert servo.licence
+        assert servo.measured or servo.effort_limit
+        for spread in servo.measured.values():
+            assert spread.low <= spread.value <= spread.high
+    with pytest.raises(RobotError, match="value 3 must lie from low 1 to high 2"):
+        Spread(3.0, 1.0, 2.0)
+
+
+def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loads(tmp_path, capsys):
+    robot = write_arm(tmp_path / "nominal", TWO)
+    values = {"shoulder": (0.8, 0.1, 0.03), "elbow": (1.2, 0.3, 0.05)}
+    fields = ("damping", "frictionloss", "armature")
+    save_robot(robot.with_servos({j: dict(zip(fields, v, strict=True)) for j, v in values.items()}), tmp_path / "id")
+    command = ["robot", "servos", "--from", str(tmp_path / "id")]
+    assert main(command) == 2  # without a licence
+    capsys.readouterr()
+    command += ["--source", "my logs", "--licence", "CC0-1.0"]
+    assert main(command) == 0
+    entry = capsys.readouterr().out
+    (servo, _) = write_arm(tmp_path / "used", TWO.replace(SERVO, entry)).servos
+    assert (servo.name, servo.source, servo.licence, servo.joints, servo.robots) == ("S1", "my logs", "CC0-1.0", 2, 1)
+    for field, low, high in zip(fields, *values.values(), strict=True):
+        assert vars(servo.measured[field]) == pytest.approx({"value": (low + high) / 2, "low": low, "high": high})
+    assert main([*command, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["servos"][0]["damping"] == {"value": 1.0, "low": 0.8, "high": 1.2}
+
+
+def test_the_interval_of_a_single_joint_is_that_of_its_standard_error(tmp_path):
+    robot = write_arm(tmp_path / "nominal", TWO).with_servos({"elbow": {"frictionloss": 0.2}})
+    save_robot(robot, tmp_path / "id")
+    fields, std = ("kp", "frictionloss"), 0.02 / 20.0  # on the axis: friction over kp
+    rest = ((0.0,) * 3, ((0.0,) * 3,) * 3, (1.0,) * 3, 0.0, 0.0, 0.0)
+    joints = {
+        joint: JointUncertainty(tuple(x), ((0.0, 0.0), (0.0, std**2)), *rest)
+        for joint, x in to_axes(robot, fields).items()
+    }
+    ParameterUncertainty(fields, joints, (), 24, True).save(tmp_path / "id")
+    (servo,) = measured_types([load_robot(tmp_path / "id")], "my logs", "CC0-1.0")
+    assert servo.measured == {"frictionloss": Spread(0.2, 0.167, 0.233)}  # 1.645 of them
+
+
+def test_a_robot_s_own_servo_type_comes_before_the_table_s(tmp_path):
+    used = TWO.replace('"S1"', '"STS3215"')
+    own, packaged = (write_arm(tmp_path, toml).servos[0] for toml in (used, used.split("[[servo]]")[0]))
+    assert (own.source, own.measured["armature"].value) == ("a bench", 0.02)
+    assert packaged == load_robot("so101").servos[0]
 
 
 def test_an_undefined_servo_type_is_refused(tmp_path):

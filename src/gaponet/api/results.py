@@ -259,7 +259,7 @@ class TorqueResult(Result):
     fit: TorqueDrivenFit = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        from gaponet.sysid.torque_motors import PASSIVE_FIELDS
+        from gaponet.robot.servo_fields import PASSIVE_FIELDS
 
         fit, robot = self.fit, self.robot
         joints = {

@@ -14,11 +14,11 @@ from gaponet.cli import options
 from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import Out, writes
 from gaponet.report.tables import mrad, mrad_with_error
-from gaponet.robot.servo_fields import SERVO_FIELDS, Term
+from gaponet.robot.servo_fields import PASSIVE_FIELDS, SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument
+from gaponet.robot.toml_file import MEASURED_FIELDS
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
-from gaponet.sysid.torque_motors import PASSIVE_FIELDS
 
 UNDETERMINED = "not determined by these logs"
 
@@ -95,8 +95,8 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     rows = [[j, *(_cell(v.get(f), fit.std[j].get(f), SERVO_FIELDS[f].factor) for f in shown)]
             for j, v in values.items()]  # fmt: skip
     for servo in dict.fromkeys(filter(None, (fit.robot.servos[i] for i in fit.robot.operated_index))):
-        published = [_cell(servo.published.get(f), None, SERVO_FIELDS[f].factor) for f in shown]
-        rows.append([f"published for {servo.name}, {servo.source}", *published])
+        if any(cells := [servo.text(f) if f in MEASURED_FIELDS else "" for f in shown]):
+            rows.append([f"servo {servo.name}, {servo.source}", *cells])
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in shown)]
     screen.wide_table("Identified servos, ± standard error", columns, rows)
     for term in fit.comparisons:

@@ -1,8 +1,9 @@
-"""gaponet robot new, check, list, link, show."""
+"""gaponet robot new, check, list, link, show, servos."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,7 +14,8 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.cli.options import Flag, Folder, Json, Model, actions
 from gaponet.cli.out import Out
-from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
+from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument, servo_table
+from gaponet.robot.toml_file import MEASURED_FIELDS
 from gaponet.share.reading import open_dataset
 
 if TYPE_CHECKING:
@@ -102,6 +104,7 @@ def new(
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
     effort_limit: tuple[str, ...] = (),
+    servo: tuple[str, ...] = (),
     packages: tuple[str, ...] = (),
     rate: float = 50.0,
     keyframe: str = "",
@@ -120,6 +123,8 @@ def new(
             value replaces an earlier one. Default: the model's actuators.
         kd: Damping gain, likewise, N·m·s/rad.
         effort_limit: Torque limit, likewise, N·m.
+        servo: Servo type, likewise, as gaponet robot servos lists them: its measured damping, friction and armature and
+            its torque limit replace the model's.
         packages: NAME=FOLDER for package://NAME in a URDF. Default: searched around the file.
         rate: Commands per second, Hz.
         keyframe: Keyframe that gives the home position and the angles of frozen joints. Default: the first, or zero.
@@ -132,10 +137,12 @@ def new(
     from gaponet.robot.new import RobotOptions, new_robot
 
     screen = Out(json)
-    made = new_robot(model, out, RobotOptions(joints, kp, kd, effort_limit, packages, rate, keyframe, contacts, name))
+    options = RobotOptions(joints, kp, kd, effort_limit, servo, packages, rate, keyframe, contacts, name)
+    made = new_robot(model, out, options)
     for note in made.notes:
         screen.say(f"  {note}", "   note", "cyan")
-    for what, field in (("kp", "kp_source"), ("kd", "kd_source"), ("effort_limit", "limit_source")):
+    passive = ("damping, friction, armature", "passive_source")
+    for what, field in (("kp", "kp_source"), ("kd", "kd_source"), ("effort_limit", "limit_source"), passive):
         screen.say(f"  {what}: {', '.join(dict.fromkeys(getattr(d, field) for d in made.drives))}", "   from", "cyan")
     picture = None
     try:
@@ -262,6 +269,50 @@ def show(
     })  # fmt: skip
 
 
-@actions(new=new, check=check, list=list_robots, link=link, show=show)
+def servos(
+    name: tyro.conf.Positional[str] = "",
+    measured: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = (),
+    source: str = "",
+    licence: str = "",
+    json: Json = False,
+) -> None:
+    """Servo types: limits, measured values (median, and 5 to 95 % of joints with their standard errors), and sources.
+
+    Args:
+        name: Only types with this in their names.
+        measured: Identified robot folders; prints an entry for each servo type of their joints, as TOML, instead.
+        source: Data set of the recordings, for --from.
+        licence: Licence of the data set, for --from.
+    """
+    from gaponet.robot.servo_fields import SERVO_FIELDS
+    from gaponet.sysid.servo_types import measured_types, toml_entry
+
+    out, table = Out(json), servo_table()
+    if measured and not (source and licence):
+        raise UsageError("--from: name the recordings' data set with --source, and its licence with --licence")
+    types = measured_types(list(map(load_robot, measured)), source, licence) if measured else table.servo
+    types = [servo for servo in types if name.lower() in servo.name.lower()]
+    if not types:
+        raise UsageError(f"no servo type has '{name}' in its name; gaponet robot servos lists them")
+    if measured:
+        for line in "\n".join(map(toml_entry, types)).splitlines():
+            out.say(line)
+    else:
+        stated = {"effort_limit": "torque limit, N·m", "speed_limit": "speed limit, rad/s", "gain": "kp of 1, N·m/rad"}
+        parts = {"measured (5…95 %)": MEASURED_FIELDS[:3], "stated": tuple(stated), "more terms": MEASURED_FIELDS[3:]}
+        for what, fields in parts.items():
+            headings = [stated.get(f) or SERVO_FIELDS[f].heading for f in fields]
+            rows = [[servo.name, *(servo.text(f) for f in fields)] for servo in types]
+            title = f"Servo types, version {table.version}: {what}"
+            out.table(title, ["servo type", *headings], [row for row in rows if any(row[1:])])
+        for servo in types:
+            counts = servo.gaponet and f"joints: {servo.joints}, robots: {servo.robots}; gaponet {servo.gaponet}"
+            limits = servo.limit_source and f"limits: {servo.limit_source}"
+            sources = filter(None, (servo.variant, servo.source, servo.licence, counts, limits))
+            out.say(f"{servo.name}: {'; '.join(sources)}")
+    out.result({"version": table.version, "servos": [asdict(servo) for servo in types]})
+
+
+@actions(new=new, check=check, list=list_robots, link=link, show=show, servos=servos)
 def robot(action: None) -> None:
-    """Make, check or show a robot folder; listen to a robot."""
+    """Make, check or show a robot folder; list servo types; listen to a robot."""

@@ -11,6 +11,8 @@ import numpy as np
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.finding import abbreviate
+from gaponet.robot.servo_fields import PASSIVE_FIELDS
+from gaponet.robot.spec import ServoType, servo_type
 
 NO_LIMIT = 1e6  # N·m
 ON_JOINT = [int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)]
@@ -23,6 +25,7 @@ class Drive:
     Attributes:
         actuator: Name of the joint's only actuator, else "".
         kp, kd, limit, home: N·m/rad, N·m·s/rad, N·m, rad.
+        servo: Servo type that the user named.
     """
 
     name: str
@@ -34,6 +37,19 @@ class Drive:
     limit: float
     limit_source: str
     home: float
+    servo: ServoType | None
+
+    @property
+    def passive(self) -> dict[str, float]:
+        """Damping, dry friction and armature of the servo type, where it has them."""
+        measured = self.servo.measured if self.servo else {}
+        return {f: max(measured[f].value, 0.0) for f in PASSIVE_FIELDS if f in measured}
+
+    @property
+    def passive_source(self) -> str:
+        """Source of these values."""
+        values = ", ".join(self.passive) or "no values"
+        return f"servo {self.servo.name} ({values}: {self.servo.source})" if self.servo else "the model"
 
 
 def drives(
@@ -47,13 +63,15 @@ def drives(
 
     Args:
         pose: Home pose, (nq).
-        given: The user's options kp, kd and effort_limit, such as ("100", "*wrist*=20").
+        given: The user's options kp, kd, effort_limit and servo, such as ("100", "*wrist*=20").
         file: Name of the model, for sources and messages.
 
     Raises:
         UsageError: An option is no number or names no joint, or a joint has no kp.
     """
-    options = {name: _parse_option(name, words, joints) for name, words in given.items()}
+    words = {name: _by_joint(name, given[name], joints) for name in given}
+    servos = {j: servo_type(word.rpartition("=")[2], f"--servo {word}") for j, word in words.pop("servo").items()}
+    options = {name: {j: _number(name, word) for j, word in by.items()} for name, by in words.items()}
     result, without_gain = [], []
     for name in joints:
         j = model.joint(name).id
@@ -72,11 +90,14 @@ def drives(
             kd, sources["kd"] = options["kd"][name], "--kd"
         limits = [*_limits(model, j, actuators, file), (NO_LIMIT, f"{file} has none: write the motor's")]
         limit, why = min(limits, key=lambda x: x[0])
+        servo = servos.get(name)
+        if servo is not None and servo.effort_limit is not None:
+            limit, why = servo.effort_limit, f"servo {servo.name}"
         if name in options["effort_limit"]:
             limit, why = options["effort_limit"][name], "--effort-limit"
         actuator = model.actuator(actuators[0]).name if len(actuators) == 1 else ""
         home = float(pose[model.jnt_qposadr[j]])
-        result.append(Drive(name, actuator, kp, sources["kp"], kd, sources["kd"], limit, why, home))
+        result.append(Drive(name, actuator, kp, sources["kp"], kd, sources["kd"], limit, why, home, servo))
     if without_gain:
         raise UsageError(
             f"{file} has no position gain for {abbreviate(without_gain)}: give those of the controller that recorded "
@@ -110,20 +131,22 @@ def _limits(model: mujoco.MjModel, j: int, actuators: list[int], file: str) -> I
             yield float(gear * most), f"ctrlrange of its motor in {file}"
 
 
-def _parse_option(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, float]:
-    """Convert ("100", "*wrist*=20") to joint → number; a later word overrides earlier ones."""
-    values: dict[str, float] = {}
+def _by_joint(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, str]:
+    """Return joint → its last word among ("100", "*wrist*=20")."""
+    by: dict[str, str] = {}
     for word in words:
-        pattern, _, number = word.rpartition("=")
-        matches = [j for j in joints if fnmatchcase(j, pattern or "*")]
-        try:
-            value = float(number)
-        except ValueError:
-            value = np.nan
-        flag = f"--{name.replace('_', '-')} {word}"
-        if not (np.isfinite(value) and 0 <= value <= NO_LIMIT):
-            raise UsageError(f"{flag}: give a number from 0 to {NO_LIMIT:g}, or PATTERN=NUMBER")
+        matches = [j for j in joints if fnmatchcase(j, word.rpartition("=")[0] or "*")]
         if not matches:
-            raise UsageError(f"{flag}: no such joint; there are: {', '.join(joints)}")
-        values |= dict.fromkeys(matches, value)
-    return values
+            raise UsageError(f"--{name.replace('_', '-')} {word}: no such joint; there are: {', '.join(joints)}")
+        by |= dict.fromkeys(matches, word)
+    return by
+
+
+def _number(name: str, word: str) -> float:
+    try:
+        value = float(word.rpartition("=")[2])
+    except ValueError:
+        value = np.nan
+    if not 0 <= value <= NO_LIMIT:
+        raise UsageError(f"--{name.replace('_', '-')} {word}: give a number from 0 to {NO_LIMIT:g}, or PATTERN=NUMBER")
+    return value

@@ -32,6 +32,7 @@ class RobotOptions:
     Attributes:
         joints: Logged joints; all others are fixed. Default: those with an actuator, or all hinges if none has one.
         kp, kd, effort_limit: "100" or "*wrist*=20", N·m/rad, N·m·s/rad, N·m; a later value overrides earlier ones.
+        servo: "STS3215" or "*wrist*=XL330-M288-T": types whose measured values and torque limits replace the model's.
         packages: "NAME=FOLDER" of package://NAME.
         rate: Rate of commands, Hz.
         keyframe: Home position, also of fixed joints; default: the first keyframe.
@@ -42,6 +43,7 @@ class RobotOptions:
     kp: tuple[str, ...] = ()
     kd: tuple[str, ...] = ()
     effort_limit: tuple[str, ...] = ()
+    servo: tuple[str, ...] = ()
     packages: tuple[str, ...] = ()
     rate: float = 50.0
     keyframe: str = ""
@@ -77,9 +79,13 @@ def new_robot(path: Path, out: Path, options: RobotOptions) -> NewRobot:
     model = compile_spec(spec, path)
     logged = _logged_joints(model, options.joints, path)
     pose, source = _home(model, options.keyframe, path)
-    given = {name: getattr(options, name) for name in ("kp", "kd", "effort_limit")}
+    given = {name: getattr(options, name) for name in ("kp", "kd", "effort_limit", "servo")}
     joint_drives = drives(model, logged, pose, given, path.name)
     notes += _notes(spec, model, logged, pose, path)
+    for d in joint_drives:
+        for name, value in d.passive.items():
+            polynomial = np.ndim(getattr(spec.joint(d.name), name))  # of newer MuJoCo; a number of older
+            setattr(spec.joint(d.name), name, [[value], [0.0], [0.0]] if polynomial else value)
     text = _robot_xml(spec, model, logged, pose, path, options.contacts)
     robot_toml = _robot_toml(model, joint_drives, options, path, source)
     for name in (*_joint_names(model), *(model.body(b).name for b in range(model.nbody))):
@@ -239,6 +245,7 @@ def _robot_toml(
             *([f"aliases = [{json.dumps(d.actuator)}]  # its actuator"] if d.actuator not in ("", *names) else []),
             f"kp = {d.kp!r}  # N·m/rad: {d.kp_source}", f"kd = {d.kd!r}  # N·m·s/rad: {d.kd_source}",
             f"effort_limit = {d.limit!r}  # N·m: {d.limit_source}",
+            *([f"servo = {json.dumps(d.servo.name, ensure_ascii=False)}  # --servo"] if d.servo else []),
             f"home = {float(d.home)!r}  # rad: {source}", "operated = true",
         ]  # fmt: skip
     for side, body, pos, why in _mounts(model, names):

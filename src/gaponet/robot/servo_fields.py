@@ -123,6 +123,7 @@ SERVO_FIELDS: dict[str, ServoField] = {
         _angle("stop_high", heading="high stop, rad", default=math.nan, cause="contact"),
     )
 }  # fmt: skip
+PASSIVE_FIELDS = ("armature", "damping", "frictionloss")  # that a joint has without a motor
 SERVO_TERMS = tuple(f.name for f in SERVO_FIELDS.values() if f.in_servo_model)
 STOP_FIELDS = ("stop_low", "stop_high")
 TERMS: dict[Term, tuple[str, ...]] = {

@@ -24,7 +24,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.base.structure import read_toml
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
-from gaponet.robot.toml_file import PayloadMount, RobotTable, ServoType, Table, Tip
+from gaponet.robot.toml_file import PayloadMount, RobotTable, ServoTable, ServoType, Table, Tip
 
 __all__ = ["PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "load_robot", "packaged_robots"]
 
@@ -64,7 +64,7 @@ class RobotSpec:
         friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's, (n).
         min_torque: Smallest torque that turns the motor, (n), N·m.
         encoder_step: Resolution of the servo's angle, (n), rad; 0 if it has no effect.
-        servos: Servo type of each joint, (n); None if robot.toml states none.
+        servos: Servo type of each joint, (n), of robot.toml or servos.toml; None if robot.toml names none.
         tips, table: Tips that can touch a table, and the table; all other contacts are then off.
         carries_payload: True if the simulated robot carries the payload of the recordings.
         gain_scale: Factor on kp and kd of operated joints in [[joint]]; kp and kd include it.
@@ -327,14 +327,19 @@ def _folder(name_or_path: str | Path) -> Path:
     return packaged
 
 
-def _servo_types(table: RobotTable) -> tuple[ServoType | None, ...]:
-    """Return the servo type of each joint."""
-    types: dict[str, ServoType | None] = {"": None} | {servo.name: servo for servo in table.servo}
-    for joint in table.joint:
-        if joint.servo not in types:
-            names = ", ".join(s.name for s in table.servo) or "none"
-            raise RobotError(f"joint '{joint.name}': servo '{joint.servo}' is no [[servo]]; there are: {names}")
-    return tuple(types[joint.servo] for joint in table.joint)
+@functools.cache
+def servo_table() -> ServoTable:
+    """Return the package's servo types."""
+    return read_toml(ServoTable, PACKAGE_FOLDER.parent / "servos.toml", RobotError)
+
+
+def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoType:
+    """Return the servo type of that name among a robot.toml's own and the package's; `where` begins the error."""
+    types = {servo.name: servo for servo in (*servo_table().servo, *own)}
+    if name not in types:
+        near = " or ".join(difflib.get_close_matches(name, types, n=MAX_SUGGESTIONS, cutoff=0.0))
+        raise RobotError(f"{where}: servo '{name}' is no [[servo]], nor in gaponet robot servos; nearest: {near}")
+    return types[name]
 
 
 def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
@@ -355,7 +360,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         payload_mounts=table.payload_mount,
         dt=table.dt,
         timestep=table.timestep,
-        servos=_servo_types(table),
+        servos=tuple(servo_type(j.servo, f"joint '{j.name}'", table.servo) if j.servo else None for j in joints),
         tips=table.tip,
         table=table.table,
         contacts=table.contacts,

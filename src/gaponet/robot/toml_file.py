@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval, Len
 
-from gaponet.base.structure import Angle, Name
-from gaponet.robot.servo_fields import SERVO_FIELDS
+from gaponet.base.errors import RobotError
+from gaponet.base.structure import Angle, Count, Name
+from gaponet.robot.servo_fields import PASSIVE_FIELDS, SERVO_FIELDS
 
 Gain = Annotated[float, Interval(ge=0, le=1e6)]
 Metres = Annotated[float, Interval(ge=-100, le=100)]
@@ -23,27 +24,71 @@ class _Joint:
     home: Angle = 0.0  # rad
     operated: bool = True
     log_unit: Literal["rad", "deg", "fraction"] = "rad"
-    servo: str = ""  # name of a [[servo]]
+    servo: str = ""  # name of a servo type
     aliases: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
+class Spread:
+    """Value of a servo type: the median of its joints, and the 5 and 95 % of their estimates and standard errors."""
+
+    value: float
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.value <= self.high:
+            raise RobotError(f"value {self.value:g} must lie from low {self.low:g} to high {self.high:g}")
+
+
+@dataclass(frozen=True)
 class ServoType:
-    """[[servo]]: servo type that joints refer to, with published measurements and their source."""
+    """[[servo]]: servo type that joints refer to; in servos.toml, or in a robot.toml, whose types come first."""
 
     name: Name
-    source: str = ""
-    damping: Gain | None = None  # N·m·s/rad
-    armature: Gain | None = None  # kg·m²
-    frictionloss: Gain | None = None  # N·m
+    variant: str = ""  # gear, supply, place
+    source: str = ""  # data set of the measured values
+    licence: str = ""  # of the data set
+    gaponet: str = ""  # version or commit that identified the values
+    robots: Count = 0  # that the values are of
+    joints: Count = 0
     gain: Gain | None = None  # N·m/rad for a firmware kp of 1
     gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = None  # V, of its supply; gain is in proportion
+    effort_limit: Gain | None = None  # N·m
+    speed_limit: Gain | None = None  # rad/s
+    limit_source: str = ""
+    damping: Spread | Gain | None = None  # N·m·s/rad beside the stated kd; below 0 the servo acts with less kd
+    frictionloss: Spread | Gain | None = None  # N·m
+    armature: Spread | Gain | None = None  # kg·m²
+    stribeck: Spread | Gain | None = None  # N·m
+    stribeck_speed: Spread | Gain | None = None  # rad/s
+    friction_motor: Spread | Gain | None = None  # N·m per N·m of the motor
 
     @property
-    def published(self) -> dict[str, float]:
-        """Published values by field."""
-        values = {"damping": self.damping, "armature": self.armature, "frictionloss": self.frictionloss}
-        return {name: value for name, value in values.items() if value is not None}
+    def measured(self) -> dict[str, Spread]:
+        """Measured values by field; one without an interval is its own."""
+        values = ((f, getattr(self, f)) for f in MEASURED_FIELDS)
+        return {f: x if isinstance(x, Spread) else Spread(x, x, x) for f, x in values if x is not None}
+
+    def text(self, field: str) -> str:
+        """Return a value in the unit of the field's heading, with its interval or supply; "" if there is none."""
+        value, factor = getattr(self, field), SERVO_FIELDS[field].factor if field in MEASURED_FIELDS else 1.0
+        if isinstance(value, Spread):
+            middle, low, high = (f"{float(f'{factor * x:.2g}'):g}" for x in vars(value).values())
+            return f"{middle} ({low}…{high})"
+        supply = f" at {self.gain_volts:g} V" if field == "gain" and self.gain_volts else ""
+        return "" if value is None else f"{factor * value:.3g}{supply}"
+
+
+MEASURED_FIELDS = (*PASSIVE_FIELDS, "stribeck", "stribeck_speed", "friction_motor")
+
+
+@dataclass(frozen=True)
+class ServoTable:
+    """servos.toml; `version` rises when a value changes."""
+
+    version: Count
+    servo: tuple[ServoType, ...]
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from gaponet.sysid.problem import (
     standard_errors,
 )  # fmt: skip
 from gaponet.sysid.robot_rollouts import cut
-from gaponet.sysid.servo_types import far_from_published
+from gaponet.sysid.servo_types import far_from_servo_type
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
 from gaponet.sysid.torque import with_torque
 
@@ -184,7 +184,7 @@ def _fit_robot(
         ]
     warnings = (
         *joints.bounds.warnings(values[-1], fitted_fields(values[-1])), *stop_questions(given, robot),
-        *far_from_published(fitted), *errors.sentences,
+        *far_from_servo_type(fitted), *errors.sentences,
     )  # fmt: skip
     before, after = (float(judge.errors(v).mean()) for v in (first, values))
     by_joint = zip(*(judge.errors_by_joint(v).tolist() for v in (first, values)), strict=True)

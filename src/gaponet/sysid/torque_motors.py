@@ -21,6 +21,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
+from gaponet.robot.servo_fields import PASSIVE_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model
@@ -33,7 +34,6 @@ HORIZONS_S = (0.1, 0.5, 1.0)
 PART_S = 4.0  # of recordings that fit and judge in turn
 MIN_ROWS = 20  # of a regression
 HUBER_SCALE, HUBER_ROUNDS = 1.345, 10  # in standard deviations, beyond which a row counts less: somebody pushed
-PASSIVE_FIELDS = ("armature", "damping", "frictionloss")
 
 
 class _Rows(NamedTuple):
