@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -30,95 +28,131 @@ from gaponet.experiments.real.questions import Question
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import open_dataset
-from gaponet.sim.model import build_model
-from gaponet.sim.replay import replay
+from gaponet.sim.model import build_spec, stiffen_friction
+from gaponet.sim.replay import idle_limbs, replay
 
 WINDOW, COUNT, SETTLE = 5.0, 8, 0.1  # length of a window, s; number of windows; ignored start, s
 LOW, HIGH, STEP = (0.1, 0.0, 0.0, 0.0, 0.0, -10.0), (10.0, 10.0, 50.0, 50.0, 5.0, 10.0), 0.02
+EVALUATIONS = 25
+LOSS = {"x_scale": "jac", "loss": "soft_l1", "f_scale": 0.01}  # of errors, rad
+
+
+class Problem:
+    """Windows of recordings, and the scaled parameters of n operated joints, (6 n,).
+
+    Attributes:
+        cuts: Windows.
+        specs: Simulator of each window; limbs that no command moves are locked.
+        states: Start of each window: time, positions, velocities.
+        op: Operated joints among those that are not locked.
+        start, low, high: Start and bounds: kp, total damping, friction, armature, delay, offset of each joint.
+    """
+
+    def __init__(
+        self, sequences: list[Sequence], robot: RobotSpec, window: float = 8.0, count: int = 40, friction: float = 200.0
+    ) -> None:
+        """Take `count` windows of so many seconds; `friction` bounds dry friction in thousandths of kp."""
+        lengths = [round(window / s.dt) for s in sequences]
+        cuts = [s.rows(slice(a, a + k)) for s, k in zip(sequences, lengths, strict=True) for a in range(0, len(s), k)]
+        cuts = [c for c in cuts if c.duration > 0.9 * window] or list(sequences)
+        self.cuts = cuts = [cuts[i * len(cuts) // min(count, len(cuts))] for i in range(min(count, len(cuts)))]
+        self.robot, self.steps = robot, [robot.steps_per(c.dt) for c in cuts]
+        locked = idle_limbs(cuts, robot)
+        free = [j for j in robot.joint_names if j not in locked]
+        self.free, self.op = robot.index(free), np.array([free.index(j) for j in robot.operated])
+        self.specs = [
+            build_spec(robot, c.meta.payload_mass, c.meta.payload_side, c.dt, locked, physics_only=True) for c in cuts
+        ]
+        of = robot.operated_index
+        self.gains = np.array([[r.kp[of], r.kd[of]] for r in (robot.with_gains(*c.meta.recorded_gains) for c in cuts)])
+        self.states = np.array([[0.0, *c.qpos[0, self.free], *c.qvel[0, self.free]] for c in cuts], float)
+        self.ticks = np.arange(max((len(c) - 1) * k for c, k in zip(cuts, self.steps, strict=True)))
+        own, n = self.specs[0].compile(), len(of)
+        self.kp, self.kd, damping = robot.kp[of], robot.kd[of], own.dof_damping[self.op] + robot.kd[of]
+        # Stiff joints are unstable with less armature at this step.
+        armature, late = np.maximum(own.dof_armature[self.op], 2.5e-5 * self.kp), np.full(n, 0.02)
+        slow = np.maximum(damping, 0.05 * self.kp)
+        self.scale = np.stack([self.kp, slow, 1e-3 * self.kp, armature, late, late / 2])
+        self.low, self.high = np.repeat(LOW, n), np.repeat((*HIGH[:2], friction, *HIGH[3:]), n)
+        start = np.stack([self.kp, damping, own.dof_frictionloss[self.op], armature, late, 0 * late]) / self.scale
+        self.start = np.clip(start.ravel(), self.low + 0.2, self.high - 0.2)  # the trust region is slow at bounds
+
+    def servos(self, x: np.ndarray, window: int) -> dict[str, np.ndarray]:
+        """Return kp, kd, damping, frictionloss, armature, delay and offset, (n,) each, in a window with its gains."""
+        kp, total, friction, armature, delay, offset = np.reshape(x, (6, -1)) * self.scale
+        given_kp, given_kd = self.gains[window]
+        return {"kp": kp * given_kp / self.kp, "kd": np.maximum(given_kd - np.maximum(self.kd - total, 0), 0),
+                "damping": np.maximum(total - self.kd, 0), "frictionloss": friction, "armature": armature,
+                "delay": delay, "offset": offset}  # fmt: skip
+
+    def controls(self, delay: np.ndarray, window: int) -> np.ndarray:
+        """Return late commands by physics step; linear between commands, so that a delay has a gradient."""
+        cut, times = self.cuts[window], self.ticks * self.specs[window].option.timestep
+        ctrl = cut.ctrl[np.minimum(self.ticks // self.steps[window], len(cut) - 1)][:, self.free].astype(float)
+        for late, j in zip(delay, self.op, strict=True):
+            ctrl[:, j] = np.interp(times - late, times, ctrl[:, j])
+        return ctrl
+
+    def errors(self, states: np.ndarray, window: int) -> np.ndarray:
+        """Return q_sim − q_real of the joints that were recorded, (rows, n) rad, of a rollout's states."""
+        cut, steps = self.cuts[window], self.steps[window]
+        qpos = states[steps - 1 :: steps, 1 + self.op][: len(cut) - 1]
+        error = np.clip(qpos - cut.qpos[1:, self.robot.operated_index], -1, 1)
+        recorded = [j not in cut.meta.unrecorded for j in self.robot.operated]
+        return np.where(np.isfinite(error), error, 1.0)[round(SETTLE / cut.dt) :] * recorded
+
+    def robot_with(self, x: np.ndarray) -> RobotSpec:
+        """Return the robot with fitted parameters."""
+        kp, total, friction, armature, delay, offset = np.reshape(x, (6, -1)) * self.scale
+        servo = {"kp": kp, "damping": total - self.kd, "frictionloss": friction, "armature": armature, "delay": delay,
+                 "offset": offset}  # fmt: skip
+        names = self.robot.operated
+        return self.robot.with_servos({j: {f: float(v[i]) for f, v in servo.items()} for i, j in enumerate(names)})
+
+
+def equal_problem(question: Question) -> Problem:
+    """Return 40 windows of 8 s and friction up to kp / 5, as gaponet identify has them."""
+    gains = {s.meta.recorded_gains for s in question.fitted}
+    return Problem(question.fitted, question.robot.with_gains(*gains.pop()) if len(gains) == 1 else question.robot)
 
 
 def equal_windows(question: Question) -> FittedSim:
-    """Fit with 40 windows of 8 s and friction up to kp / 5, as gaponet identify does."""
-    period = Counter(s.dt for s in question.fitted).most_common(1)[0][0]
-    sequences = [s for s in question.fitted if s.dt == period]
-    gains = {s.meta.recorded_gains for s in sequences}
-    robot = question.robot.with_gains(*gains.pop()) if len(gains) == 1 else question.robot
-    return FittedSim(plain_fit(sequences, robot, window=8.0, count=40, friction=200.0))
+    """Fit with the windows and bounds of gaponet identify."""
+    return FittedSim(fit(equal_problem(question)))
 
 
-def plain_fit(
-    sequences: list[Sequence],
-    robot: RobotSpec,
-    nthread: int = 0,
-    evaluations: int = 25,
-    window: float = WINDOW,
-    count: int = COUNT,
-    friction: float = 50.0,
-) -> RobotSpec:
-    """Fit the robot to windows of recordings with one control period and the gains of robot.toml.
+def plain_fit(sequences: list[Sequence], robot: RobotSpec) -> RobotSpec:
+    """Fit the robot to eight windows of 5 s."""
+    return fit(Problem(sequences, robot, WINDOW, COUNT, 50.0))
 
-    Args:
-        window: Length of a window, s.
-        count: Number of windows.
-        friction: Largest dry friction, thousandths of kp.
-    """
-    length = round(window / sequences[0].dt)
-    cuts = [s.rows(slice(a, a + length)) for s in sequences for a in range(0, len(s), length)]
-    cuts = [c for c in cuts if c.duration > 0.9 * window] or list(sequences)
-    cuts = [cuts[i * len(cuts) // min(count, len(cuts))] for i in range(min(count, len(cuts)))]
-    rows, op = min(map(len, cuts)), robot.operated_index
-    n, kd = len(op), robot.kd[robot.operated_index]
-    models = [build_model(robot, c.meta.payload_mass, c.meta.payload_side, c.dt, physics_only=True) for c in cuts]
-    own, h, steps = models[0], models[0].opt.timestep, robot.steps_per(cuts[0].dt)
-    damping = own.dof_damping[op] + kd
-    armature = np.maximum(
-        own.dof_armature[op], 2.5e-5 * robot.kp[op]
-    )  # stiff joints are unstable with less at this step
-    late, zero = np.full(n, 0.02), np.zeros(n)
-    scale = np.stack(
-        [robot.kp[op], np.maximum(damping, 0.05 * robot.kp[op]), 1e-3 * robot.kp[op], armature, late, late / 2]
-    )
-    low, high = np.repeat(LOW, n), np.repeat((*HIGH[:2], friction, *HIGH[3:]), n)
-    start = np.stack([robot.kp[op], damping, own.dof_frictionloss[op], armature, late, zero]) / scale
-    start = np.clip(start.ravel(), low + 0.2, high - 0.2)  # the trust region is slow at bounds
-    state = np.concatenate([[[0.0, *c.qpos[0], *c.qvel[0]]] for c in cuts]).astype(float)
-    real = np.stack([c.qpos[1:rows, op] for c in cuts])
-    time_of = np.arange((rows - 1) * steps) * h
-    engines = [mujoco.MjData(models[0]) for _ in range(nthread or 2)]
-    pool = Rollout(nthread=len(engines))
+
+def fit(problem: Problem, threads: int = 2) -> RobotSpec:
+    """Fit a robot by least squares."""
+    op, windows = problem.op, range(len(problem.cuts))
+    models = [spec.compile() for spec in problem.specs]
+    for model in models:
+        stiffen_friction(model)
+    engines, pool = [mujoco.MjData(models[0]) for _ in range(threads)], Rollout(nthread=threads)
 
     def errors(x: np.ndarray) -> np.ndarray:
-        kp, total, friction, armature, delay, offset = np.reshape(x, (6, n)) * scale
-        late, controls = [], []
-        for c, model in zip(cuts, models, strict=True):
-            one = mujoco.MjModel.__copy__(model)
-            one.actuator_gainprm[op, 0], one.actuator_biasprm[op, 0] = kp, kp * offset
-            one.actuator_biasprm[op, 1], one.actuator_biasprm[op, 2] = -kp, -np.minimum(kd, total)
-            one.dof_damping[op], one.dof_frictionloss[op] = np.maximum(total - kd, 0), friction
-            one.dof_armature[op] = armature
-            ctrl = c.ctrl[np.arange(len(time_of)) // steps].astype(float)
-            for i, j in enumerate(op):  # linear between commands, so that a delay has a gradient
-                ctrl[:, j] = np.interp(time_of - delay[i], time_of, ctrl[:, j])
-            late.append(one)
-            controls.append(ctrl)
-        found, _ = pool.rollout(late, engines, state, np.stack(controls))
-        qpos = found[:, steps - 1 :: steps, 1 + op]
-        return np.where(np.isfinite(qpos), np.clip(qpos - real, -1, 1), 1.0)[:, round(SETTLE / cuts[0].dt) :].ravel()
+        changed, controls = [], []
+        for w, model in enumerate(models):
+            v, one = problem.servos(x, w), mujoco.MjModel.__copy__(model)
+            one.actuator_gainprm[op, 0], one.actuator_biasprm[op, 0] = v["kp"], v["kp"] * v["offset"]
+            one.actuator_biasprm[op, 1], one.actuator_biasprm[op, 2] = -v["kp"], -v["kd"]
+            one.dof_damping[op], one.dof_frictionloss[op] = v["damping"], v["frictionloss"]
+            one.dof_armature[op] = v["armature"]
+            changed.append(one)
+            controls.append(problem.controls(v["delay"], w))
+        states, _ = pool.rollout(changed, engines, problem.states, np.stack(controls))
+        return np.concatenate([problem.errors(states[w], w).ravel() for w in windows])
 
     def slopes(x: np.ndarray) -> np.ndarray:
-        here, by = errors(x), np.where(x + STEP > high, -STEP, STEP)
+        here, by = errors(x), np.where(x + STEP > problem.high, -STEP, STEP)
         return np.stack([(errors(x + row) - here) / by[i] for i, row in enumerate(np.diag(by))], axis=1)
 
-    fit = least_squares(
-        errors, start, slopes, (low, high), x_scale="jac", loss="soft_l1", f_scale=0.01, max_nfev=evaluations
-    )
-    kp, total, friction, armature, delay, offset = np.reshape(fit.x, (6, n)) * scale
-    servo = {"kp": kp, "damping": np.maximum(total - kd, 0), "frictionloss": friction, "armature": armature,
-             "delay": delay, "offset": offset}  # fmt: skip
-    found = robot.with_servos({j: {f: float(v[i]) for f, v in servo.items()} for i, j in enumerate(robot.operated)})
-    less = np.array(robot.kd)
-    less[op] = np.minimum(kd, total)
-    return replace(found, kd=less)
+    box = problem.low, problem.high
+    return problem.robot_with(least_squares(errors, problem.start, slopes, box, max_nfev=EVALUATIONS, **LOSS).x)
 
 
 def main() -> None:
