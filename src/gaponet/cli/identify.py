@@ -101,8 +101,8 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     screen.wide_table("Identified servos, ± standard error", columns, rows)
     for term in fit.comparisons:
         judges = "motions" if term.name == "torque" else "recordings"
-        count = f" over {len(term.before)} {judges}" * (len(term.before) > 1)
-        verdict = f"{count}; {'not ' * (not term.accepted)}kept"
+        over = f" over {len(term.before)} {judges}" * (len(term.before) > 1)
+        verdict = f"{over}; {'not ' * (not term.accepted)}kept"
         screen.say(f"{term.name}: validation error falls by {mrad_with_error(*term.gain)}{verdict}")
     if fit.chosen == "torque":
         for m in fit.robot.payload_mounts:

@@ -64,8 +64,8 @@ def train(
     if trained.candidates:
         rows = {"without a network": val["start"]} | {title(name): e for name, e in trained.candidates.items()}
         rows[f"{kind}, at the end"] = val["model"]
-        heading = "Validation error, mrad; each with a fifth of the budget"
-        screen.table(heading, ["candidate", "MPJAE"], [[name, mrad(error)] for name, error in rows.items()])
+        columns = ["each with a fifth of the budget", "mrad"]
+        screen.table("Validation error", columns, [[name, mrad(error)] for name, error in rows.items()])
         if "trees" not in trained.candidates:
             screen.say("boosted trees were not tried: pip install 'gaponet[trees]'")
     screen.say(
@@ -74,7 +74,7 @@ def train(
         f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
     gain = NetworkGain("identified", val["added"], val.get("error", math.nan), val["start"])
-    screen.say(f"{kind} reduces the error of validation motions by {gain.text}")
+    screen.say(f"with {kind} the error of validation motions falls by {gain.text}")
     step = f"gaponet eval {out} {quote(dataset)}"
     if not gain.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"

@@ -58,8 +58,9 @@ def network_gain(methods: Scores, own: str) -> NetworkGain:
     return NetworkGain(base, before["mpjae"] - after["mpjae"], standard_error(paired), before["mpjae"])
 
 
-def _by_independent_motion(scores: Scores) -> Scores:
-    return scores.get("by_independent_motion", scores["by_motion"])  # files of earlier versions lack the first
+def _by_independent_motion(scores: Scores) -> dict[str, Any]:
+    name = "by_independent_motion"
+    return dict(scores[name if name in scores else "by_motion"])  # files of earlier versions lack the first
 
 
 def verdict(methods: Scores) -> list[str]:
@@ -84,7 +85,7 @@ def verdict(methods: Scores) -> list[str]:
 def _about_network(methods: Scores, own: str) -> str:
     gain, error = network_gain(methods, own), methods[own]["mpjae"]
     text = (
-        f"With {title(own)} the error is {mrad(error)} mrad: its network reduces the error of {title(gain.base)} by "
+        f"With {title(own)} the error is {mrad(error)} mrad: the correction reduces the error of {title(gain.base)} by "
         f"{gain.text}"
     )
     return (

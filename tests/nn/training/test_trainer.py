@@ -8,6 +8,7 @@ import pytest
 from arm import recordings, write_arm, write_dataset
 
 import gaponet.sim.batch
+from gaponet.api.files import export_network
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.data.split import split_entries, write_split
 from gaponet.nn.artifact import GapModel
@@ -82,6 +83,17 @@ def test_a_plain_network_trains_and_is_evaluated_beside_the_operator(trained, ro
     result = evaluate([run, tmp_path / "run"], data, robot).result
     assert [m for m in result["methods"] if m in LEARNED] == ["mlp", "gaponet"]
     assert set(ORDER) | {"target", "recorded"} <= set(METHODS)
+
+
+def test_trees_train_without_ppo_and_are_exported_like_networks(trained, robot, tmp_path, monkeypatch):
+    pytest.importorskip("sklearn")
+    monkeypatch.setattr("gaponet.nn.trees.TREES", 15)
+    config = replace(SMALL, model=replace(SMALL.model, kind="trees"))
+    model = Trainer(trained[0], robot, tmp_path / "run", config, STEPS).run()
+    assert GapModel.how_trained(model.card) == "supervised pre-training (3 rounds), no PPO"
+    assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
+    assert "trees" in evaluate([tmp_path / "run"], trained[0], robot).result["methods"]
+    assert export_network(tmp_path / "run", to="torch").parity < 1e-5
 
 
 def test_card_and_progress_state_inputs_errors_and_label_fits(trained):
