@@ -79,13 +79,14 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
 
     It is reached if the servo asks for AT_TORQUE_LIMIT of the robot's limit in MIN_LIMITED_SHARE of a joint's rows.
     """
-    op, at_limit, rows = robot.operated_index, 0.0, 0.0
+    op = robot.operated_index
+    at_limit, rows = np.zeros((2, len(op)))
     for s in sequences:
         own = robot.with_gains(*s.meta.recorded_gains)
         torque = np.abs(own.kp * (s.ctrl - s.qpos) - own.kd * s.qvel)[:, op]
-        recorded = [j not in s.meta.unrecorded for j in robot.operated]
-        at_limit = at_limit + recorded * (torque > AT_TORQUE_LIMIT * robot.effort_limit[op]).sum(axis=0)
-        rows = rows + len(s) * np.array(recorded)
+        recorded = np.array([j not in s.meta.unrecorded for j in robot.operated])
+        at_limit += recorded * (torque > AT_TORQUE_LIMIT * robot.effort_limit[op]).sum(axis=0)
+        rows += len(s) * recorded
     return ("limit", *DEFAULT_TERMS) if (at_limit > MIN_LIMITED_SHARE * rows).any() else DEFAULT_TERMS
 
 
