@@ -32,11 +32,16 @@ def standard_error(values: Array | ListOf[float]) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
+def by_motion(metas: Iterable[SequenceMeta], values: Array) -> Array:
+    """Return the mean of values (recordings,) over the recordings of each independent motion, (motions,)."""
+    names = np.array([m.independent_motion for m in metas])
+    return np.array([values[names == name].mean() for name in dict.fromkeys(names.tolist())])
+
+
 def mean_reduction(metas: Iterable[SequenceMeta], before: Array, after: Array) -> tuple[float, float]:
     """Return the mean of before − after, (recordings,) each, and its standard error over independent motions."""
-    motions = np.array([m.independent_motion for m in metas])
     reduction = before - after
-    return float(reduction.mean()), standard_error([reduction[motions == m].mean() for m in sorted({*motions})])
+    return float(reduction.mean()), standard_error(by_motion(metas, reduction))
 
 
 def confidence_factor(freedom: int) -> float:

@@ -20,7 +20,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.metrics import runs
+from gaponet.sim.metrics import by_motion, runs
 from gaponet.sim.model import LOOSE_IMPEDANCE, STIFF_MOBILITY, idle_joints, model_hash
 
 CHUNK = 256  # simulations side by side
@@ -91,8 +91,7 @@ def rollout_errors(
 
 def motion_errors(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     """Return `rollout_errors` averaged over the sequences of each independent motion, (motions,) rad."""
-    each, motions = rollout_errors(sequences, robot), np.array([s.meta.independent_motion for s in sequences])
-    return np.array([each[motions == motion].mean() for motion in dict.fromkeys(motions.tolist())])
+    return by_motion([s.meta for s in sequences], rollout_errors(sequences, robot))
 
 
 def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:

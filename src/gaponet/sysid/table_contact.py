@@ -18,7 +18,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import tips_of
-from gaponet.sim.metrics import Comparison
+from gaponet.sim.metrics import Comparison, by_motion
 from gaponet.sim.model import write_table
 from gaponet.sim.replay import rollout_errors
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
@@ -44,7 +44,7 @@ class TableFit:
 
     Attributes:
         robot: The robot, with the table and the zeros if they are accepted.
-        accepted: Whether they explain the windows significantly better than no table (`Comparison`).
+        accepted: Whether they explain the windows' motions significantly better than no table (`Comparison`).
         before, after: Mean |error| of the windows without and with table, (windows,) rad.
         motions: Motions in which a tip comes near.
     """
@@ -115,7 +115,7 @@ def fit_table(
     away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
     scene = _TableRollouts(parts, with_table, nthread)
     scene = _TableRollouts(_most_wrong(scene, away), with_table, nthread)
-    motions = tuple(dict.fromkeys(s.meta.motion for s in scene.parts))
+    motions = tuple(dict.fromkeys(s.meta.independent_motion for s in scene.parts))
     heights = lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
     if measured is not None:
         heights = np.array([measured.height])
@@ -131,7 +131,8 @@ def fit_table(
         errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
     best = int(np.argmin(errors))
     without, within = scene.mean(away[0]), scene.mean(results[best][0])
-    accepted = Comparison("table", without, within).accepted
+    metas = [s.meta for s in scene.parts]
+    accepted = Comparison("table", by_motion(metas, without), by_motion(metas, within)).accepted
     return TableFit(tables[best] if accepted else robot, accepted, without, within, motions)
 
 
