@@ -81,7 +81,10 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     fit, errors, values = made.fit, made.errors, made.values()
     nominal, left = (mrad_with_error(e.mean(), standard_error(e)) for e in errors.values())
     ratio, count, folds = errors["identified"].mean() / errors["nominal"].mean(), len(errors["nominal"]), fit.held_out
-    screen.say(f"nominal {nominal} → identified {left} ({ratio:.2f} of nominal); independent motions: {count}")
+    judges = f"{count} independent motions judge."
+    if count == 1:
+        judges = "A single motion judges: the error of other motions is not known. Record three motions or more."
+    screen.say(f"nominal {nominal} → identified {left} ({ratio:.2f} of nominal). {judges}")
     if len(folds) > 1:
         screen.say(
             f"These are errors of {len(folds)}-fold cross-validation, since few motions validate. "
@@ -103,7 +106,9 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         judges = "motions" if term.name == "torque" else "recordings"
         over = f" over {len(term.before)} {judges}" * (len(term.before) > 1)
         verdict = f"{over}; {'not ' * (not term.accepted)}kept"
-        screen.say(f"{term.name}: validation error falls by {mrad_with_error(*term.gain)}{verdict}")
+        gain, error = term.gain
+        moves = f"{'rises' if gain < 0 else 'falls'} by {mrad_with_error(abs(gain), error)}"
+        screen.say(f"{term.name}: validation error {moves}{verdict}")
     if fit.chosen == "torque":
         for m in fit.robot.payload_mounts:
             screen.say(
