@@ -59,8 +59,7 @@ def network_gain(methods: Scores, own: str) -> NetworkGain:
 
 
 def _by_independent_motion(scores: Scores) -> dict[str, Any]:
-    name = "by_independent_motion"
-    return dict(scores[name if name in scores else "by_motion"])  # files of earlier versions lack the first
+    return dict(scores.get("by_independent_motion") or scores["by_motion"])  # earlier versions lack the first
 
 
 def verdict(methods: Scores) -> list[str]:
