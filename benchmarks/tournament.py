@@ -67,7 +67,10 @@ def call(*words: object) -> str:
     """Run a command and return what it prints."""
     out, said = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
-        code = gaponet(list(map(str, words)))
+        try:
+            code = gaponet(list(map(str, words)))
+        except SystemExit as end:  # the command line was not understood
+            code = end.code
     if code:
         told = (out.getvalue() + said.getvalue()).strip().splitlines()
         raise RefusedError(f"{words[0]} ended with {code}: {' '.join(told[-3:])}")
@@ -112,9 +115,12 @@ def play(
     ))  # fmt: skip
     (folder / "vendor.xml").write_text(robot.file())
     data, fresh, mine, found = (folder / x for x in ("data", "fresh", "robot", "identified"))
-    mounts = ["--mounts", f"hand={robot.bodies[-1]}:0,0,0"] if robot.payload else []
     call("robot", "new", folder / "vendor.xml", "--out", mine, "--rate", robot.rate, "--name", "stranger",
-         "--joints", *robot.joints, *mounts)  # fmt: skip
+         "--joints", *robot.joints)  # fmt: skip
+    if robot.payload:  # where it hangs is known; robot new guesses it
+        robot_file = mine / "robot.toml"
+        mount = f'[[payload_mount]]\nside = "hand"\nbody = "{robot.bodies[-1]}"\npos = [0.0, 0.0, 0.0]\n'
+        robot_file.write_text(robot_file.read_text().partition("[[payload_mount]]")[0] + mount)
     for logs, out in ((folder / "logs", data), (folder / "fresh_logs", fresh)):
         for place in sorted(logs.iterdir()):
             call("import", place, "--robot", mine, "--out", out, "--unit-id", "a", "--payload-mass",
