@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -238,6 +238,7 @@ def train(
     from gaponet.nn.training.trainer import Trainer
 
     config, whole, folder = config or TrainConfig(), Budget.parse(budget), Path(out)
+    shared: dict[str, Any] = {}
     with ranks.joined(config.device), ranks.on_first(lock_folder(folder, "run")):
         data, spec = as_dataset(dataset, robot)
         require_commands(data)
@@ -248,7 +249,7 @@ def train(
 
             return Trainer(
                 data, spec, run, replace(config, model=replace(config.model, kind=kind)), whole.part(share),
-                resume=resume, holdout_units=holdout_units, show=show, log=log,
+                resume=resume, holdout_units=holdout_units, show=show, log=log, shared=shared,
             ).run()  # fmt: skip
 
         if model == "auto":

@@ -185,3 +185,11 @@ def test_recordings_with_several_gains_or_with_others_than_the_robots_need_an_op
     with pytest.raises(UsageError, match=message):
         Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
     Trainer(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)
+
+
+def test_a_training_that_uses_shared_results_equals_the_one_that_made_them(trained, robot, tmp_path, monkeypatch):
+    data, budget, shared = trained[0], Budget(steps=16 * 60), {}
+    first = Trainer(data, robot, tmp_path / "first", SMALL, budget, shared=shared).run()
+    monkeypatch.setattr("gaponet.nn.training.trainer.trajectory_labels", None)
+    second = Trainer(data, robot, tmp_path / "second", SMALL, budget, shared=shared).run()
+    assert second.card["val_mpjae"] == first.card["val_mpjae"]

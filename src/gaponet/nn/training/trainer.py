@@ -60,6 +60,7 @@ class Trainer:
         holdout_units: tuple[str, ...] = (),
         show: Callable[[Status], None] = lambda status: None,
         log: tuple[str, ...] = (),
+        shared: dict[str, Any] | None = None,
     ) -> None:
         """Read the recordings and write the run's setup. All inputs are checked before training takes time.
 
@@ -70,6 +71,8 @@ class Trainer:
             holdout_units: Units that are only in the test split.
             show: Called with the state of the run.
             log: Any of run_folder.LOG_KINDS.
+            shared: Results that do not depend on the kind of network; trainings of several kinds on the same recordings
+                fill and use it.
 
         Raises:
             DatasetError, UsageError: The recordings, the options or the folder do not fit.
@@ -95,6 +98,7 @@ class Trainer:
         net.to(config.network_device())
         self.loggers = Loggers(() if ranks.rank() else log, out, asdict(config))
         self.baseline: DelayOffset | None = None
+        self.shared = {} if shared is None else shared
         self.validator = Validator(self.data.val, robot, config.model, self.rank_config.threads)
         self.rng_state = torch.get_rng_state()
         self.nominal_error = float("nan")
@@ -144,9 +148,16 @@ class Trainer:
 
     def _write_baseline(self) -> DelayOffset:
         robot = self.robot.before_identification
-        baseline = self.baseline or DelayOffset.fit(self.data.train, robot, self.rank_config.threads)
+        fit = lambda: DelayOffset.fit(self.data.train, robot, self.rank_config.threads)  # noqa: E731
+        baseline = self.baseline or self._once("baseline", fit)
         write_json(self.out / "delay_offset.json", baseline)
         return baseline
+
+    def _once(self, name: str, make: Callable[[], Any]) -> Any:
+        """Return a shared result, which the first training makes."""
+        if name not in self.shared:
+            self.shared[name] = make()
+        return self.shared[name]
 
     def _pretrain(self) -> None:
         """Supervised pre-training (nn/training/pretraining.py)."""
@@ -155,7 +166,7 @@ class Trainer:
         sequences = self.data.labelled_subset(config.rows)
         env = self._env(config.num_envs, UNLIMITED, self.config.seed, sequences=sequences)
         largest = 0.99 * self.config.model.delta_max
-        labels = trajectory_labels(sequences, self.robot, largest, threads, self._tick)
+        labels = self._once("labels", lambda: trajectory_labels(sequences, self.robot, largest, threads, self._tick))
         pretraining = Pretraining(self.net, env, labels, config, _rank_seed(self.config.seed), threads)
         if state.pretraining_rounds == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
