@@ -315,4 +315,4 @@ def servos(
 
 @actions(new=new, check=check, list=list_robots, link=link, show=show, servos=servos)
 def robot(action: None) -> None:
-    """Make, check or show a robot folder; list servo types; listen to a robot."""
+    """Make, check or show a robot folder; list servo types."""
