@@ -147,7 +147,8 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     rows = sum(int(t.over_limit.sum()) for _, t in over)
     text = (
         f"torque beyond the limit of robot.toml in {rows} rows of {_motions([s for s, _ in over])}; worst "
-        f"{worst[i]:.2f} N·m on {robot.joint_names[i]} (limit {robot.effort_limit[i]:.2f}): a collision, a spike?"
+        f"{worst[i]:.2f} N·m on {robot.joint_names[i]} (limit {robot.effort_limit[i]:.2f}): a collision, a "
+        "spike or a wrong limit"
     )
     yield Finding("warning", "saturation", text, (robot.joint_names[i],), {"rows": rows, "worst": float(worst[i])})
 
@@ -161,7 +162,8 @@ def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Ite
         if top > MIN_FLAT_SHARE * robot.effort_limit[i] and rows >= MIN_FLAT_ROWS:
             text = (
                 f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of {_motions([s for s, _ in near])}:"
-                f" the motor or its driver gives no more. Write effort_limit = {top:.3g} in robot.toml, or cut these"
+                f" the motor or its driver gives no more. Write effort_limit = {top:.3g} in robot.toml, or leave "
+                "these recordings out"
             )
             yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
 

@@ -71,8 +71,8 @@ class Trainer:
             holdout_units: Units that are only in the test split.
             show: Called with the state of the run.
             log: Any of run_folder.LOG_KINDS.
-            shared: Results that do not depend on the kind of network; trainings of several kinds on the same recordings
-                fill and use it.
+            shared: Name → result that does not depend on the kind of network, and the seconds that it took. Trainings
+                of several kinds on the same recordings fill and use it; each has the same time left for its network.
 
         Raises:
             DatasetError, UsageError: The recordings, the options or the folder do not fit.
@@ -154,10 +154,14 @@ class Trainer:
         return baseline
 
     def _once(self, name: str, make: Callable[[], Any]) -> Any:
-        """Return a shared result, which the first training makes."""
-        if name not in self.shared:
-            self.shared[name] = make()
-        return self.shared[name]
+        """Return a shared result. The first training makes it; its time counts for every training that uses it."""
+        if name in self.shared:
+            result, seconds = self.shared[name]
+            self.started_at -= seconds
+            return result
+        began, result = time.monotonic(), make()
+        self.shared[name] = result, time.monotonic() - began
+        return result
 
     def _pretrain(self) -> None:
         """Supervised pre-training (nn/training/pretraining.py)."""
