@@ -127,8 +127,10 @@ class Judge:
         for sequences in folds:
             touch = _contact_rows(sequences, robot, contact_height)
             rollouts = RobotRollouts(list(sequences), robot, nthread, touch=touch)
-            # Repetitions and gains of what one unit plays with one payload are one judge.
-            keys = [(s.meta.motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
+            # Repetitions, pieces and gains of what one unit plays with one payload are one judge.
+            keys = [
+                (s.meta.independent_motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences
+            ]
             rows = {one: np.array([key == one for key in keys])[rollouts.window] for one in dict.fromkeys(keys)}
             rows = {key: counted for key, counted in rows.items() if counted.any()}
             self._folds.append((rollouts, list(rows.values())))
