@@ -128,9 +128,8 @@ class Judge:
             touch = _contact_rows(sequences, robot, contact_height)
             rollouts = RobotRollouts(list(sequences), robot, nthread, touch=touch)
             # Repetitions, pieces and gains of what one unit plays with one payload are one judge.
-            keys = [
-                (s.meta.independent_motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences
-            ]
+            metas = [s.meta for s in sequences]
+            keys = [(m.independent_motion, m.unit_id, m.payload_mass, m.payload_side) for m in metas]
             rows = {one: np.array([key == one for key in keys])[rollouts.window] for one in dict.fromkeys(keys)}
             rows = {key: counted for key, counted in rows.items() if counted.any()}
             self._folds.append((rollouts, list(rows.values())))

@@ -231,9 +231,8 @@ class KinematicChains:
 
 def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:
     """Return the fields among values that a joint's search changes, in order; encoder_step if `encoder`."""
-    return [
-        f for f in (*CLASSIC, "effort_limit", *SERVO_TERMS) if f in values and (encoder or f != "encoder_step")
-    ]  # fmt: skip
+    every = (*CLASSIC, "effort_limit", *SERVO_TERMS)
+    return [f for f in every if f in values and (encoder or f != "encoder_step")]
 
 
 def robot_fields(values: Values) -> list[str]:
