@@ -58,5 +58,5 @@ def test_the_page_has_the_same_table():
         assert row(", ".join(phases), events, following or "the same", action.value) in page
     for trigger in Trigger:
         assert row(trigger.name.lower(), trigger.value) in page
-    states = page[page.index("## States") : page.index("## One plan before motion")]
+    states = page[page.index("## State machine") : page.index("## Commands without a robot")]
     assert sum(line.startswith("| ") for line in states) == len(TRANSITIONS) + len(Trigger) + 2
