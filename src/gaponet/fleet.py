@@ -28,7 +28,6 @@ from gaponet.sysid.uncertainty import ParameterUncertainty, format_change
 
 KIND = "fleet"
 SAME, FAILED = "same", "not checked"
-FORMER_VERDICTS = {"not asked": FAILED}  # former name in ROBOT.json → name
 MARKS = {SAME: "·", "drifted": "■", "contradictory": "?", FAILED: "–"}
 MAX_NIGHTS_SHOWN = 14
 
@@ -141,8 +140,7 @@ def check_fleet(
 
 def load_nights(file: Path) -> list[Night]:
     """Return a robot's nights, the first one first."""
-    nights = read_json(list[Night], file, UsageError, "remove it to forget its nights") if file.is_file() else []
-    return [n | {"verdict": FORMER_VERDICTS.get(n["verdict"], n["verdict"])} for n in nights]
+    return read_json(list[Night], file, UsageError, "remove it to forget its nights") if file.is_file() else []
 
 
 def changed_since(nights: list[Night]) -> str:

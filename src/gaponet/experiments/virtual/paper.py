@@ -79,7 +79,7 @@ TABLE_2: dict[str, tuple[tuple[str, str, Printed | None], ...]] = {
 }
 
 PAPER_MODEL = "paper"  # the paper's network in its own setting
-SUPERVISED = f"{PAPER_MODEL}:payload_input=off:warm_start.rounds=2"  # the same network with the recipe of gaponet train
+SUPERVISED = f"{PAPER_MODEL}:payload_input=off:pretraining.rounds=2"  # the same, trained as by gaponet train
 LEARNED = ("mlp", PAPER_MODEL, "gaponet")
 AXES = delivery.AXES
 RECIPES = {"paper": "PPO alone", "labels": "supervised labels, then PPO"}
