@@ -76,14 +76,16 @@ class Adaptation:
         Raises:
             UsageError: The recordings are of several units.
         """
-        unit = _one_unit(sequences)
+        units = sorted({s.meta.unit_id for s in sequences})
+        if len(units) != 1:
+            raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
         fitted = adapt(sequences, simulator, seconds, model.corrector(simulator), progress)
         servos = {
             j: {f: float(getattr(fitted.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
             for j in simulator.operated
         }
         logs = tuple(s.content_hash() for s in sequences)
-        return Adaptation(unit, model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after)
+        return Adaptation(units[0], model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after)
 
     @classmethod
     def load(cls, run: Path, weights: str) -> dict[str, Adaptation]:
@@ -101,11 +103,3 @@ class Adaptation:
                 )
             adaptations[adaptation.unit_id] = adaptation
         return adaptations
-
-
-def _one_unit(sequences: ListOf[Sequence]) -> str:
-    """Return the unit of these recordings; refuse those of several."""
-    units = sorted({s.meta.unit_id for s in sequences})
-    if len(units) != 1:
-        raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
-    return units[0]
