@@ -11,7 +11,6 @@ import numpy as np
 import tyro
 
 from gaponet import api
-from gaponet.api.results import DoctorResult, ImportResult
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import progress_bar
@@ -21,6 +20,8 @@ from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
+    from gaponet.data.doctor import DoctorResult
+    from gaponet.data.importer import ImportResult
     from gaponet.data.offsets import JointOffset
     from gaponet.data.store import Entry
 
@@ -100,7 +101,6 @@ def doctor(
         fix: Print a proposal for logs.toml after the findings; nothing is applied.
         figures: Folder for a picture of each finding.
     """
-    from gaponet.data.doctor import Diagnosis
     from gaponet.robot.finding import Finding
     from gaponet.share.reading import open_dataset
 
@@ -108,7 +108,7 @@ def doctor(
     data, spec = open_dataset(dataset, robot)
     with progress_bar("examining") as update:
         diagnosis = api.doctor(data, robot=spec, progress=update)
-    out.say(f", {Diagnosis.inventory(data)}", spec.name)
+    out.say(f", {diagnosis.inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
     proposal = Finding.proposal(list(diagnosis.findings)) if fix else ""
     for line in proposal.splitlines():
