@@ -39,7 +39,7 @@ def test_import_says_what_came_in_and_that_nothing_was_applied_and_the_same_agai
     told = " ".join(capsys.readouterr().out.split())
     assert "1 sequences, 0.1 min at 49.85 Hz, robot so101, unit lab, payload 0 kg" in told
     assert "nothing was applied to the data" in told
-    assert "Next: gaponet doctor" in told
+    assert "next: gaponet doctor" in told
     assert (tmp_path / "data" / "offsets.json").is_file()
     assert import_so101(logs, tmp_path / "data") == 0
     assert "1 there already, 0 added" in capsys.readouterr().out

@@ -120,7 +120,7 @@ def doctor(
         with lock_folder(figures, "figures"):
             drawn = draw_findings(data, spec, list(diagnosis.findings), figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")
-    out.say(f"next: gaponet doctor {dataset} --fix" if diagnosis.count("error") else f"next: gaponet gap {dataset}")
+    out.next(f"gaponet doctor {dataset} --fix" if diagnosis.count("error") else f"gaponet gap {dataset}")
     out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": proposal,
                 "figures": [str(path) for path in drawn]} | diagnosis.to_dict())  # fmt: skip
 
@@ -190,7 +190,7 @@ def _show_import(out: Out, made: ImportResult) -> None:
     _show_offsets(out, table["fast_lag_s"], offsets)
     if offsets:
         out.say(f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data.")
-    out.say(f"Next: gaponet doctor {data.path!s}")
+    out.next(f"gaponet doctor {data.path!s}")
     out.result(table)
 
 

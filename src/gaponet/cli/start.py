@@ -162,8 +162,13 @@ def start(
                 if inspection.logs_toml:
                     write_text(logs_toml, inspection.logs_toml)
                 record.begin(shlex.join(next(words for words in commands if words[0] == "import")[2:]))
-                _run(screen, commands, lines, record, anyway)
+                Out.names_next = False
+                try:
+                    _run(screen, commands, lines, record, anyway)
+                finally:
+                    Out.names_next = True
             screen.say(f"commands that ran: {out / COMMANDS_FILE}")
+            screen.next(f"look at {out / 'identified' / 'report.html'}")
     screen.result({
         "robot": inspection.robot.name, "joints": inspection.log.joint_names, "recordings": inspection.recordings,
         "rate_hz": inspection.rate, "logs_toml": inspection.logs_toml, "commands": lines, "ran": not dry_run,
