@@ -51,7 +51,7 @@ def found(diagnosis: DoctorResult, check: str, level: str) -> Finding:
 def test_a_good_recording_has_no_warning(arm, tmp_path):
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), tau=wave(ROWS, 2)))
     assert [f for f in diagnosis.findings if f.level in ("warning", "error")] == []
-    assert diagnosis.verdict == "Good: nothing found that training should not see."
+    assert diagnosis.verdict == "Good: no error and no warning."
 
 
 def test_findings_stand_worst_first(arm, tmp_path):
@@ -123,8 +123,35 @@ def test_swapped_joints_are_an_error(arm, tmp_path):
     texts = [f.message for f in diagnosis.findings if f.check == "order" and f.level == "error"]
     assert len(texts) == 2
     assert texts[0].startswith("the command of shoulder moves elbow, not shoulder (correlation 1.00, 1 of 1 motions)")
-    assert "--map" in texts[0]
-    assert diagnosis.verdict.startswith("Do not train on this yet: 2 error(s)")
+    assert '[columns] "ctrl.elbow" =' in texts[0]
+    assert diagnosis.verdict.startswith("Do not train on this yet: 2 errors")
+
+
+def test_columns_in_a_wrong_order_are_named_one_by_one_without_what_follows_from_them(so101, tmp_path):
+    rng = np.random.default_rng(0)
+    logs = []
+    for motion in ("a", "b", "c"):
+        ctrl = lowpass(np.repeat(rng.uniform(-0.5, 0.5, (30, 6)), 30, axis=0), 0.02, 1.0)
+        qpos = late(ctrl, 4)[:, [2, 0, 1, 3, 4, 5]]
+        logs.append(arm_sequence(so101, ctrl, qpos, motion=motion))
+    bad = [f for f in examine(so101, tmp_path, *logs).findings if f.level in ("warning", "error")]
+    assert [f.check for f in bad if f.level == "error"] == ["order"] * 3
+    assert not {f.check for f in bad} & {"stuck", "blocked"}
+    assert "name the command's columns in logs.toml ([columns] \"ctrl." in bad[0].message
+
+
+def test_radians_beside_logs_in_degrees_are_an_error(arm, tmp_path):
+    ctrl, qpos = good()
+    notes = {"notes": {"converted_from": dict.fromkeys(arm.joint_names, "deg")}}
+    small = np.radians(1)
+    logs = [
+        arm_sequence(arm, ctrl, qpos, "right", **notes),
+        arm_sequence(arm, ctrl * small, qpos * small, "w", **notes),
+    ]
+    finding = found(examine(arm, tmp_path, *logs), "unit", "error")
+    assert finding.message.startswith(
+        "no command of w is further than 3.3° from zero: radians that were read as degrees"
+    )
 
 
 def test_two_joints_told_the_same_are_not_taken_for_swapped(arm, tmp_path):
@@ -365,7 +392,7 @@ def test_two_rates_in_one_dataset_are_a_warning(arm, tmp_path):
 def test_a_lag_of_three_periods_is_reported_as_60_ms(arm, tmp_path):
     finding = found(examine(arm, tmp_path, arm_sequence(arm, *good(lag=3))), "lag", "note")
     assert finding.values["elbow"]["median"] == pytest.approx(0.06, abs=0.003)
-    assert "elbow 60 ms" in finding.message
+    assert "after 60 ms" in finding.message
 
 
 def test_sag_is_reported_for_the_lightest_and_the_heaviest_payload(arm, tmp_path):
@@ -403,7 +430,7 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
     diagnosis = DoctorResult.of(real_dataset, so101, gravity_model=gravity_of(so101))
-    assert diagnosis.verdict == "Usable. Read the 3 warning(s) first."
+    assert diagnosis.verdict == "Usable. Read the 3 warnings first."
     lags = found(diagnosis, "lag", "note").values
     for joint in so101.operated:
         assert 0.08 <= lags[joint]["median"] <= 0.16

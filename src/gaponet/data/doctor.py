@@ -21,6 +21,8 @@ from gaponet.data.store import Dataset
 from gaponet.robot.finding import LEVELS, Finding
 from gaponet.robot.spec import RobotSpec
 
+CONSEQUENCES = ("blocked", "stuck", "sag")  # findings that an exchanged, mirrored or mis-scaled joint causes
+
 
 @dataclass(frozen=True)
 class DoctorResult:
@@ -42,12 +44,11 @@ class DoctorResult:
     @property
     def verdict(self) -> str:
         """The result in one sentence."""
-        errors, warnings = self.count("error"), self.count("warning")
-        if errors:
-            return f"Do not train on this yet: {errors} error(s) and {warnings} warning(s)."
-        if warnings:
-            return f"Usable. Read the {warnings} warning(s) first."
-        return "Good: nothing found that training should not see."
+        count = {level: self.count(level) for level in ("error", "warning")}
+        texts = [f"{n} {level}{'s' * (n > 1)}" for level, n in count.items() if n]
+        if count["error"]:
+            return f"Do not train on this yet: {' and '.join(texts)}."
+        return f"Usable. Read the {texts[0]} first." if texts else "Good: no error and no warning."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
@@ -77,6 +78,8 @@ class DoctorResult:
         dataset.require_sequences()
         surveys = survey_all(dataset, robot, progress, executor)
         findings = [f for check in CHECKS for f in check.run(surveys, robot)]
+        wrong = {j for f in findings if f.level == "error" and f.check in ("order", "sign", "unit") for j in f.joints}
+        findings = [f for f in findings if f.check not in CONSEQUENCES or not f.joints or not wrong >= set(f.joints)]
         if gravity_model is not None:
             findings += _examine_loads(findings, surveys, robot, gravity_model)
         findings.sort(key=lambda f: -LEVELS.index(f.level))

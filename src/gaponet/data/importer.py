@@ -239,7 +239,7 @@ class _Source:
         needed = {"unit_id": "--unit-id NAME", "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)"}
         missing = [flag for name, flag in needed.items() if name not in self.labels | stated]
         if missing:
-            raise UsageError(f"{log.source}: this format does not say it: give {' and '.join(missing)}")
+            raise UsageError(f"{log.source}: this format does not state unit or payload: give {' and '.join(missing)}")
         # A relative path: no home folder gets into a dataset.
         source = Path(os.path.relpath(log.source, Path(os.path.abspath(self.src)).parent)).as_posix()
         origin = {"source": source, "source_sha256": sha256, "repetition": UNSTATED_REPETITION}

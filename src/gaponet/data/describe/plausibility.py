@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     for name in (n for n in UNITS if n in log.channels):
         values = log.channels[name].values
         if name in ("ctrl", "qpos"):
-            require_radians(values, log.joint_names, robot, lambda row, name=name: f"{log.row(name, row)}: {name}")
+            require_radians(values, log.joint_names, robot, partial(_with_channel, log, name))
             continue
         wrong = _nonsense(name, log, robot)
         if (strict or name == FEEDFORWARD) and wrong.any():  # commands are never made up
@@ -84,6 +85,11 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     return replace(
         log, channels=channels, meta=log.meta | {"notes": log.meta.get("notes", {}) | {"nonsense": replaced}}
     )
+
+
+def _with_channel(log: Log, name: str, row: int) -> str:
+    """Return what to call a row of a channel in an error."""
+    return f"{log.row(name, row)}: {name}"
 
 
 def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
@@ -120,5 +126,5 @@ def require_radians(values: Array, joint_names: tuple[str, ...], robot: RobotSpe
         if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
             raise LogError(
                 f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
-                "must be in radians: these look like degrees (--position-unit deg)"
+                "must be in radians: these look like degrees (--position-unit deg, if all of these logs are)"
             )
