@@ -54,7 +54,7 @@ CHECK_FILES: dict[str, dict[str, str]] = {
     "actuator-net": ACTION_TERM
     | {"check.py": "check_mjlab.py", "check_newton.py": "check_newton.py", "actuators.py": "actuators.py"},
 }
-SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, least torque and friction; numpy or torch."""
+SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, torque limits and friction; numpy or torch."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ import numpy as np
 ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the joints
 '''
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
-    array_module, servo.present, servo.exp, servo.passing_friction, servo.resting_friction, servo.friction_limit,
-    servo.servo_torque,
+    array_module, servo.present, servo.exp, servo.torque_range, servo.passing_friction, servo.resting_friction,
+    servo.friction_limit, servo.servo_torque,
 )  # fmt: skip
 OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts|unit_events) import")
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)

@@ -28,20 +28,32 @@ MAX_KP_LOG_CHANGE, LARGE_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.2, 0.3
 MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
 UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")  # of an unexcited joint, fitted as others move it
+MIN_INVERSE = 1e-5  # on an inverse axis; less counts as none
+SPEED_QUANTILE, MIN_SPEED = 0.995, 0.1  # of a joint's recorded speeds, and rad/s: the greatest is at least this
 BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
 
 
 def to_axis(field: str, value: Array, kp: Array) -> Array:
     """Return values of a field on its axis."""
     axis = SERVO_FIELDS[field].axis
+    if axis == "inverse":
+        return np.divide(1.0, value, out=np.zeros_like(value, float), where=value > 0)
     return np.log(np.maximum(value, 1e-9)) if axis == "log" else value / kp if axis == "over kp" else value
 
 
 def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
     """Return values in SI units of fields on their axes; kp is that of `x`, or given."""
     values = {f: np.exp(v) if SERVO_FIELDS[f].axis == "log" else v for f, v in x.items()}
+    for f in (f for f in x if SERVO_FIELDS[f].axis == "inverse"):
+        values[f] = np.divide(1.0, x[f], out=np.zeros_like(x[f], float), where=x[f] > MIN_INVERSE)
     kp = values.get("kp", kp)
     return {f: v * kp if SERVO_FIELDS[f].axis == "over kp" else v for f, v in values.items()}
+
+
+def greatest_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
+    """Return the greatest recorded speed of each operated joint, at least MIN_SPEED, (n,) rad/s; without outliers."""
+    speeds = [np.quantile(np.abs(s.qvel[:, robot.operated_index]), SPEED_QUANTILE, axis=0) for s in sequences]
+    return np.maximum(np.max(speeds, axis=0), MIN_SPEED)
 
 
 def first_values(robot: RobotSpec) -> Values:
@@ -134,6 +146,7 @@ class Bounds:
         }
         self.start |= {f: np.where(self.unexcited, self.first[f], self.start[f]) for f in ("delay", "armature")}
         self.start |= {f: self.first[f] for f in SERVO_TERMS if self.first[f].any()}
+        slow = 1 / greatest_speeds(sequences, robot)  # s/rad
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)
         self.limits: dict[str, tuple[Array, Array, Array]] = {
@@ -143,11 +156,13 @@ class Bounds:
             "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
             "effort_limit": (0.05 * limit / kp, 5 * limit / kp, 0.2 * limit / kp),
             "encoder_step": (counts, counts, one),
+            "no_load_speed": (0 * one, 2 * slow, 0.1 * slow),
         }
         guess = {f.name: f.guess * one for f in SERVO_FIELDS.values() if f.guess is not None}
         self.guess = from_axis(guess, kp) | {
             "effort_limit": 0.6 * limit,  # one that is too high has no slope
             "encoder_step": counts,
+            "no_load_speed": np.where(self.unexcited, 0.0, 2 / slow),
         }
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from gaponet.sim import servo
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
-from gaponet.sim.servo import friction_limit, present, servo_torque
+from gaponet.sim.servo import friction_limit, present, servo_torque, torque_range
 
 advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
@@ -209,8 +209,10 @@ class JointRollouts:
             heavy, slope = inertia + armature, _filled(slope, shape)
             turn, stop = h / (heavy + h * damping), heavy / -h
             for aim in self._targets(t, values["delay"]) + offset:
-                torque = servo_torque(terms, kp, aim, q)
-                torque = np.minimum(np.maximum(torque - kd * w if has_kd else torque, -limit), limit)
+                torque, least, most = servo_torque(terms, kp, aim, q), -limit, limit
+                if "no_load_speed" in terms:
+                    least, most = torque_range(limit, w / terms["no_load_speed"])
+                torque = np.minimum(np.maximum(torque - kd * w if has_kd else torque, least), most)
                 load = slope * q + weight
                 most = friction_limit(terms, dry, w, torque, load)
                 net = torque - load - pull - own * w

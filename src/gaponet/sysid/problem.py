@@ -348,7 +348,8 @@ def _undetermined(
             continue
         wide, also_over_kp = dict[str, str](), list[str]()
         for k, f in enumerate(names):
-            if f == "stribeck_speed" and not values["stribeck"][i]:
+            # A line that takes less than a tenth of the torque at the joint's greatest speed counts as none.
+            if (f == "stribeck_speed" and not values["stribeck"][i]) or (f == "no_load_speed" and x[i, k] < 1):
                 continue
             value, error = values[f][i], std[f][i]
             if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):
