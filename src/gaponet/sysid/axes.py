@@ -123,6 +123,7 @@ class Bounds:
         first: The given robot's own values.
         start: Start of a search: with a delay, and with as much armature as the physics step resolves.
         stated: Whether all recordings state their kp.
+        inertia: Inertia of the links at the MJCF's reference pose, without armature, (n,) kg·m².
         kd: The servos' kd, (n,) N·m·s/rad. Damping may take from it, stated or not: firmware filters the velocity.
         unexcited: Joints that no command moves, (n,).
         limits: Field → lowest, highest, a large change, (n,) each, in the axes' units.
@@ -139,7 +140,8 @@ class Bounds:
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
         self.unexcited = excitation < MIN_EXCITATION_RAD
         least_inertia = kp * (MIN_STEPS_PER_RADIAN * model.opt.timestep) ** 2
-        resolved = least_inertia - (model.dof_M0 - model.dof_armature)[op]
+        self.inertia = (model.dof_M0 - model.dof_armature)[op]
+        resolved = least_inertia - self.inertia
         self.start: Values = {f: self.first[f] for f in CLASSIC} | {
             "delay": np.maximum(self.first["delay"], START_DELAY_S),
             "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),

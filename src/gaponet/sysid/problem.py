@@ -315,10 +315,15 @@ def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
 
 
 def _discretisation_std(problem: FitProblem, values: Values) -> Values:
-    """Return standard errors of damping, armature and delay by the length of a physics step, (n,)."""
+    """Return standard errors of damping, armature, delay and no-load speed by the length of a physics step, (n,)."""
     h = UNIFORM_STD * problem.physics_step
     total = values["damping"] + problem.robot.kd[problem.robot.operated_index]
-    return {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
+    std = {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
+    if "no_load_speed" in values:  # the limit follows the speed a step late, half a step on average
+        limit = values.get("effort_limit", problem.bounds.first["effort_limit"])
+        late = problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
+        std["no_load_speed"] = late * (values["no_load_speed"] > 0)
+    return std
 
 
 def _inverse(normal: Array, size: Array) -> Array:
