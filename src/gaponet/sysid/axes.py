@@ -167,6 +167,13 @@ class Bounds:
             "no_load_speed": np.where(self.unexcited, 0.0, 2 / slow),
         }
 
+    def visible(self, field: str, values: Values) -> Array:
+        """Return a field of values (n,), 0 where it has no effect to speak of: a line that takes less than a tenth of
+        the torque at a joint's greatest speed."""
+        inverse = SERVO_FIELDS[field].axis == "inverse"
+        none = inverse and to_axis(field, values[field], values["kp"]) < self.limits[field][2]
+        return np.where(none, 0.0, values[field])
+
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
         axes, warnings = Axes(self, names, values), []
