@@ -435,8 +435,8 @@ def _isaaclab_term() -> Any:
             super().__init__(cfg, env)
             self.folder, self.payload_mass = Path(cfg.folder), cfg.payload_mass
             facts = read_facts(self.folder)
-            if cfg.check and facts["law"] and "model" in facts:
-                law = ", ".join(facts["law"])
+            law = ", ".join(term for term in facts["law"] if term != "no_load_speed")
+            if cfg.check and law and "model" in facts:
                 raise ValueError(
                     f"{cfg.folder}: trained with a servo model ({law}), which Isaac Lab lacks; or give check=False"
                 )
@@ -453,19 +453,31 @@ def _isaaclab_form(facts: dict[str, Any]) -> str:
 
 
 def isaaclab_actuators(folder: str | Path) -> dict[str, Any]:
-    """Return an IdealPDActuatorCfg of the servos; `isaaclab_action` has their delays and offsets."""
-    from isaaclab.actuators import IdealPDActuatorCfg
+    """Return an IdealPDActuatorCfg of the servos, and a DCMotorCfg for each joint with a no-load speed.
+
+    `isaaclab_action` has their delays and offsets.
+    """
+    from isaaclab.actuators import DCMotorCfg, IdealPDActuatorCfg
 
     facts = read_facts(folder)
     joints = facts[_isaaclab_form(facts)]
-    column = lambda field: {name: joint[field] for name, joint in joints.items()}  # noqa: E731
     fields = {field.name for field in dataclasses.fields(IdealPDActuatorCfg)}
-    limit = "actuator_effort_limit" if "actuator_effort_limit" in fields else "effort_limit"  # Isaac Lab 3 renamed it
-    return {
-        "servos": IdealPDActuatorCfg(
-            joint_names_expr=list(joints), stiffness=column("kp"), damping=column("kd"), armature=column("armature"),
-            friction=column("frictionloss"), viscous_friction=column("damping"), **{limit: column("effort_limit")},
-        )
+    own = "actuator_" if "actuator_effort_limit" in fields else ""  # Isaac Lab 3 renamed the limits
+
+    def group(kind: Any, names: list[str], **more: float) -> Any:
+        column = lambda field: {name: joints[name][field] for name in names}  # noqa: E731
+        return kind(
+            joint_names_expr=names, stiffness=column("kp"), damping=column("kd"), armature=column("armature"),
+            friction=column("frictionloss"), viscous_friction=column("damping"),
+            **{f"{own}effort_limit": column("effort_limit")}, **more,
+        )  # fmt: skip
+
+    motors = {name: joint for name, joint in joints.items() if joint.get("no_load_speed")}
+    plain = [name for name in joints if name not in motors]
+    return ({"servos": group(IdealPDActuatorCfg, plain)} if plain else {}) | {
+        name: group(DCMotorCfg, [name], saturation_effort=joint["effort_limit"],
+                    **{f"{own}velocity_limit": joint["no_load_speed"]})
+        for name, joint in motors.items()
     }  # fmt: skip
 
 
