@@ -13,6 +13,7 @@ from gaponet.sysid import table_contact
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.motion_limits import default_terms
 from gaponet.sysid.problem import JointFit, standard_errors
 
 SERVO = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.06, "offset": 0.0, "delay": 0.0}
@@ -46,6 +47,20 @@ def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
         for i, joint in enumerate(robot.joint_names):  # within 5 %, or two standard errors
             assert abs(found[field][i] - value) < max(0.05 * value, 2 * std[joint][field])
             assert std[joint][field] < value
+
+
+@pytest.mark.parametrize("no_load", [1.5, 0.0])
+def test_a_torque_speed_line_is_recovered_and_none_is_seen_where_none_is(tmp_path, no_load):
+    robot, template = write_arm(tmp_path / "arm"), recordings(write_arm(tmp_path / "arm"), 1, rows=80)[0]
+    robot = replace(robot, effort_limit=np.full(2, 2.5), kd=np.full(2, 0.5))
+    jumps = np.random.default_rng(0).uniform(-1, 1, (5, 4, 2)).repeat(20, axis=1)
+    asked = [replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}")) for i, c in enumerate(jumps)]
+    true = robot.with_servos({joint: {"no_load_speed": no_load, "kp": 18.0} for joint in robot.joint_names})
+    parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replay(asked, true), strict=True)]
+    assert "speed" in default_terms(parts[:4], robot)
+    found = identify(parts[:4], robot, parts[4:], windows=4, terms=("speed",), table=False, folds=1)
+    np.testing.assert_allclose(found.robot.no_load_speed, no_load, rtol=0.05)
+    assert found.after < 0.1 * found.before
 
 
 def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):

@@ -165,15 +165,17 @@ def advance(
                     load, low, high = here[3] * q[c] + here[1], -limit[c], limit[c]
                     if fades:
                         low, high = torque_range(limit[c], w[c] / no_load[c])
+                    wanted, most = kp[c] * (aim - q[c]), dry[c]
                     if has_terms:
-                        torque = requested_torque(kp[c], aim, q[c], least[c], step[c], deadband[c])
-                        torque = min(max(torque - brake[c] * w[c], low), high)
+                        wanted = requested_torque(kp[c], aim, q[c], least[c], step[c], deadband[c])
+                    wanted -= brake[c] * w[c]
+                    torque = min(max(wanted, low), high)
+                    if has_terms:
                         most = joint_friction(dry[c], rest[c], speed[c], by_motor[c], by_load[c], w[c], torque, load)
-                    else:
-                        torque, most = min(max(kp[c] * (aim - q[c]) - brake[c] * w[c], low), high), dry[c]
                     net = torque - load - here[2] - own[c] * w[c]
                     net += min(max(-heavy / h * w[c] - net, -most), most)
-                    w[c] += h / (heavy + h * (own[c] + brake[c])) * net
+                    implicit = own[c] + brake[c] * (torque == wanted)  # as MuJoCo: not kd of a motor at its limit
+                    w[c] += h / (heavy + h * implicit) * net
                     q[c] += h * w[c]
                     if q[c] < stops[j, 0]:
                         q[c], w[c] = stops[j, 0], max(w[c], 0.0)
