@@ -34,7 +34,7 @@ MIN_BEYOND_STOP_RAD, MIN_STOP_ROWS = 0.1, 50  # that commands go beyond a stop, 
 AT_STOP_RAD = 0.005  # from the end of a joint's path
 MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
 AT_TORQUE_LIMIT, MIN_LIMITED_SHARE = 0.9, 0.01  # of the robot's limit; of a joint's rows
-FAST, DRIVEN_FAST = 0.5, 0.5  # of a joint's greatest speed; of the robot's limit, in the direction of motion
+FAST, DRIVEN_FAST = 0.5, 0.7  # of a joint's greatest speed; of the robot's limit, in the direction of motion
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
