@@ -180,9 +180,8 @@ def _labels(
     ])  # fmt: skip
     for line in labels.remarks:
         screen.say(line)
-    screen.say(
-        f"written: {out / 'labels.csv'!s}; next: gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}"
-    )
+    screen.say(f"written: {out / 'labels.csv'!s}")
+    screen.next(f"gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}")
     screen.result({"cells": labels.groups, "agreement": labels.agreement, "recordings": labels.recordings})
 
 

@@ -72,7 +72,8 @@ def identify(
             terms=terms, table=table, threads=threads, budget=budget, stops=stops, progress=update,
         )  # fmt: skip
     _show(screen, made, details)
-    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {robot_argument(out)}")
+    screen.say(f"robot folder: {out}, after {made.seconds:.0f} s")
+    screen.next(f"gaponet gap {dataset} --robot {robot_argument(out)}")
     screen.result(made.to_dict())
 
 
@@ -101,7 +102,7 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         if any(cells := [servo.text(f) if f in MEASURED_FIELDS else "" for f in shown]):
             rows.append([f"servo {servo.name}, {servo.source}", *cells])
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in shown)]
-    screen.wide_table("Identified servos, ± standard error", columns, rows)
+    screen.table("Identified servos, ± standard error", columns, rows)
     for term in fit.comparisons:
         judges = "motions" if term.name == "torque" else "recordings"
         over = f" over {len(term.before)} {judges}" * (len(term.before) > 1)

@@ -153,9 +153,7 @@ def new(
         screen.say(f"  no picture: {error}", "   note", "cyan")
     result = check_robot(screen, made.robot, None, ())
     screen.say(f"written: {out}/robot.toml, robot.xml{', picture.png' if picture else ''}")
-    screen.say(
-        f"Next: look at robot.toml and the picture; gaponet import LOGS --robot {robot_argument(out)} --out data"
-    )
+    screen.next(f"look at robot.toml and the picture; gaponet import LOGS --robot {robot_argument(out)} --out data")
     screen.result(result | {"folder": str(out), "notes": made.notes, "picture": picture and str(picture)})
 
 
@@ -243,7 +241,7 @@ def show(
     sure = {j: summarize(known, j) for j in known.joints}
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in fields)]
-    screen.wide_table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
+    screen.table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
     for line in sentences(known):
         screen.say(line)
     if out is not None:

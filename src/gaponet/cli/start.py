@@ -139,15 +139,15 @@ def start(
         try:
             inspection = inspect_inputs(model, logs, logs_toml, robot_options, read_options, guess_joints=dry_run)
         except DescriptionNeededError as error:
-            if not dry_run:
-                out.mkdir(parents=True, exist_ok=True)
-                write_text(logs_toml, error.text)
-                hint = f"{logs_toml} is a guess from these logs; check it, then give the same command again"
-                raise UsageError(f"{error}: {hint}") from None
             for line in error.text.splitlines():
                 screen.say(f"  {line}")
-            raise UsageError(f"{error}. The lines above are a guess from these logs; without --dry-run they are "
-                             f"written to {logs_toml} for you to check") from None  # fmt: skip
+            if dry_run:
+                then = f"without --dry-run they are written to {logs_toml} for you to check"
+            else:
+                then = f"they are in {logs_toml}: check those with a ?, then give the same command again"
+                with lock_folder(out, "started"):
+                    write_text(logs_toml, error.text)
+            raise UsageError(f"{error}. The lines above are a guess from these logs; {then}") from None
         _print_inspection(screen, inspection, model, logs, unit_id, payload_mass)
         commands = make_commands(inspection, model, logs, out, robot_options, import_options, cut is None)
         for words in commands:
@@ -162,8 +162,13 @@ def start(
                 if inspection.logs_toml:
                     write_text(logs_toml, inspection.logs_toml)
                 record.begin(shlex.join(next(words for words in commands if words[0] == "import")[2:]))
-                _run(screen, commands, lines, record, anyway)
+                Out.names_next = False
+                try:
+                    _run(screen, commands, lines, record, anyway)
+                finally:
+                    Out.names_next = True
             screen.say(f"commands that ran: {out / COMMANDS_FILE}")
+            screen.next(f"look at {out / 'identified' / 'report.html'}")
     screen.result({
         "robot": inspection.robot.name, "joints": inspection.log.joint_names, "recordings": inspection.recordings,
         "rate_hz": inspection.rate, "logs_toml": inspection.logs_toml, "commands": lines, "ran": not dry_run,

@@ -54,7 +54,7 @@ CHECK_FILES: dict[str, dict[str, str]] = {
     "actuator-net": ACTION_TERM
     | {"check.py": "check_mjlab.py", "check_newton.py": "check_newton.py", "actuators.py": "actuators.py"},
 }
-SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, least torque and friction; numpy or torch."""
+SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, torque limits and friction; numpy or torch."""
 
 from __future__ import annotations
 
@@ -66,9 +66,10 @@ import numpy as np
 ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the joints
 '''
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
-    array_module, servo.present, servo.exp, servo.passing_friction, servo.resting_friction, servo.friction_limit,
-    servo.servo_torque,
+    array_module, servo.present, servo.exp, servo.torque_range, servo.passing_friction, servo.resting_friction,
+    servo.friction_limit, servo.servo_torque,
 )  # fmt: skip
+ENGINE_TERMS = {"isaaclab": ("no_load_speed",)}  # terms of the servo model that an engine's own servos have
 OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts|unit_events) import")
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 DELAY_NOTES = {
@@ -132,7 +133,7 @@ def export_robot(
     train, validation = recordings[0], comparable(recordings[1], robot, payload_mass)
     if not validation:
         raise UsageError(f"no validation motion was made with {payload_mass:g} kg and the robot's own gains")
-    plain = fit_plain_servos(robot, train, progress=progress)
+    plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
     facts = simulator_facts(robot, robot.dt, payload_mass, plain)
     motions = check_motions(validation, robot)
     facts |= {"file": ROBOT, "prefix": prefix, "virtual": validation[0].meta.virtual}
@@ -167,7 +168,8 @@ def export_robot(
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     """Return effects that an engine's form of a robot lacks."""
-    notes, servos, law = [], facts["plain"].values(), ", ".join(facts["law"])
+    notes, servos = [], facts["plain"].values()
+    law = ", ".join(term for term in facts["law"] if term not in ENGINE_TERMS.get(to, ()))
     if to == "mjcf":
         for name, *stops in zip(robot.joint_names, robot.stop_low, robot.stop_high, strict=True):
             if at := " and ".join(f"{x:.2f}" for x in stops if np.isfinite(x)):

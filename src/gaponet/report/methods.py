@@ -34,6 +34,7 @@ METHODS = {  # title, colour
     "stribeck": ("friction at rest", "#1d6b4c"),
     "load": ("friction by load", "#17543c"),
     "servo": ("least torque, encoder", "#113f2d"),
+    "motor": ("torque by speed", "#0b2a1e"),
     "contact": ("table, stops, zeros", "#6b4f2a"),
     "hand": ("where payloads hang, the hand", "#8d6e44"),
     "raw": ("raw targets", "#5c5c5c"),

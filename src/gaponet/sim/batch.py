@@ -246,6 +246,8 @@ class BatchSim:
         if "effort_limit" in values:
             limit = values["effort_limit"]
             batch.expand("actuator_forcerange")[:, at] = np.stack([-limit, limit], axis=-1)
+            if self.servo_model is not None:
+                self.servo_model.effort[:, at] = limit
         if "delay" in values and model.nhistory:
             batch.expand("actuator_delay")[:, at] = values["delay"]
         if "zero" in values:

@@ -225,13 +225,15 @@ def _with_terms(
     """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted."""
     comparisons = list[Comparison]()
     for term in terms:
+        first = TERMS[term][0]
         each = [_fit_term(term, *one, searches) for one in zip(fits, wholes, base, strict=True)]
         richer = [together if together is not None else alone for alone, together in each]
         if each[0][1] is not None:
             richer = min([alone for alone, _ in each], richer, key=lambda v: float(judge.errors(v).mean()))
+        richer = [v | {first: fit.bounds.visible(first, v)} for fit, v in zip(fits, richer, strict=True)]
         comparisons.append(judge.compare(term, values, richer))
         if comparisons[-1].accepted:  # a term that is zero in every joint only gave the others more iterations
-            used = any(v[TERMS[term][0]].any() for v in richer)
+            used = any(v[first].any() for v in richer)
             values = base = [{f: x for f, x in v.items() if f not in TERMS[term] or used} for v in richer]
     return tuple(comparisons), values
 

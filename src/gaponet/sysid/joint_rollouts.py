@@ -25,7 +25,7 @@ from gaponet.sim import servo
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
-from gaponet.sim.servo import friction_limit, present, servo_torque
+from gaponet.sim.servo import friction_limit, present, servo_torque, torque_range
 
 advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
@@ -198,19 +198,21 @@ class JointRollouts:
         kp, kd = v["kp"] * _filled(self.kp_ratio.T, shape), _filled(self.kd.T, shape)
         kd = np.maximum(kd + np.minimum(v["damping"], 0), 0)
         own, armature, offset, dry = np.maximum(v["damping"], 0), v["armature"], v["offset"], v["frictionloss"]
-        damping, limit = own + kd, v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
+        limit = v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
         h = _filled(self.periods / self.count, shape)
         low, high = (_filled(x[:, None], shape) for x in self.stops.T)
-        has_kd = bool(kd.any())
         q, w = _filled(self.qpos[..., 0], shape), _filled(self.qvel[..., 0], shape)
         out = np.zeros((*shape, self.counted.shape[1]), np.float32)
         for t in range(self.qpos.shape[2] - 1):
             inertia, weight, pull, slope = self.tables[..., t]
             heavy, slope = inertia + armature, _filled(slope, shape)
-            turn, stop = h / (heavy + h * damping), heavy / -h
+            stop = heavy / -h
             for aim in self._targets(t, values["delay"]) + offset:
-                torque = servo_torque(terms, kp, aim, q)
-                torque = np.minimum(np.maximum(torque - kd * w if has_kd else torque, -limit), limit)
+                wanted, least, most = servo_torque(terms, kp, aim, q) - kd * w, -limit, limit
+                if "no_load_speed" in terms:
+                    least, most = torque_range(limit, w / terms["no_load_speed"])
+                torque = np.minimum(np.maximum(wanted, least), most)
+                turn = h / (heavy + h * (own + kd * (torque == wanted)))
                 load = slope * q + weight
                 most = friction_limit(terms, dry, w, torque, load)
                 net = torque - load - pull - own * w

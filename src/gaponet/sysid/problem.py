@@ -289,6 +289,8 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     by = {f: np.stack([(a[f] - values[f]) / 1e-3 for a in ahead], axis=-1) for f in names}
     std = {f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + (np.abs(g) * lost).max(axis=1) for f, g in by.items()}
     std |= {f: np.hypot(std[f], error) for f, error in _discretisation_std(problem, values).items()}
+    if "no_load_speed" in std:  # a joint without a line: on its axis zero, but infinite in SI units
+        std["no_load_speed"] *= values["no_load_speed"] > 0
     unit = axes.unit[..., None]
     wide = unit * (cov + 1e3 * np.eye(len(names)) * lost[..., None, :]) * np.swapaxes(unit, -1, -2)
     unknown = _undetermined(problem, values, axes, std, width)
@@ -315,10 +317,15 @@ def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
 
 
 def _discretisation_std(problem: FitProblem, values: Values) -> Values:
-    """Return standard errors of damping, armature and delay by the length of a physics step, (n,)."""
+    """Return standard errors of damping, armature, delay and no-load speed by the length of a physics step, (n,)."""
     h = UNIFORM_STD * problem.physics_step
     total = values["damping"] + problem.robot.kd[problem.robot.operated_index]
-    return {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
+    std = {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
+    if "no_load_speed" in values:  # the limit follows the speed a step late, half a step on average
+        limit = values.get("effort_limit", problem.bounds.first["effort_limit"])
+        late = problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
+        std["no_load_speed"] = late
+    return std
 
 
 def _inverse(normal: Array, size: Array) -> Array:
@@ -348,7 +355,7 @@ def _undetermined(
             continue
         wide, also_over_kp = dict[str, str](), list[str]()
         for k, f in enumerate(names):
-            if f == "stribeck_speed" and not values["stribeck"][i]:
+            if (f == "stribeck_speed" and not values["stribeck"][i]) or (f == "no_load_speed" and not values[f][i]):
                 continue
             value, error = values[f][i], std[f][i]
             if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):

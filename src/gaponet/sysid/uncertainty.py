@@ -1,8 +1,8 @@
 """Uncertainty of a robot's fitted parameters, stored as uncertainty.json in its folder.
 
 The parameters are Gaussian on axes that do not depend on a motor's gain: the logarithms of kp and stribeck_speed;
-torques, damping and armature divided by kp; other fields in SI units. The file also holds what the recordings showed by
-themselves, for comparison with later ones, and the error of motions that were not fitted.
+torques, damping and armature divided by kp; 1 / no_load_speed; other fields in SI units. The file also holds what the
+recordings showed by themselves, for comparison with later ones, and the error of motions that were not fitted.
 """
 
 from __future__ import annotations
@@ -216,6 +216,8 @@ def format_change(field: str, change: float, uncertainty: ParameterUncertainty, 
     if record.axis == "log":
         return f"× {np.exp(change):.2f}"
     value = uncertainty.joints[joint].values[uncertainty.fields.index(field)]
+    if record.axis == "inverse" and min(value, value + change) > 0:
+        return f"× {value / (value + change):.2f}"
     return f"{100 * change / value:+.0f} %" if value > 1e-9 else "from none"
 
 

@@ -134,23 +134,11 @@ def read_logs(
     rate: float | None = None,
     strict: bool = False,
 ) -> Iterator[tuple[str, Log]]:
-    """Yield (motion name, Log) for every recording under a path.
+    """Yield (motion name, Log) for every recording under a path; arguments and errors as of gaponet.api.import_logs.
 
     While data.log.skip_bad_rows is open, bad rows are cut, recordings that cannot be read are left out, and both are
-    listed there.
-
-    Args:
-        fmt: One of formats(); default by looking.
-        joint_map: The log's name of a joint → the robot's; wins over logs.toml.
-        logs: A logs.toml (data.describe.logs_file); default the one in the folder of the logs.
-        position_unit, time_unit, rate: Win over logs.toml; refused where the format itself fixes them. rate, Hz, is
-            of logs without a clock.
-        strict: Refuse a recording whose velocity, torque or temperature is nonsense somewhere, instead of making up for
-            that channel there (data.describe.plausibility).
-        allow_pickle: Open pickled files, with an unpickler that makes arrays, numbers and text and nothing else.
-
-    Raises:
-        LogError, JointMismatchError, UsageError: What, where and what to do.
+    listed there. joint_map, position_unit, time_unit and rate win over logs.toml; the last three are refused where the
+    format itself fixes them.
     """
     specified, file = read_logs_file(path, logs)
     reader = _reader(path, fmt or specified.get("format"))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque
+from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque, torque_range
 
 CHECK_WORLDS = 3
 Motion = dict[str, Any]  # one of check.npz: ctrl, qpos, qvel (T, n) in rad and rad/s, dt in s
@@ -43,7 +43,7 @@ class Servos:
         self.model = model
         self.dof, self.qpos, self.servo = addresses(model, list(joints), prefix)
         self.kp, self.frictionloss = column["kp"], column["frictionloss"]
-        self.bias = self.kp * column["offset"]
+        self.bias, self.effort = self.kp * column["offset"], column["effort_limit"]
         model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = column["armature"], column["damping"]
         model.actuator_gainprm[self.servo, 0], model.actuator_biasprm[self.servo, 0] = self.kp, self.bias
         model.actuator_biasprm[self.servo, 1], model.actuator_biasprm[self.servo, 2] = -self.kp, -column["kd"]
@@ -56,13 +56,16 @@ class Servos:
         self.terms = present({name: column[name] for name in SERVO_TERMS if name in column})
 
     def before(self, data: Any) -> None:
-        """Set bias and friction for the next physics step, under data.ctrl."""
+        """Set bias, torque limits and friction for the next physics step, under data.ctrl."""
         if not self.terms:
             return
         model, torque, load = self.model, data.actuator_force[self.servo], data.qfrc_bias[self.dof]
         model.dof_frictionloss[self.dof] = friction_limit(
             self.terms, self.frictionloss, data.qvel[self.dof], torque, load
         )
+        if "no_load_speed" in self.terms:
+            limits = torque_range(self.effort, data.qvel[self.dof] / self.terms["no_load_speed"])
+            model.actuator_forcerange[self.servo] = np.stack(limits, axis=-1)
         if "encoder_step" in self.terms or "min_torque" in self.terms:
             q, ctrl = data.qpos[self.qpos], data.ctrl[self.servo]
             wanted = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q)
