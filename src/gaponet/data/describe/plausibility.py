@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     for name in (n for n in UNITS if n in log.channels):
         values = log.channels[name].values
         if name in ("ctrl", "qpos"):
-            require_radians(values, log.joint_names, robot, lambda row, name=name: f"{log.row(name, row)}: {name}")
+            require_radians(values, log.joint_names, robot, partial(_place, log, name))
             continue
         wrong = _nonsense(name, log, robot)
         if (strict or name == FEEDFORWARD) and wrong.any():  # commands are never made up
@@ -107,6 +108,10 @@ def _made_up(name: str, log: Log, wrong: Array) -> Array:
         known = (at, np.gradient(qpos[:, j], at)) if name == "qvel" else (time[~bad], values[~bad, j])
         out[bad, j] = np.interp(time[bad], *known)
     return out
+
+
+def _place(log: Log, name: str, row: int) -> str:
+    return f"{log.row(name, row)}: {name}"
 
 
 def require_radians(values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]) -> None:
