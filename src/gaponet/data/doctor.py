@@ -67,7 +67,6 @@ class DoctorResult:
         """Examine every sequence, and judge them together.
 
         Args:
-            robot: The dataset's robot.
             gravity_model: Gravity of the nominal model, which shows wrong zeros, signs, gains and payload labels; these
                 are not examined without it.
 

@@ -91,8 +91,6 @@ def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
 
 def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
-    if not path.exists():
-        raise LogError(f"{path}: does not exist")
     matches = [fmt for fmt, where in formats().items() if attempt(where, partial(_detects, fmt, path), False)]
     others = [fmt for fmt in matches if fmt != "table"]
     if others and len(matches) > len(others):
@@ -193,10 +191,9 @@ def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
 
 
 def _reader(path: Path, fmt: str | None) -> ModuleType:
-    reader = module(fmt or detect(path))
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    return reader
+    return module(fmt or detect(path))
 
 
 def _loaders(
