@@ -58,7 +58,9 @@ def test_import_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
 
 def test_the_payload_must_be_said(logs, tmp_path, capsys):
     assert main(["import", str(logs), "--robot", "so101", "--unit-id", "lab", "--out", str(tmp_path / "data")]) == 2
-    assert "this format does not say it: give --payload-mass 0 (kg in each hand" in capsys.readouterr().err
+    assert (
+        "this format does not state unit or payload: give --payload-mass 0 (kg in each hand" in capsys.readouterr().err
+    )
     assert main(["import", str(logs), "--robot", "so101", "--out", str(tmp_path / "data")]) == 2
     assert "give --unit-id NAME and --payload-mass 0 (kg" in capsys.readouterr().err  # all at once
     assert not (tmp_path / "data").exists()

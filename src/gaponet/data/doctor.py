@@ -51,14 +51,9 @@ class Diagnosis:
 
     @classmethod
     def of(
-        cls,
-        dataset: Dataset,
-        robot: RobotSpec,
-        *,
-        gravity_model: Gravity | None = None,
-        progress: Progress = no_progress,
-        executor: str | Executor = LOCAL,
-    ) -> Diagnosis:
+        cls, dataset: Dataset, robot: RobotSpec, *, gravity_model: Gravity | None = None,
+        progress: Progress = no_progress, executor: str | Executor = LOCAL,
+    ) -> Diagnosis:  # fmt: skip
         """Examine every sequence, and judge them together.
 
         Args:
