@@ -54,7 +54,7 @@ def waterfall(gap: dict[str, Any]) -> Figure:
     axes[0, 0].invert_yaxis()
     robot = f"{'VIRTUAL' if gap['virtual'] else 'real'} {gap['robot']}"
     fig.suptitle(
-        f"{robot}, {gap['sequences']} {'held-out ' if gap['unseen'] else ''}recordings: reduction of the error by each "
+        f"{robot}, {gap['sequences']} {'test ' if gap['unseen'] else ''}recording{'s' * (gap['sequences'] != 1)}: reduction of the error by each "
         "step (hollow: increase)\ndashed: floor, by encoder and repeatability (– unknown)",
         fontsize=9, x=0.01, ha="left",
     )  # fmt: skip
