@@ -56,14 +56,9 @@ class DoctorResult:
 
     @classmethod
     def of(
-        cls,
-        dataset: Dataset,
-        robot: RobotSpec,
-        *,
-        gravity_model: Gravity | None = None,
-        progress: Progress = no_progress,
-        executor: str | Executor = LOCAL,
-    ) -> DoctorResult:
+        cls, dataset: Dataset, robot: RobotSpec, *, gravity_model: Gravity | None = None,
+        progress: Progress = no_progress, executor: str | Executor = LOCAL,
+    ) -> DoctorResult:  # fmt: skip
         """Examine every sequence, and judge them together.
 
         Args:

@@ -101,8 +101,9 @@ def detect(path: Path) -> str:
         ways = " or ".join(f"--format {fmt}" for fmt in matches)
         raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in matches)}; say {ways}")
     if not matches:
-        known = "; ".join(f"{fmt}: {about(fmt)}" for fmt in formats())
-        raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
+        if (path / "dataset.json").is_file():
+            raise LogError(f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}")
+        raise LogError(f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains them)")
     return matches[0]
 
 
