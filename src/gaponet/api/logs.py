@@ -291,16 +291,9 @@ def unit_recordings(
     motions: tuple[str, ...] = (),
     payload_mass: float | None = None,
 ) -> Iterator[tuple[str, list[Sequence]]]:
-    """Read one unit's recordings from a dataset, or from logs that are imported into a temporary folder.
+    """Yield one unit's id and its recordings, from a dataset or from logs; arguments as of `check`.
 
-    Args:
-        source: A dataset, or logs that `import_logs` reads.
-        unit: Unit to read, where there are several.
-        motions: Only these.
-        payload_mass: kg in each hand, of logs whose format does not state it.
-
-    Yields:
-        The unit's id and its recordings.
+    Logs are imported into a temporary folder.
 
     Raises:
         UsageError: The unit is not there, or there are several and none is named.

@@ -74,7 +74,7 @@ def check(
     named = {m.joint for m in drift.moved}
     screen.table(
         f"{made.recordings} recordings, {drift.seconds:.0f} s: largest change of each joint",
-        ["joint", "parameter", "change", "standard errors", "effect, mrad", "least that counts, mrad", ""],
+        ["joint", "parameter", "change", "standard errors", "effect, mrad", "least that counts, mrad", "verdict"],
         [
             _row(m, uncertainty, drift, m.joint in named)
             for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))
@@ -124,4 +124,4 @@ def _row(m: ParameterChange, uncertainty: ParameterUncertainty, drift: Drift, co
     least = drift.min_effect.get(m.joint) or sum(drift.min_effect.values()) / len(drift.min_effect)
     by = format_change(m.field, m.by, uncertainty, m.joint)
     return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * least:.2f}",
-            "moved" if counts else ""]  # fmt: skip
+            "changed" if counts else "same"]  # fmt: skip

@@ -14,11 +14,13 @@ from gaponet.cli import options
 from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import Out, writes
 from gaponet.report.tables import mrad, mrad_with_error
+from gaponet.robot.finding import abbreviate
 from gaponet.robot.servo_fields import PASSIVE_FIELDS, SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument
 from gaponet.robot.toml_file import MEASURED_FIELDS
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
+from gaponet.sysid.uncertainty import JointSummary
 
 UNDETERMINED = "not determined by these logs"
 
@@ -96,13 +98,15 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         end = "" if fit.improved else " No fit was better, so these servos are written as they are."
         screen.say(f"Start and prior: {taken}.{end}")
     shown = [f for f in SERVO_FIELDS if any(v.get(f) for v in values.values())]
-    rows = [[j, *(_cell(v.get(f), fit.std[j].get(f), SERVO_FIELDS[f].factor) for f in shown)]
-            for j, v in values.items()]  # fmt: skip
+    rows, sources = [[j, *(_cell(v, fit.std[j], f) for f in shown)] for j, v in values.items()], list[str]()
     for servo in dict.fromkeys(filter(None, (fit.robot.servos[i] for i in fit.robot.operated_index))):
         if any(cells := [servo.text(f) if f in MEASURED_FIELDS else "" for f in shown]):
-            rows.append([f"servo {servo.name}, {servo.source}", *cells])
+            rows.append([f"servo {servo.name}", *cells])
+            sources.append(f"servo {servo.name}: {servo.source}")
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in shown)]
     screen.table("Identified servos, ± standard error", columns, rows)
+    for source in sources:
+        screen.say(source)
     for term in fit.comparisons:
         judges = "motions" if term.name == "torque" else "recordings"
         over = f" over {len(term.before)} {judges}" * (len(term.before) > 1)
@@ -129,14 +133,16 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         if details or warning not in unknown:
             screen.say(f"  {warning}", "warning", "yellow")
     if unknown and not details:
-        joints = ", ".join(w.partition(":")[0] for w in unknown)
-        screen.say(f"not determined in part: {joints}; --details says what. Take a joint's values as a set")
+        joints = abbreviate([w.partition(":")[0] for w in unknown])
+        screen.say(f"some parameters are not determined: {joints}; --details lists them. Use a joint's values together")
 
 
-def _cell(value: float | None, std: float | None, factor: float) -> str:
-    if value is None:
+def _cell(joint: dict[str, float], errors: dict[str, float], field: str) -> str:
+    if field not in joint or (field == "stribeck_speed" and not joint["stribeck"]):
         return ""
-    return format_uncertainty(value * factor, std * factor) if std else f"{value * factor:.3g}"
+    if errors.get(field):
+        return JointSummary(joint, errors).cell(field)
+    return f"{joint[field] * SERVO_FIELDS[field].factor:.3g}"
 
 
 def _show_torque(screen: Out, made: TorqueResult, current: bool) -> None:

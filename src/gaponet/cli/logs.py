@@ -30,29 +30,15 @@ MAX_ROWS = 60
 
 @like(api.import_logs)
 def import_logs(
-    src: tyro.conf.Positional[Path | None] = None,
-    robot: str = "",
-    out: Path | None = None,
-    unit_id: str | None = None,
-    payload_mass: float | None = None,
-    payload_side: str | None = None,
-    map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    format: str | None = None,
-    logs: Path | None = None,
-    position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None,
-    rate: float | None = None,
-    cut: float | None = None,
-    level: Literal["joint", "upper_body", "whole_body"] | None = None,
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
-    skip_bad: bool = False,
-    strict: bool = False,
-    allow_pickle: bool = False,
-    guess: bool = False,
-    formats: Flag = False,
-    json: Json = False,
-) -> None:
+    src: tyro.conf.Positional[Path | None] = None, robot: str = "", out: Path | None = None, unit_id: str | None = None,
+    payload_mass: float | None = None, payload_side: str | None = None,
+    map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (), format: str | None = None,
+    logs: Path | None = None, position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None, rate: float | None = None, cut: float | None = None,
+    level: Literal["joint", "upper_body", "whole_body"] | None = None, kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (), skip_bad: bool = False, strict: bool = False, allow_pickle: bool = False,
+    guess: bool = False, formats: Flag = False, json: Json = False,
+) -> None:  # fmt: skip
     """Read a robot's logs into a dataset; the same call adds what is new.
 
     A bad log refuses them all (--skip-bad leaves it out instead).
@@ -216,8 +202,8 @@ def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:
     columns = ["motion", "kg", "s", "Hz", "jitter", "gap", "lag"]
     out.table("Sequences; jitter, longest gap and fast lag in ms", columns, [
         [r["motion"] + f" ({r['repetition']})" * (r["repetition"] > 0), f"{r['payload_mass']:g}",
-         f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}", f"{r['jitter_ms']:.2f}",
-         f"{r['longest_gap_ms']:.1f}", _span(list(r["fast_lag_s"].values()))]
+         f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}", f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}",
+         _span(list(r["fast_lag_s"].values()))]
         for r in shown
     ])  # fmt: skip
     if len(shown) < len(diagnosis.sequences):

@@ -60,8 +60,8 @@ def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda
         return _say(": ".join(str(part) for part in ("File", error.filename, error.strerror or error) if part))
     except MemoryError:
         return _say("Memory: there is not enough of it for this; give less at once, or close other programs")
-    except KeyboardInterrupt:
-        print("interrupted; what was written so far is complete", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"interrupted; {str(stop) or 'what was written so far is complete'}", file=sys.stderr)
         return 128 + signal.SIGINT
     return 0
 

@@ -56,18 +56,12 @@ class DoctorResult:
 
     @classmethod
     def of(
-        cls,
-        dataset: Dataset,
-        robot: RobotSpec,
-        *,
-        gravity_model: Gravity | None = None,
-        progress: Progress = no_progress,
-        executor: str | Executor = LOCAL,
-    ) -> DoctorResult:
+        cls, dataset: Dataset, robot: RobotSpec, *, gravity_model: Gravity | None = None,
+        progress: Progress = no_progress, executor: str | Executor = LOCAL,
+    ) -> DoctorResult:  # fmt: skip
         """Examine every sequence, and judge them together.
 
         Args:
-            robot: The dataset's robot.
             gravity_model: Gravity of the nominal model, which shows wrong zeros, signs, gains and payload labels; these
                 are not examined without it.
 

@@ -78,24 +78,11 @@ class ImportResult:
 
 
 def import_logs(
-    src: str | Path,
-    robot: RobotSpec,
-    unit_id: str | None,
-    payload_mass: float | None,
-    out: str | Path,
-    *,
-    payload_side: str | None = None,
-    level: str | None = None,
-    fmt: str | None = None,
-    gravity: Gravity | None = None,
-    simulator: str = "",
-    progress: Progress = no_progress,
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
-    skip_bad: bool = False,
-    cut: float | None = None,
-    **options: Any,
-) -> ImportResult:
+    src: str | Path, robot: RobotSpec, unit_id: str | None, payload_mass: float | None, out: str | Path, *,
+    payload_side: str | None = None, level: str | None = None, fmt: str | None = None, gravity: Gravity | None = None,
+    simulator: str = "", progress: Progress = no_progress, kp: tuple[str, ...] = (), kd: tuple[str, ...] = (),
+    skip_bad: bool = False, cut: float | None = None, **options: Any,
+) -> ImportResult:  # fmt: skip
     """Import every recording under a path that the dataset does not hold yet. A bad recording refuses all of them.
 
     What was written before a full disk or a kill stays, complete, and the same call adds the rest.

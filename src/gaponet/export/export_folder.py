@@ -140,7 +140,7 @@ def export_robot(
     facts["error_mrad"] = {form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))}
     errors = {"in gaponet": rollout_error(validation, robot)}
     if robot.has_servo_model:
-        errors["in gaponet, fitted without the law"] = rollout_error(validation, plain)
+        errors["in gaponet, without the servo model"] = rollout_error(validation, plain)
     file, notes = None, _notes(robot, facts, to)
     with lock_folder(out, FOLDER_KIND):
         if to == "mjcf":

@@ -35,9 +35,9 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     period = float(np.median([1 / s.rate_hz for s in surveys]))
     low, high = every.min(), every.max()
     text = (
-        f"state follows command after {np.median(every) * 1e3:.0f} ms ({low * 1e3:.0f}–{high * 1e3:.0f} over joints "
-        f"and motions at {FAST_COMMAND_RAD_S} rad/s or faster): {low / period:.0f} to {high / period:.0f} control "
-        "periods, which a network's history must span"
+        f"state follows command after {np.median(every) * 1e3:.0f} ms ({low * 1e3:.0f}–{high * 1e3:.0f} over joints and"
+        f" motions at {FAST_COMMAND_RAD_S} rad/s or faster), {low / period:.0f} to {high / period:.0f} periods: "
+        "a network's history must span it"
     )
     expected = _expected_lag(robot)
     sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))

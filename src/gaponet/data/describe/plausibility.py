@@ -61,7 +61,7 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     for name in (n for n in UNITS if n in log.channels):
         values = log.channels[name].values
         if name in ("ctrl", "qpos"):
-            require_radians(values, log.joint_names, robot, partial(_with_channel, log, name))
+            require_radians(values, log.joint_names, robot, partial(_place, log, name))
             continue
         wrong = _nonsense(name, log, robot)
         if (strict or name == FEEDFORWARD) and wrong.any():  # commands are never made up
@@ -87,11 +87,6 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     )
 
 
-def _with_channel(log: Log, name: str, row: int) -> str:
-    """Return what to call a row of a channel in an error."""
-    return f"{log.row(name, row)}: {name}"
-
-
 def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
     """Where a channel holds what no joint does, (k, n)."""
     values = np.abs(log.channels[name].values)
@@ -115,6 +110,10 @@ def _made_up(name: str, log: Log, wrong: Array) -> Array:
     return out
 
 
+def _place(log: Log, name: str, row: int) -> str:
+    return f"{log.row(name, row)}: {name}"
+
+
 def require_radians(values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]) -> None:
     """Refuse positions (k, n) that can only be degrees, or another joint's; where: what to call a row in the error.
 
@@ -126,5 +125,5 @@ def require_radians(values: Array, joint_names: tuple[str, ...], robot: RobotSpe
         if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
             raise LogError(
                 f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
-                "must be in radians: these look like degrees (--position-unit deg, if all of these logs are)"
+                "must be in radians: these look like degrees (--position-unit deg)"
             )

@@ -91,8 +91,6 @@ def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
 
 def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
-    if not path.exists():
-        raise LogError(f"{path}: does not exist")
     matches = [fmt for fmt, where in formats().items() if attempt(where, partial(_detects, fmt, path), False)]
     others = [fmt for fmt in matches if fmt != "table"]
     if others and len(matches) > len(others):
@@ -103,8 +101,9 @@ def detect(path: Path) -> str:
         ways = " or ".join(f"--format {fmt}" for fmt in matches)
         raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in matches)}; say {ways}")
     if not matches:
-        known = "; ".join(f"{fmt}: {about(fmt)}" for fmt in formats())
-        raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
+        if (path / "dataset.json").is_file():
+            raise LogError(f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}")
+        raise LogError(f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains them)")
     return matches[0]
 
 
@@ -193,10 +192,9 @@ def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
 
 
 def _reader(path: Path, fmt: str | None) -> ModuleType:
-    reader = module(fmt or detect(path))
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    return reader
+    return module(fmt or detect(path))
 
 
 def _loaders(

@@ -40,16 +40,7 @@ class _NoDataError(Exception):
 def write_figures(
     dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = no_progress
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write every figure for which the dataset has data.
-
-    Args:
-        dataset: At least one sequence.
-        robot: The dataset's robot.
-        out: Folder; figures of the same name are replaced.
-
-    Returns:
-        The files; and {figure: reason for its absence}.
-    """
+    """Write every figure for which the dataset has data; return the files, and {figure: reason for its absence}."""
     dataset.require_robot(robot)
     dataset.require_sequences()
     with lock_folder(out, "figures"):
