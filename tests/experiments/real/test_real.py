@@ -91,10 +91,10 @@ def test_unknown_sets_and_questions_are_refused_and_absent_sets_skipped(tmp_path
 def test_the_method_on_the_page_runs(arm, played, tmp_path):
     code = re.search(r"```python\n(.*?)```", (DOCS / "benchmark.md").read_text(encoding="utf-8"), re.DOTALL)[1]
     (tmp_path / "mine.py").write_text(code)
-    name, method = load_method(f"{tmp_path / 'mine.py'}:half_gravity")
+    name, method = load_method(f"{tmp_path / 'mine.py'}:late_targets")
     (question,) = questions("new motions", played, arm, None)
     moved = method(question).positions(question.test)
-    assert name == "half_gravity"
+    assert name == "late_targets"
     assert [q.shape for q in moved] == [s.qpos.shape for s in question.test]
     with pytest.raises(UsageError, match=r"no such file; give FILE\.py:FUNCTION"):
         load_method("nothing.py:f")
