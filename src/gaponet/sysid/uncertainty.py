@@ -216,7 +216,7 @@ def format_change(field: str, change: float, uncertainty: ParameterUncertainty, 
     if record.axis == "log":
         return f"× {np.exp(change):.2f}"
     value = uncertainty.joints[joint].values[uncertainty.fields.index(field)]
-    return f"{100 * change / value:+.0f} %" if value > 1e-9 else "from none"
+    return f"{max(100 * change / value, -100):+.0f} %" if value > 1e-9 else "from none"
 
 
 def table_rows(uncertainty: ParameterUncertainty, fields: tuple[str, ...]) -> list[list[str]]:
