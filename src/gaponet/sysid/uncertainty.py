@@ -218,7 +218,7 @@ def format_change(field: str, change: float, uncertainty: ParameterUncertainty, 
     value = uncertainty.joints[joint].values[uncertainty.fields.index(field)]
     if record.axis == "inverse" and min(value, value + change) > 0:
         return f"× {value / (value + change):.2f}"
-    return f"{100 * change / value:+.0f} %" if value > 1e-9 else "from none"
+    return f"{max(100 * change / value, -100):+.0f} %" if value > 1e-9 else "from none"
 
 
 def table_rows(uncertainty: ParameterUncertainty, fields: tuple[str, ...]) -> list[list[str]]:

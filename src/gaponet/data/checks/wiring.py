@@ -228,7 +228,10 @@ def _limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 
 def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Is one recording filed under two payloads or units?"""
+    """Is one recording filed under two payloads or units, and were all made with the same gains?"""
+    if (kinds := len({(s.entry.meta.kp, s.entry.meta.kd) for s in surveys})) > 1:
+        text = f"{kinds} sets of kp and kd while recording: each recording is simulated with its own; is that meant?"
+        yield Finding("note", "labels", text)
     ids: dict[str, list[str]] = defaultdict(list)
     for s in surveys:
         ids[s.samples].append(s.entry.id)

@@ -84,14 +84,9 @@ class RawRecording:
 
     @classmethod
     def of_arrays(
-        cls,
-        file: Path,
-        arrays: dict[str, Any],
-        names: tuple[str, ...] = (),
-        name: str = "",
-        part: str = "",
+        cls, file: Path, arrays: dict[str, Any], names: tuple[str, ...] = (), name: str = "", part: str = "",
         **more: Any,
-    ) -> RawRecording:
+    ) -> RawRecording:  # fmt: skip
         """A recording of arrays in memory; those that are not one row of numbers per sample are left alone.
 
         Args:

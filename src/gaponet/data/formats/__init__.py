@@ -122,17 +122,10 @@ def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
 
 
 def read_logs(
-    path: Path,
-    robot: RobotSpec,
-    fmt: str | None = None,
-    joint_map: dict[str, str] | None = None,
-    logs: str | Path | None = None,
-    position_unit: str | None = None,
-    time_unit: str | None = None,
-    allow_pickle: bool = False,
-    rate: float | None = None,
-    strict: bool = False,
-) -> Iterator[tuple[str, Log]]:
+    path: Path, robot: RobotSpec, fmt: str | None = None, joint_map: dict[str, str] | None = None,
+    logs: str | Path | None = None, position_unit: str | None = None, time_unit: str | None = None,
+    allow_pickle: bool = False, rate: float | None = None, strict: bool = False,
+) -> Iterator[tuple[str, Log]]:  # fmt: skip
     """Yield (motion name, Log) for every recording under a path; arguments and errors as of gaponet.api.import_logs.
 
     While data.log.skip_bad_rows is open, bad rows are cut, recordings that cannot be read are left out, and both are
