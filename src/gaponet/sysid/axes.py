@@ -29,6 +29,7 @@ MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
 UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")  # of an unexcited joint, fitted as others move it
 MIN_INVERSE = 1e-5  # on an inverse axis; less counts as none
+MIN_LINE, LARGE_LINE_CHANGE = 0.2, 0.1  # share of the torque that a motor has lost at a joint's greatest speed
 SPEED_QUANTILE, MIN_SPEED = 0.995, 0.1  # of a joint's recorded speeds, and rad/s: the greatest is at least this
 BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
 
@@ -158,7 +159,7 @@ class Bounds:
             "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
             "effort_limit": (0.05 * limit / kp, 5 * limit / kp, 0.2 * limit / kp),
             "encoder_step": (counts, counts, one),
-            "no_load_speed": (0 * one, 2 * slow, 0.1 * slow),
+            "no_load_speed": (0 * one, 2 * slow, LARGE_LINE_CHANGE * slow),
         }
         guess = {f.name: f.guess * one for f in SERVO_FIELDS.values() if f.guess is not None}
         self.guess = from_axis(guess, kp) | {
@@ -168,11 +169,10 @@ class Bounds:
         }
 
     def visible(self, field: str, values: Values) -> Array:
-        """Return a field of values (n,), 0 where it has no effect to speak of: a line that takes less than a tenth of
-        the torque at a joint's greatest speed."""
+        """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE."""
         inverse = SERVO_FIELDS[field].axis == "inverse"
-        none = inverse and to_axis(field, values[field], values["kp"]) < self.limits[field][2]
-        return np.where(none, 0.0, values[field])
+        least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field][2] if inverse else 0.0
+        return np.where(inverse & (to_axis(field, values[field], values["kp"]) < least), 0.0, values[field])
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
