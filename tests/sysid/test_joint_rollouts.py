@@ -27,6 +27,7 @@ FIRST = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "of
         {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2},
         {"encoder_step": 0.005, "min_torque": 0.2},
         {"kd": 1.0},
+        {"backlash": 0.02},
     ],
 )
 def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Literal, get_args
 
 # Terms of the servo model that identification may add, one by one; `ServoField.term` names a field's.
-Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"]
+Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder", "backlash"]
 DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load")
 Axis = Literal["value", "log", "over kp"]
 
@@ -118,6 +118,9 @@ SERVO_FIELDS: dict[str, ServoField] = {
                    prior_std=0.003, cause="servo", term="min_torque", in_servo_model=True),
         ServoField("encoder_step", "rad", "encoder, mrad", 1e3, limits=(0.0, 1.0), cause="servo", term="encoder",
                    in_servo_model=True, single_joint=True, shared=False),
+        ServoField("backlash", "rad", "backlash, mrad", 1e3, limits=(0.0, 1.0), bounds=(0.0, 0.1, 0.003), guess=0.004,
+                   prior_std=0.01, large_value=0.01, cause="servo", term="backlash", in_servo_model=True, shared=False,
+                   advice="check for a loose horn or a slipping gear"),
         _angle("zero", heading="zero, mrad", factor=1e3, cause="contact"),
         _angle("stop_low", heading="low stop, rad", default=math.nan, cause="contact"),
         _angle("stop_high", heading="high stop, rad", default=math.nan, cause="contact"),
