@@ -6,7 +6,10 @@ import pytest
 from arm import write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.export.shipped import mujoco_servos
+from gaponet.export.simulator_facts import simulator_facts
 from gaponet.sim.batch import BatchSim
+from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 from gaponet.sysid.joint_rollouts import JointRollouts
 
@@ -94,3 +97,13 @@ def test_a_state_goes_on_with_its_gap(pendulum):
             sim.step(target[None])
         ends.append(sim.qpos.copy())
     np.testing.assert_array_equal(*ends)
+
+
+def test_exported_servos_move_as_the_simulator(pendulum):
+    robot = pendulum.with_servos({"swing": SERVO})
+    ctrl = command()[:100]
+    meta = SequenceMeta(robot.name, "a", "swing", 0.0, virtual=True)
+    (simulated,) = replay([Sequence(meta, robot.joint_names, 0.01, ctrl, ctrl, 0.0 * ctrl)], robot)
+    motion = {"ctrl": ctrl, "qpos": ctrl, "qvel": 0.0 * ctrl, "dt": 0.01}
+    played = mujoco_servos.play(build_model(robot), simulator_facts(robot, 0.01), motion)
+    np.testing.assert_allclose(played, simulated.qpos, atol=1e-6)
