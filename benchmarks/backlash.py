@@ -17,6 +17,7 @@ import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.batch import Batch
 
 DT, H = 0.01, 5e-4  # s: of the logs, of the true robot's physics
 MOTIONS, SECONDS = 8, 5.0
@@ -110,29 +111,35 @@ class PlayRobot:
         s = np.clip(s / (0.6 if kind == 1 else 0.02), 0, 1)
         return knots[i] + (knots[i + 1] - knots[i]) * (10 * s**3 - 15 * s**4 + 6 * s**5) * (1.0 if kind == 1 else 0.4)
 
-    def record(self, ctrl: np.ndarray, motion: str, noise: bool = True) -> Sequence:
-        """Simulate a motion and log it."""
+    def record(self, ctrl: np.ndarray, names: list[str]) -> list[Sequence]:
+        """Simulate motions (m, T, n) rad and log them."""
         model, n = mujoco.MjModel.from_xml_string(self.xml(True)), len(self.kp)
         model.dof_solref[:] = [2.5 * H, 1.0]
         model.dof_solimp[:] = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-        data, each = mujoco.MjData(model), round(DT / H)
+        batch = Batch(model, nsim=len(ctrl), nthread=1)
+        qpos, qvel, applied = (batch.bind(name) for name in ("qpos", "qvel", "qfrc_applied"))
+        friction = batch.expand("dof_frictionloss")
         motor = np.array([model.joint(f"j{i}").dofadr[0] for i in range(n)])
-        link = np.array([model.joint(f"p{i}").dofadr[0] if self.backlash[i] > 0 else -1 for i in range(n)])
-        data.qpos[motor] = ctrl[0]
-        states, late = np.zeros((len(ctrl), 2, n)), round(self.delay / H)
-        for t in range(-50, len(ctrl)):
+        gap = self.backlash > 0  # the play hinge of a joint is the next one
+        qpos[:, motor], friction[:, motor] = ctrl[:, 0], self.friction
+        each, late, rows = round(DT / H), round(self.delay / H), ctrl.shape[1]
+        link = np.zeros(ctrl.shape)
+        for t in range(-50, rows):
             for part in range(each):
-                q, v = ((x[motor] + np.where(link >= 0, x[link], 0)) for x in (data.qpos, data.qvel))
+                q = qpos[:, motor] + gap * qpos[:, motor + gap]
                 if t >= 0 and part == 0:
-                    states[t] = q, v
-                target = ctrl[np.clip((t * each + part - late) // each, 0, len(ctrl) - 1)]
-                model.dof_frictionloss[motor] = self.friction + self.stribeck / (1 + (data.qvel[motor] / 0.05) ** 2)
-                data.qfrc_applied[motor] = self.kp * (target - q)
-                mujoco.mj_step(model, data)
-        rng = np.random.default_rng([self.seed, len(motion), int(1e6 * abs(ctrl).sum()) % 2**31])
-        qpos = states[:, 0]
-        if noise:
-            qpos = np.round((qpos + NOISE_RAD * rng.standard_normal(qpos.shape)) / COUNT_RAD) * COUNT_RAD
+                    link[:, t] = q
+                target = ctrl[:, min(max((t * each + part - late) // each, 0), rows - 1)]
+                if self.stribeck.any():
+                    friction[:, motor] = self.friction + self.stribeck / (1 + (qvel[:, motor] / 0.05) ** 2)
+                applied[:, motor] = self.kp * (target - q)
+                batch.step()
+        return [self.log(c, q, name, i) for i, (c, q, name) in enumerate(zip(ctrl, link, names, strict=True))]
+
+    def log(self, ctrl: np.ndarray, qpos: np.ndarray, motion: str, number: int) -> Sequence:
+        """Return the log of a motion, (T, n) rad each, with an encoder's noise and steps."""
+        noise = np.random.default_rng([self.seed, number, 9]).standard_normal(qpos.shape)
+        qpos = np.round((qpos + NOISE_RAD * noise) / COUNT_RAD) * COUNT_RAD
         meta = SequenceMeta(f"play{self.seed}", "a", motion, 0.0, virtual=True)
-        names = tuple(f"j{i}" for i in range(n))
+        names = tuple(f"j{i}" for i in range(len(self.kp)))
         return Sequence(meta, names, DT, ctrl, qpos, np.gradient(qpos, DT, axis=0))

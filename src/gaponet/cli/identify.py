@@ -109,6 +109,8 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         gain, error = term.gain
         moves = f"{'rises' if gain < 0 else 'falls'} by {mrad_with_error(abs(gain), error)}"
         screen.say(f"{term.name}: validation error {moves}{verdict}")
+    for finding in fit.findings:
+        screen.say(finding)
     if fit.chosen == "torque":
         for m in fit.robot.payload_mounts:
             screen.say(

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 # Terms of the servo model that identification may add, one by one; `ServoField.term` names a field's.
 Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder", "backlash"]
-DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load")
+DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load", "backlash")
 Axis = Literal["value", "log", "over kp"]
 
 MAX_VALUE = 1e6  # of gains and torques in robot.toml

@@ -67,14 +67,15 @@ class Servos:
             ctrl = data.ctrl[self.servo]
             bias = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q) - self.kp * (ctrl - q)
         if "backlash" in self.terms:
+            h = model.opt.timestep
             if data.time != self._play_time:  # a new state
                 self.play = Play(self.terms["backlash"], *self._motor, load, qvel)
             else:
-                self.play.after(qvel, torque, data.qfrc_constraint[self.dof], model.opt.timestep)
-            limit, armature, damping, applied, gear, more = self.play.before(limit, self.kp, q, qvel, model.opt.timestep)
+                self.play.after(qvel, torque, data.qfrc_constraint[self.dof], h)
+            limit, armature, damping, applied, gear, more = self.play.before(limit, self.kp, q, qvel, h)
             model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = armature, damping
             data.qfrc_applied[self.dof], model.actuator_gear[self.servo, 0] = applied, gear
-            bias, self._play_time = bias + more, data.time + model.opt.timestep
+            bias, self._play_time = bias + more, data.time + h
         model.dof_frictionloss[self.dof] = limit
         model.actuator_biasprm[self.servo, 0] = bias
 
