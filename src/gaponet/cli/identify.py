@@ -72,6 +72,8 @@ def identify(
             terms=terms, table=table, threads=threads, budget=budget, stops=stops, progress=update,
         )  # fmt: skip
     _show(screen, made, details)
+    if "backlash" in (terms or ()) and "backlash" not in [c.name for c in made.fit.comparisons]:
+        screen.say("backlash: no gap makes a joint's rollouts better. Only a load that changes its sign shows one")
     screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {robot_argument(out)}")
     screen.result(made.to_dict())
 
