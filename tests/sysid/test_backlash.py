@@ -34,6 +34,7 @@ def fitted(folder, width):
         parts.append(replace(asked, qpos=noisy, qvel=moved.qvel))
     fit = JointFit(JointRollouts(parts, robot, nthread=1), robot, Bounds(robot, parts))
     without = fit.search((), {f: np.full(1, v) for f, v in SERVO.items()})
+    fit.prior.update_correlation_time(fit.rollouts, without)
     return fit, without, fit.search(("backlash",), without | {"backlash": fit.bounds.guess["backlash"]})
 
 
@@ -44,7 +45,7 @@ def test_a_gap_is_found_and_probable(tmp_path):
     chance = backlash.probability(fit, without, values)
     assert chance > 0.99
     (sentence,) = backlash.findings(("turn",), values["backlash"], chance, {"turn": {"backlash": 5e-4}})
-    assert sentence.startswith("turn: backlash ") and sentence.endswith("mrad (probability 0.99 or more)")
+    assert sentence.startswith("turn: backlash ") and sentence.endswith("mrad (probability above 0.99)")
 
 
 def test_friction_alone_is_no_gap(tmp_path):

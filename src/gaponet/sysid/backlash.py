@@ -64,10 +64,11 @@ def findings(
         std: Joint → field → standard error; of a robot without backlash it lacks the field.
     """
     sentences = []
-    for joint, gap, p in zip(joints, width, chance, strict=True):
+    for joint, gap, p in zip(joints, width.tolist(), chance.tolist(), strict=True):
         if p >= MIN_PROBABILITY and "backlash" in std[joint]:
             size = format_uncertainty(1e3 * gap, 1e3 * std[joint]["backlash"])
-            sentences.append(f"{joint}: backlash {size} mrad (probability {min(p, 0.99):.2f}{' or more' * (p > 0.99)})")
+            chance_of_it = "above 0.99" if p > 0.99 else f"{p:.2f}"
+            sentences.append(f"{joint}: backlash {size} mrad (probability {chance_of_it})")
         elif gap > MIN_WIDTH_RAD:
             sentences.append(
                 f"{joint}: backlash of {1e3 * gap:.1f} mrad is not distinguishable from static friction (probability "
