@@ -45,7 +45,8 @@ def test_a_gap_is_found_and_probable(tmp_path):
     chance = backlash.probability(fit, without, values)
     assert chance > 0.99
     (sentence,) = backlash.findings(("turn",), values["backlash"], chance, {"turn": {"backlash": 5e-4}})
-    assert sentence.startswith("turn: backlash ") and sentence.endswith("mrad (probability above 0.99)")
+    assert sentence.startswith("turn: backlash ")
+    assert sentence.endswith("mrad (probability above 0.99)")
 
 
 def test_friction_alone_is_no_gap(tmp_path):
@@ -54,6 +55,7 @@ def test_friction_alone_is_no_gap(tmp_path):
     chance = backlash.probability(fit, without, values)
     assert chance < 0.5
     (mixed,) = backlash.only_probable([without], [values], chance)
-    assert mixed["backlash"] == 0 and mixed["kp"] == without["kp"]
+    assert mixed["backlash"] == 0
+    assert mixed["kp"] == without["kp"]
     (sentence,) = backlash.findings(("turn",), np.array([0.002]), chance, {"turn": {}})
     assert "not distinguishable from static friction" in sentence
