@@ -131,6 +131,7 @@ class Play:
     def after(self, qvel: Any, torque: Any, constraint: Any, h: Any, rows: Any = slice(None)) -> None:
         """Advance the gaps of rows, from speeds, the servos' torques and the constraints' torques after a step."""
         (armature, damping), closed, change = self._own, abs(self.gap) >= self.half, qvel - self._qvel
+        # A contact counts as friction, up to the limit of friction: under contact the gap is only approximate.
         force = torque + self._impact - damping * qvel - (self._kd + armature / h) * change
         force = force + np.clip(constraint, -self._limit, self._limit)
         gap, rotor = crossed(self.half, self.gap, self.rotor, closed, qvel, torque, damping, self._limit, armature, h)

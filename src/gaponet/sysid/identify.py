@@ -225,11 +225,12 @@ def _with_terms(
 ) -> tuple[tuple[Comparison, ...], list[Values], tuple[Array, Array] | None]:  # fmt: skip
     """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted.
 
-    Backlash is fitted if it is worth a search. Its widths, rad, and probabilities are returned, (n,).
+    Backlash that the robot lacks is fitted if it is worth a search. Its widths, rad, and probabilities are returned,
+    (n,).
     """
     comparisons, gaps = list[Comparison](), None
     for term in terms:
-        if term == "backlash" and not backlash.worth_a_search(fits[-1], base[-1]):
+        if term == "backlash" and ("backlash" in base[-1] or not backlash.worth_a_search(fits[-1], base[-1])):
             continue
         each = [_fit_term(term, *one, searches) for one in zip(fits, wholes, base, strict=True)]
         richer = [together if together is not None else alone for alone, together in each]
