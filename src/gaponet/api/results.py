@@ -153,7 +153,7 @@ class IdentifyResult:
             },
             "table": vars(self.robot.table) if self.robot.table else None,
             "touching": list(fit.table_fit.motions) if fit.table_fit else [],
-            "warnings": list(fit.warnings), "undetermined": fit.undetermined,
+            "warnings": list(fit.warnings), "findings": list(fit.findings), "undetermined": fit.undetermined,
             "seconds": self.seconds, "robot": str(self.folder),
         }  # fmt: skip
 

@@ -74,6 +74,8 @@ def identify(
             terms=terms, table=table, threads=threads, budget=budget, stops=stops, progress=update,
         )  # fmt: skip
     _show(screen, made, details)
+    if "backlash" in (terms or ()) and "backlash" not in [c.name for c in made.fit.comparisons]:
+        screen.say("backlash: no gap makes a joint's rollouts better. Only a load that changes its sign shows one")
     screen.say(f"robot folder: {out}, after {made.seconds:.0f} s")
     screen.next(f"gaponet gap {dataset} --robot {robot_argument(out)}")
     screen.result(made.to_dict())
@@ -114,6 +116,8 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         gain, error = term.gain
         moves = f"{'rises' if gain < 0 else 'falls'} by {mrad_with_error(abs(gain), error)}"
         screen.say(f"{term.name}: validation error {moves}{verdict}")
+    for finding in fit.findings:
+        screen.say(finding)
     if fit.chosen == "torque":
         for m in fit.robot.payload_mounts:
             screen.say(

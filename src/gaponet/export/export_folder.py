@@ -67,7 +67,7 @@ ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the j
 '''
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
     array_module, servo.present, servo.exp, servo.torque_range, servo.passing_friction, servo.resting_friction,
-    servo.friction_limit, servo.servo_torque,
+    servo.friction_limit, servo.servo_torque, servo.crossed, servo.Play,
 )  # fmt: skip
 ENGINE_TERMS = {"isaaclab": ("no_load_speed",)}  # terms of the servo model that an engine's own servos have
 OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts|unit_events) import")
@@ -189,6 +189,8 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
         )
     if law and to in ("isaaclab", "newton", "drake", "urdf"):
         notes.append(f"the servo model ({law}) is not in {to}: the numbers were fitted without it")
+    if to == "mjlab" and robot.backlash.any():
+        notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")
     return notes
 
 
@@ -277,7 +279,7 @@ def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
     constants = (
         f"SERVO_TERMS = {SERVO_TERMS}\n"
         f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
-        f"DEADBAND_STEPS = {servo.DEADBAND_STEPS}\n"
+        f"DEADBAND_STEPS, OPENED = {servo.DEADBAND_STEPS}, {servo.OPENED}\n"
     )
     functions = [inspect.getsource(f) for f in SERVO_MODEL]
     write_text(folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + constants, *functions]))

@@ -65,6 +65,7 @@ class RobotSpec:
         min_torque: Smallest torque that turns the motor, (n), N·m.
         encoder_step: Resolution of the servo's angle, (n), rad; 0 if it has no effect.
         no_load_speed: Speed at which the motor has no torque left, (n), rad/s at the nominal supply; 0 without effect.
+        backlash: Width of the gap between motor and link, (n), rad.
         servos: Servo type of each joint, (n), of robot.toml or servos.toml; None if robot.toml names none.
         tips, table: Tips that can touch a table, and the table; all other contacts are then off.
         carries_payload: True if the simulated robot carries the payload of the recordings.
@@ -105,6 +106,7 @@ class RobotSpec:
     min_torque: Array = field(default_factory=lambda: np.array(0.0))
     encoder_step: Array = field(default_factory=lambda: np.array(0.0))
     no_load_speed: Array = field(default_factory=lambda: np.array(0.0))
+    backlash: Array = field(default_factory=lambda: np.array(0.0))
     servos: tuple[ServoType | None, ...] = ()
     tips: tuple[Tip, ...] = ()
     table: Table | None = None

@@ -81,6 +81,7 @@ class Identified:
         undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
         held_out: Recordings that were not fitted and the robot that was fitted without them, one pair for each fold of
             a cross-validation; `robot` itself where nothing was fitted to them afterwards.
+        findings: A sentence about the backlash of each joint that may have any.
     """
 
     robot: RobotSpec
@@ -95,6 +96,7 @@ class Identified:
     covariance: Covariance = field(default_factory=dict)
     undetermined: dict[str, tuple[str, ...]] = field(default_factory=dict)
     held_out: tuple[HeldOut, ...] = ()
+    findings: tuple[str, ...] = ()
 
     @property
     def improved(self) -> bool:

@@ -25,6 +25,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Comparison
+from gaponet.sysid import backlash
 from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
@@ -162,7 +163,7 @@ def _fit_robot(
     identified = given.nominal is not None
     chosen, values = judge.best_by_joint(candidates) if identified else judge.best(candidates)
     base = values if identified or chosen != "given" else candidates["limbs"]
-    comparisons, values = _with_terms(fits, wholes, judge, terms, values, base, searches)
+    comparisons, values, gaps = _with_terms(fits, wholes, judge, terms, values, base, searches)
     chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
     joints, whole, first = fits[-1], wholes[-1], [one.bounds.first for one in fits]
     errors = standard_errors(whole, values[-1])
@@ -192,7 +193,7 @@ def _fit_robot(
     return Identified(
         fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit,
         dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,
-        errors.undetermined, tuple(held_out),
+        errors.undetermined, tuple(held_out), backlash.findings(robot.operated, *gaps, errors.std) if gaps else (),
     )  # fmt: skip
 
 
@@ -221,21 +222,32 @@ def _classic_candidates(
 def _with_terms(
     fits: ListOf[JointFit], wholes: ListOf[RobotFit], judge: Judge, terms: tuple[Term, ...], values: list[Values],
     base: list[Values], searches: _SearchProgress,
-) -> tuple[tuple[Comparison, ...], list[Values]]:  # fmt: skip
-    """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted."""
-    comparisons = list[Comparison]()
+) -> tuple[tuple[Comparison, ...], list[Values], tuple[Array, Array] | None]:  # fmt: skip
+    """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted.
+
+    Backlash that the robot lacks is fitted if it is worth a search. Its widths, rad, and probabilities are returned,
+    (n,).
+    """
+    comparisons, gaps = list[Comparison](), None
     for term in terms:
         first = TERMS[term][0]
+        if term == "backlash" and ("backlash" in base[-1] or not backlash.worth_a_search(fits[-1], base[-1])):
+            continue
         each = [_fit_term(term, *one, searches) for one in zip(fits, wholes, base, strict=True)]
         richer = [together if together is not None else alone for alone, together in each]
         if each[0][1] is not None:
             richer = min([alone for alone, _ in each], richer, key=lambda v: float(judge.errors(v).mean()))
         richer = [v | {first: fit.bounds.visible(first, v)} for fit, v in zip(fits, richer, strict=True)]
+        if term == "backlash":
+            without = fits[-1].search((), base[-1], report=lambda cost: searches.expired())
+            chance = backlash.probability(fits[-1], without, each[-1][0])
+            gaps = richer[-1]["backlash"], chance
+            richer = backlash.only_probable(values, richer, chance)
         comparisons.append(judge.compare(term, values, richer))
         if comparisons[-1].accepted:  # a term that is zero in every joint only gave the others more iterations
             used = any(v[first].any() for v in richer)
             values = base = [{f: x for f, x in v.items() if f not in TERMS[term] or used} for v in richer]
-    return tuple(comparisons), values
+    return tuple(comparisons), values, gaps
 
 
 def _fit_term(

@@ -33,6 +33,7 @@ PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5, "damping": 1.0}  # of the robot fil
 PRIORS = len(PRIOR_LOG_STD)
 MIN_SHARE = 1e-3  # of the file's value; less counts as this
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
+RELATIVE_GAP_STD = 0.06  # of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py)
 UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
 MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
 
@@ -317,15 +318,14 @@ def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
 
 
 def _discretisation_std(problem: FitProblem, values: Values) -> Values:
-    """Return standard errors of damping, armature, delay and no-load speed by the length of a physics step, (n,)."""
+    """Return standard errors of damping, armature, delay, no-load speed and backlash by the physics step, (n,)."""
     h = UNIFORM_STD * problem.physics_step
     total = values["damping"] + problem.robot.kd[problem.robot.operated_index]
     std = {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
     if "no_load_speed" in values:  # the limit follows the speed a step late, half a step on average
         limit = values.get("effort_limit", problem.bounds.first["effort_limit"])
-        late = problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
-        std["no_load_speed"] = late
-    return std
+        std["no_load_speed"] = problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
+    return std | {"backlash": RELATIVE_GAP_STD * values["backlash"]} if "backlash" in values else std
 
 
 def _inverse(normal: Array, size: Array) -> Array:

@@ -87,6 +87,8 @@ class RobotRollouts:
         sim.set_servos(self.robot.operated, {f: np.repeat(x, m, axis=0) for f, x in values.items()})
         for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
             sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
+            if sim.servo_model is not None:
+                sim.servo_model.armature[w::m, i], sim.servo_model.values["backlash"][w::m, i] = IMMOVABLE_ARMATURE, 0.0
         return self.simulated_errors(sim)
 
     def simulated_errors(self, sim: BatchSim) -> Array:
