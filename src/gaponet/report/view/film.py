@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.report.view.picture import Camera
-from gaponet.report.view.side_by_side import Clip, SideBySide
+from gaponet.report.view.side_by_side import largest_error_time
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -55,13 +55,6 @@ def write(camera: Camera, path: Path, progress: Callable[[int, int], None] = lam
         else:
             camera.picture(largest_error_time(camera.scene.shown, clip)).save(temporary)
     return 1 if suffix == ".png" else len(times)
-
-
-def largest_error_time(shown: SideBySide, clip: Clip) -> float:
-    """Return the time of the largest error of the first simulated copy, s."""
-    first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
-    simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(shown.motions)
-    return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt
 
 
 def _write_gif(pictures: list[Image], path: Path, milliseconds: int) -> None:
