@@ -51,13 +51,13 @@ class Player:
         @self.worst.on_click
         def _(_: Any) -> None:
             self.playing.value, self.time.value = False, worst
-            self.update()
 
         self.update()
 
     def update(self) -> None:
         """Show the scene at the slider's time."""
         scene, now = self.scene, float(self.time.value)
+        self.updated = now
         scene.pose(now)
         with self.server.atomic():
             for body, frame in self.frames.items():
@@ -72,7 +72,8 @@ class Player:
         if self.playing.value:
             on = self.time.value - self.clip.start + elapsed * self.speed.value
             self.time.value = self.clip.start + on % self.clip.duration
-        self.update()
+        if self.time.value != self.updated:
+            self.update()
 
     def remove(self) -> None:
         """Remove the robots and the controls."""
@@ -109,7 +110,7 @@ class Player:
         self.server.initial_camera.fov = np.radians(45)
         for camera in (self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())):
             camera.look_at = self.scene.middle
-            camera.position = self.scene.middle + 2.0 * self.scene.extent * np.cross(across, up)
+            camera.position = self.scene.middle + 2.6 * self.scene.extent * np.cross(across, up)
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> None:

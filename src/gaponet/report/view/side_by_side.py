@@ -208,7 +208,7 @@ def side_by_side(
 def standing(robot: RobotSpec) -> SideBySide:
     """Return a robot at home."""
     home, still = np.tile(robot.qpos_home, (2, 1)), np.zeros(2)
-    real = Sequence(SequenceMeta(robot.name, "home", "", 0.0), robot.joint_names, robot.dt, home, home, 0 * home)
+    real = Sequence(SequenceMeta(robot.name, "home", "home", 0.0), robot.joint_names, robot.dt, home, home, 0 * home)
     return SideBySide(real, robot, (Copy("nominal", home, still),), None)
 
 
