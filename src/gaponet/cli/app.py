@@ -30,4 +30,7 @@ def app(folder: tyro.conf.Positional[Path] = Path("gaponet_app"), port: int = 80
     with lock_folder(folder, "app"):
         page = App(folder.resolve(), port)
         Out().say(f"open {page.address} in a browser; Ctrl-C ends")
-        run_until_interrupt(page.server, page.tick)
+        try:
+            run_until_interrupt(page.server, page.tick)
+        finally:
+            page.jobs.cancel()

@@ -26,13 +26,14 @@ PROGRESS_LINE = re.compile(r"^\w+: (\d+) %, \d+ s(?:, (.*))?$")
 
 
 class Job:
-    """One command, with its files: words after `gaponet`, result, and what it printed."""
+    """One command and its files: step, words after `gaponet`, the folder that it writes, and what it printed."""
 
     def __init__(self, folder: Path) -> None:
         number, _, self.step = folder.name.partition("-")
         self.folder, self.number = folder, int(number)
         self.words: list[str] = json.loads((folder / "command.json").read_text(encoding="utf-8"))
-        self.command = shlex.join(["gaponet", *(word for word in self.words if word != "--json")])
+        self.command = shlex.join(["gaponet", *self.words])
+        self.out = f"{self.step}{self.number}"
 
     @cached_property
     def result(self) -> dict[str, Any] | None:
@@ -47,9 +48,8 @@ class Job:
         """Lines that the command printed for people."""
         return (self.folder / "log.txt").read_text(encoding="utf-8", errors="replace").splitlines()
 
-    @property
     def progress(self) -> tuple[float, str]:
-        """Percent done, and the note beside it."""
+        """Return the percentage that is done, and the note beside it."""
         last = next((m for line in reversed(self.lines) if (m := PROGRESS_LINE.match(line))), None)
         return (float(last[1]), last[2] or "") if last else (0.0, "")
 
@@ -89,13 +89,13 @@ class Jobs:
         if self.running:
             raise UsageError(f"gaponet {self.running.words[0]} is running; wait for it, or cancel it")
         number = max((job.number for job in self.all), default=0) + 1
-        folder, given = self.folder / "jobs" / f"{number:03d}-{step}", (*words, "--json")
-        folder.mkdir(parents=True)
-        write_json(folder / "command.json", [f"{step}{number}" if word == OUT else word for word in given])
+        folder = self.folder / "jobs" / f"{number:03d}-{step}"
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "command.json", [f"{step}{number}" if word == OUT else word for word in words])
         with (folder / "result.json").open("wb") as out, (folder / "log.txt").open("wb") as log:
             self.process = subprocess.Popen(
-                module_command("gaponet", *Job(folder).words), stdin=subprocess.DEVNULL, stdout=out, stderr=log,
-                cwd=self.folder, env=os.environ | {LINE_INTERVAL_VARIABLE: "0.5"},
+                module_command("gaponet", *Job(folder).words, "--json"), stdin=subprocess.DEVNULL, stdout=out,
+                stderr=log, cwd=self.folder, env=os.environ | {LINE_INTERVAL_VARIABLE: "0.5"},
             )  # fmt: skip
 
     def cancel(self) -> None:

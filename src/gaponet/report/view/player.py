@@ -40,7 +40,7 @@ class Player:
             heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
             heading += escape_markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
             self.title = gui.add_markdown(heading + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
-            self.playing = gui.add_checkbox("play", True)
+            self.playing = gui.add_checkbox("play", len(shown.real) > 2)
             self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, shown.real.dt, clip.start)
             self.worst = gui.add_button(f"Worst moment: {worst:.2f} s")
             self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
@@ -113,12 +113,12 @@ class Player:
             camera.position = self.scene.middle + 2.6 * self.scene.extent * np.cross(across, up)
 
 
-def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> None:
-    """Add a chart over time (T), s; curves: name → values (T) and colour."""
+def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:
+    """Return a new chart over time (T), s; curves: name → values (T) and colour."""
     from viser.uplot import Scale, Series
 
     rows = np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int))
-    gui.add_uplot(
+    return gui.add_uplot(
         (time[rows], *(values[rows] for values, _ in curves.values())),
         (Series(label="time, s"), *(Series(label=n, stroke=colour, width=2) for n, (_, colour) in curves.items())),
         title=title, aspect=2.2, scales={"x": Scale(time=False)},
