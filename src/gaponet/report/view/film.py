@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.report.view.picture import Camera
@@ -59,13 +61,10 @@ def write(camera: Camera, path: Path, progress: Callable[[int, int], None] = lam
 
 def _write_gif(pictures: list[Image], path: Path, milliseconds: int) -> None:
     """Write with one palette for all frames and no dithering, which keeps the file small."""
-    from PIL.Image import Dither, Quantize, new
+    from PIL.Image import Dither, Quantize, fromarray
 
-    sample = pictures[:: max(len(pictures) // 4, 1)]
-    sheet = new("RGB", (sample[0].width, sample[0].height * len(sample)))
-    for i, picture in enumerate(sample):
-        sheet.paste(picture, (0, i * picture.height))
-    palette = sheet.quantize(GIF_COLOURS, Quantize.MAXCOVERAGE)
+    sample = np.concatenate([np.asarray(p) for p in pictures[:: max(len(pictures) // 4, 1)]])
+    palette = fromarray(sample).quantize(GIF_COLOURS, Quantize.MAXCOVERAGE)
     frames = [p.quantize(palette=palette, dither=Dither.NONE) for p in pictures]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True)
 

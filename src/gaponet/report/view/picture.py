@@ -1,13 +1,16 @@
-"""Pictures of a scene: rendered off screen by MuJoCo, labelled by Pillow."""
+"""Pictures of a scene, and of models in a row: rendered off screen by MuJoCo, labelled by Pillow."""
 
 from __future__ import annotations
 
+import io
 import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import mujoco
+import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.report.view.gl import INSTALL_HINT
 from gaponet.report.view.scene import Scene
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
 INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
 SEPARATOR = "  ·  "  # Pillow's own font has this, but no ×
 MAX_HEIGHT = 0.7  # of the width
+SIDE, HEAD = 480, 30  # pixels of one model's square and of its label
+FLOOR = mujoco.mjtGeom.mjGEOM_PLANE
 
 
 @dataclass(frozen=True)
@@ -154,3 +159,54 @@ def renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
             return mujoco.Renderer(model, height, width)
     except Exception as error:  # GL libraries raise exceptions of any type
         raise UsageError(f"cannot render off screen ({type(error).__name__}: {error}). {INSTALL_HINT}") from None
+
+
+def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
+    """Return a PNG of models (label, model, qpos) in a row, all with the camera that fits the first.
+
+    Raises:
+        UsageError: Nothing can be rendered here; the message says what to install.
+    """
+    from PIL import Image, ImageDraw
+
+    image = Image.new("RGB", (SIDE * len(models), SIDE + HEAD), "white")
+    draw = ImageDraw.Draw(image)
+    camera = mujoco.MjvCamera()
+    camera.azimuth, camera.elevation = 140, -15
+    for i, (label, model, qpos) in enumerate(models):
+        data = mujoco.MjData(model)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        if i == 0:
+            low, high = _box(model, data)
+            camera.lookat[:] = (low + high) / 2
+            camera.distance = 1.15 * float(np.linalg.norm(high - low))
+        model.geom_rgba[model.geom_type == FLOOR, 3] = 0
+        model.vis.map.znear = 0.01 / model.stat.extent
+        model.vis.headlight.ambient[:] = 0.5
+        picture = renderer(model, SIDE, SIDE)
+        picture.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
+        picture.update_scene(data, camera)
+        image.paste(Image.fromarray(_white(picture)), (SIDE * i, HEAD))
+        picture.close()
+        draw.text((SIDE * (i + 0.5), HEAD / 2), label, INK, font(17), anchor="mm")
+    file = io.BytesIO()
+    image.save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
+def _box(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array]:
+    """Return the corners of a box around all geoms except floors, m."""
+    shown = model.geom_type != FLOOR
+    if not shown.any():
+        return data.xpos.min(axis=0), data.xpos.max(axis=0)
+    radius, centres = np.linalg.norm(model.geom_aabb[shown, 3:], axis=1)[:, None], data.geom_xpos[shown]
+    return (centres - radius).min(axis=0, initial=np.inf), (centres + radius).max(axis=0, initial=-np.inf)
+
+
+def _white(picture: mujoco.Renderer) -> Array:
+    """Return the picture with a white background."""
+    pixels = picture.render().copy()
+    picture.enable_segmentation_rendering()
+    pixels[picture.render()[:, :, 0] < 0] = 255
+    return pixels
