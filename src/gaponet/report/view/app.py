@@ -187,7 +187,9 @@ class App:
             self.status.content = _ending(every[-1]) if every else "Six steps, from left to right."
         for step, (text, hint, pictures) in self.texts.items():
             job = self.jobs.result(step)
-            text.content, pictures.content = hint if job is None else _report(job), self._pictures(step, job)
+            text.content, pictures.content = _report(job) if job else hint, self._pictures(step, job)
+            if step == "identify" and job is None and (reason := self._locked()):
+                text.content = reason
         self.fit.disabled, self.proposal.visible = bool(self._locked()), self.jobs.result("doctor") is not None
         if self.jobs.result("import"):
             data = self._dataset()
