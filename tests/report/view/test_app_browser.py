@@ -13,7 +13,10 @@ import pytest
 pytestmark = pytest.mark.browser
 MOTIONS = ("center_workspace", "circular_motion", "figure_eight", "triangle_wave")
 PATIENCE = 600.0  # s, of a command on a busy machine
-FIND = "[...document.querySelectorAll({0})].filter(e => e.innerText.trim().startsWith({1}) && e.offsetParent !== null)"
+FIND = (
+    "[...document.querySelectorAll({0})]"
+    ".filter(e => (e.innerText || '').trim().startsWith({1}) && e.offsetParent !== null)"
+)
 
 
 class Clicker:
