@@ -33,7 +33,7 @@ POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "signed_percent
 TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
 POLL_S, MAX_UNPACKED_BYTES = 0.5, 2 << 30
 PANEL_WIDTH = 560  # pixels
-STYLE = "<style>[class*=Slider-mark], .uplot, .uplot * {font-size: 12px !important}</style>"
+STYLE = "<style>[class*=Slider-mark], .uplot, .uplot *, [class*=mantine] input {font-size: 12px !important}</style>"
 
 
 class App:

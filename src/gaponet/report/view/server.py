@@ -9,6 +9,7 @@ import secrets
 import time
 from collections.abc import Callable
 from http import HTTPStatus
+from importlib import import_module
 from typing import Any
 
 from gaponet.base.errors import UsageError
@@ -31,8 +32,8 @@ def open_server(label: str, port: int) -> tuple[Any, str]:
         UsageError: This version of viser would serve without the check.
     """
     import viser
-    import websockets.asyncio.server as transport
 
+    transport: Any = import_module("websockets.asyncio.server")
     token, serve, guarded = secrets.token_urlsafe(24), transport.serve, list[Any]()
 
     def guarded_serve(*args: Any, process_request: Any, **options: Any) -> Any:
