@@ -20,7 +20,7 @@ from gaponet.plugins import load
 
 # Task → commands.
 TASKS = {
-    "Start here": ("start", "demo"),
+    "Start here": ("app", "start", "demo"),
     "Logs": ("import", "doctor", "data", "excite", "collect", "robot"),
     "The gap": ("gap", "view"),
     "Closing it": ("identify", "adapt", "train", "export"),

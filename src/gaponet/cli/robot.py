@@ -146,7 +146,7 @@ def new(
         screen.say(f"  {what}: {', '.join(dict.fromkeys(getattr(d, field) for d in made.drives))}", "   from", "cyan")
     picture = None
     try:
-        from gaponet.report.view.still import still
+        from gaponet.report.view.picture import still
 
         picture = _picture(made, model.name, still)
     except (UsageError, ModuleNotFoundError) as error:

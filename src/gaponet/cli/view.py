@@ -64,7 +64,7 @@ def view(
     if render is not None:
         _film(scene, clip, render, width, magnify, out)
     else:
-        from gaponet.report.view.web import serve
+        from gaponet.report.view.player import serve
 
         serve(scene, clip, port, magnify, out.say)
     out.result({
