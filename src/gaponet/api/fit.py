@@ -49,6 +49,7 @@ def identify(
     threads: int = 0,
     budget: str | None = None,
     stops: bool = False,
+    masses: bool = False,
     progress: Progress = no_progress,
 ) -> IdentifyResult:
     """Fit the servos of the simulator, and the table under the robot, to the training motions.
@@ -75,6 +76,7 @@ def identify(
         threads: 0 for all cores.
         budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.
         stops: Add an end stop to joints that stayed behind several commands; otherwise they are reported.
+        masses: Fit masses, centres of mass and inertias of the links too; accepted as a term is.
 
     Raises:
         DatasetError, UsageError: A unit is not there, or `like` has no joint that corresponds.
@@ -106,7 +108,17 @@ def identify(
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
     with lock_folder(folder, "robot"):
         fitted = fit(
-            data.sequences(split["train"]), start, val, windows, terms, table, threads, progress, seconds, stops
+            data.sequences(split["train"]),
+            start,
+            val,
+            windows,
+            terms,
+            table,
+            threads,
+            progress,
+            seconds,
+            stops,
+            masses=masses,
         )
         after, given, nominal = (
             held_out_errors(HeldOut(s, one or own) for s, own in fitted.held_out)

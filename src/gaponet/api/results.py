@@ -152,6 +152,7 @@ class IdentifyResult:
                 c.name: {"gain": c.gain[0], "standard_error": c.gain[1], "kept": c.accepted} for c in fit.comparisons
             },
             "table": vars(self.robot.table) if self.robot.table else None,
+            "links": {body: vars(link) for body, link in self.robot.links.items()},
             "touching": list(fit.table_fit.motions) if fit.table_fit else [],
             "warnings": list(fit.warnings), "findings": list(fit.findings), "undetermined": fit.undetermined,
             "seconds": self.seconds, "robot": str(self.folder),

@@ -36,6 +36,7 @@ def identify(
     threads: int = 0,
     budget: str | None = None,
     stops: Flag = False,
+    masses: Flag = False,
     current: Flag = False,
     details: Flag = False,
     robot: Robot = None,
@@ -71,7 +72,7 @@ def identify(
     with progress_bar("identifying") as update:
         made = api.identify(
             data, out=out, windows=windows, robot=spec, like=like, units=units, holdout_units=holdout_units,
-            terms=terms, table=table, threads=threads, budget=budget, stops=stops, progress=update,
+            terms=terms, table=table, threads=threads, budget=budget, stops=stops, masses=masses, progress=update,
         )  # fmt: skip
     _show(screen, made, details)
     if "backlash" in (terms or ()) and "backlash" not in [c.name for c in made.fit.comparisons]:
@@ -116,8 +117,8 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         gain, error = term.gain
         moves = f"{'rises' if gain < 0 else 'falls'} by {mrad_with_error(abs(gain), error)}"
         screen.say(f"{term.name}: validation error {moves}{verdict}")
-    for finding in fit.findings:
-        screen.say(finding)
+    for sentence in (*fit.findings, *(fit.links.sentences() if fit.links else ())):
+        screen.say(f"  {sentence}")
     if fit.chosen == "torque":
         for m in fit.robot.payload_mounts:
             screen.say(

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +153,10 @@ def export_robot(
                 notes.append(f"{text}: now they are; ctrl of keyframes not")
         elif to == "urdf":
             assert source is not None
-            file = edit_urdf(source, out, facts, robot.operated)
+            file, other = edit_urdf(source, out, facts, robot)
+            if other:
+                notes.append(f"inertias of {', '.join(other)} were not written: their masses in the file are others")
+                plain = replace(plain, links={n: link for n, link in plain.links.items() if n not in other})
             errors[f"{file.name} alone, all else as before"] = rollout_error(validation, with_urdf_fields(plain))
         elif to != "json":
             file = out / ROBOT
