@@ -46,6 +46,7 @@ from gaponet.sysid.servo_types import far_from_servo_type
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
 from gaponet.sysid.torque import with_torque
 
+ONE_PAYLOAD = "masses and gains are known up to a common factor: record two payloads before you trust a third"
 FOLDS = 3  # of the cross-validation
 WINDOWS = 40  # of joints by themselves
 ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
@@ -172,7 +173,7 @@ def _fit_robot(
     if masses:
         start = values if any(c.accepted for c in comparisons) else base
         results = [_fit_links(*one, searches) for one in zip(wholes, start, strict=True)]
-        tried = [r.links for r in results], [r.values for r in results]
+        tried = [r.axes.links(r.x) for r in results], [r.values for r in results]
         after = judge.errors(tried[1], tried[0]) if results[-1].x.any() else judge.errors(values)
         comparison = Comparison("masses", judge.errors(values), after)
         comparisons = *comparisons, comparison
@@ -200,9 +201,10 @@ def _fit_robot(
             HeldOut(part, replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high))
             for (_, part), one in zip(splits, robots, strict=False)
         ]
+    one_payload = bool(links and robot.payload_mounts) and len({s.meta.payload_mass for s in sequences}) == 1
     warnings = (
-        *joints.bounds.warnings(values[-1], fitted_fields(values[-1])), *stop_questions(given, robot),
-        *far_from_servo_type(fitted), *errors.sentences,
+        *[ONE_PAYLOAD] * one_payload, *joints.bounds.warnings(values[-1], fitted_fields(values[-1])),
+        *stop_questions(given, robot), *far_from_servo_type(fitted), *errors.sentences,
     )  # fmt: skip
     pairs = (first, ()), (values, links)
     before, after = (float(judge.errors(*pair).mean()) for pair in pairs)
