@@ -98,7 +98,7 @@ def test_recordings_show_a_heavy_link_by_its_moment_and_the_error_falls(robot):
     result = fit.descend(lambda cost: None)
     errors = [
         np.abs(fit.whole.rollouts.flat_errors({f: v[None] for f, v in result.values.items()}, [one])).mean()
-        for one in ({}, result.links)
+        for one in ({}, fit.axes.links(result.x))
     ]
     assert errors[1] < 0.3 * errors[0]
     before, now, std, prior = result.moments()

@@ -108,18 +108,9 @@ def identify(
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
     with lock_folder(folder, "robot"):
         fitted = fit(
-            data.sequences(split["train"]),
-            start,
-            val,
-            windows,
-            terms,
-            table,
-            threads,
-            progress,
-            seconds,
-            stops,
+            data.sequences(split["train"]), start, val, windows, terms, table, threads, progress, seconds, stops,
             masses=masses,
-        )
+        )  # fmt: skip
         after, given, nominal = (
             held_out_errors(HeldOut(s, one or own) for s, own in fitted.held_out)
             for one in (None, spec, spec.nominal or spec)

@@ -30,8 +30,7 @@ def edit_urdf(path: Path, out: Path, facts: dict[str, Any], robot: RobotSpec) ->
         robot: Robot with the joints and links to change.
 
     Returns:
-        The copy, and the links whose mass in the file is not that of the robot before identification: they stay,
-        because their frame may differ too.
+        The copy, and links that stay: their mass in the file is not the nominal one, so their frame may differ too.
 
     Raises:
         RobotError: A joint is not in the file, or it is no URDF.

@@ -224,9 +224,10 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
     model = copy.copy(model)
     for name, link in robot.links.items():
         body = model.body(name)
-        axes = np.linalg.eigh(full_inertia(link.inertia))[1][:, ::-1].copy()  # the largest first, as compiled
+        inertia = np.array(link.inertia)[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)
+        axes = np.linalg.eigh(inertia)[1][:, ::-1].copy()  # the largest first, as compiled
         axes[:, 0] *= np.sign(np.linalg.det(axes))
-        body.inertia[:] = np.diag(axes.T @ full_inertia(link.inertia) @ axes)
+        body.inertia[:] = np.diag(axes.T @ inertia @ axes)
         body.mass[:], body.ipos[:] = link.mass, link.pos
         mujoco.mju_mat2Quat(body.iquat, axes.ravel())
         model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
@@ -234,12 +235,6 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
     stiffen_friction(model)
     _soften_table(model, robot)
     return model
-
-
-def full_inertia(values: tuple[float, ...]) -> Array:
-    """Return the inertia matrix (3, 3) of xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz, xy, xz, yz = values
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _remove_fixed(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:

@@ -47,6 +47,7 @@ from gaponet.sysid.servo_types import far_from_servo_type
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
 from gaponet.sysid.torque import with_torque
 
+ONE_PAYLOAD = "masses and gains are known up to a common factor: record two payloads before you trust a third"
 FOLDS = 3  # of the cross-validation
 WINDOWS = 40  # of joints by themselves
 ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
@@ -196,9 +197,10 @@ def _fit_robot(
             HeldOut(part, replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high))
             for (_, part), one in zip(splits, robots, strict=False)
         ]
+    one_payload = bool(links and robot.payload_mounts) and len({s.meta.payload_mass for s in sequences}) == 1
     warnings = (
-        *joints.bounds.warnings(values[-1], fitted_fields(values[-1])), *stop_questions(given, robot),
-        *far_from_servo_type(fitted), *errors.sentences,
+        *[ONE_PAYLOAD] * one_payload, *joints.bounds.warnings(values[-1], fitted_fields(values[-1])),
+        *stop_questions(given, robot), *far_from_servo_type(fitted), *errors.sentences,
     )  # fmt: skip
     pairs = (first, ()), (values, links)
     before, after = (float(judge.errors(*pair).mean()) for pair in pairs)
@@ -274,7 +276,7 @@ def _with_links(
         searches.begin()
         report = searches.report("masses", ("all joints",), whole.rollouts.rows.sum(keepdims=True))
         results.append(LinkFit(whole, one).descend(report))
-    links, servos = [r.links for r in results], [r.values for r in results]
+    links, servos = [r.axes.links(r.x) for r in results], [r.values for r in results]
     before = judge.errors(values)
     comparison = Comparison("masses", before, judge.errors(servos, links) if results[-1].x.any() else before)
     return (comparison, results[-1], links, servos) if comparison.accepted else (comparison, None, [], values)

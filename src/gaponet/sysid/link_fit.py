@@ -6,6 +6,7 @@ angles to them stays. Without payloads, nothing shows whether all masses and all
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -32,21 +33,15 @@ MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; e
 
 
 class LinkFit:
-    """Fit of links and servos in the simulator of the whole robot.
-
-    Attributes:
-        axes: Coordinates of the links.
-        directions: Orthonormal columns, (L · COORDINATES, K): the directions that the recordings determine.
-    """
+    """Fit of links and servos; `directions` are orthonormal columns (L · COORDINATES, K) that recordings determine."""
 
     def __init__(self, whole: RobotFit, values: Values) -> None:
         """Take a fit of servos and its values (n,)."""
         fields = CLASSIC if whole.bounds.n * len(CLASSIC) <= MAX_SERVO_NUMBERS else FEW_FIELDS
         self.whole, self._servos = whole, Axes(whole.bounds, fields, values)
         self._first, self.axes, self._n = values, LinkAxes(whole.robot), whole.bounds.n
-        # A stated kp would shift all masses.
-        kp = whole.prior.given["kp"]
-        self._prior = whole.prior.with_kp(kp, np.full(self._n, PRIOR_LOG_STD["kp"]))
+        self._prior = copy.copy(whole.prior)
+        self._prior.log_std = PRIOR_LOG_STD  # a stated kp would shift all masses
         self._prior.residual = FIRST_RESIDUAL_SHARE * whole.prior.residual
         self._weigh()
         self.directions = self._determined() if self.axes.names else np.zeros((0, 0))
@@ -117,6 +112,7 @@ class LinkFit:
         return here, jac
 
     def _bounds(self) -> tuple[Array, Array]:
+        """Return the lowest and highest x, (1, P)."""
         ends = np.full(self.directions.shape[1], MAX_CHANGE)
         return np.r_[self._servos.low.ravel(), -ends][None], np.r_[self._servos.high.ravel(), ends][None]
 

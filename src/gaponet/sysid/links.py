@@ -27,11 +27,8 @@ MAX_STD_SHARE = 0.7  # of the prior's; a value with more is not determined
 class LinkAxes:
     """Coordinates of links, in standard deviations of their prior, (…, L · COORDINATES); zero is the robot's file.
 
-    A link is a moving body with the bodies that are welded to it, at or after an operated joint, without payloads.
-
-    Attributes:
-        names: Body with the joint of each of the L links.
-        scale: Standard deviations of the prior, (L, COORDINATES).
+    A link is a body with a joint and those that are welded to it, without payloads. `names` are those of the bodies
+    with joints; `scale` are the standard deviations of the prior, (L, COORDINATES).
     """
 
     def __init__(self, robot: RobotSpec) -> None:
@@ -39,23 +36,18 @@ class LinkAxes:
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)
-        moved = {int(model.joint(j).bodyid[0]) for j in robot.operated}
         self._bodies: list[list[tuple[str, Array, Array]]] = []  # of each link: body, its frame in the link's, P
         self.names, scale, self._arms = list[str](), list[Array](), list[Array]()
         for root in range(1, model.nbody):
-            if model.body_weldid[root] == root and model.body_jntnum[root] and moved & _chain(model, root):
-                own = [
-                    b for b in np.flatnonzero(model.body_weldid == root)
-                    if model.body_mass[b] > 0 and not model.body(b).name.startswith("payload_")
-                ]  # fmt: skip
+            if model.body_weldid[root] == root and model.body_jntnum[root]:
+                welded = np.flatnonzero((model.body_weldid == root) & (model.body_mass > 0)).tolist()
+                own = [b for b in welded if not model.body(b).name.startswith("payload_")]
                 if own and all(model.body(b).name and not model.body_simple[b] for b in own):
                     self.names.append(model.body(root).name)
                     self._bodies.append(_members(model, data, root, own))
                     scale.append(_prior_std(model, data, root))
-                    centre = model.body_mass[own] @ data.xipos[own] / model.body_mass[own].sum()
-                    self._arms.append(
-                        data.xmat[root].reshape(3, 3).T @ (centre - data.xanchor[model.body_jntadr[root]])
-                    )
+                    arm = _centre(model, data, own) - data.xanchor[model.body_jntadr[root]]
+                    self._arms.append(data.xmat[root].reshape(3, 3).T @ arm)
         self.scale = np.array(scale).reshape(-1, COORDINATES)
 
     def links(self, x: Array) -> dict[str, Link]:
@@ -67,10 +59,7 @@ class LinkAxes:
         return links
 
     def moments(self, x: Array) -> Array:
-        """Return mass, kg, centre of mass, m from the file's, and moment about the joint, kg·m, of each link, (L, 7).
-
-        They are in the axes of the link's body.
-        """
+        """Return mass, kg, centre of mass, m from the file's, and moment about the joint, kg·m, (L, 7); body's axes."""
         rows = []
         for own, bodies, arm in zip(x.reshape(-1, COORDINATES) * self.scale, self._bodies, self._arms, strict=True):
             p = _upper(own) @ sum(p for _, _, p in bodies) @ _upper(own).T
@@ -79,14 +68,13 @@ class LinkAxes:
         return np.array(rows)
 
 
-def _chain(model: mujoco.MjModel, body: int) -> set[int]:
-    """Return a body and those that carry it."""
-    return {body} | (_chain(model, int(model.body_parentid[body])) if body else set())
+def _centre(model: mujoco.MjModel, data: mujoco.MjData, own: list[int]) -> Array:
+    return np.asarray(model.body_mass[own] @ data.xipos[own] / model.body_mass[own].sum())
 
 
 def _members(model: mujoco.MjModel, data: mujoco.MjData, root: int, own: list[int]) -> list[tuple[str, Array, Array]]:
     """Return name, frame (4, 4) and pseudo-inertia of bodies, about their common centre of mass in the axes of root."""
-    centre = model.body_mass[own] @ data.xipos[own] / model.body_mass[own].sum()
+    centre = _centre(model, data, own)
     turn, members = data.xmat[root].reshape(3, 3), []
     for b in own:
         frame, inertial = np.eye(4), np.eye(4)
@@ -129,24 +117,12 @@ def _link(p: Array, frame: Array) -> Link:
 
 @dataclass(frozen=True)
 class LinkResult:
-    """Fitted links.
-
-    Attributes:
-        axes: Coordinates of the links.
-        x: Fitted coordinates, (L · COORDINATES,).
-        covariance: Their covariance, (L · COORDINATES, L · COORDINATES); 1 where only the prior is known.
-        values: Values of the servos that were fitted with them, (n,).
-    """
+    """Fitted coordinates x (L · COORDINATES,) of links, their covariance, and values (n,) of the servos beside them."""
 
     axes: LinkAxes
     x: Array
     covariance: Array
     values: Values
-
-    @property
-    def links(self) -> dict[str, Link]:
-        """The robot's identified links."""
-        return self.axes.links(self.x)
 
     def moments(self) -> tuple[Array, Array, Array, Array]:
         """Return `LinkAxes.moments` before and now, their standard errors now and by the prior alone, (L, 7) each."""

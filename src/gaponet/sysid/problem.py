@@ -44,7 +44,6 @@ class _GainPrior:
     Its weight decreases with the residual of the best fit and increases with the residual's correlation time.
 
     Attributes:
-        given: Field → centre of the prior, (n,).
         log_std: Field → standard deviation of its logarithm.
         residual: RMS error of each joint's best fit so far, (n,) rad.
         correlation_time: Duration of a recording that counts as one measurement, (n,) s.
@@ -54,16 +53,10 @@ class _GainPrior:
         self.residual = np.full(bounds.n, 1e-3)
         self.correlation_time = np.full(bounds.n, CORRELATION_TIME_BOUNDS_S[1])
         self._row_period = max(row_period, 0.01)
-        self.log_std: dict[str, Array | float] = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
+        self.log_std: dict[str, float] = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
         self._servo_damping = {"damping": bounds.kd}  # beside the joint's own
         given = {f: bounds.first[f] + self._servo_damping.get(f, 0.0) for f in self.log_std}
-        self.given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
-
-    def with_kp(self, kp: Array, log_std: Array) -> _GainPrior:
-        """Return the prior with another centre and width of kp, (n,)."""
-        prior = copy.copy(self)
-        prior.given, prior.log_std = self.given | {"kp": kp}, self.log_std | {"kp": log_std}
-        return prior
+        self._given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
 
     def error_std(self) -> Array:
         """Return the standard deviation that one row's error has beside the prior, (n,) in ERROR_SCALE_RAD."""
@@ -71,10 +64,10 @@ class _GainPrior:
 
     def errors(self, values: Values) -> Array:
         """Return the prior's errors of candidates (k, n), (k, n, PRIORS) in ERROR_SCALE_RAD."""
-        own = {f: values[f] + self._servo_damping.get(f, 0.0) for f in self.given}
+        own = {f: values[f] + self._servo_damping.get(f, 0.0) for f in self._given}
         far = [
             np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given)) * self.error_std() / self.log_std[f]
-            for f, given in self.given.items()
+            for f, given in self._given.items()
         ]
         return np.stack(far, axis=-1)
 

@@ -77,9 +77,7 @@ class RobotRollouts:
 
     def flat_errors(self, values: dict[str, Array], links: ListOf[dict[str, Link]] = ()) -> Array:
         """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n) as for BatchSim.set_servos.
-
-        Candidates may have `links` of their own, (k,); else they have the robot's.
-        """
+        Candidates may have `links` of their own, (k,)."""
         k, m = len(values["kp"]), len(self.parts)
         delay = np.array(self.robot.delay)
         delay[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
@@ -94,10 +92,8 @@ class RobotRollouts:
             if sim.servo_model is not None:
                 sim.servo_model.armature[w::m, i], sim.servo_model.values["backlash"][w::m, i] = IMMOVABLE_ARMATURE, 0.0
         if links:
-            models = [
-                {c: with_links(model, replace(self.robot, links=one)) for c, model in sim.models.items()}
-                for one in links
-            ]
+            robots = [replace(self.robot, links=one) for one in links]
+            models = [{c: with_links(model, robot) for c, model in sim.models.items()} for robot in robots]
             for name in LINK_FIELDS:
                 rows = np.array([getattr(each[c], name) for each in models for c in conditions])
                 if rows.size:
