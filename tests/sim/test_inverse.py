@@ -70,7 +70,7 @@ def test_torque_limits_bound_the_targets(tmp_path):
 def test_a_torque_speed_line_bounds_the_targets_of_a_moving_joint(tmp_path):
     """At half of its no-load speed a motor has half of its torque, however fast it is to become."""
     robot = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.4"))
-    robot = robot.with_servos(dict.fromkeys(robot.joint_names, {"no_load_speed": 2.0}))
+    robot = robot.with_servos({joint: {"no_load_speed": 2.0} for joint in robot.joint_names})
     inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     at, speed = np.zeros((1, 2)), np.ones((1, 2))
     targets = inverse([Period(at, speed, at + 0.02, speed + 1.0, at)])
