@@ -248,7 +248,8 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
 
 
 def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
-    rng, law = np.random.default_rng(0), dict(zip(SERVO_TERMS, (0.1, 0.2, 0.05, 0.08, 0.3, 0.02, 3.0), strict=True))
+    rng, values = np.random.default_rng(0), (0.1, 0.2, 0.05, 0.08, 0.3, 0.02, 3.0, 0.0)
+    law = dict(zip(SERVO_TERMS, values, strict=True))
     robot = write_arm(tmp_path / "arm").with_servos({"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}})
     scene = mujoco.MjModel.from_xml_string(re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt)))
     q, v, torque, load, ctrl = rng.uniform(-0.2, 0.2, (5, 20, 2))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from arm import TOML, write_arm
 
+from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import build_model, build_spec
 
@@ -151,7 +152,7 @@ def test_a_torque_falls_with_speed_and_brakes_whole(arm):
 
 def test_the_mujoco_model_holds_the_servo_model(arm):
     model = build_model(servo_model(arm, stribeck=0.1, stribeck_speed=0.05))
-    assert model.actuator_user[0].tolist() == [0.1, 0.05, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert model.actuator_user[0].tolist() == [0.1, 0.05] + [0.0] * (len(SERVO_TERMS) - 2)
     assert build_model(arm).nuser_actuator == 0
 
 

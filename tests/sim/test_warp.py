@@ -147,7 +147,7 @@ def test_the_servo_model_agrees_with_mujoco(tmp_path, rates, delay):
 
 @pytest.mark.parametrize("parts", [("stribeck", "stribeck_speed"), ("encoder_step",), ("no_load_speed",), SERVO_TERMS])
 def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp_path, parts):
-    law = dict(zip(SERVO_TERMS, (0.05, 0.2, 0.1, 0.2, 0.02, 1e-3, 1.0), strict=True))
+    law = dict(zip(SERVO_TERMS, (0.05, 0.2, 0.1, 0.2, 0.02, 1e-3, 1.0, 0.0), strict=True))
     robot = replace(write_arm(tmp_path), timestep=0.02, **{name: law[name] for name in parts})
     robot = robot.with_servos({"elbow": {"offset": 0.1}})
     ours = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * 3, 1)

@@ -29,6 +29,7 @@ FIRST = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "of
         {"kd": 1.0},
         {"kd": 1.0, "effort_limit": 2.0, "no_load_speed": 1.5},
         {"effort_limit": 2.0, "no_load_speed": 1.5, "friction_motor": 0.2},
+        {"backlash": 0.02},
     ],
 )
 def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from rich.progress import Progress as Bars
 from gaponet.base.text import escape
 
 LINE_INTERVAL_S = 10.0  # without a terminal
+LINE_INTERVAL_VARIABLE = "GAPONET_LINE_INTERVAL_S"  # environment variable that replaces it
 MAX_UNFINISHED = 0.99  # largest fraction that is shown before the end
 
 Progress = Callable[[float, float, str], None]  # done, total, note
@@ -83,7 +85,8 @@ def _progress(title: str) -> Iterator[_Show]:
 def _lines(title: str, console: Console) -> Iterator[_Show]:
     """Print progress as lines: the first update, then one per LINE_INTERVAL_S at most, and the end."""
     start = time.monotonic()
-    last, fraction, newest = start - LINE_INTERVAL_S, 0.0, ""
+    interval = float(os.environ.get(LINE_INTERVAL_VARIABLE, LINE_INTERVAL_S))
+    last, fraction, newest = start - interval, 0.0, ""
 
     def show(running: Running, done: float, total: float, note: str = "") -> None:
         nonlocal last, fraction, newest
@@ -92,7 +95,7 @@ def _lines(title: str, console: Console) -> Iterator[_Show]:
             *(f"{name} {100 * part:.0f} % {progress_text}".rstrip() for name, (part, progress_text) in running.items()),
         ]
         fraction, newest = done / total if total else 0.0, "; ".join(task for task in tasks if task)
-        if time.monotonic() - last >= LINE_INTERVAL_S and (fraction < 1 or last >= start):
+        if time.monotonic() - last >= interval and (fraction < 1 or last >= start):
             last = time.monotonic()
             print_line(min(fraction, MAX_UNFINISHED))
 

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the j
 '''
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
     array_module, servo.present, servo.exp, servo.torque_range, servo.passing_friction, servo.resting_friction,
-    servo.friction_limit, servo.servo_torque,
+    servo.friction_limit, servo.servo_torque, servo.crossed, servo.Play,
 )  # fmt: skip
 ENGINE_TERMS = {"isaaclab": ("no_load_speed",)}  # terms of the servo model that an engine's own servos have
 OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts|unit_events) import")
@@ -140,7 +140,7 @@ def export_robot(
     facts["error_mrad"] = {form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))}
     errors = {"in gaponet": rollout_error(validation, robot)}
     if robot.has_servo_model:
-        errors["in gaponet, fitted without the law"] = rollout_error(validation, plain)
+        errors["in gaponet, without the servo model"] = rollout_error(validation, plain)
     file, notes = None, _notes(robot, facts, to)
     with lock_folder(out, FOLDER_KIND):
         if to == "mjcf":
@@ -153,7 +153,10 @@ def export_robot(
                 notes.append(f"{text}: now they are; ctrl of keyframes not")
         elif to == "urdf":
             assert source is not None
-            file = edit_urdf(source, out, facts, robot.operated)
+            file, other = edit_urdf(source, out, facts, robot)
+            if other:
+                notes.append(f"inertias of {', '.join(other)} were not written: their masses in the file are others")
+                plain = replace(plain, links={n: link for n, link in plain.links.items() if n not in other})
             errors[f"{file.name} alone, all else as before"] = rollout_error(validation, with_urdf_fields(plain))
         elif to != "json":
             file = out / ROBOT
@@ -189,6 +192,8 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
         )
     if law and to in ("isaaclab", "newton", "drake", "urdf"):
         notes.append(f"the servo model ({law}) is not in {to}: the numbers were fitted without it")
+    if to == "mjlab" and robot.backlash.any():
+        notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")
     return notes
 
 
@@ -277,7 +282,7 @@ def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
     constants = (
         f"SERVO_TERMS = {SERVO_TERMS}\n"
         f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
-        f"DEADBAND_STEPS = {servo.DEADBAND_STEPS}\n"
+        f"DEADBAND_STEPS, OPENED = {servo.DEADBAND_STEPS}, {servo.OPENED}\n"
     )
     functions = [inspect.getsource(f) for f in SERVO_MODEL]
     write_text(folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + constants, *functions]))

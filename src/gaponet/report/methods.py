@@ -37,6 +37,7 @@ METHODS = {  # title, colour
     "motor": ("torque by speed", "#0b2a1e"),
     "contact": ("table, stops, zeros", "#6b4f2a"),
     "hand": ("where payloads hang, the hand", "#8d6e44"),
+    "links": ("masses of the links", "#7a9a4d"),
     "raw": ("raw targets", "#5c5c5c"),
     "feedforward": ("nominal model's feed-forward alone", "#c9b28f"),
     "identified feedforward": ("identified model's feed-forward alone", "#2a9d6f"),

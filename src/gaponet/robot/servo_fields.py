@@ -12,8 +12,8 @@ from functools import partial
 from typing import Literal, get_args
 
 # Terms of the servo model that identification may add, one by one; `ServoField.term` names a field's.
-Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder", "speed"]
-DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load")
+Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder", "speed", "backlash"]
+DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load", "backlash")
 Axis = Literal["value", "log", "over kp", "inverse"]
 
 MAX_VALUE = 1e6  # of gains and torques in robot.toml
@@ -121,6 +121,9 @@ SERVO_FIELDS: dict[str, ServoField] = {
                    in_servo_model=True, single_joint=True, shared=False),
         ServoField("no_load_speed", "rad/s", "no-load speed, rad/s", axis="inverse", prior_std=0.02, cause="motor",
                    term="speed", in_servo_model=True, advice="check effort_limit in robot.toml"),
+        ServoField("backlash", "rad", "backlash, mrad", 1e3, limits=(0.0, 1.0), bounds=(0.0, 0.1, 0.003), guess=0.004,
+                   prior_std=0.01, large_value=0.01, cause="servo", term="backlash", in_servo_model=True, shared=False,
+                   advice="check for a loose horn or a slipping gear"),
         _angle("zero", heading="zero, mrad", factor=1e3, cause="contact"),
         _angle("stop_low", heading="low stop, rad", default=math.nan, cause="contact"),
         _angle("stop_high", heading="high stop, rad", default=math.nan, cause="contact"),

@@ -166,8 +166,10 @@ class WarpSim:
         """device: "cuda", torch's present GPU (of several processes each has its own), or "warp-cpu", Warp's CPU.
 
         Raises:
-            UsageError: No such device.
+            UsageError: No such device, or servos with backlash.
         """
+        if sim.servo_model is not None and sim.servo_model.values["backlash"].any():
+            raise UsageError(f"{sim.robot.name}: no GPU simulates its backlash; use --device cpu, or backlash = 0")
         warp.config.log_level = warp.LOG_WARNING if device == "cuda" else warp.LOG_ERROR
         device = f"cuda:{torch.cuda.current_device()}" if device == "cuda" else "cpu"
         try:

@@ -25,7 +25,7 @@ from gaponet.sim import servo
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
-from gaponet.sim.servo import friction_limit, present, servo_torque, torque_range
+from gaponet.sim.servo import crossed, friction_limit, present, servo_torque, torque_range
 
 advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
@@ -203,6 +203,9 @@ class JointRollouts:
         low, high = (_filled(x[:, None], shape) for x in self.stops.T)
         q, w = _filled(self.qpos[..., 0], shape), _filled(self.qvel[..., 0], shape)
         out = np.zeros((*shape, self.counted.shape[1]), np.float32)
+        half, rotor = terms.get("backlash", np.zeros(shape)) / 2, w.copy()
+        first = self.tables[..., 0]
+        gap = np.where(first[1] + first[3] * q < 0, -half, half)
         for t in range(self.qpos.shape[2] - 1):
             inertia, weight, pull, slope = self.tables[..., t]
             heavy, slope = inertia + armature, _filled(slope, shape)
@@ -216,13 +219,22 @@ class JointRollouts:
                 load = slope * q + weight
                 most = friction_limit(terms, dry, w, torque, load)
                 net = torque - load - pull - own * w
-                w = w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most))
+                before, w = w, w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most))
+                if "backlash" in terms:
+                    force = inertia * (w - before) / h + load + pull
+                    pressed = (abs(gap) >= half) & (force * gap >= 0)
+                    link = np.where(pressed, w, before - h / inertia * (load + pull))
+                    gap, rotor = crossed(half, gap, rotor, pressed, link, torque, own, most, armature, h)
+                    both = (inertia * link + armature * rotor) / heavy
+                    met = abs(gap) >= half
+                    w, rotor = np.where(met, both, link), np.where(met, both, rotor)
                 q = q + h * w
                 w = np.where(q < low, np.maximum(w, 0), np.where(q > high, np.minimum(w, 0), w))
                 q = np.minimum(np.maximum(q, low), high)
             touch = self.touch[:, t + 1]
             if touch.any():  # goes on from the recording
                 q[..., touch], w[..., touch] = self.qpos[:, touch, t + 1], self.qvel[:, touch, t + 1]
+                rotor[..., touch] = w[..., touch]
             if (t + 1) % self.thin == 0:
                 out[..., (t + 1) // self.thin] = q - self.qpos[..., t + 1]
         return out

@@ -71,8 +71,8 @@ def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
             stop = float(getattr(stopped, name)[i])
             if np.isfinite(stop) and stop != getattr(given, name)[i]:
                 questions.append(
-                    f"{joint}: stayed at {stop:.3f} rad where commands went on towards {given.qpos_range[i, side]:.3f}:"
-                    " if that is a stop, identify with --stops; if something was in its way, leave those motions out"
+                    f"{joint}: stayed at {stop:.3f} rad where commands went {('lower', 'higher')[side]}: "
+                    "if that is a stop, identify with --stops; if something was in its way, leave those motions out"
                 )
     return questions
 

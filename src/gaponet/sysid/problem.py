@@ -33,6 +33,7 @@ PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5, "damping": 1.0}  # of the robot fil
 PRIORS = len(PRIOR_LOG_STD)
 MIN_SHARE = 1e-3  # of the file's value; less counts as this
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
+RELATIVE_GAP_STD = 0.06  # of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py)
 UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
 MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
 
@@ -43,6 +44,8 @@ class _GainPrior:
     Its weight decreases with the residual of the best fit and increases with the residual's correlation time.
 
     Attributes:
+        given: Field → centre of the prior, (n,).
+        log_std: Field → standard deviation of its logarithm.
         residual: RMS error of each joint's best fit so far, (n,) rad.
         correlation_time: Duration of a recording that counts as one measurement, (n,) s.
     """
@@ -51,10 +54,16 @@ class _GainPrior:
         self.residual = np.full(bounds.n, 1e-3)
         self.correlation_time = np.full(bounds.n, CORRELATION_TIME_BOUNDS_S[1])
         self._row_period = max(row_period, 0.01)
-        self._log_std = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
+        self.log_std: dict[str, Array | float] = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
         self._servo_damping = {"damping": bounds.kd}  # beside the joint's own
-        given = {f: bounds.first[f] + self._servo_damping.get(f, 0.0) for f in self._log_std}
-        self._given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
+        given = {f: bounds.first[f] + self._servo_damping.get(f, 0.0) for f in self.log_std}
+        self.given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
+
+    def with_kp(self, kp: Array, log_std: Array) -> _GainPrior:
+        """Return the prior with another centre and width of kp, (n,)."""
+        prior = copy.copy(self)
+        prior.given, prior.log_std = self.given | {"kp": kp}, self.log_std | {"kp": log_std}
+        return prior
 
     def error_std(self) -> Array:
         """Return the standard deviation that one row's error has beside the prior, (n,) in ERROR_SCALE_RAD."""
@@ -62,10 +71,10 @@ class _GainPrior:
 
     def errors(self, values: Values) -> Array:
         """Return the prior's errors of candidates (k, n), (k, n, PRIORS) in ERROR_SCALE_RAD."""
-        own = {f: values[f] + self._servo_damping.get(f, 0.0) for f in self._given}
+        own = {f: values[f] + self._servo_damping.get(f, 0.0) for f in self.given}
         far = [
-            np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given)) * self.error_std() / self._log_std[f]
-            for f, given in self._given.items()
+            np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given)) * self.error_std() / self.log_std[f]
+            for f, given in self.given.items()
         ]
         return np.stack(far, axis=-1)
 
@@ -317,15 +326,14 @@ def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
 
 
 def _discretisation_std(problem: FitProblem, values: Values) -> Values:
-    """Return standard errors of damping, armature, delay and no-load speed by the length of a physics step, (n,)."""
+    """Return standard errors of damping, armature, delay, no-load speed and backlash by the physics step, (n,)."""
     h = UNIFORM_STD * problem.physics_step
     total = values["damping"] + problem.robot.kd[problem.robot.operated_index]
     std = {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
     if "no_load_speed" in values:  # the limit follows the speed a step late, half a step on average
         limit = values.get("effort_limit", problem.bounds.first["effort_limit"])
-        late = problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
-        std["no_load_speed"] = late
-    return std
+        std["no_load_speed"] = problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
+    return std | {"backlash": RELATIVE_GAP_STD * values["backlash"]} if "backlash" in values else std
 
 
 def _inverse(normal: Array, size: Array) -> Array:

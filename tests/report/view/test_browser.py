@@ -17,15 +17,18 @@ OFF = 60  # |difference| of one channel, of 255, by which a pixel is another
 @pytest.fixture
 def web(arm):
     """Two copies of a moving arm, served and played as gaponet view does."""
+    from gaponet.report.view.player import Player
     from gaponet.report.view.scene import Scene
+    from gaponet.report.view.server import open_server
     from gaponet.report.view.side_by_side import Clip, Copy, SideBySide
-    from gaponet.report.view.web import WebScene
 
     real = recordings(arm, 1, rows=200, kp=0.5)[0]
     swing = 0.8 * np.sin(np.arange(len(real)) / 20)[:, None] * np.ones(2)
     off = {"nominal": 0.4, "gaponet": 0.1}
     shown = SideBySide(real, arm, tuple(Copy(m, swing + o, np.full(len(real), o)) for m, o in off.items()), None)
-    served = WebScene(Scene(shown), Clip.from_start(shown, 0.0, 3.0), port=0)
+    server, address = open_server("test", 0)
+    served = Player(server, Scene(shown), Clip.from_start(shown, 0.0, 3.0))
+    served.address = address
     served.playing.value = False
     ended = threading.Event()
 
@@ -55,10 +58,10 @@ def test_the_canvas_shows_the_robot_and_it_moves_when_played_and_stands_when_not
     from browser import Browser, wait
 
     assert colour("gaponet") == "#c8102e"
-    with Browser() as page:
-        page.ask("Page.navigate", url=web.url)
+    with Browser(800, 450) as page:
+        page.ask("Page.navigate", url=web.address)
         wait(lambda: page.value("!!document.querySelector('canvas')"))
-        wait(lambda: reddish(page.look("canvas")) > 1500)
+        wait(lambda: reddish(page.look("canvas")) > 500)
         wait(lambda: moved(page.look("canvas"), page.look("canvas")) == 0)  # all is loaded
         still = page.look("canvas")
         colours = np.unique(still.reshape(-1, 3), axis=0)

@@ -187,19 +187,21 @@ def test_bad_clips_and_files_are_refused_with_what_to_do(four, tmp_path):
 
 def test_the_browser_gets_a_mesh_for_every_body_where_it_is(four):
     pytest.importorskip("viser")
-    from gaponet.report.view.web import WebScene
+    from gaponet.report.view.player import Player
+    from gaponet.report.view.server import open_server
 
-    scene = Scene(four)
+    scene, (server, _) = Scene(four), open_server("test", 0)
     object.__setattr__(four.real.meta, "motion", "![x](https:evil.example)")
-    web = WebScene(scene, Clip.from_start(four, 0.0, 0.6), port=0)
+    object.__setattr__(four.motions[1], "error", np.where(np.arange(40) == 20, 0.9, 0.3))
     try:
-        assert r"!\[x\](https:evil.example)" in web.title.content
-        web.playing.value = True
-        web.speed.value = 1.0
-        web.advance(0.2)
+        player = Player(server, scene, Clip.from_start(four, 0.0, 0.6))
+        assert r"!\[x\](https:evil.example)" in player.title.content
+        player.speed.value = 1.0
+        player.advance(0.2)
         body = scene.model.body("gaponet/fore").id
         scene.pose(0.2)
-        np.testing.assert_allclose(web.frames[body].position, scene.data.xpos[body], atol=1e-5)
-        assert "| nominal simulator | 300.0 | 300.0 |" in web.table.content
+        np.testing.assert_allclose(player.frames[body].position, scene.data.xpos[body], atol=1e-5)
+        assert "| nominal simulator | 300.0 | 315.4 |" in player.table.content
+        assert player.worst.label == "Worst moment: 0.40 s"
     finally:
-        web.server.stop()
+        server.stop()

@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.report.view.picture import Camera
-from gaponet.report.view.side_by_side import Clip, SideBySide
+from gaponet.report.view.side_by_side import largest_error_time
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -57,22 +59,12 @@ def write(camera: Camera, path: Path, progress: Callable[[int, int], None] = lam
     return 1 if suffix == ".png" else len(times)
 
 
-def largest_error_time(shown: SideBySide, clip: Clip) -> float:
-    """Return the time of the largest error of the first simulated copy, s."""
-    first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
-    simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(shown.motions)
-    return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt
-
-
 def _write_gif(pictures: list[Image], path: Path, milliseconds: int) -> None:
     """Write with one palette for all frames and no dithering, which keeps the file small."""
-    from PIL.Image import Dither, Quantize, new
+    from PIL.Image import Dither, Quantize, fromarray
 
-    sample = pictures[:: max(len(pictures) // 4, 1)]
-    sheet = new("RGB", (sample[0].width, sample[0].height * len(sample)))
-    for i, picture in enumerate(sample):
-        sheet.paste(picture, (0, i * picture.height))
-    palette = sheet.quantize(GIF_COLOURS, Quantize.MAXCOVERAGE)
+    sample = np.concatenate([np.asarray(p) for p in pictures[:: max(len(pictures) // 4, 1)]])
+    palette = fromarray(sample).quantize(GIF_COLOURS, Quantize.MAXCOVERAGE)
     frames = [p.quantize(palette=palette, dither=Dither.NONE) for p in pictures]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True)
 

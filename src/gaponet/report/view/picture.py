@@ -1,10 +1,10 @@
-"""Pictures of a scene: rendered off screen by MuJoCo, labelled by Pillow."""
+"""Pictures of a scene, and of models in a row: rendered off screen by MuJoCo, labelled by Pillow."""
 
 from __future__ import annotations
 
+import io
 import warnings
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -22,24 +22,25 @@ if TYPE_CHECKING:
 
 INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
 SEPARATOR = "  ·  "  # Pillow's own font has this, but no ×
-MAX_HEIGHT = 0.8  # of the width
+MAX_HEIGHT = 0.7  # of the width
+SIDE, HEAD = 480, 30  # pixels of one model's square and of its label
+FLOOR = mujoco.mjtGeom.mjGEOM_PLANE
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Heights of head line, robots, labels and error curve from top to bottom, pixels; scale: pixels per metre."""
+    """Heights of head line, robots and labels from top to bottom, pixels; scale: pixels per metre."""
 
     width: int
     head: int
     robots: int
     labels: int
-    course: int
     scale: float
 
     @property
     def height(self) -> int:
         """Height of the whole picture, pixels."""
-        return self.head + self.robots + self.labels + self.course
+        return self.head + self.robots + self.labels
 
     @classmethod
     def for_scene(cls, scene: Scene, width: int) -> Layout:
@@ -51,11 +52,11 @@ class Layout:
         if not 160 <= width <= 3840:
             raise UsageError(f"--width is {width}; give 160 to 3840 pixels")
         tall = scene.box[3] - scene.box[2]
-        head, labels, course = (round(height * max(width / 960, 0.5)) for height in (34, 54, 96))
-        scale = min(width / (scene.spacing * len(scene.base)), (MAX_HEIGHT * width - head - labels - course) / tall)
+        head, labels = (round(height * max(width / 960, 0.5)) for height in (34, 60))
+        scale = min(width / (scene.spacing * len(scene.base)), (MAX_HEIGHT * width - head - labels) / tall)
         robots = round(1.1 * tall * scale)
-        robots += (head + robots + labels + course) % 2  # h264 wants even sizes
-        return cls(width, head, robots, labels, course, scale)
+        robots += (head + robots + labels) % 2  # h264 wants even sizes
+        return cls(width, head, robots, labels, scale)
 
 
 class Camera:
@@ -65,7 +66,7 @@ class Camera:
         """Open a GL context.
 
         Args:
-            clip: Its speed is printed on the picture; the error is drawn over its time.
+            clip: Its speed is printed on the picture.
             width: Width of the picture, pixels, even; the height follows from the robots.
             magnify: Printed on the picture.
         """
@@ -90,7 +91,7 @@ class Camera:
         rendered = Image.fromarray(self.renderer.render())
         image = Image.new("RGB", (self.layout.width, self.layout.height), rendered.getpixel((0, 0)))
         image.paste(rendered, (0, self.layout.head))
-        self._write(image, ImageDraw.Draw(image), time)
+        self._write(ImageDraw.Draw(image), time)
         return image
 
     def _lens(self) -> mujoco.MjvCamera:
@@ -105,11 +106,11 @@ class Camera:
         scene.model.vis.map.znear, scene.model.vis.map.zfar = 0.01, 20
         return lens
 
-    def _write(self, image: Picture, draw: ImageDraw, time: float) -> None:
+    def _write(self, draw: ImageDraw, time: float) -> None:
         shown, layout, k = self.scene.shown, self.layout, len(self.scene.base)
         row, small, large = self.scene.row(time), self.fonts[13], self.fonts[17]
         self._head(draw, time)
-        top = layout.height - layout.course - layout.labels
+        top = layout.height - layout.labels
         pitch = self.scene.spacing * layout.scale
         for i, m in enumerate(shown.motions):
             x = layout.width / 2 + (i - (k - 1) / 2) * pitch
@@ -117,7 +118,6 @@ class Camera:
             if m.method != "recorded":
                 text = f"{m.error[row] * 1e3:.1f} mrad now, {m.mpjae * 1e3:.1f} mean"
                 draw.text((x, top + 1.5 * large.size), text, FAINT, small, anchor="ma")
-        self._course(image, draw, row)
 
     def _head(self, draw: ImageDraw, time: float) -> None:
         """Write VIRTUAL where it applies, the recording on the left, and the time on the right."""
@@ -134,46 +134,6 @@ class Camera:
         draw.text((pad, pad * 0.8), mark, ALARM, font, stroke_width=0.4, stroke_fill=ALARM)
         draw.text((pad + font.getlength(mark), pad * 0.8), left, INK, font)
         draw.text((self.layout.width - pad, pad * 0.8), right, INK, font, anchor="ra")
-
-    def _course(self, image: Picture, draw: ImageDraw, row: int) -> None:
-        """Draw |error| against time of each motion, with a line at the present."""
-        strip, x, (high, low) = self.strip
-        top = self.layout.height - self.layout.course
-        image.paste(strip, (0, top), strip)
-        now = x[np.clip(row - self.scene.row(self.clip.start), 0, len(x) - 1)]
-        draw.line([(now, top + high), (now, top + low)], INK, 1)
-
-    @cached_property
-    def strip(self) -> tuple[Picture, Array, tuple[float, float]]:
-        """Error curves of all pictures; x of each row; top and bottom of the axis, pixels."""
-        from PIL import Image, ImageDraw
-
-        layout, real, small = self.layout, self.scene.shown.real, self.fonts[13]
-        pad = layout.head // 3
-        first, last = (self.scene.row(t) for t in (self.clip.start, self.clip.stop))
-        rows = np.arange(first, max(last, first + 1) + 1).clip(max=len(real) - 1)
-        errors = {m.colour: m.error[rows] * 1e3 for m in self.scene.shown.motions if m.method != "recorded"}
-        peak = max([float(e.max()) for e in errors.values()] + [1e-3])
-        unit = f"{peak:.2g} mrad" if peak < 10 else f"{peak:.0f} mrad"
-        bottom, high = layout.course - pad - small.size, 1.2 * pad
-        left, right = pad + small.getlength(unit) + pad / 2, layout.width - pad
-        x = left + np.arange(len(rows)) / max(len(rows) - 1, 1) * (right - left)
-        fine = 4  # Pillow's lines have hard edges
-        strip = Image.new("RGBA", (layout.width * fine, layout.course * fine), (255, 255, 255, 0))
-        draw = ImageDraw.Draw(strip)
-        draw.line([(left * fine, bottom * fine), (right * fine, bottom * fine)], "#bbbbbb", fine)
-        for colour, error in errors.items():
-            y = bottom - error / peak * (bottom - high)
-            points = (np.stack([x, y], axis=1) * fine).ravel().tolist()
-            draw.line(points, colour, round(fine * max(1.4 * layout.width / 960, 1)), joint="curve")
-        strip = strip.resize((layout.width, layout.course), Image.Resampling.BOX)
-        draw = ImageDraw.Draw(strip)
-        draw.text((left - pad / 2, high), unit, FAINT, small, anchor="rm")
-        draw.text((left - pad / 2, bottom), "0", FAINT, small, anchor="rm")
-        draw.text((left, bottom + 3), f"{rows[0] * real.dt:.1f} s", FAINT, small)
-        draw.text((right, bottom + 3), f"{rows[-1] * real.dt:.1f} s", FAINT, small, anchor="ra")
-        draw.text(((left + right) / 2, bottom + 3), "mean |error| of the operated joints", FAINT, small, anchor="ma")
-        return strip, x, (high, bottom)
 
 
 def _payload(mass: float, side: str) -> str:
@@ -199,3 +159,54 @@ def renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
             return mujoco.Renderer(model, height, width)
     except Exception as error:  # GL libraries raise exceptions of any type
         raise UsageError(f"cannot render off screen ({type(error).__name__}: {error}). {INSTALL_HINT}") from None
+
+
+def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
+    """Return a PNG of models (label, model, qpos) in a row, all with the camera that fits the first.
+
+    Raises:
+        UsageError: Nothing can be rendered here; the message says what to install.
+    """
+    from PIL import Image, ImageDraw
+
+    image = Image.new("RGB", (SIDE * len(models), SIDE + HEAD), "white")
+    draw = ImageDraw.Draw(image)
+    camera = mujoco.MjvCamera()
+    camera.azimuth, camera.elevation = 140, -15
+    for i, (label, model, qpos) in enumerate(models):
+        data = mujoco.MjData(model)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        if i == 0:
+            low, high = _box(model, data)
+            camera.lookat[:] = (low + high) / 2
+            camera.distance = 1.15 * float(np.linalg.norm(high - low))
+        model.geom_rgba[model.geom_type == FLOOR, 3] = 0
+        model.vis.map.znear = 0.01 / model.stat.extent
+        model.vis.headlight.ambient[:] = 0.5
+        picture = renderer(model, SIDE, SIDE)
+        picture.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
+        picture.update_scene(data, camera)
+        image.paste(Image.fromarray(_white(picture)), (SIDE * i, HEAD))
+        picture.close()
+        draw.text((SIDE * (i + 0.5), HEAD / 2), label, INK, font(17), anchor="mm")
+    file = io.BytesIO()
+    image.save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
+def _box(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array]:
+    """Return the corners of a box around all geoms except floors, m."""
+    shown = model.geom_type != FLOOR
+    if not shown.any():
+        return data.xpos.min(axis=0), data.xpos.max(axis=0)
+    radius, centres = np.linalg.norm(model.geom_aabb[shown, 3:], axis=1)[:, None], data.geom_xpos[shown]
+    return (centres - radius).min(axis=0, initial=np.inf), (centres + radius).max(axis=0, initial=-np.inf)
+
+
+def _white(picture: mujoco.Renderer) -> Array:
+    """Return the picture with a white background."""
+    pixels = picture.render().copy()
+    picture.enable_segmentation_rendering()
+    pixels[picture.render()[:, :, 0] < 0] = 255
+    return pixels

@@ -33,10 +33,9 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
         UsageError: Nothing can be rendered here; the message says what to install.
     """
     choose_gl()
-    from gaponet.report.view.film import largest_error_time
     from gaponet.report.view.picture import Camera
     from gaponet.report.view.scene import Scene
-    from gaponet.report.view.side_by_side import Clip, Copy, SideBySide
+    from gaponet.report.view.side_by_side import Clip, Copy, SideBySide, largest_error_time
 
     whole = {}
     for method, q in qpos.items():

@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.progress import Progress, no_progress, with_note
-from gaponet.data.sequence import Sequence
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import busiest_window
 from gaponet.data.store import Dataset, Entry
 from gaponet.report.candidate import Candidate, FittedData
@@ -138,6 +138,13 @@ class Clip:
         return self.start + np.arange(count) * period * self.speed
 
 
+def largest_error_time(shown: SideBySide, clip: Clip) -> float:
+    """Return the time of the largest error of the first simulated copy, s."""
+    first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
+    simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(shown.motions)
+    return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt
+
+
 def select_entry(
     dataset: Dataset, runs: ListOf[Path], motion: str = "", unit: str = "", payload_mass: float | None = None
 ) -> Entry:
@@ -196,6 +203,13 @@ def side_by_side(
     motions = tuple(Copy(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
     folders = [*runs, *([robot.folder] if robot.nominal is not None else [])]
     return SideBySide(real, robot, motions, was_used(entry, folders) if folders else None)
+
+
+def standing(robot: RobotSpec) -> SideBySide:
+    """Return a robot at home."""
+    home, still = np.tile(robot.qpos_home, (2, 1)), np.zeros(2)
+    real = Sequence(SequenceMeta(robot.name, "home", "home", 0.0), robot.joint_names, robot.dt, home, home, 0 * home)
+    return SideBySide(real, robot, (Copy("nominal", home, still),), None)
 
 
 def was_used(entry: Entry, folders: ListOf[Path]) -> bool:

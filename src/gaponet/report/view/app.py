@@ -1,0 +1,305 @@
+"""The page of `gaponet app`: six steps from logs to an identified simulator, each by commands in one folder."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.errors import GAPONetError, UsageError
+from gaponet.base.files import atomic_write, write_text
+from gaponet.base.text import escape_markdown
+from gaponet.data.describe.guess import guess_logs
+from gaponet.data.formats import look
+from gaponet.data.store import Dataset
+from gaponet.report.methods import colour
+from gaponet.report.view.jobs import OUT, PROGRESS_LINE, Job, Jobs
+from gaponet.report.view.player import Player, draw_curves
+from gaponet.report.view.scene import Scene
+from gaponet.report.view.server import open_server
+from gaponet.report.view.side_by_side import Clip, SideBySide, side_by_side, standing
+from gaponet.robot.finding import Finding
+from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
+from gaponet.sim.dataset_robot import dataset_robot
+
+MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
+POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "signed_percent")
+TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
+POLL_S, MAX_UNPACKED_BYTES = 0.5, 2 << 30
+PANEL_WIDTH = 560  # pixels
+STYLE = "<style>[class*=Slider-mark], .uplot, .uplot *, [class*=mantine] input {font-size: 12px !important}</style>"
+
+
+class App:
+    """Controls, texts and pictures of the page. All pages of a server show the same."""
+
+    def __init__(self, folder: Path, port: int) -> None:
+        """Serve the page of a folder, an absolute path, which holds logs, models, commands and their results."""
+        self.folder, self.jobs, self.polled, self.seen = folder, Jobs(folder), 0.0, (-1, True)
+        self.server, self.address = open_server("gaponet app", port)
+        self.gui = self.server.gui
+        self.texts: dict[str, tuple[Any, str, Any]] = {}  # step → text, hint, pictures
+        self.player: Player | None = None
+        for name in ("logs", "model"):
+            (folder / name).mkdir(exist_ok=True)
+        self.gui.main_panel.set_width(PANEL_WIDTH)
+        self.gui.add_html(STYLE)
+        self.status, self.bar = self.gui.add_markdown(""), self.gui.add_progress_bar(0.0)
+        self.cancel = self._button("Cancel", lambda _: self.jobs.cancel())
+        tabs = self.gui.add_tab_group()
+        for number, step in enumerate((self._robot, self._logs, self._check, self._gap, self._identify, self._use), 1):
+            with tabs.add_tab(f"{number} {step.__name__.strip('_').capitalize()}"):
+                step()
+        self.refresh()
+
+    def tick(self, elapsed: float) -> None:
+        """Play on, and look after the running command."""
+        if self.player is not None:
+            self.player.advance(elapsed)
+        self.polled += elapsed
+        if self.polled >= POLL_S:
+            self.polled = 0.0
+            self._attempt(self.refresh)
+
+    # Steps: controls, and the command of each button.
+
+    def _robot(self) -> None:
+        self.model = self.gui.add_dropdown("robot", packaged_robots())
+        self._button(
+            "Upload a model: MJCF, URDF, or a .zip with its meshes", lambda e: self._store(e, "model"), upload=True
+        )
+        hints = {"joints": "names; empty for all that the model drives", "kp": "N·m/rad", "kd": "N·m·s/rad"}
+        self.options = {name: self.gui.add_text(name, "", hint=hint) for name, hint in hints.items()}
+        self._button("Use this robot", self._use_robot)
+        self._text("robot", "Choose a robot of the package, or upload a model of yours.")
+
+    def _use_robot(self, _: Any) -> None:
+        given = {f"--{name}": box.value.split() for name, box in self.options.items() if box.value.split()}
+        if any(word.startswith("-") for words in given.values() for word in words):
+            raise UsageError("joints, kp and kd are names and numbers, without a dash in front")
+        if (name := str(self.model.value)) in packaged_robots():
+            self.jobs.start("robot", "robot", "check", name)
+        else:
+            self.jobs.start("robot", "robot", "new", name, "--out", OUT, *(w for k in given for w in (k, *given[k])))
+
+    def _logs(self) -> None:
+        self._button("Upload a log, or a .zip of logs", lambda e: self._store(e, "logs"), upload=True)
+        self.gui.add_markdown(f"Or copy them into {escape_markdown(str(self.folder / 'logs'))}.")
+        self.unit, self.mass = self.gui.add_text("unit", "lab"), self.gui.add_number("payload, kg", 0.0, min=0.0)
+        self.position = self.gui.add_dropdown("positions in", POSITION_UNITS)
+        self.described = self.gui.add_text("logs.toml", "", multiline=True)
+        self._button("Guess logs.toml from the logs", self._guess)
+        self._button("Read the logs", self._read)
+        self._text("import", "Choose the robot first. Then upload logs, and read them.")
+        self.recording, self.joint = (self.gui.add_dropdown(name, ("–",)) for name in ("recording", "joint"))
+        lines = {name: (np.zeros(2), colour(key)) for name, key in (("target", "target"), ("measured", "gaponet"))}
+        self.curves = draw_curves(self.gui, np.arange(2), lines, "rad")
+        for choice in (self.recording, self.joint):
+            choice.on_update(lambda _: self._draw_recording())
+
+    def _guess(self, _: Any) -> None:
+        kind, facts, recordings = look(self.folder / "logs")
+        self.described.value = guess_logs(recordings, self._chosen_robot(), kind, dict(facts))
+
+    def _read(self, _: Any) -> None:
+        robot, file = self._need("robot"), self.folder / "logs" / "logs.toml"
+        file.unlink(missing_ok=True)
+        if self.described.value.strip():
+            write_text(file, self.described.value)
+        words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}", "--out", OUT]
+        words += [f"--position-unit={self.position.value}"] * (self.position.value in POSITION_UNITS[1:])
+        self.jobs.start("import", "import", "logs", f"--robot={_robot_argument(robot)}", *words)
+
+    def _check(self) -> None:
+        start = lambda _: self.jobs.start("doctor", "doctor", self._need("import").out, "--figures", OUT)  # noqa: E731
+        self._button("Check the recordings", start)
+        self.proposal = self._button("Write a proposal for logs.toml into step Logs", self._propose)
+        self._text("doctor", "Read the logs first. Then check them.")
+
+    def _propose(self, _: Any) -> None:
+        findings = [Finding(**f) for f in (self._need("doctor").result or {})["findings"]]
+        self.described.value = f"{self.described.value}\n{Finding.proposal(findings)}".lstrip()
+
+    def _gap(self) -> None:
+        self._button("Measure the error", lambda _: self.jobs.start("gap", "gap", self._need("import").out))
+        self._button("Show the recording of step Logs beside its simulation", self._show)
+        self.stage = self.gui.add_folder(None)
+        self._text("gap", "Read the logs first. Then measure how far the simulator is from the robot.")
+
+    def _show(self, _: Any) -> None:
+        data, identified = self._dataset(), self.jobs.result("identify")
+        robot = dataset_robot(data) if identified is None else load_robot(self.folder / identified.out)
+        self._play(side_by_side(data, next(e for e in data.entries if e.id == self.recording.value), robot))
+
+    def _identify(self) -> None:
+        self.limit = self.gui.add_text("time limit", "", hint="such as 60s or 4m; empty for none")
+        self.table = self.gui.add_checkbox("look for a table under the robot", True)
+        self.fit = self._button("Identify", self._fit)
+        self._text("identify", "Check the recordings first. Identification is locked while the check finds an error.")
+        self._text("causes", "")
+
+    def _fit(self, _: Any) -> None:
+        if reason := self._locked():
+            raise UsageError(reason)
+        words = [f"--budget={time}" for time in self.limit.value.split()[:1]] + ["--no-table"] * (not self.table.value)
+        self.jobs.start("identify", "identify", self._need("import").out, "--out", OUT, *words)
+
+    def _locked(self) -> str:
+        """Return why identification may not start; "" if it may."""
+        job = self.jobs.result("doctor")
+        if job is None:
+            return self.texts["identify"][1]
+        errors = ", ".join(f["check"] for f in (job.result or {})["findings"] if f["level"] == "error")
+        return errors and f"Locked: the check finds an error ({errors}). Step Check says what to do."
+
+    def _use(self) -> None:
+        self.target = self.gui.add_dropdown("for", TARGETS)
+        self._button("Export", lambda _: self.jobs.start(
+            "export", "export", self._need("identify").out, "--to", str(self.target.value), "--out", OUT
+        ))  # fmt: skip
+        self._text("export", "Identify the robot first. Then export it for your simulator.")
+
+    def _store(self, event: Any, place: str) -> None:
+        store_upload(event.target.value.name, event.target.value.content, self.folder / place)
+        self.status.content = f"{escape_markdown(event.target.value.name)} is stored in {place}."
+
+    # What the page shows: only what the files say.
+
+    def refresh(self) -> None:
+        """Show the running command; when one starts or ends, also the results and what may be done next."""
+        running, every = self.jobs.running, self.jobs.all
+        self.bar.visible = self.cancel.visible = running is not None
+        if running is not None:
+            self.bar.value, note = running.progress()
+            self.status.content = f"**gaponet {running.words[0]}**, {self.bar.value:.0f} %. {escape_markdown(note)}"
+        models = [f for f in sorted((self.folder / "model").rglob("*")) if f.suffix.lower() in MODEL_SUFFIXES]
+        self.model.options = [*packaged_robots(), *(f.relative_to(self.folder).as_posix() for f in models)]
+        if self.seen == (state := (len(every), running is None)):
+            return
+        self.seen = state
+        if running is None:
+            self.status.content = _ending(every[-1]) if every else "Six steps, from left to right."
+        for step, (text, hint, pictures) in self.texts.items():
+            job = self.jobs.result(step)
+            text.content, pictures.content = _report(job) if job else hint, self._pictures(step, job)
+            if step == "identify" and job is None and (reason := self._locked()):
+                text.content = reason
+        self.fit.disabled, self.proposal.visible = bool(self._locked()), self.jobs.result("doctor") is not None
+        if self.jobs.result("import"):
+            data = self._dataset()
+            self.recording.options, self.joint.options = [e.id for e in data.entries], data.joint_names
+            self._draw_recording()
+        if running is None and every and every[-1].result and every[-1].step == "identify":
+            self.jobs.start("causes", "gap", self._need("import").out, "--robot", f"./{every[-1].out}")
+        elif self.player is None and self.jobs.result("robot"):
+            self._play(standing(self._chosen_robot()))
+
+    def _play(self, shown: SideBySide) -> None:
+        if self.player is not None:
+            self.player.remove()
+        with self.stage:
+            self.player = Player(self.server, Scene(shown), Clip.from_start(shown, 0.0, 3600.0))
+
+    def _draw_recording(self) -> None:
+        """Draw target and measured position of the chosen joint in the chosen recording."""
+        data = self._dataset()
+        entry = next((e for e in data.entries if e.id == self.recording.value), None)
+        if entry is None or self.joint.value not in data.joint_names:
+            return  # the choices are being replaced
+        real, j = data.read(entry), data.joint_names.index(self.joint.value)
+        self.curves.data = (real.dt * np.arange(len(real)), *(x[:, j].astype(float) for x in (real.ctrl, real.qpos)))
+
+    def _pictures(self, step: str, job: Job | None) -> str:
+        """Return the figures of a result as HTML, with links that save them."""
+        files = [] if job is None else (job.result or {}).get("figures", [])
+        if job is not None and step == "causes":
+            files = [f"{self._need('identify').out}/gap.{kind}" for kind in ("svg", "png")]
+        sources = {Path(f): base64.b64encode((self.folder / f).read_bytes()).decode() for f in files}
+        html, saved = "", '<a download="{}" href="data:image/{};base64,{}">save {}</a> '
+        for file, data in sources.items():
+            if file.suffix == ".svg":
+                html += f'<img alt="{step}" style="width:100%;background:white" src="data:image/svg+xml;base64,{data}">'
+            html += saved.format(file.name, file.suffix[1:].replace("svg", "svg+xml"), data, file.suffix[1:].upper())
+        return html
+
+    def _text(self, step: str, hint: str) -> None:
+        """Add the place of a step's result; `hint` stands there before."""
+        self.texts[step] = self.gui.add_markdown(hint), hint, self.gui.add_html("")
+
+    def _button(self, label: str, act: Callable[[Any], None], upload: bool = False) -> Any:
+        button = (self.gui.add_upload_button if upload else self.gui.add_button)(label)
+        (button.on_upload if upload else button.on_click)(lambda event: self._attempt(act, event))
+        return button
+
+    def _attempt(self, act: Callable[..., None], *arguments: Any) -> None:
+        """Call a function; an error is shown above the steps."""
+        try:
+            act(*arguments)
+        except (GAPONetError, OSError) as error:
+            self.status.content = f"**Not done.** {escape_markdown(str(error))}"
+
+    def _need(self, step: str) -> Job:
+        job = self.jobs.result(step)
+        if job is None:
+            raise UsageError(self.texts[step][1])
+        return job
+
+    def _chosen_robot(self) -> RobotSpec:
+        name = _robot_argument(self._need("robot"))
+        return load_robot(name if name in packaged_robots() else self.folder / name)
+
+    def _dataset(self) -> Dataset:
+        return Dataset(self.folder / self._need("import").out)
+
+
+def store_upload(name: str, content: bytes, folder: Path) -> None:
+    """Write an uploaded file, or what a .zip holds, below a folder; names cannot lead out of it."""
+    if name.lower().endswith(".zip"):
+        try:
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
+                    raise UsageError(f"{name}: holds more than {MAX_UNPACKED_BYTES >> 30} GiB; give it in parts")
+                archive.extractall(folder)  # which drops .. and a leading / from names
+        except (zipfile.BadZipFile, RuntimeError) as error:
+            raise UsageError(f"{name}: is not readable ({error}); pack it again, without a password") from None
+    else:
+        with atomic_write(folder / (re.split(r"[/\\:]", name)[-1].lstrip(".") or "file")) as temporary:
+            temporary.write_bytes(content)
+
+
+def _robot_argument(job: Job) -> str:
+    """Return the value of --robot for the robot of the first step."""
+    return job.words[2] if job.words[1] == "check" else f"./{job.out}"
+
+
+def _ending(job: Job) -> str:
+    """Return how a command ended, in Markdown."""
+    if job.result is not None:
+        return f"**gaponet {job.words[0]}** has ended."
+    last = [line for line in job.lines if line.strip() and not PROGRESS_LINE.match(line)][-1:]
+    why = last[0] if last else "it was cancelled; what was there before is unchanged."
+    return f"**gaponet {job.words[0]}** gave no result: {escape_markdown(why)}"
+
+
+def _report(job: Job) -> str:
+    """Return what a command printed, in Markdown, and the command."""
+    lines, heading = list[str](), list[str]()
+    for line in job.lines:
+        cells = [escape_markdown(cell.strip()) for cell in line.strip("┃│").replace("┃", "│").split("│")]
+        if line.startswith("┃"):
+            heading = [f"{a} {b}".strip() for a, b in zip(heading, cells, strict=True)] if heading else cells
+        elif line.startswith("┡"):
+            lines += [f"| {' | '.join(heading)} |", f"| --- |{' ---: |' * (len(heading) - 1)}"]
+            heading = []
+        elif line.startswith("│"):
+            lines.append(f"| {' | '.join(cells)} |")
+        elif line[:1] not in ("┏", "└") and not PROGRESS_LINE.match(line) and not line.startswith("     ok "):
+            bold = "**" * line.lstrip().startswith(("error ", "warning "))
+            lines += ["", f"{bold}{' '.join(cells)}{bold}"]
+    return "\n".join([*lines, "", f"To repeat it in the folder of this page: {escape_markdown(job.command)}"])

@@ -1,0 +1,155 @@
+"""A scene in the page: orbit with the mouse, play, pause, move through the clip, errors beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.text import escape_markdown
+from gaponet.report.view.scene import Scene
+from gaponet.report.view.server import open_server, run_until_interrupt
+from gaponet.report.view.side_by_side import Clip, largest_error_time
+
+CURVE_ROWS = 1000  # of a chart
+
+
+class Player:
+    """The bodies of a scene as viser frames with meshes, and controls in the current container of the page."""
+
+    def __init__(self, server: Any, scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
+        """Draw a scene.
+
+        Args:
+            server: viser server.
+            clip: Part that is played; it repeats.
+            magnify: Stated in the page.
+        """
+        self.server, self.scene, self.clip = server, scene, clip
+        self.root = server.scene.add_frame("/robots", show_axes=False)
+        self.frames = self._bodies()
+        self._labels()
+        self._aim()
+        shown, worst = scene.shown, largest_error_time(scene.shown, clip)
+        meta, gui = shown.real.meta, server.gui
+        self.folder = gui.add_folder(None)
+        with self.folder:
+            heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
+            heading += escape_markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
+            self.title = gui.add_markdown(heading + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
+            self.playing = gui.add_checkbox("play", len(shown.real) > 2)
+            self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, shown.real.dt, clip.start)
+            self.worst = gui.add_button(f"Worst moment: {worst:.2f} s")
+            self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
+            self.table = gui.add_markdown("")
+            copies = {m.name: (1e3 * m.error, m.colour) for m in shown.motions if m.method != "recorded"}
+            draw_curves(gui, np.arange(len(shown.real)) * shown.real.dt, copies, "mean |error|, mrad")
+
+        @self.worst.on_click
+        def _(_: Any) -> None:
+            self.playing.value, self.time.value = False, worst
+
+        self.update()
+
+    def update(self) -> None:
+        """Show the scene at the slider's time."""
+        scene, now = self.scene, float(self.time.value)
+        self.updated = now
+        scene.pose(now)
+        with self.server.atomic():
+            for body, frame in self.frames.items():
+                frame.position, frame.wxyz = scene.data.xpos[body], scene.data.xquat[body]
+        row = scene.row(now)
+        errors = [(m.name, m.error[row] * 1e3, m.mpjae * 1e3) for m in scene.shown.motions if m.method != "recorded"]
+        rows = "\n".join(f"| {name} | {e:.1f} | {mean:.1f} |" for name, e, mean in errors)
+        self.table.content = f"| mean error, mrad | now | whole motion |\n| --- | ---: | ---: |\n{rows}"
+
+    def advance(self, elapsed: float) -> None:
+        """Advance by `elapsed` s of wall time; the clip repeats."""
+        if self.playing.value:
+            on = self.time.value - self.clip.start + elapsed * self.speed.value
+            self.time.value = self.clip.start + on % self.clip.duration
+        if self.time.value != self.updated:
+            self.update()
+
+    def remove(self) -> None:
+        """Remove the robots and the controls."""
+        self.folder.remove()
+        self.root.remove()
+
+    def _bodies(self) -> dict[int, Any]:
+        model, frames = self.scene.model, {}
+        seen = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
+        for body in range(model.nbody):
+            geoms = [g for g in seen if model.geom_bodyid[g] == body]
+            if not geoms:
+                continue
+            name = "/robots/" + model.body(body).name.replace("/", "_")
+            frames[body] = self.server.scene.add_frame(name, show_axes=False)
+            for g in geoms:
+                vertices, faces = surface(model, int(g))
+                colour = (255 * model.geom_rgba[g, :3]).astype(int)
+                self.server.scene.add_mesh_simple(
+                    f"{name}/{g}", vertices, faces, color=colour, opacity=float(model.geom_rgba[g, 3]),
+                    position=model.geom_pos[g], wxyz=model.geom_quat[g],
+                )  # fmt: skip
+        across = float(2.5 * self.scene.extent)
+        self.server.scene.add_grid("/robots/floor", across, across, position=(0, 0, self.scene.floor))
+        return frames
+
+    def _labels(self) -> None:
+        above = self.scene.view.axes[1] * 1.08 * self.scene.box[3]
+        for m, base in zip(self.scene.shown.motions, self.scene.base, strict=True):
+            self.server.scene.add_label(f"/robots/label_{m.method}", m.name, position=base + above)
+
+    def _aim(self) -> None:
+        across, up = self.scene.view.axes
+        self.server.initial_camera.fov = np.radians(45)
+        for camera in (self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())):
+            camera.look_at = self.scene.middle
+            camera.position = self.scene.middle + 2.6 * self.scene.extent * np.cross(across, up)
+
+
+def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:
+    """Return a new chart over time (T), s; curves: name → values (T) and colour."""
+    from viser.uplot import Scale, Series
+
+    rows = np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int))
+    return gui.add_uplot(
+        (time[rows], *(values[rows] for values, _ in curves.values())),
+        (Series(label="time, s"), *(Series(label=n, stroke=colour, width=2) for n, (_, colour) in curves.items())),
+        title=title, aspect=2.2, scales={"x": Scale(time=False)},
+    )  # fmt: skip
+
+
+def serve(scene: Scene, clip: Clip, port: int, magnify: float, say: Callable[[str], None]) -> None:
+    """Serve one scene until Ctrl-C."""
+    server, address = open_server("gaponet view", port)
+    say(f"open {address} in a browser; Ctrl-C ends")
+    run_until_interrupt(server, Player(server, scene, clip, magnify).advance)
+
+
+def surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
+    """Return vertices (k, 3), m in the geom's frame, and triangles (m, 3)."""
+    from trimesh import creation
+
+    kind, (a, b, c) = model.geom_type[geom], (float(x) for x in model.geom_size[geom])
+    match kind:
+        case mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = model.mesh(model.geom_dataid[geom])
+            first, face = mesh.vertadr[0], mesh.faceadr[0]
+            return model.mesh_vert[first : first + mesh.vertnum[0]], model.mesh_face[face : face + mesh.facenum[0]]
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+            shape = creation.capsule(2 * b, a, count=[12, 12])
+            shape.apply_translation(-shape.bounds.mean(axis=0))
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            shape = creation.cylinder(a, 2 * b, sections=16)
+        case mujoco.mjtGeom.mjGEOM_BOX:
+            shape = creation.box((2 * a, 2 * b, 2 * c))
+        case _:  # sphere, ellipsoid
+            shape = creation.icosphere(2)
+            shape.apply_scale((a, a, a) if kind == mujoco.mjtGeom.mjGEOM_SPHERE else (a, b, c))
+    return np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.uint32)

@@ -1,0 +1,138 @@
+"""The page of gaponet app without a browser: files, commands and what it shows."""
+
+import io
+import json
+import time
+import zipfile
+from types import SimpleNamespace
+
+import pytest
+
+from gaponet.base.errors import UsageError
+from gaponet.report.view.app import App, _report, store_upload
+from gaponet.report.view.jobs import OUT, Jobs
+
+
+def archive(**files):
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as made:
+        for name, text in files.items():
+            made.writestr(name, text)
+    return content.getvalue()
+
+
+def finish(jobs, step, result, words=("x",)):
+    """A command that has ended."""
+    folder = jobs.folder / "jobs" / f"{len(jobs.all) + 1:03d}-{step}"
+    folder.mkdir(parents=True)
+    (folder / "command.json").write_text(json.dumps(list(words)))
+    (folder / "result.json").write_text("" if result is None else json.dumps(result))
+    (folder / "log.txt").write_text("")
+
+
+def wait_for(jobs):
+    end = time.monotonic() + 120
+    while jobs.running:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_names_of_uploads_cannot_lead_out_of_the_folder(tmp_path):
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    store_upload("a.zip", archive(**{"walk/state.csv": "1", "b.csv": "2"}), logs)
+    assert (logs / "walk" / "state.csv").read_text() == "1"
+    for name in ("../out.csv", "/tmp/out.csv", "a/../../out.csv", "..\\out.csv", "C:out.csv"):
+        store_upload("evil.zip", archive(**{name: "x"}), logs)
+        store_upload(name, b"x", logs)
+    assert [p for p in tmp_path.rglob("*") if p.is_file() and logs not in p.parents] == []
+    assert (logs / "out.csv").read_text() == "x"
+    with pytest.raises(UsageError, match="is not readable"):
+        store_upload("a.zip", b"no archive", logs)
+
+
+def test_a_result_is_out_of_date_when_what_it_was_made_from_is_newer(tmp_path):
+    jobs = Jobs(tmp_path)
+    for step in ("robot", "import", "doctor", "identify"):
+        finish(jobs, step, {"step": step})
+    finish(jobs, "import", None)  # failed: the one before counts
+    assert jobs.result("identify").result == {"step": "identify"}
+    finish(jobs, "import", {"step": "import"})
+    assert jobs.result("import").number == 6
+    assert jobs.result("doctor") is None
+    assert jobs.result("identify") is None
+    assert jobs.result("robot").number == 1
+    assert Jobs(tmp_path).result("import").number == 6  # another page, another day
+
+
+def test_one_command_at_a_time_and_cancelling_leaves_what_was_there(tmp_path):
+    jobs = Jobs(tmp_path)
+    jobs.start("robot", "robot", "list")
+    with pytest.raises(UsageError, match="gaponet robot is running"):
+        jobs.start("robot", "robot", "list")
+    wait_for(jobs)
+    assert "so101" in [robot["name"] for robot in jobs.result("robot").result["robots"]]
+    assert jobs.result("robot").command == "gaponet robot list"
+    jobs.start("robot", "robot", "new", "missing.xml", "--out", OUT)
+    assert jobs.running.words[-2:] == ["--out", "robot2"]
+    jobs.cancel()
+    assert jobs.running is None
+    assert jobs.all[-1].result is None
+    assert jobs.result("robot").number == 1
+
+
+@pytest.fixture
+def page(tmp_path):
+    pytest.importorskip("viser")
+    opened = App(tmp_path, 0)
+    yield opened
+    if opened.jobs.running:
+        opened.jobs.cancel()
+    opened.server.stop()
+
+
+def test_nothing_starts_before_what_it_needs_and_the_page_says_what(page):
+    for act, hint in ((page._read, "Choose a robot"), (page._show, "Choose the robot"), (page._fit, "Check the rec")):
+        page._attempt(act, None)
+        assert hint in page.status.content
+    assert page.fit.disabled
+    assert page.jobs.all == []
+
+
+def test_identification_is_locked_while_the_check_finds_an_error(page):
+    for step in ("robot", "import"):
+        finish(page.jobs, step, {}, ("robot", "check", "so101"))
+    finding = {"level": "error", "check": "sign", "message": "elbow moves against its command"}
+    finish(page.jobs, "doctor", {"findings": [finding]})
+    assert "Locked: the check finds an error (sign)" in page._locked()
+    page._attempt(page._fit, None)
+    assert "Locked" in page.status.content
+    finish(page.jobs, "doctor", {"findings": [finding | {"level": "warning"}]})
+    assert page._locked() == ""
+
+
+def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
+    job = SimpleNamespace(command="gaponet gap data", lines=[
+        "gap: 50 %, 3 s, note", "By joint", "┏━━┳━━┓", "┃ joint ┃ MPJAE, ┃", "┃       ┃   mrad ┃", "┡━━╇━━┩",
+        "│ <b>x</b> │ 3.1 │", "└──┴──┘", "     ok  sign: fine", "![x](https://evil.example)",
+    ])  # fmt: skip
+    text = _report(job)
+    assert "| joint | MPJAE, mrad |\n| --- | ---: |\n| \\<b\\>x\\</b\\> | 3.1 |" in text
+    assert r"!\[x\](https://evil.example)" in text
+    assert "note" not in text
+    assert "sign" not in text
+    assert text.endswith(": gaponet gap data")
+
+
+def test_a_name_in_the_form_is_no_option_of_the_command(page):
+    finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
+    page.unit.value = "--allow-pickle"
+    page._attempt(page._read, None)
+    assert "--unit-id=--allow-pickle" in page.jobs.all[-1].words
+    page.jobs.cancel()
+    (page.folder / "model" / "arm.xml").write_text("<mujoco/>")
+    page.refresh()
+    page.model.value = "model/arm.xml"
+    page.options["kp"].value = "--contacts"
+    page._attempt(page._use_robot, None)
+    assert "without a dash" in page.status.content

@@ -1,0 +1,163 @@
+"""The page of gaponet app by clicking: from real SO-101 logs to an export. make browser."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+pytestmark = pytest.mark.browser
+MOTIONS = ("center_workspace", "circular_motion", "figure_eight", "triangle_wave")
+PATIENCE = 600.0  # s, of a command on a busy machine
+FIND = (
+    "[...document.querySelectorAll({0})]"
+    ".filter(e => (e.innerText || '').trim().startsWith({1}) && e.offsetParent !== null)"
+)
+
+
+class Clicker:
+    """What a person does with the page."""
+
+    def __init__(self, browser, address):
+        from browser import wait
+
+        self.browser, self.wait = browser, wait
+        browser.ask("Page.navigate", url=f"{address}?fixedDpr=0.15")  # few pixels: software draws them
+        browser.ask("DOM.enable")
+        wait(lambda: "1 Robot" in self.text())
+
+    def text(self):
+        return self.browser.value("document.body.innerText") or ""
+
+    def sees(self, words):
+        end = time.monotonic() + PATIENCE
+        while words not in self.text():
+            assert time.monotonic() < end, f"no {words} in\n{self.text()}"
+            time.sleep(0.5)
+
+    def press(self, x, y):
+        for kind in ("mousePressed", "mouseReleased"):
+            self.browser.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def centre(self, elements):
+        box = f"(e => e && (b => [b.x + b.width / 2, b.y + b.height / 2])(e.getBoundingClientRect()))({elements}[0])"
+        return self.wait(lambda: self.browser.value(box))
+
+    def click(self, label):
+        element = FIND.format("'button'", json.dumps(label))
+        assert self.wait(lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)"))
+
+    def tab(self, label):
+        self.press(*self.centre(FIND.format("'*'", json.dumps(label)) + ".filter(e => !e.children.length)"))
+
+    def field(self, label):
+        labels = FIND.format("'label'", json.dumps(label))
+        inside = "e => {while (!e.querySelector('input')) e = e.parentElement; return e.querySelector('input')}"
+        return f"{labels}.map({inside})"
+
+    def choose(self, label, option):
+        self.press(*self.centre(self.field(label)))
+        element = FIND.format("'[role=option]'", json.dumps(option))
+        assert self.wait(lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)"))
+
+    def write(self, label, text):
+        self.wait(lambda: self.browser.value(f"({self.field(label)}[0].focus(), true)"))
+        self.browser.ask("Input.insertText", text=text)
+
+    def upload(self, label, file):
+        button = f"{FIND.format(repr('button'), json.dumps(label))}[0]"
+        name = self.wait(lambda: self.browser.value(f"{button}.parentElement.querySelector('input[type=file]').id"))
+        root = self.browser.ask("DOM.getDocument", depth=0)["root"]["nodeId"]
+        node = self.browser.ask("DOM.querySelector", nodeId=root, selector=f"[id='{name}']")["nodeId"]
+        self.browser.ask("DOM.setFileInputFiles", files=[str(file)], nodeId=node)
+
+
+@pytest.fixture
+def page(tmp_path):
+    pytest.importorskip("viser")
+    from gaponet.report.view.app import App
+
+    (tmp_path / "work").mkdir()
+    opened, ended = App(tmp_path / "work", 0), threading.Event()
+
+    def run():
+        while not ended.wait(1 / 30):
+            opened.tick(1 / 30)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield opened
+    ended.set()
+    thread.join()
+    opened.jobs.cancel()
+    opened.server.stop()
+
+
+def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
+    """All six steps; the second page shows what the first began; cancelling leaves what was there."""
+    from browser import Browser
+
+    logs = tmp_path / "some" / "logs"
+    for motion in MOTIONS:
+        (source,) = sage_so101.rglob(f"*/{motion}")
+        shutil.copytree(source, logs / motion)
+    archive = shutil.make_archive(str(tmp_path / "logs"), "zip", logs)
+    with Browser(1000, 700) as first:
+        at = Clicker(first, page.address)
+        at.choose("robot", "so101")
+        at.click("Use this robot")
+        at.sees("gaponet robot has ended")
+        at.tab("2 Logs")
+        at.click("Read the logs")
+        at.sees("gaponet import gave no result")  # there are none
+        at.upload("Upload a log", archive)
+        at.sees("logs.zip is stored")
+        at.click("Read the logs")
+        at.sees("4 sequences")
+        at.tab("5 Identify")
+        at.sees("Check the recordings first")
+        assert first.value(f"{FIND.format(repr('button'), repr('Identify'))}[0].disabled")
+        at.tab("3 Check")
+        at.click("Check the recordings")
+        at.sees("Usable.")
+        assert first.value("[...document.images].some(i => i.naturalWidth > 100)")
+        at.tab("4 Gap")
+        at.click("Measure the error")
+        at.sees("The nominal simulator is")
+        at.click("Show the recording")
+        at.sees("whole motion")
+        at.tab("5 Identify")
+        at.write("time limit", "20s")
+        first.value("[...document.querySelectorAll('input[type=checkbox]')].at(-1).click()")
+        time.sleep(1.0)
+        at.click("Identify")
+        at.sees("gaponet identify, ")
+        assert first.complaints() == []
+    assert page.jobs.running.words[0] == "identify"  # the page is closed
+    with Browser(1000, 700) as second:
+        at = Clicker(second, page.address)
+        at.sees("gaponet gap has ended")
+        at.tab("5 Identify")
+        at.sees("mrad (one motion) → identified")
+        at.tab("6 Use")
+        at.click("Export")
+        at.sees("robot.xml alone")
+        at.tab("5 Identify")
+        at.click("Identify")
+        at.sees("gaponet identify, ")
+        before = page.jobs.result("identify").number
+        at.click("Cancel")
+        at.sees("it was cancelled")
+        assert page.jobs.result("identify").number == before
+        assert second.complaints() == []
+    script = page.folder / page.jobs.result("export").out / "check.py"
+    said = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, check=True, cwd=script.parent
+    ).stdout
+    alone, ours = map(float, re.search(r"alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups())
+    assert alone == pytest.approx(ours, rel=0.05)
+    print(said)
