@@ -223,8 +223,7 @@ def table(work: Path) -> None:
             some = [r for r in rows if (r["line"], r["simulator"]) == (line, simulator)]
             if not some:
                 continue
-            both = np.array([[np.mean(r["without"]), np.mean(r["with"]) if r["tried"] else np.mean(r["without"])]
-                             for r in some])  # fmt: skip
+            both = np.array([[np.mean(r["without"]), np.mean(r["with"])] for r in some if r["tried"]])
             gain = both[:, 0] - both[:, 1]
             inside = [
                 abs(v - e) < NORMAL_90 * s

@@ -34,7 +34,8 @@ MIN_BEYOND_STOP_RAD, MIN_STOP_ROWS = 0.1, 50  # that commands go beyond a stop, 
 AT_STOP_RAD = 0.005  # from the end of a joint's path
 MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
 AT_TORQUE_LIMIT, MIN_LIMITED_SHARE = 0.9, 0.01  # of the robot's limit; of a joint's rows
-FAST, DRIVEN_FAST = 0.5, 0.7  # of a joint's greatest speed; of the robot's limit, in the direction of motion
+FAST, DRIVEN_FAST = 0.5, 0.8  # of a joint's greatest speed; of the robot's limit, in the direction of motion
+MIN_FAST_SHARE = 0.003  # of a joint's rows
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
@@ -80,11 +81,12 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
     """Return DEFAULT_TERMS, after "limit" and "speed" if gains and recorded errors ask a joint for such torques.
 
     That is so if the servo asks, in MIN_LIMITED_SHARE of a joint's rows, for AT_TORQUE_LIMIT of the robot's limit; for
-    "speed" for DRIVEN_FAST of it while the joint moves in that direction at FAST of its greatest speed.
+    "speed", in MIN_FAST_SHARE, for DRIVEN_FAST of it while the joint moves that way at FAST of its greatest speed.
     """
     op = robot.operated_index
     fast, limit = FAST * greatest_speeds(sequences, robot), robot.effort_limit[op]
-    reached, rows = {"limit": np.zeros(len(op)), "speed": np.zeros(len(op))}, np.zeros(len(op))
+    reached: dict[Term, Array] = {"limit": np.zeros(len(op)), "speed": np.zeros(len(op))}
+    rows = np.zeros(len(op))
     for s in sequences:
         own = robot.with_gains(*s.meta.recorded_gains)
         torque, qvel = (own.kp * (s.ctrl - s.qpos) - own.kd * s.qvel)[:, op], s.qvel[:, op]
@@ -93,8 +95,8 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
         driven = (torque * np.sign(qvel) > DRIVEN_FAST * limit) & (np.abs(qvel) > fast)
         reached["speed"] += recorded * driven.sum(axis=0)
         rows += len(s) * recorded
-    terms: list[Term] = [t for t in ("limit", "speed") if (reached[t] > MIN_LIMITED_SHARE * rows).any()]
-    return (*terms, *DEFAULT_TERMS)
+    shares: dict[Term, float] = {"limit": MIN_LIMITED_SHARE, "speed": MIN_FAST_SHARE}
+    return (*(t for t, share in shares.items() if (reached[t] > share * rows).any()), *DEFAULT_TERMS)
 
 
 def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
