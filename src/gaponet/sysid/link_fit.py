@@ -14,12 +14,12 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
+from gaponet.sim.links import COORDINATES, LinkAxes, LinkResult
 from gaponet.sim.model import build_model, with_links
 from gaponet.sysid import least_squares
 from gaponet.sysid.axes import CLASSIC, Axes, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED
 from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, Progress
-from gaponet.sysid.links import COORDINATES, LinkAxes, LinkResult
 from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
 
 ROWS = 400  # of recordings, whose torques choose directions
