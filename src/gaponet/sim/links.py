@@ -152,7 +152,7 @@ class LinkResult:
                 for i, axis in enumerate("xyz", 4)
                 if moved[i] and not known[[0, i - 3]].all()
             ]
-            unknown = [what for what, one in zip(("mass", "x", "y", "z"), known, strict=False) if not one]
-            parts += [f"not determined by themselves: {', '.join(unknown)}"] * bool(unknown)
+            unknown = ", ".join(what for what, one in zip(("mass", *"xyz"), known, strict=False) if not one)
+            parts += [f"not determined by themselves: {unknown}"] * bool(unknown)
             sentences.append(f"{name}: {', '.join(parts)}")
         return sentences

@@ -78,8 +78,7 @@ class LinkFit:
         torque, (_, v, a) = np.concatenate(torques), np.concatenate(motions, axis=1)
         kp = self._first["kp"]
         moved = np.concatenate(slopes, axis=1) / DIFFERENCE_STEP / kp  # (10 L, rows, n) rad
-        seconds = sum(s.duration for s in parts)
-        count = seconds / self._prior.correlation_time  # independent measurements, (n,)
+        count = sum(s.duration for s in parts) / self._prior.correlation_time  # independent measurements, (n,)
         information = np.zeros((size, size))
         for i, j in enumerate(op):
             servo = np.stack(
@@ -111,24 +110,20 @@ class LinkFit:
         self._slopes = here[0, 0], jac[0, 0]
         return here, jac
 
-    def _bounds(self) -> tuple[Array, Array]:
-        """Return the lowest and highest x, (1, P)."""
-        ends = np.full(self.directions.shape[1], MAX_CHANGE)
-        return np.r_[self._servos.low.ravel(), -ends][None], np.r_[self._servos.high.ravel(), ends][None]
-
     def descend(self, report: Progress) -> LinkResult:
         """Fit links and servos together; return them with the links' covariance."""
         first = np.r_[self._servos.normalize(self._first).ravel(), np.zeros(self.directions.shape[1])]
         if not self.directions.size:
             return LinkResult(self.axes, np.zeros(self.axes.scale.size), np.eye(self.axes.scale.size), self._first)
-        low, high = self._bounds()
-        x = first[None, None]
+        x, ends = first[None, None], np.full(self.directions.shape[1], MAX_CHANGE)
+        low, high = np.r_[self._servos.low.ravel(), -ends][None], np.r_[self._servos.high.ravel(), ends][None]
         for i, count in enumerate(ITERATIONS):
             if i:
                 values, coordinates = self._unpacked(x[0][None])
                 errors = self.whole.rollouts.flat_errors(values, [self.axes.links(c) for c in coordinates])
-                cost = least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD)
-                self._prior.update_residual(cost, self.whole.rollouts.rows)
+                self._prior.update_residual(
+                    least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD), self.whole.rollouts.rows
+                )
                 self._weigh()
             x, _ = least_squares.descend(x, low, high, self.errors, count, report, MIN_COST_DECREASE, self.derive)
         values, coordinates = self._unpacked(x[0][None])
