@@ -29,8 +29,8 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import replay
 from gaponet.sysid.axes import CLASSIC, Bounds, with_values
-from gaponet.sysid.drift import drift
-from gaponet.sysid.evidence import estimate_uncertainty
+from gaponet.sysid.evidence.drift import drift
+from gaponet.sysid.evidence.evidence import estimate_uncertainty
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.problem import JointFit, standard_errors
 from gaponet.sysid.robot_rollouts import cut

@@ -13,7 +13,7 @@ from gaponet.data.store import Dataset
 from gaponet.fleet import changed_since, check_fleet, load_nights
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.evidence import estimate_uncertainty
+from gaponet.sysid.evidence.evidence import estimate_uncertainty
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 

@@ -20,7 +20,12 @@ RANKS = (
     "experiments", "api", "fleet", "cli", "__main__",
 )  # fmt: skip
 # The same within sub-packages: these folders may be imported by those after them, never by what lies beside them.
-INNER = {"nn": ("training",), "sysid": ("motion",), "report": ("figures", "view"), "experiments": ("virtual",)}
+INNER = {
+    "nn": ("training",),
+    "sysid": ("evidence", "motion"),
+    "report": ("figures", "view"),
+    "experiments": ("virtual",),
+}
 BESIDE = {"report": {"report"}}  # modules above the folders beside them
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
 MODULES = {

@@ -10,12 +10,12 @@ from gaponet.base.errors import RobotError
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import Link, load_robot
 from gaponet.sim.batch import MODEL_FIELDS
+from gaponet.sim.links import COORDINATES, LinkAxes
 from gaponet.sim.model import build_model, model_hash, with_links
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.link_fit import LinkFit
-from gaponet.sysid.links import COORDINATES, LinkAxes
 from gaponet.sysid.problem import JointFit
 from gaponet.sysid.robot_rollouts import cut
 

@@ -15,8 +15,8 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay
 from gaponet.sysid.acceptance import HeldOut
-from gaponet.sysid.drift import drift
-from gaponet.sysid.evidence import estimate_uncertainty
+from gaponet.sysid.evidence.drift import drift
+from gaponet.sysid.evidence.evidence import estimate_uncertainty
 from gaponet.sysid.uncertainty import OLD_KEYS, ParameterUncertainty, from_axes
 
 TRUE = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
@@ -219,7 +219,7 @@ def test_another_arm_that_no_parameter_explains_has_drifted(arm, folder, monkeyp
     mine = ParameterUncertainty.load(robot)
     fresh = drift(robot, mine, played(arm, 70, 6), 1)
     assert (fresh.verdict, fresh.far) == ("same", {})
-    monkeypatch.setattr("gaponet.sysid.drift.MIN_EFFECT_RATIO", 1e9)
+    monkeypatch.setattr("gaponet.sysid.evidence.drift.MIN_EFFECT_RATIO", 1e9)
     found = drift(robot, mine, played(heavy, 70, 6), 1)
     assert found.verdict == "drifted"
     assert "no number explains how far these logs are from the model" in found.advice

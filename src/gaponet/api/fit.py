@@ -190,7 +190,7 @@ def _save_uncertainty(
     before: ParameterUncertainty | None, held_out: ListOf[HeldOut] = (),
 ) -> None:  # fmt: skip
     """Write the parameter uncertainty of a robot folder."""
-    from gaponet.sysid.evidence import estimate_uncertainty
+    from gaponet.sysid.evidence.evidence import estimate_uncertainty
 
     for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
         (folder / name).unlink(missing_ok=True)

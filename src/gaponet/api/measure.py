@@ -156,7 +156,7 @@ def check(
         RobotError: The robot folder holds no parameter uncertainty.
         UsageError: The recordings are too short, or move no joint.
     """
-    from gaponet.sysid.drift import drift
+    from gaponet.sysid.evidence.drift import drift
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
     spec = as_robot(Path(robot) if isinstance(robot, str) else robot)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.spec import RobotSpec
     from gaponet.sysid.acceptance import Identified
-    from gaponet.sysid.drift import Drift, ParameterChange
+    from gaponet.sysid.evidence.drift import Drift, ParameterChange
     from gaponet.sysid.torque_motors import TorqueDrivenFit
 
 __all__ = [

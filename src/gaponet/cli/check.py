@@ -17,7 +17,7 @@ from gaponet.robot.spec import load_robot
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 if TYPE_CHECKING:
-    from gaponet.sysid.drift import Drift, ParameterChange
+    from gaponet.sysid.evidence.drift import Drift, ParameterChange
 
 Robot = Annotated[
     Folder,

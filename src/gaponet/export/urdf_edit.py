@@ -66,7 +66,8 @@ def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
     for name, link in robot.links.items():
         inertial = (tag := tags.get(prefix + name)) and source.child(tag, "inertial")
         mass = inertial and source.child(inertial, "mass")
-        if not mass or not np.isclose(float(mass.attributes["value"]), before.body(name).mass[0], rtol=1e-2):
+        as_before = mass and np.isclose(float(mass.attributes["value"]), before.body(name).mass[0], rtol=1e-2)
+        if inertial is None or not as_before:
             other.append(name)
             continue
         axes = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(text_of, link.inertia), strict=True)

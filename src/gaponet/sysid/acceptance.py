@@ -13,10 +13,10 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import hash_order
 from gaponet.robot.spec import Link, RobotSpec
+from gaponet.sim.links import LinkResult
 from gaponet.sim.metrics import MIN_RELATIVE_GAIN, MIN_RELATIVE_GAIN_ONE_MOTION, Comparison
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.axes import Values
-from gaponet.sysid.links import LinkResult
 from gaponet.sysid.robot_rollouts import RobotRollouts
 from gaponet.sysid.table_contact import TableFit, tip_heights
 

@@ -25,13 +25,13 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.links import LinkResult
 from gaponet.sim.metrics import Comparison
 from gaponet.sysid import backlash
 from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Links, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.link_fit import LinkFit
-from gaponet.sysid.links import LinkResult
 from gaponet.sysid.motion_limits import default_terms, stop_questions, with_speed_limits, with_stops
 from gaponet.sysid.problem import (
     CHAIN_ITERATIONS,

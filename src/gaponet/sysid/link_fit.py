@@ -14,12 +14,12 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
+from gaponet.sim.links import COORDINATES, LinkAxes, LinkResult
 from gaponet.sim.model import build_model, with_links
 from gaponet.sysid import least_squares
 from gaponet.sysid.axes import CLASSIC, Axes, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED
 from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, Progress
-from gaponet.sysid.links import COORDINATES, LinkAxes, LinkResult
 from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
 
 ROWS = 400  # of recordings, whose torques choose directions
@@ -78,8 +78,7 @@ class LinkFit:
         torque, (_, v, a) = np.concatenate(torques), np.concatenate(motions, axis=1)
         kp = self._first["kp"]
         moved = np.concatenate(slopes, axis=1) / DIFFERENCE_STEP / kp  # (10 L, rows, n) rad
-        seconds = sum(s.duration for s in parts)
-        count = seconds / self._prior.correlation_time  # independent measurements, (n,)
+        count = sum(s.duration for s in parts) / self._prior.correlation_time  # independent measurements, (n,)
         information = np.zeros((size, size))
         for i, j in enumerate(op):
             servo = np.stack(
@@ -88,8 +87,8 @@ class LinkFit:
             weight = np.sqrt(count[i] / len(v)) / self._prior.residual[i]
             d, s = weight * moved[:, :, i].T, weight * servo
             information += d.T @ d - d.T @ s @ np.linalg.pinv(s.T @ s) @ s.T @ d
-        size, vectors = np.linalg.eigh(information)
-        chosen = np.flatnonzero(size > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
+        strength, vectors = np.linalg.eigh(information)
+        chosen = np.flatnonzero(strength > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
         return np.asarray(vectors[:, chosen])
 
     def _unpacked(self, x: Array) -> tuple[Values, list[Array]]:
@@ -111,24 +110,20 @@ class LinkFit:
         self._slopes = here[0, 0], jac[0, 0]
         return here, jac
 
-    def _bounds(self) -> tuple[Array, Array]:
-        """Return the lowest and highest x, (1, P)."""
-        ends = np.full(self.directions.shape[1], MAX_CHANGE)
-        return np.r_[self._servos.low.ravel(), -ends][None], np.r_[self._servos.high.ravel(), ends][None]
-
     def descend(self, report: Progress) -> LinkResult:
         """Fit links and servos together; return them with the links' covariance."""
         first = np.r_[self._servos.normalize(self._first).ravel(), np.zeros(self.directions.shape[1])]
         if not self.directions.size:
             return LinkResult(self.axes, np.zeros(self.axes.scale.size), np.eye(self.axes.scale.size), self._first)
-        low, high = self._bounds()
-        x = first[None, None]
+        x, ends = first[None, None], np.full(self.directions.shape[1], MAX_CHANGE)
+        low, high = np.r_[self._servos.low.ravel(), -ends][None], np.r_[self._servos.high.ravel(), ends][None]
         for i, count in enumerate(ITERATIONS):
             if i:
                 values, coordinates = self._unpacked(x[0][None])
                 errors = self.whole.rollouts.flat_errors(values, [self.axes.links(c) for c in coordinates])
-                cost = least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD)
-                self._prior.update_residual(cost, self.whole.rollouts.rows)
+                self._prior.update_residual(
+                    least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD), self.whole.rollouts.rows
+                )
                 self._weigh()
             x, _ = least_squares.descend(x, low, high, self.errors, count, report, MIN_COST_DECREASE, self.derive)
         values, coordinates = self._unpacked(x[0][None])
@@ -136,8 +131,9 @@ class LinkFit:
         z = coordinates[0] @ self.directions
         std = np.sqrt(np.einsum("pk,pq,qk->k", self.directions, covariance, self.directions))
         small = np.abs(own).max(axis=1, keepdims=True) < MIN_CHANGE
-        own = np.where(small | ~(np.abs(z) > MIN_SIGNIFICANCE * std).any(), 0.0, own).ravel()
-        return LinkResult(self.axes, own, covariance, {f: v[0].copy() for f, v in values.items()})
+        significant = (np.abs(z) > MIN_SIGNIFICANCE * std).any()
+        changed = np.where(small | ~significant, 0.0, own).ravel()
+        return LinkResult(self.axes, changed, covariance, {f: v[0].copy() for f, v in values.items()})
 
     def _covariance(self) -> Array:
         """Return the covariance of the links' coordinates at the last slopes; the prior's at right angles to these."""

@@ -10,7 +10,7 @@ from arm import TOML, XML, commands, record, write_arm
 from gaponet.cli.main import main
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.evidence import estimate_uncertainty
+from gaponet.sysid.evidence.evidence import estimate_uncertainty
 from gaponet.sysid.motion import experiment_design
 from gaponet.sysid.motion.experiment_design import (
     ExperimentDesign,

@@ -21,7 +21,7 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
-from gaponet.sysid.evidence import evidence
+from gaponet.sysid.evidence.evidence import evidence
 from gaponet.sysid.motion.coordinated import ANY
 from gaponet.sysid.motion.library import SIGNALS, Library, short
 from gaponet.sysid.motion.motion import GRID, Motion

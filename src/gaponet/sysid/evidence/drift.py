@@ -22,7 +22,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.axes import identified_joints
-from gaponet.sysid.evidence import Evidence, evidence, gradient_covariance, inverted, widened
+from gaponet.sysid.evidence.evidence import Evidence, evidence, gradient_covariance, inverted, widened
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.uncertainty import PLAY, ParameterUncertainty
 

@@ -16,7 +16,6 @@ from gaponet.base.arrays import Array
 from gaponet.base.text import format_uncertainty
 from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.model import build_model
-from gaponet.sysid.axes import Values
 
 COORDINATES = 10  # of a link: log of mass, of stretches (3), shears (3) and shifts (3)
 MASS_LOG_STD, STRETCH_STD, SHIFT_STD = np.log(1.3), 0.15, 0.15  # of the prior; shifts relative to the link's length
@@ -122,7 +121,7 @@ class LinkResult:
     axes: LinkAxes
     x: Array
     covariance: Array
-    values: Values
+    values: dict[str, Array]
 
     def moments(self) -> tuple[Array, Array, Array, Array]:
         """Return `LinkAxes.moments` before and now, their standard errors now and by the prior alone, (L, 7) each."""
@@ -153,7 +152,7 @@ class LinkResult:
                 for i, axis in enumerate("xyz", 4)
                 if moved[i] and not known[[0, i - 3]].all()
             ]
-            unknown = [what for what, one in zip(("mass", "x", "y", "z"), known, strict=False) if not one]
-            parts += [f"not determined by themselves: {', '.join(unknown)}"] * bool(unknown)
+            unknown = ", ".join(what for what, one in zip(("mass", *"xyz"), known, strict=False) if not one)
+            parts += [f"not determined by themselves: {unknown}"] * bool(unknown)
             sentences.append(f"{name}: {', '.join(parts)}")
         return sentences
