@@ -87,8 +87,8 @@ class LinkFit:
             weight = np.sqrt(count[i] / len(v)) / self._prior.residual[i]
             d, s = weight * moved[:, :, i].T, weight * servo
             information += d.T @ d - d.T @ s @ np.linalg.pinv(s.T @ s) @ s.T @ d
-        size, vectors = np.linalg.eigh(information)
-        chosen = np.flatnonzero(size > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
+        strength, vectors = np.linalg.eigh(information)
+        chosen = np.flatnonzero(strength > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
         return np.asarray(vectors[:, chosen])
 
     def _unpacked(self, x: Array) -> tuple[Values, list[Array]]:
@@ -131,8 +131,8 @@ class LinkFit:
         z = coordinates[0] @ self.directions
         std = np.sqrt(np.einsum("pk,pq,qk->k", self.directions, covariance, self.directions))
         small = np.abs(own).max(axis=1, keepdims=True) < MIN_CHANGE
-        own = np.where(small | ~(np.abs(z) > MIN_SIGNIFICANCE * std).any(), 0.0, own).ravel()
-        return LinkResult(self.axes, own, covariance, {f: v[0].copy() for f, v in values.items()})
+        changed = np.where(small | ~(np.abs(z) > MIN_SIGNIFICANCE * std).any(), 0.0, own).ravel()
+        return LinkResult(self.axes, changed, covariance, {f: v[0].copy() for f, v in values.items()})
 
     def _covariance(self) -> Array:
         """Return the covariance of the links' coordinates at the last slopes; the prior's at right angles to these."""

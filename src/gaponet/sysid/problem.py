@@ -167,6 +167,8 @@ class JointFit(FitProblem):
 class RobotFit(FitProblem):
     """Fit of all joints in the simulator of the whole robot."""
 
+    rollouts: RobotRollouts
+
     def descend(
         self, fields: ListOf[str], rest: Values, starts: ListOf[Values], iterations: ListOf[int], *,
         report: Progress = lambda cost: None,
