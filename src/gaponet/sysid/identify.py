@@ -174,8 +174,8 @@ def _fit_robot(
         start = values if any(c.accepted for c in comparisons) else base
         results = [_fit_links(*one, searches) for one in zip(wholes, start, strict=True)]
         tried = [r.axes.links(r.x) for r in results], [r.values for r in results]
-        after = judge.errors(tried[1], tried[0]) if results[-1].x.any() else judge.errors(values)
-        comparison = Comparison("masses", judge.errors(values), after)
+        fitted_errors = judge.errors(tried[1], tried[0]) if results[-1].x.any() else judge.errors(values)
+        comparison = Comparison("masses", judge.errors(values), fitted_errors)
         comparisons = *comparisons, comparison
         if comparison.accepted:
             linked, (links, values) = results[-1], tried
