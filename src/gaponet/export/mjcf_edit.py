@@ -289,10 +289,8 @@ def _add_surroundings(
     for name, link in robot.links.items():
         tag, values = body(prefix + name, "identified_link"), {"mass": text_of(link.mass), "pos": text_of(*link.pos)}
         inertial = f"<inertial {_attributes(values | {'fullinertia': text_of(*link.inertia)})}/>"
-        if (own := source.child(tag, "inertial")) is not None:
-            source.replace(own, inertial)
-        else:
-            source.insert(tag, inertial)
+        own = source.child(tag, "inertial")
+        source.replace(own, inertial) if own else source.insert(tag, inertial)
     for mount in robot.payload_mounts:
         if mass := payload_mass + mount.mass:
             radius = (3 * mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3)

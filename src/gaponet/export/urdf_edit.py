@@ -64,10 +64,10 @@ def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
     before, other = build_model(robot.before_identification), list[str]()
     tags = {t.attributes.get("name", ""): t for t in source.tags if t.name == "link"}
     for name, link in robot.links.items():
-        inertial = (tag := tags.get(prefix + name)) and source.child(tag, "inertial")
-        mass = inertial and source.child(inertial, "mass")
-        as_before = mass and np.isclose(float(mass.attributes["value"]), before.body(name).mass[0], rtol=1e-2)
-        if inertial is None or not as_before:
+        inertial = source.child(tag, "inertial") if (tag := tags.get(prefix + name)) else None
+        mass = source.child(inertial, "mass") if inertial else None
+        own = float(mass.attributes["value"]) if mass else np.nan
+        if inertial is None or not np.isclose(own, before.body(name).mass[0], rtol=1e-2):
             other.append(name)
             continue
         axes = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(text_of, link.inertia), strict=True)

@@ -112,8 +112,7 @@ class _Mount:
 
 @dataclass(frozen=True)
 class Link:
-    """[identified_link.BODY]: mass (kg), centre of mass (m) and inertia about it (xx, yy, zz, xy, xz, yz in kg·m²) of
-    an MJCF body, in its frame."""
+    """[identified_link.BODY]: mass (kg), centre (m), inertia about it (xx, yy, zz, xy, xz, yz, kg·m²), body's frame."""
 
     mass: Annotated[float, Interval(ge=0, le=1e4)]
     pos: tuple[Metres, Metres, Metres]

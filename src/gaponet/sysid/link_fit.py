@@ -27,8 +27,7 @@ MIN_INFORMATION, MAX_DIRECTIONS = 1.0, 12  # of a direction over the prior's, an
 ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
 FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
 MAX_SERVO_NUMBERS, FEW_FIELDS = 36, ("kp", "armature")  # fitted with the links; of robots with more, these fields
-MIN_CHANGE = 0.1  # of a link's coordinates, in standard deviations of the prior; a smaller one is none
-MAX_CHANGE = 6.0
+MIN_CHANGE, MAX_CHANGE = 0.1, 6.0  # of a link's coordinates, in standard deviations of the prior; less is none
 MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
 
 
@@ -121,9 +120,8 @@ class LinkFit:
             if i:
                 values, coordinates = self._unpacked(x[0][None])
                 errors = self.whole.rollouts.flat_errors(values, [self.axes.links(c) for c in coordinates])
-                self._prior.update_residual(
-                    least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD), self.whole.rollouts.rows
-                )
+                cost = least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD)
+                self._prior.update_residual(cost, self.whole.rollouts.rows)
                 self._weigh()
             x, _ = least_squares.descend(x, low, high, self.errors, count, report, MIN_COST_DECREASE, self.derive)
         values, coordinates = self._unpacked(x[0][None])
@@ -131,8 +129,7 @@ class LinkFit:
         z = coordinates[0] @ self.directions
         std = np.sqrt(np.einsum("pk,pq,qk->k", self.directions, covariance, self.directions))
         small = np.abs(own).max(axis=1, keepdims=True) < MIN_CHANGE
-        significant = (np.abs(z) > MIN_SIGNIFICANCE * std).any()
-        changed = np.where(small | ~significant, 0.0, own).ravel()
+        changed = np.where(small | ~(np.abs(z) > MIN_SIGNIFICANCE * std).any(), 0.0, own).ravel()
         return LinkResult(self.axes, changed, covariance, {f: v[0].copy() for f, v in values.items()})
 
     def _covariance(self) -> Array:

@@ -76,8 +76,7 @@ class RobotRollouts:
         self.rows = self.recorded.sum(axis=1)
 
     def flat_errors(self, values: dict[str, Array], links: ListOf[dict[str, Link]] = ()) -> Array:
-        """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n) as for BatchSim.set_servos.
-        Candidates may have `links` of their own, (k,)."""
+        """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n), `links` (k,)."""
         k, m = len(values["kp"]), len(self.parts)
         delay = np.array(self.robot.delay)
         delay[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
