@@ -1,4 +1,4 @@
-"""Training on two processes of torchrun, whose ranks are killed, frozen or orphaned at random moments: docs/scale.md.
+"""Training on two processes of torchrun, its ranks killed, frozen or orphaned at random: docs/results/speed.md.
 
     python benchmarks/ranks.py WORK [--kills 6] [--seed 0]
 

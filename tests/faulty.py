@@ -11,7 +11,7 @@ import numpy as np
 from logs import write_sage
 
 from gaponet.base.errors import GAPONetError
-from gaponet.data.doctor import Diagnosis
+from gaponet.data.doctor import DoctorResult
 from gaponet.data.importer import import_logs
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import gravity_of
@@ -86,7 +86,7 @@ def recordings(robot: RobotSpec, kp: float = 0.9) -> list[Recording]:
 
 
 def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Callable[[Path], None] | None = None,
-            gain: float | None = None, logs_toml: str = "") -> Diagnosis | GAPONetError:  # fmt: skip
+            gain: float | None = None, logs_toml: str = "") -> DoctorResult | GAPONetError:  # fmt: skip
     """Write the logs, import them and call the doctor; an import that refuses is an answer as well."""
     for log in logs:
         place = folder / f"{log.payload:g}" / "real" / robot.name / "tests" / log.motion
@@ -102,7 +102,7 @@ def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Calla
                 else tuple(f"{n}={gain * k}" for n, k in zip(robot.joint_names, robot.kp, strict=True))
             )
             report = import_logs(folder / f"{mass:g}", robot, "a", mass, folder / "data", kp=kp)
-        return Diagnosis.of(report.dataset, robot, gravity_model=gravity_of(robot))
+        return DoctorResult.of(report.dataset, robot, gravity_model=gravity_of(robot))
     except GAPONetError as error:
         return error
 

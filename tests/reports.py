@@ -31,7 +31,7 @@ def evaluated_run(arm: RobotSpec, data: Dataset, folder: Path, simulator: RobotS
         data.append(replace(sequence, ctrl=ctrl.astype(np.float32)))
     motions = sorted({e.meta.motion for e in data.entries})
     untrained(folder, simulator or arm, data, train=motions[:1], val=motions[1:2], test=motions[2:])
-    amend(folder, **FACTS, stages={"warm_start_rounds": [3, 10], "ppo_updates": 0})
+    amend(folder, **FACTS, stages={"pretraining_rounds": [3, 10], "ppo_updates": 0})
     (folder / "config.json").write_text(json.dumps(CONFIG))
     (folder / "progress.jsonl").write_text(json.dumps(LINE) + "\n")
     evaluate([folder], data, arm).save(folder)

@@ -41,7 +41,7 @@ def widths(layers: tuple[int, ...]) -> str:
         ("algorithm.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
         ("algorithm.md", f"Oracle answers at {TRAIN.pretraining.sensor_states} states"),
         ("algorithm.md", f"{PRIOR_RAD} rad per unit of scale"),
-        ("experiments.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
+        ("benchmark.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
     ],
 )  # fmt: skip
 def test_a_default_that_a_page_states_is_that_of_the_code(page, said):

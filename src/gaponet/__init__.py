@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from gaponet.api import *  # noqa: F403
     from gaponet.api.results import *  # noqa: F403
     from gaponet.base.progress import progress_bar as progress_bar
+    from gaponet.data.doctor import DoctorResult as DoctorResult
+    from gaponet.data.importer import ImportResult as ImportResult
     from gaponet.data.store import Dataset as Dataset
     from gaponet.deploy.aligned_sim import AlignedSim as AlignedSim
     from gaponet.deploy.compensator import Compensator as Compensator
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from gaponet.robot.spec import RobotSpec as RobotSpec
     from gaponet.robot.spec import load_robot as load_robot
     from gaponet.share.reading import open_dataset as open_dataset
+    from gaponet.testing.collect import CollectResult as CollectResult
 else:
     _MODULES = {  # public name → module
         **dict.fromkeys(
@@ -42,12 +45,14 @@ else:
             "gaponet.api",
         ),
         **dict.fromkeys(
-            ("AdaptResult", "CheckResult", "CollectResult", "DoctorResult", "EvalResult", "ExciteResult",
-             "ExportResult", "GapResult", "IdentifyResult", "ImportResult", "PairResult", "ReplayResult",
-             "TorqueResult", "TrainResult"),
+            ("AdaptResult", "CheckResult", "EvalResult", "ExciteResult", "ExportResult", "GapResult",
+             "IdentifyResult", "PairResult", "ReplayResult", "TorqueResult", "TrainResult"),
             "gaponet.api.results",
         ),
         "progress_bar": "gaponet.base.progress",
+        "CollectResult": "gaponet.testing.collect",
+        "DoctorResult": "gaponet.data.doctor",
+        "ImportResult": "gaponet.data.importer",
         "Dataset": "gaponet.data.store",
         "open_dataset": "gaponet.share.reading",
         "load_robot": "gaponet.robot.spec",

@@ -15,20 +15,17 @@ from pathlib import Path
 
 from typing_extensions import TypedDict
 
-from gaponet.api import adapt_robot
-from gaponet.api.logs import unit_recordings
+from gaponet.api import adapt_robot, check
 from gaponet.base.errors import GAPONetError, NoGainError, UsageError
 from gaponet.base.executor import open_pool
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import read_json
 from gaponet.report.page import render
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.drift import drift
 from gaponet.sysid.uncertainty import ParameterUncertainty, format_change
 
 KIND = "fleet"
 SAME, FAILED = "same", "not checked"
-FORMER_VERDICTS = {"not asked": FAILED}  # former name in ROBOT.json → name
 MARKS = {SAME: "·", "drifted": "■", "contradictory": "?", FAILED: "–"}
 MAX_NIGHTS_SHOWN = 14
 
@@ -72,23 +69,21 @@ class Job:
 def check_robot(job: Job) -> Night:
     """Check one robot, and adapt it if it drifted."""
     began, spec = time.process_time(), load_robot(job.robot)
-    uncertainty = ParameterUncertainty.require(spec)
-    with unit_recordings(job.logs, spec, job.unit, (), job.payload_mass) as (_, sequences):
-        drifted = drift(spec, uncertainty, sequences, 1)
-    adapted, advice = None, drifted.advice
-    if drifted.verdict == "drifted" and job.out is not None:
+    checked = check(spec, job.logs, unit=job.unit, payload_mass=job.payload_mass, threads=1)
+    uncertainty, adapted, advice = ParameterUncertainty.require(spec), None, checked.advice
+    if checked.verdict == "drifted" and job.out is not None:
         try:
             made = adapt_robot(spec, job.logs, out=job.out, unit=job.unit, payload_mass=job.payload_mass)
             adapted = 1e3 * made.before, 1e3 * made.after
         except NoGainError:
             advice += "; an adaptation does not reduce the error on these logs"
     return {
-        "night": job.night, "verdict": drifted.verdict, "advice": advice, "recordings": len(sequences),
+        "night": job.night, "verdict": checked.verdict, "advice": advice, "recordings": checked.recordings,
         "moved": [
             f"{m.joint} {m.field} {format_change(m.field, m.by, uncertainty, m.joint)} ({m.sigmas:+.0f} σ)"
-            for m in drifted.moved
+            for m in checked.drift.moved
         ],
-        "numbers": [(m.joint, m.field) for m in drifted.moved], "seconds": drifted.seconds,
+        "numbers": [(m.joint, m.field) for m in checked.drift.moved], "seconds": checked.drift.seconds,
         "adapted": adapted, "took": time.process_time() - began,
     }  # fmt: skip
 
@@ -97,15 +92,7 @@ def check_fleet(
     robots: Path, logs: Path, out: Path, name: str, adapt: bool = True, payload_mass: float | None = None,
     executor: str | Executor = "local", workers: int = 0,
 ) -> Iterator[tuple[str, Night, int]]:  # fmt: skip
-    """Check every robot that was not checked this night, and write the page.
-
-    Args:
-        robots: Folder of robot folders.
-        logs: Folder with a folder of logs, or a dataset, for each robot by name; or one dataset whose units have these
-            names.
-        out: Folder of the results.
-        name: Name of the night, such as 2026-11-23.
-        adapt: Write an adapted robot to OUT/adapted/ROBOT if it drifted.
+    """Check every robot that was not checked this night, and write the page; arguments as of `gaponet check --fleet`.
 
     Yields:
         Robot, its night, and the number of robots; first the robots that were checked before.
@@ -141,8 +128,7 @@ def check_fleet(
 
 def load_nights(file: Path) -> list[Night]:
     """Return a robot's nights, the first one first."""
-    nights = read_json(list[Night], file, UsageError, "remove it to forget its nights") if file.is_file() else []
-    return [n | {"verdict": FORMER_VERDICTS.get(n["verdict"], n["verdict"])} for n in nights]
+    return read_json(list[Night], file, UsageError, "remove it to forget its nights") if file.is_file() else []
 
 
 def changed_since(nights: list[Night]) -> str:

@@ -39,7 +39,7 @@ def test_import_says_what_came_in_and_that_nothing_was_applied_and_the_same_agai
     told = " ".join(capsys.readouterr().out.split())
     assert "1 sequences, 0.1 min at 49.85 Hz, robot so101, unit lab, payload 0 kg" in told
     assert "nothing was applied to the data" in told
-    assert "Next: gaponet doctor" in told
+    assert "next: gaponet doctor" in told
     assert (tmp_path / "data" / "offsets.json").is_file()
     assert import_so101(logs, tmp_path / "data") == 0
     assert "1 there already, 0 added" in capsys.readouterr().out
@@ -58,7 +58,9 @@ def test_import_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
 
 def test_the_payload_must_be_said(logs, tmp_path, capsys):
     assert main(["import", str(logs), "--robot", "so101", "--unit-id", "lab", "--out", str(tmp_path / "data")]) == 2
-    assert "this format does not say it: give --payload-mass 0 (kg in each hand" in capsys.readouterr().err
+    assert (
+        "this format does not state unit or payload: give --payload-mass 0 (kg in each hand" in capsys.readouterr().err
+    )
     assert main(["import", str(logs), "--robot", "so101", "--out", str(tmp_path / "data")]) == 2
     assert "give --unit-id NAME and --payload-mass 0 (kg" in capsys.readouterr().err  # all at once
     assert not (tmp_path / "data").exists()

@@ -132,7 +132,7 @@ def test_what_is_said_of_the_logs_reaches_their_import(place, capsys):
 
 
 @pytest.mark.parametrize("name", ["a1", "x"])
-def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, capsys, name):
+def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, monkeypatch, capsys, name):
     for file in Path("logs").iterdir():
         text = file.read_text()
         file.write_text(text.replace("shoulder", name) if name == "a1" else text.replace("meas", name))
@@ -141,12 +141,17 @@ def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, 
     assert "\\n" not in said.err
     assert re.search('^ *"a1" = "shoulder"' if name == "a1" else '^ *# qpos = "…"', said.out, re.MULTILINE)
     assert main(["start", "arm.xml", "logs"]) == 2
-    assert "started/logs.toml is a guess from these logs; check it" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "they are in started/logs.toml: check those with a ?" in said.err
+    assert (name == "a1") == ('"a1" = "shoulder"' in said.out)
     told = Path("started/logs.toml")
     text = told.read_text()
     assert ('"a1" = "shoulder"' if name == "a1" else '# qpos = "…"') in text
     told.write_text(text if name == "a1" else re.sub("# qpos.*", 'qpos = "{joint}_x"', text))
     assert main(["start", "arm.xml", "logs", "--dry-run"]) == 0, text
+    monkeypatch.setattr(start, "main", lambda words: 2)
+    assert main(["start", "arm.xml", "logs"]) == 2
+    assert "stopped at: gaponet robot new" in capsys.readouterr().err  # the folder that holds the guess is its own
 
 
 def test_logs_with_an_error_are_not_fitted(place, monkeypatch, capsys):

@@ -16,7 +16,7 @@ from logs import arm_sequence, late, table_text, wave
 
 from gaponet.base.errors import DatasetError, WorkerError
 from gaponet.data.checks.timing import MIN_EARLY_RATIO, _drift
-from gaponet.data.doctor import Diagnosis
+from gaponet.data.doctor import DoctorResult
 from gaponet.data.importer import import_logs
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import Response, lowpass
@@ -35,14 +35,14 @@ def good(rows: int = ROWS, lag: int = 3) -> tuple[np.ndarray, np.ndarray]:
     return ctrl, late(ctrl, lag)
 
 
-def examine(arm, tmp_path, *sequences) -> Diagnosis:
+def examine(arm, tmp_path, *sequences) -> DoctorResult:
     dataset = Dataset.create(tmp_path / "data", arm)
     for sequence in sequences:
         dataset.append(sequence)
-    return Diagnosis.of(dataset, arm)
+    return DoctorResult.of(dataset, arm)
 
 
-def found(diagnosis: Diagnosis, check: str, level: str) -> Finding:
+def found(diagnosis: DoctorResult, check: str, level: str) -> Finding:
     """The one finding of a check at a level."""
     (finding,) = [f for f in diagnosis.findings if (f.check, f.level) == (check, level)]
     return finding
@@ -51,7 +51,7 @@ def found(diagnosis: Diagnosis, check: str, level: str) -> Finding:
 def test_a_good_recording_has_no_warning(arm, tmp_path):
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), tau=wave(ROWS, 2)))
     assert [f for f in diagnosis.findings if f.level in ("warning", "error")] == []
-    assert diagnosis.verdict == "Good: nothing found that training should not see."
+    assert diagnosis.verdict == "Good: no error and no warning."
 
 
 def test_findings_stand_worst_first(arm, tmp_path):
@@ -123,8 +123,35 @@ def test_swapped_joints_are_an_error(arm, tmp_path):
     texts = [f.message for f in diagnosis.findings if f.check == "order" and f.level == "error"]
     assert len(texts) == 2
     assert texts[0].startswith("the command of shoulder moves elbow, not shoulder (correlation 1.00, 1 of 1 motions)")
-    assert "--map" in texts[0]
-    assert diagnosis.verdict.startswith("Do not train on this yet: 2 error(s)")
+    assert '[columns] "ctrl.elbow" =' in texts[0]
+    assert diagnosis.verdict.startswith("Do not train on this yet: 2 errors")
+
+
+def test_columns_in_a_wrong_order_are_named_one_by_one_without_what_follows_from_them(so101, tmp_path):
+    rng = np.random.default_rng(0)
+    logs = []
+    for motion in ("a", "b", "c"):
+        ctrl = lowpass(np.repeat(rng.uniform(-0.5, 0.5, (30, 6)), 30, axis=0), 0.02, 1.0)
+        qpos = late(ctrl, 4)[:, [2, 0, 1, 3, 4, 5]]
+        logs.append(arm_sequence(so101, ctrl, qpos, motion=motion))
+    bad = [f for f in examine(so101, tmp_path, *logs).findings if f.level in ("warning", "error")]
+    assert [f.check for f in bad if f.level == "error"] == ["order"] * 3
+    assert not {f.check for f in bad} & {"stuck", "blocked"}
+    assert "name the command's columns in logs.toml ([columns] \"ctrl." in bad[0].message
+
+
+def test_radians_beside_logs_in_degrees_are_an_error(arm, tmp_path):
+    ctrl, qpos = good()
+    notes = {"notes": {"converted_from": dict.fromkeys(arm.joint_names, "deg")}}
+    small = np.radians(1)
+    logs = [
+        arm_sequence(arm, ctrl, qpos, "right", **notes),
+        arm_sequence(arm, ctrl * small, qpos * small, "w", **notes),
+    ]
+    finding = found(examine(arm, tmp_path, *logs), "unit", "error")
+    assert finding.message.startswith(
+        "no command of w is further than 3.3° from zero: radians that were read as degrees"
+    )
 
 
 def test_two_joints_told_the_same_are_not_taken_for_swapped(arm, tmp_path):
@@ -210,11 +237,11 @@ def hanging(arm, payload: float = 0.0) -> Sequence:
     return arm_sequence(arm, ctrl, qpos, payload=payload, tau=tau)
 
 
-def weigh(arm, tmp_path, *sequences) -> Diagnosis:
+def weigh(arm, tmp_path, *sequences) -> DoctorResult:
     dataset = Dataset.create(tmp_path / "data", arm)
     for sequence in sequences:
         dataset.append(sequence)
-    return Diagnosis.of(
+    return DoctorResult.of(
         dataset, arm, gravity_model=lambda qpos, mass, side: static_torque(build_model(arm, mass, side), qpos)
     )
 
@@ -273,7 +300,7 @@ def test_a_torque_fed_forward_beside_the_command_is_told_from_a_servo_that_sags(
     arm, tmp_path, share, behind_gears, level
 ):
     data = write_dataset(tmp_path / "data", arm, [standing(arm, seed, share, behind_gears) for seed in range(4)])
-    diagnosis = Diagnosis.of(data, arm, gravity_model=gravity_of(arm))
+    diagnosis = DoctorResult.of(data, arm, gravity_model=gravity_of(arm))
     finding = found(diagnosis, "feed-forward", level)
     if level == "ok":
         assert finding.message == "no torque beside the commands is seen at rest"
@@ -285,7 +312,7 @@ def test_a_torque_fed_forward_beside_the_command_is_told_from_a_servo_that_sags(
 
 def test_a_few_rests_do_not_tell_what_holds_the_arm(arm, tmp_path):
     data = write_dataset(tmp_path / "data", arm, [standing(arm, 0, 1.0)])
-    finding = found(Diagnosis.of(data, arm, gravity_model=gravity_of(arm)), "feed-forward", "ok")
+    finding = found(DoctorResult.of(data, arm, gravity_model=gravity_of(arm)), "feed-forward", "ok")
     assert "too few rests with torque" in finding.message
 
 
@@ -313,7 +340,7 @@ def test_rows_at_12_to_40_hz_are_no_error_of_clocks_and_say_which_times_are_not_
         (folder / f"m{seed}.csv").write_text(table_text({"time": time} | columns))
     data = import_logs(folder, arm, "a", 0.0, tmp_path / "data", position_unit="rad", time_unit="s").dataset
     assert "apart, and shorter delays are not known" in data.entries[0].meta.notes["why_resampled"]
-    diagnosis = Diagnosis.of(data, arm)
+    diagnosis = DoctorResult.of(data, arm)
     assert [f.message for f in diagnosis.findings if f.level == "error" or f.check in ("copied", "averaged")] == [
         "commands come before states"
     ]
@@ -349,10 +376,10 @@ def test_other_processes_measure_the_same_and_workers_that_die_are_an_error(arm,
     for sequence in recordings(arm, 3, rows=ROWS):
         dataset.append(sequence)
     with ProcessPoolExecutor(2, get_context("spawn")) as processes:
-        there = Diagnosis.of(dataset, arm, executor=processes).as_dict()
-    assert json.dumps(there) == json.dumps(Diagnosis.of(dataset, arm).as_dict())
+        there = DoctorResult.of(dataset, arm, executor=processes).to_dict()
+    assert json.dumps(there) == json.dumps(DoctorResult.of(dataset, arm).to_dict())
     with pytest.raises(WorkerError, match="workers died of it"):
-        Diagnosis.of(dataset, arm, executor=DyingExecutor())
+        DoctorResult.of(dataset, arm, executor=DyingExecutor())
 
 
 def test_two_rates_in_one_dataset_are_a_warning(arm, tmp_path):
@@ -365,7 +392,7 @@ def test_two_rates_in_one_dataset_are_a_warning(arm, tmp_path):
 def test_a_lag_of_three_periods_is_reported_as_60_ms(arm, tmp_path):
     finding = found(examine(arm, tmp_path, arm_sequence(arm, *good(lag=3))), "lag", "note")
     assert finding.values["elbow"]["median"] == pytest.approx(0.06, abs=0.003)
-    assert "elbow 60 ms" in finding.message
+    assert "after 60 ms" in finding.message
 
 
 def test_sag_is_reported_for_the_lightest_and_the_heaviest_payload(arm, tmp_path):
@@ -389,21 +416,21 @@ def test_one_recording_under_two_payloads_is_an_error(arm, tmp_path):
 def test_an_empty_dataset_and_another_robot_are_refused(arm, so101, tmp_path):
     dataset = Dataset.create(tmp_path / "data", arm)
     with pytest.raises(DatasetError, match="holds no sequences yet; import or collect some"):
-        Diagnosis.of(dataset, arm)
+        DoctorResult.of(dataset, arm)
     with pytest.raises(DatasetError, match="holds robot 'arm'"):
-        Diagnosis.of(dataset, so101)
+        DoctorResult.of(dataset, so101)
 
 
 def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
     dataset = Dataset.create(tmp_path / "data", arm)
     dataset.append(arm_sequence(arm, *good()))
     dataset.append(arm_sequence(arm, *good(), payload=1.5, unit="b"))
-    assert Diagnosis.inventory(dataset) == "2 sequences, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
+    assert DoctorResult.inventory(dataset) == "2 sequences, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
 
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
-    diagnosis = Diagnosis.of(real_dataset, so101, gravity_model=gravity_of(so101))
-    assert diagnosis.verdict == "Usable. Read the 3 warning(s) first."
+    diagnosis = DoctorResult.of(real_dataset, so101, gravity_model=gravity_of(so101))
+    assert diagnosis.verdict == "Usable. Read the 3 warnings first."
     lags = found(diagnosis, "lag", "note").values
     for joint in so101.operated:
         assert 0.08 <= lags[joint]["median"] <= 0.16

@@ -1,4 +1,4 @@
-"""The newcomer's page: what it shows is there, its robot is recorded, its change reaches every engine."""
+"""The first change on the architecture page: what it shows is there, its robot is recorded, it reaches every engine."""
 
 import inspect
 import os
@@ -16,7 +16,7 @@ from gaponet.data.store import Dataset
 from gaponet.sim import servo
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "newcomer.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 LINES = re.findall(r"^([-+])    (return .*)$", PAGE, re.M)
 COMMANDS = [shlex.split(c, comments=True) for c in re.findall(r"^gaponet .*$", PAGE, re.M)]
 

@@ -14,7 +14,7 @@ from runs import random_run
 
 from gaponet.base.errors import ModelError
 from gaponet.cli.main import main
-from gaponet.export.export_folder import export_model
+from gaponet.export.export_folder import export_model, export_robot
 from gaponet.export.shipped import gaponet_action
 from gaponet.export.shipped.gaponet_action import (
     AlignedAction,
@@ -248,12 +248,14 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
 
 
 def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
-    rng, law = np.random.default_rng(0), dict(zip(SERVO_TERMS, (0.1, 0.2, 0.05, 0.08, 0.3, 0.02), strict=True))
+    rng, values = np.random.default_rng(0), (0.1, 0.2, 0.05, 0.08, 0.3, 0.02, 3.0, 0.0)
+    law = dict(zip(SERVO_TERMS, values, strict=True))
     robot = write_arm(tmp_path / "arm").with_servos({"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}})
     scene = mujoco.MjModel.from_xml_string(re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt)))
     q, v, torque, load, ctrl = rng.uniform(-0.2, 0.2, (5, 20, 2))
     seen = {"qpos": q, "qvel": v, "actuator_force": torque, "qfrc_bias": load}
     model = SimpleNamespace(dof_frictionloss=torch.zeros(20, 2), actuator_biasprm=torch.zeros(20, 2, 10))
+    model.actuator_forcerange = torch.tensor([[-5.0, 5.0]]).repeat(20, 2, 1)
     data = SimpleNamespace(**{name: torch.tensor(x).float() for name, x in seen.items()})
     sim = SimpleNamespace(mj_model=scene, model=model, data=data, device="cpu", num_envs=20)
     sim.expand_model_fields, entity = lambda fields: None, SimpleNamespace(update=lambda dt: None)
@@ -265,6 +267,8 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
     asked = servo_torque(terms, kp, ctrl + robot.offset, q)
     np.testing.assert_allclose(model.actuator_biasprm[:, :, 0], asked - kp * (ctrl - q), atol=1e-5)
+    limits = np.stack([np.full(20, 5.0), 5.0 * np.minimum(1 - v[:, 1] / 3.0, 1)], axis=1)
+    np.testing.assert_allclose(model.actuator_forcerange[:, :, 1], limits, atol=1e-5)
     found.restart(torch.ones(20, dtype=torch.bool), torch.full((20, 2), 0.01))
     np.testing.assert_allclose(found.torque, np.tile(kp * (robot.offset + 0.01), (20, 1)), atol=1e-6)
 
@@ -283,13 +287,19 @@ def isaac_lab(monkeypatch):
         actuator_effort_limit: dict
 
     @dataclass
+    class Motors(Servos):
+        saturation_effort: float
+        actuator_velocity_limit: float
+
+    @dataclass
     class Config:
         class_type: object = None
         use_default_offset: bool = True
 
     modules = {
         "isaaclab": {}, "isaaclab.envs": {}, "isaaclab.envs.mdp.actions": {},
-        "isaaclab.utils": {"configclass": dataclass}, "isaaclab.actuators": {"IdealPDActuatorCfg": Servos},
+        "isaaclab.utils": {"configclass": dataclass},
+        "isaaclab.actuators": {"IdealPDActuatorCfg": Servos, "DCMotorCfg": Motors},
         "isaaclab.envs.mdp": {"JointPositionActionCfg": Config},
         "isaaclab.envs.mdp.actions.joint_actions": {"JointPositionAction": JointPositionAction},
     }  # fmt: skip
@@ -308,6 +318,16 @@ def test_isaac_labs_classes_are_found_by_name_as_hydra_looks_for_them(place, mon
     (servos,) = isaaclab_actuators(place / "torch").values()
     assert servos.stiffness == {"shoulder": 20.0, "elbow": 20.0}
     assert servos.actuator_effort_limit == {"shoulder": 5.0, "elbow": 5.0}
+
+
+def test_a_joint_with_a_no_load_speed_is_isaac_labs_dc_motor(tmp_path, monkeypatch):
+    isaac_lab(monkeypatch)
+    robot = write_arm(tmp_path / "arm").with_servos({"elbow": {"no_load_speed": 4.0, "kp": 11.0}})
+    export_robot(robot, "isaaclab", tmp_path / "out")
+    servos, motor = isaaclab_actuators(tmp_path / "out").values()
+    assert servos.joint_names_expr == ["shoulder"]
+    assert (motor.joint_names_expr, motor.stiffness) == (["elbow"], {"elbow": 11.0})
+    assert (motor.saturation_effort, motor.actuator_velocity_limit) == (5.0, 4.0)
 
 
 def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_rest():

@@ -111,7 +111,7 @@ def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(lawf
     assert made.virtual
     assert made.errors["in gaponet"] == pytest.approx(0.0, abs=1e-9)
     assert made.errors["scene.xml with servo_law.py"] < 2e-5
-    assert made.errors["scene.xml alone"] == pytest.approx(made.errors["in gaponet, fitted without the law"], rel=0.02)
+    assert made.errors["scene.xml alone"] == pytest.approx(made.errors["in gaponet, without the servo model"], rel=0.02)
     assert made.errors["scene.xml alone"] > 0.003
     assert any("elbow met something at -1.20 rad" in note for note in made.notes)
     before, now = (mujoco.MjModel.from_xml_path(str(f)) for f in (mine, made.file))

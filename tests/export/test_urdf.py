@@ -3,6 +3,7 @@
 import json
 import subprocess
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import mujoco
 import pytest
@@ -12,6 +13,7 @@ from environments import environment
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.export.export_folder import export_robot
+from gaponet.robot.spec import Link
 
 FOUND = {
     "shoulder": {"kp": 16.0, "damping": 0.8, "frictionloss": 0.1, "delay": 0.013, "armature": 0.05},
@@ -58,6 +60,26 @@ def test_a_urdf_keeps_all_but_its_dynamics_and_efforts_and_the_loss_has_its_pric
     assert alone > 100 * made.errors["in gaponet"] + 0.002
     changed = (tmp_path / "out/changes.diff").read_text().splitlines()
     assert sum(line[:1] in "+-" and line[:3] not in ("+++", "---") for line in changed) == 9
+
+
+def test_links_are_written_where_the_file_has_the_mass_that_was_corrected(robot, tmp_path):
+    file, link = tmp_path / "mine.urdf", Link(0.4, (0.12, 0.0, 0.01), (1e-4, 2e-3, 2e-3, 0.0, 0.0, 0.0))
+    file.write_text(URDF)
+    made = export_robot(replace(robot, links={"upper": link, "fore": link}), "urdf", tmp_path / "out", source=file)
+    model = mujoco.MjModel.from_xml_path(str(made.file))
+    assert model.body("upper").mass == pytest.approx(0.4)
+    assert model.body("upper").ipos == pytest.approx(link.pos)
+    assert model.body("fore").mass == pytest.approx(0.3)  # 0.2 in robot.xml
+    assert "inertias of fore were not written: their masses in the file are others" in made.notes
+
+
+def test_links_are_written_into_the_users_mjcf(robot, tmp_path):
+    link = Link(0.4, (0.12, 0.0, 0.01), (1e-4, 2e-3, 2e-3, 0.0, 0.0, 0.0))
+    made = export_robot(replace(robot, links={"upper": link}), "mjcf", tmp_path / "out")
+    model = mujoco.MjModel.from_xml_path(str(made.file))
+    assert model.body("upper").mass == pytest.approx(0.4)
+    assert model.body("upper").ipos == pytest.approx(link.pos)
+    assert model.body("fore").mass == pytest.approx(0.2)
 
 
 def test_a_file_that_is_none_or_has_other_joints_is_refused(robot, tmp_path, capsys):

@@ -69,14 +69,6 @@ def test_a_model_of_another_simulator_is_read_and_refused(copied, robot):
         GapModel.load(copied).require(robot)
 
 
-def test_training_stages_with_their_earlier_names_are_read(copied):
-    card = json.loads((copied / "card.json").read_text())
-    stages = {"warm_start_rounds": [3, 3], "ppo_updates": 5, "ppo_anew": True}
-    (copied / "card.json").write_text(json.dumps(card | {"stages": stages}))
-    stages = GapModel.load(copied).card["stages"]
-    assert stages == {"pretraining_rounds": [3, 3], "ppo_updates": 5, "ppo_from_untrained": True}
-
-
 def test_another_joint_set_is_refused(artifact, robot):
     with pytest.raises(ModelError, match="made for arm with joints shoulder, elbow"):
         GapModel.load(artifact[0]).require(dataclasses.replace(robot, operated=("elbow",)))

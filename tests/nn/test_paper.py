@@ -16,7 +16,6 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export, sample_inputs
-from gaponet.nn.paper import RENAMED
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
@@ -62,18 +61,6 @@ def benchmark(monkeypatch):
 def test_the_published_weights_give_the_published_outputs(paper_network, benchmark):
     assert benchmark.difference(paper_network) < 1e-6
     assert np.abs(np.load(paper_network / "pairs.npz")["delta"]).max() > 0.1
-
-
-def test_weights_with_their_earlier_names_are_loaded():
-    net = network()
-    names = {today: earlier for earlier, today in RENAMED.items()}
-    state = net.state_dict()
-    earlier = {".".join([names.get(name.split(".")[0], name.split(".")[0]), *name.split(".")[1:]]): x.clone()
-               for name, x in state.items()}  # fmt: skip
-    assert earlier.keys() != state.keys()
-    other = build_network(PAPER, 2)
-    other.load_state_dict(earlier)
-    assert all(torch.equal(x, state[name]) for name, x in other.state_dict().items())
 
 
 def test_the_branch_sees_sensor_values_alone():

@@ -83,7 +83,7 @@ def scores(**errors):
     joint = lambda e: {"elbow": {"mpjae": e / 1e3}}  # noqa: E731
     return {name.replace("_", "+"): {
         "mpjae": sum(e) / 2e3, "by_joint": joint(sum(e) / 2),
-        "by_motion": {f"m{i}": {"mpjae": x / 1e3} for i, x in enumerate(e)},
+        "by_independent_motion": {f"m{i}": {"mpjae": x / 1e3} for i, x in enumerate(e)},
     } for name, e in errors.items()}  # fmt: skip
 
 

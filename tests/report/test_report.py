@@ -67,7 +67,7 @@ def test_a_table_in_the_terminal_names_the_method(evaluated, command, capsys):
 
 
 def test_a_trained_run_is_not_called_undertrained(run):
-    amend(run, stages={"warm_start_rounds": [10, 10], "ppo_updates": 40})
+    amend(run, stages={"pretraining_rounds": [10, 10], "ppo_updates": 40})
     card = GapModel.load(run).card
     said = warnings(card, "identified+gaponet", json.loads((run / "metrics.json").read_text()))
     assert not any("Undertrained" in text for text in said)

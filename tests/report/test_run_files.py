@@ -12,7 +12,7 @@ PART = {"mpjae": 0.01}
 JOINT = PART | {"static": 0.01, "dynamic": 0.01}
 SCORES = dict.fromkeys(("mpjae", "rmse", "q_dis", "static", "dynamic", "large_0.05", "large_0.1"), 0.01) | {
     "correlation": None, "by_joint": {"elbow": JOINT}, "by_payload": {"0.5": PART}, "by_motion": {"wave": PART},
-    "by_horizon": {"1": PART, "whole": PART},
+    "by_independent_motion": {"wave": PART}, "by_horizon": {"1": PART, "whole": PART},
 }  # fmt: skip
 METRICS = {
     "methods": {"nominal": SCORES, "gaponet": SCORES}, "ratio_to_nominal": {"nominal": 1.0, "gaponet": 0.5},

@@ -25,9 +25,3 @@ def test_pieces_of_one_motion_have_no_standard_error(motions, words):
     assert network_gain(methods, "identified+mlp").reduction == pytest.approx(1e-3)
     assert words in verdict(methods)[-1]
     assert f"{motions} independent motion" in verdict(methods)[1]
-
-
-def test_files_of_earlier_versions_have_motions_only():
-    old = {k: v for k, v in scores(5e-3, 7e-3, motions=1).items() if k != "by_independent_motion"}
-    gain = network_gain({"nominal": old, "mlp": old}, "mlp")
-    assert (gain.reduction, gain.standard_error) == (0.0, 0.0)

@@ -21,7 +21,7 @@ BIG = '<worldbody><replicate count="200000"><body><geom size="1"/></body></repli
         ("<worldbody>", '<asset><texture builtin="flat" width="100000" height="100000"/></asset><worldbody>', "larger"),
         ("<worldbody>", '<size memory="900G"/><worldbody>', "memory"),
         ("<worldbody>", '<include file="robot.xml"/><worldbody>', "includes robot.xml twice"),
-        ("<worldbody>", '<include file="/dev/zero"/><worldbody>', "is missing, not a file"),
+        ("<worldbody>", '<include file="/dev/zero"/><worldbody>', "is no file"),
         ("<worldbody>", '<asset><mesh name="m" file="/dev/zero"/></asset><worldbody>', "is not a file"),
         ("<worldbody>", "<worldbody", "not valid MJCF"),
         ("<worldbody>", "<wordbody></wordbody><worldbody>", "not valid MJCF"),

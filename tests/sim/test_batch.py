@@ -156,7 +156,7 @@ def test_ramps_of_simulations_left_out_of_a_step_stand_still(tmp_path):
 OTHER = {
     "kp": 11.0, "kd": 0.7, "effort_limit": 0.4, "damping": 0.9, "armature": 0.05, "frictionloss": 0.3, "delay": 0.013,
     "offset": 0.1, "zero": 0.2, "target_speed": 0.4, "stribeck": 0.2, "stribeck_speed": 0.3, "friction_motor": 0.4,
-    "friction_external": 0.4, "min_torque": 0.5, "encoder_step": 0.05,
+    "friction_external": 0.4, "min_torque": 0.5, "encoder_step": 0.05, "no_load_speed": 1.0, "backlash": 0.3,
 }  # fmt: skip
 
 
@@ -165,7 +165,8 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     """One joint's value changes; the other joint keeps the robot's own."""
     robot = write_arm(tmp_path, xml=XML.replace('range="-1.5 1.5"', 'range="-1.5 1.5" ref="0.1"'))
     base = {"damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "kd": 0.3}
-    base |= {"delay": 0.02} if field == "delay" else dict.fromkeys(SERVO_TERMS, 0.02) if field in SERVO_TERMS else {}
+    base |= {"delay": 0.02} if field == "delay" else {}
+    base |= dict.fromkeys(SERVO_TERMS, 0.02) | {"no_load_speed": 9.0} if field in SERVO_TERMS else {}
     robot = robot.with_servos(dict.fromkeys(robot.joint_names, base))
     other, one = robot.with_servos({"elbow": {field: OTHER[field]}}), (0.0, "both", 0.02)
     sims = {name: BatchSim(r, [one]) for name, r in (("own", robot), ("set", robot), ("made", other))}

@@ -65,3 +65,14 @@ def test_torque_limits_bound_the_targets(tmp_path):
     inverse = AnalyticInverse.of(BatchSim(weak, [CONDITION]))
     still = Period(*np.zeros((5, 1, 2)))
     assert np.abs(inverse([still])).max() <= 0.1 / 20.0 + 1e-12
+
+
+def test_a_torque_speed_line_bounds_the_targets_of_a_moving_joint(tmp_path):
+    """At half of its no-load speed a motor has half of its torque, however fast it is to become."""
+    robot = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.4"))
+    robot = robot.with_servos({joint: {"no_load_speed": 2.0} for joint in robot.joint_names})
+    inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
+    at, speed = np.zeros((1, 2)), np.ones((1, 2))
+    targets = inverse([Period(at, speed, at + 0.02, speed + 1.0, at)])
+    assert inverse.high.max() == 0.4
+    np.testing.assert_allclose(inverse.kp * (targets - 0.01), 0.2, rtol=1e-3)  # 0.01 rad: the mean position

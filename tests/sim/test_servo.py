@@ -1,12 +1,15 @@
 """The servo's terms: friction by speed and load, least torque, encoder steps; one definition for every simulator."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 from arm import TOML, write_arm
 
+from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import BatchSim
-from gaponet.sim.model import build_model
+from gaponet.sim.model import build_model, build_spec
 
 
 def servo_model(robot, **values):
@@ -103,7 +106,7 @@ def test_a_restored_state_continues_identically(arm):
 def test_compiled_and_array_servo_models_agree(arm):
     pytest.importorskip("numba")
     terms = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "friction_external": 0.1}
-    robot = servo_model(arm, **terms, min_torque=0.03, encoder_step=0.002)
+    robot = servo_model(arm, **terms, min_torque=0.03, encoder_step=0.002, no_load_speed=1.0, effort_limit=1.5)
     sims = [BatchSim(robot, [(0.5, "both", 0.02)] * 3, 1) for _ in range(2)]
     for sim in sims:
         for x in sim.servo_model.values.values():
@@ -116,9 +119,40 @@ def test_compiled_and_array_servo_models_agree(arm):
     np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=1e-9)
 
 
+def test_a_torque_falls_with_speed_and_brakes_whole(arm):
+    """Between ± effort_limit the motor is MuJoCo's own <dcmotor> behind a current controller."""
+    kp, kd, limit, no_load, rows = 20.0, 0.5, 2.0, 2.0, 150
+    values = {"kp": kp, "effort_limit": limit, "no_load_speed": no_load, "damping": 0.1, "frictionloss": 0.0}
+    robot = replace(servo_model(arm, **values), kd=np.full(2, kd), timestep=0.0005)
+    sim = BatchSim(robot, [(0.0, "both", 0.02)], 1)
+    targets = np.repeat(np.random.default_rng(0).uniform(-1, 1, (rows // 30, 2)), 30, axis=0)
+    sim.reset(slice(None), targets[:1], np.zeros((1, 2)))
+    spec = build_spec(robot)
+    volts, constant = 12.0, 12.0 / no_load
+    resistance = constant * volts / limit
+    for servo in spec.actuators:
+        gains = [kp, 0, kd, 0, 0, volts]
+        servo.set_to_dcmotor(motorconst=[constant, 0], resistance=resistance, controller=gains, ctrlspec=1)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:], qpos, torque, qvel = targets[0], [], [], []
+    for target in targets:
+        sim.step(target[None])
+        data.ctrl[:] = target
+        mujoco.mj_step(model, data, robot.decimation)
+        qpos.append(sim.qpos[0] - data.qpos)
+        torque.append(sim.torque[0].copy())
+        qvel.append(sim.qvel[0].copy())
+    assert np.abs(qpos).mean() < 2e-3  # rad; both step by half a millisecond, MuJoCo's back-EMF implicitly
+    driving = np.sign(torque) * np.array(qvel) / no_load
+    assert driving.max() > 0.3  # it is a matter of speed
+    assert (np.abs(torque) <= limit * np.minimum(1, 1 - driving) + 0.05).all()
+    assert np.abs(torque)[driving < 0].max() == pytest.approx(limit)
+
+
 def test_the_mujoco_model_holds_the_servo_model(arm):
     model = build_model(servo_model(arm, stribeck=0.1, stribeck_speed=0.05))
-    assert model.actuator_user[0].tolist() == [0.1, 0.05, 0.0, 0.0, 0.0, 0.0]
+    assert model.actuator_user[0].tolist() == [0.1, 0.05] + [0.0] * (len(SERVO_TERMS) - 2)
     assert build_model(arm).nuser_actuator == 0
 
 

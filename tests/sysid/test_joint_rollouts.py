@@ -27,6 +27,9 @@ FIRST = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "of
         {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2},
         {"encoder_step": 0.005, "min_torque": 0.2},
         {"kd": 1.0},
+        {"kd": 1.0, "effort_limit": 2.0, "no_load_speed": 1.5},
+        {"effort_limit": 2.0, "no_load_speed": 1.5, "friction_motor": 0.2},
+        {"backlash": 0.02},
     ],
 )
 def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
@@ -43,7 +46,7 @@ def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
     company = np.where(runs.counted[0][:, None], whole[0] - real[0].qpos, 0.0)
     assert np.abs(company).mean() > 0.005  # it is not the robot that was recorded
     assert np.abs(alone - company).mean() < 0.1 * np.abs(company).mean()
-    assert set(changed) <= {*FIRST, *SERVO_TERMS}
+    assert set(changed) <= {*FIRST, *SERVO_TERMS, "effort_limit"}
     if joint_rollouts.advance is not None:
         np.testing.assert_allclose(runs._arrays(values)[0, :, 0].T * runs.counted[0][:, None], alone, atol=2e-4)
 

@@ -7,6 +7,7 @@ import pytest
 from arm import commands, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.robot.servo_fields import DEFAULT_TERMS
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
@@ -57,7 +58,7 @@ def test_identification_finds_a_ramp_and_warns(tmp_path, servos):
     assert found.robot.before_identification.target_speed.max() == 0
 
 
-@pytest.mark.parametrize(("limit", "terms"), [(3.0, ("limit", "stribeck", "load")), (50.0, ("stribeck", "load"))])
+@pytest.mark.parametrize(("limit", "terms"), [(3.0, ("limit", "speed", *DEFAULT_TERMS)), (50.0, DEFAULT_TERMS)])
 def test_a_torque_limit_is_fitted_where_recordings_reach_it(tmp_path, servos, limit, terms):
     logs = recorded(write_arm(tmp_path).with_servos(servos), 3, rows=240)
     limits = {j: {"effort_limit": limit} for j in servos}

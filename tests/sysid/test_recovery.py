@@ -13,6 +13,7 @@ from gaponet.sysid import table_contact
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.motion_limits import default_terms
 from gaponet.sysid.problem import JointFit, standard_errors
 
 SERVO = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.06, "offset": 0.0, "delay": 0.0}
@@ -46,6 +47,21 @@ def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
         for i, joint in enumerate(robot.joint_names):  # within 5 %, or two standard errors
             assert abs(found[field][i] - value) < max(0.05 * value, 2 * std[joint][field])
             assert std[joint][field] < value
+
+
+@pytest.mark.parametrize("no_load", [1.5, 0.0])
+def test_a_torque_speed_line_is_recovered_and_none_is_seen_where_none_is(tmp_path, no_load):
+    robot = replace(write_arm(tmp_path / "arm"), effort_limit=np.full(2, 2.5), kd=np.full(2, 0.5))
+    template, true = recordings(robot, 1, rows=80)[0], SERVO | {"no_load_speed": no_load}
+    jumps = np.random.default_rng(0).uniform(-1, 1, (2, 4, 2)).repeat(20, axis=1)
+    asked = [replace(template, ctrl=c) for c in jumps]
+    replays = replay(asked, robot.with_servos(dict.fromkeys(robot.joint_names, true)))
+    parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replays, strict=True)]
+    assert "speed" in default_terms(parts, robot)
+    fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
+    start = {f: np.full(2, v) for f, v in SERVO.items()} | {"no_load_speed": fit.bounds.guess["no_load_speed"]}
+    found = fit.search(("no_load_speed",), start)
+    np.testing.assert_allclose(fit.bounds.visible("no_load_speed", found), no_load, rtol=0.1)
 
 
 def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):

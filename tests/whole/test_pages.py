@@ -1,4 +1,4 @@
-"""Three people, a page each: what for-labs.md, for-rl.md and for-research.md tell them to run, run in their order."""
+"""Three people, a section each: what the pages tell a lab, an RL engineer and a researcher to run, in this order."""
 
 import re
 import shlex
@@ -35,15 +35,16 @@ def place(tmp_path_factory):
     return folder
 
 
-def blocks(page):
-    """(language, text) of a page's blocks."""
-    return re.findall(r"```(console|python)\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+def blocks(page, heading):
+    """(language, text) of the blocks of a page's section."""
+    section = (DOCS / page).read_text(encoding="utf-8").split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    return re.findall(r"```(console|python)\n(.*?)```", section, re.DOTALL)
 
 
-def play(page, capsys):
-    """Run a page from top to bottom; what it printed."""
+def play(page, heading, capsys):
+    """Run a section from top to bottom; what it printed."""
     capsys.readouterr()
-    for language, text in blocks(page):
+    for language, text in blocks(page, heading):
         if language == "python":
             exec(compile(text, page, "exec"), {"__name__": page})
             continue
@@ -57,11 +58,18 @@ def play(page, capsys):
     return " ".join(capsys.readouterr().out.split())
 
 
-@pytest.mark.parametrize("page", ["for-labs.md", "for-rl.md", "for-research.md"])  # each goes on where the last ended
-def test_a_page_does_what_it_says(place, monkeypatch, capsys, page):
+SECTIONS = {  # each goes on where the last ended
+    "tutorial.md": "One command",
+    "deploy.md": "A policy that fails on the robot",
+    "benchmark.md": "Your method on your recordings",
+}
+
+
+@pytest.mark.parametrize("page", SECTIONS)
+def test_a_section_does_what_it_says(place, monkeypatch, capsys, page):
     monkeypatch.chdir(place)
-    said = play(page, capsys)
-    if page == "for-labs.md":
+    said = play(page, SECTIONS[page], capsys)
+    if page == "tutorial.md":
         assert (place / "started/identified/report.html").is_file()
         assert (place / "today/robot.toml").is_file()
         found = load_robot(place / "started/identified")
@@ -69,11 +77,11 @@ def test_a_page_does_what_it_says(place, monkeypatch, capsys, page):
         assert found.delay[found.operated_index] == pytest.approx([0.04, 0.04], abs=0.008)
         here, there = map(float, re.search(r"the MJCF alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups())
         assert abs(here - there) <= 0.02 * there + 0.01
-    if page == "for-rl.md":
+    if page == "deploy.md":
         assert "The robot would not do what the simulator did: " in said
         assert (place / "mine/arm.xml").is_file()
         assert len(np.load(place / "answer.npz")["joints"]) == 2
-    if page == "for-research.md":
+    if page == "benchmark.md":
         nominal, mine, found = (
             float(re.search(rf"{n}: ([\d.]+) mrad", said)[1]) for n in ("nominal", "mine", "identified")
         )

@@ -49,6 +49,7 @@ def identify(
     threads: int = 0,
     budget: str | None = None,
     stops: bool = False,
+    masses: bool = False,
     progress: Progress = no_progress,
 ) -> IdentifyResult:
     """Fit the servos of the simulator, and the table under the robot, to the training motions.
@@ -69,11 +70,13 @@ def identify(
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
         terms: Terms of the servo model to try; each is accepted only if validation motions improve. Default: stribeck
-            and load, after limit if a joint reaches its stated torque limit.
+            and load, after limit if a joint reaches its stated torque limit; then backlash where a gap makes the
+            rollouts better at otherwise equal values.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml).
         threads: 0 for all cores.
         budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.
         stops: Add an end stop to joints that stayed behind several commands; otherwise they are reported.
+        masses: Fit masses, centres of mass and inertias of the links too; accepted as a term is.
 
     Raises:
         DatasetError, UsageError: A unit is not there, or `like` has no joint that corresponds.
@@ -105,8 +108,9 @@ def identify(
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
     with lock_folder(folder, "robot"):
         fitted = fit(
-            data.sequences(split["train"]), start, val, windows, terms, table, threads, progress, seconds, stops
-        )
+            data.sequences(split["train"]), start, val, windows, terms, table, threads, progress, seconds, stops,
+            masses=masses,
+        )  # fmt: skip
         after, given, nominal = (
             held_out_errors(HeldOut(s, one or own) for s, own in fitted.held_out)
             for one in (None, spec, spec.nominal or spec)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gaponet.api.opening import Place, as_dataset, as_robot, entries_of_unit
-from gaponet.api.results import CollectResult, DoctorResult, ExciteResult, ImportResult, PairResult, Prediction
+from gaponet.api.results import ExciteResult, PairResult, Prediction
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.store import Dataset
@@ -20,9 +20,12 @@ from gaponet.robot.folder import MOVE_STORED_ROBOT
 from gaponet.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
+    from gaponet.data.doctor import DoctorResult
+    from gaponet.data.importer import ImportResult
     from gaponet.data.sequence import Sequence
     from gaponet.sysid.motion.plan import Plan
     from gaponet.sysid.uncertainty import ParameterUncertainty
+    from gaponet.testing.collect import CollectResult
 
 DEFAULT_MINUTES, DEFAULT_FURTHER_MINUTES = 10.0, 0.5  # of motions for a new robot, and for an identified one
 
@@ -86,15 +89,11 @@ def import_logs(
     spec = as_robot(robot)
     if Dataset.open_existing(out, spec) is not None:
         require_stored_robot(Path(out), spec, DatasetError, MOVE_STORED_ROBOT)
-    report = read_logs(
+    return read_logs(
         src, spec, unit_id, payload_mass, out, payload_side=payload_side, fmt=format,
         joint_map=None if joint_map is None else dict(joint_map), logs=logs, position_unit=position_unit,
         time_unit=time_unit, rate=rate, cut=cut, level=level, kp=kp, kd=kd, skip_bad=skip_bad, strict=strict,
         allow_pickle=allow_pickle, gravity=gravity_of(spec), simulator=model_hash(spec), progress=progress,
-    )  # fmt: skip
-    return ImportResult(
-        dataset=report.dataset, robot=spec, added=tuple(report.entries), present=tuple(report.present),
-        offsets=report.offsets, cut=tuple(report.skipped),
     )  # fmt: skip
 
 
@@ -115,15 +114,11 @@ def doctor(
     Raises:
         DatasetError: The folder is no dataset, or damaged.
     """
-    from gaponet.data.doctor import Diagnosis
+    from gaponet.data.doctor import DoctorResult
     from gaponet.sim.dynamics import gravity_of
 
     data, spec = as_dataset(dataset, robot)
-    diagnosis = Diagnosis.of(data, spec, gravity_model=gravity_of(spec), progress=progress, executor=executor)
-    return DoctorResult(
-        verdict=diagnosis.verdict, findings=tuple(diagnosis.findings), sequences=tuple(diagnosis.sequences),
-        joints=tuple(diagnosis.joints),
-    )  # fmt: skip
+    return DoctorResult.of(data, spec, gravity_model=gravity_of(spec), progress=progress, executor=executor)
 
 
 def pair(
@@ -191,10 +186,7 @@ def collect(
 
     spec, plan = as_robot(robot), recording.load_recipe(recipe)
     plan = replace(plan, payloads=payloads or plan.payloads, units=units or plan.units)
-    made = recording.collect(spec, load_fleet(fleet, spec), plan, out, seed, nproc, progress, executor=executor)
-    return CollectResult(
-        dataset=Path(out), written=made.written, present=made.present, hours=made.hours, seconds=made.wall_s
-    )
+    return recording.collect(spec, load_fleet(fleet, spec), plan, out, seed, nproc, progress, executor=executor)
 
 
 def excite(
@@ -299,16 +291,9 @@ def unit_recordings(
     motions: tuple[str, ...] = (),
     payload_mass: float | None = None,
 ) -> Iterator[tuple[str, list[Sequence]]]:
-    """Read one unit's recordings from a dataset, or from logs that are imported into a temporary folder.
+    """Yield one unit's id and its recordings, from a dataset or from logs; arguments as of `check`.
 
-    Args:
-        source: A dataset, or logs that `import_logs` reads.
-        unit: Unit to read, where there are several.
-        motions: Only these.
-        payload_mass: kg in each hand, of logs whose format does not state it.
-
-    Yields:
-        The unit's id and its recordings.
+    Logs are imported into a temporary folder.
 
     Raises:
         UsageError: The unit is not there, or there are several and none is named.

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,35 +16,25 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 if TYPE_CHECKING:
-    from gaponet.data.offsets import JointOffset
-    from gaponet.data.store import Dataset, Entry
+    from gaponet.data.store import Dataset
     from gaponet.export.rollout import RolloutPrediction
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.config import ModelKind
     from gaponet.report.evaluate import Evaluation
-    from gaponet.robot.finding import Finding
     from gaponet.robot.spec import RobotSpec
     from gaponet.sysid.acceptance import Identified
     from gaponet.sysid.drift import Drift, ParameterChange
     from gaponet.sysid.torque_motors import TorqueDrivenFit
 
 __all__ = [
-    "AdaptResult", "CheckResult", "CollectResult", "DoctorResult", "EvalResult", "ExciteResult", "ExportResult",
-    "GapResult", "IdentifyResult", "ImportResult", "PairResult", "ReplayResult", "TorqueResult", "TrainResult",
+    "AdaptResult", "CheckResult", "EvalResult", "ExciteResult", "ExportResult", "GapResult", "IdentifyResult",
+    "PairResult", "ReplayResult", "TorqueResult", "TrainResult",
 ]  # fmt: skip
 Metrics = dict[str, Any]  # mpjae rad, q_dis rad·s, …, and by_joint, by_payload, by_unit, by_motion, by_horizon
 
 
-class Result:
-    """Base class of results."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result as plain data."""
-        raise NotImplementedError
-
-
 @dataclass(frozen=True, kw_only=True)
-class Measured(Result):
+class Measured:
     """Errors of simulators on recordings.
 
     Attributes:
@@ -60,80 +50,7 @@ class Measured(Result):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportResult(Result):
-    """Logs that were read into a dataset.
-
-    Attributes:
-        added: Sequences that were added.
-        present: Sequences of the same logs that the dataset held before.
-        offsets: Lag and static errors of the unit; None without a gravity model or with several units.
-        cut: Rows that were cut and logs that were left out, one line each.
-    """
-
-    dataset: Dataset
-    robot: RobotSpec
-    added: tuple[Entry, ...]
-    present: tuple[Entry, ...]
-    offsets: dict[str, JointOffset] | None
-    cut: tuple[str, ...]
-
-    @property
-    def entries(self) -> tuple[Entry, ...]:
-        """Sequences that were added, or those that were present where nothing was added."""
-        return self.added or self.present
-
-    def fast_lags(self, joint: str) -> list[float]:
-        """Lags of a joint in the sequences that command it fast, s."""
-        from gaponet.data.signals import FAST_COMMAND_RAD_S
-
-        def finding(entry: Entry, name: str) -> float | None:
-            return entry.findings.get(name, {}).get(joint)  # a collected recording has none
-
-        lags = [finding(e, "delay_s") for e in self.entries if (finding(e, "fast_speed") or 0) >= FAST_COMMAND_RAD_S]
-        return [lag for lag in lags if lag is not None]
-
-    def to_dict(self) -> dict[str, Any]:
-        offsets = self.offsets or {}
-        return {
-            "dataset": str(self.dataset.path), "imported": [e.id for e in self.added],
-            "present": [e.id for e in self.present], "sequences": len(self.dataset),
-            "minutes": sum(e.rows * e.dt for e in self.entries) / 60,
-            "rate_hz": sorted({round(1 / e.dt, 2) for e in self.entries}),
-            "fast_lag_s": {joint: self.fast_lags(joint) for joint in self.robot.operated},
-            "delay_s": {e.id: e.findings.get("delay_s", {}) for e in self.entries},
-            "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False,
-            "cut": list(self.cut),
-        }  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class DoctorResult(Result):
-    """Problems of a dataset.
-
-    Attributes:
-        verdict: One sentence.
-        findings: Problems, the worst first.
-        sequences, joints: One row of numbers per sequence and per joint.
-    """
-
-    verdict: str
-    findings: tuple[Finding, ...]
-    sequences: tuple[Mapping[str, Any], ...]
-    joints: tuple[Mapping[str, Any], ...]
-
-    def count(self, level: str) -> int:
-        """Return the number of findings of a level: error, warning or note."""
-        return sum(f.level == level for f in self.findings)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "verdict": self.verdict, "findings": [asdict(f) for f in self.findings],
-            "sequences": [dict(row) for row in self.sequences], "joints": [dict(row) for row in self.joints],
-        }  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class PairResult(Result):
+class PairResult:
     """Recordings with a paired simulation.
 
     Attributes:
@@ -186,7 +103,7 @@ class EvalResult(Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IdentifyResult(Result):
+class IdentifyResult:
     """An identified robot and its error on validation motions.
 
     Attributes:
@@ -235,14 +152,15 @@ class IdentifyResult(Result):
                 c.name: {"gain": c.gain[0], "standard_error": c.gain[1], "kept": c.accepted} for c in fit.comparisons
             },
             "table": vars(self.robot.table) if self.robot.table else None,
+            "links": {body: vars(link) for body, link in self.robot.links.items()},
             "touching": list(fit.table_fit.motions) if fit.table_fit else [],
-            "warnings": list(fit.warnings), "undetermined": fit.undetermined,
+            "warnings": list(fit.warnings), "findings": list(fit.findings), "undetermined": fit.undetermined,
             "seconds": self.seconds, "robot": str(self.folder),
         }  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
-class TorqueResult(Result):
+class TorqueResult:
     """An identified torque-driven robot.
 
     Attributes:
@@ -274,7 +192,7 @@ class TorqueResult(Result):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainResult(Result):
+class TrainResult:
     """A trained model.
 
     Attributes:
@@ -299,7 +217,7 @@ class TrainResult(Result):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptResult(Result):
+class AdaptResult:
     """Servo parameters of one unit on one day.
 
     Attributes:
@@ -326,7 +244,7 @@ class AdaptResult(Result):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckResult(Result):
+class CheckResult:
     """Comparison of new logs with an identified robot.
 
     Attributes:
@@ -355,7 +273,7 @@ class CheckResult(Result):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayResult(Result):
+class ReplayResult:
     """Motion that the identified robot would make in rollouts of a policy.
 
     Attributes:
@@ -398,7 +316,7 @@ class ReplayResult(Result):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportResult(Result):
+class ExportResult:
     """Files for another program.
 
     Attributes:
@@ -433,36 +351,7 @@ class ExportResult(Result):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectResult(Result):
-    """Recordings of virtual robots.
-
-    Attributes:
-        written: Recordings made now.
-        present: Recordings that were there before.
-        hours: Recorded time of `written`, h.
-        seconds: Wall time.
-    """
-
-    dataset: Path
-    written: int
-    present: int
-    hours: float
-    seconds: float
-
-    @property
-    def times_real_time(self) -> float:
-        """Recorded time over wall time."""
-        return self.hours * 3600 / self.seconds if self.seconds > 0 else 0.0
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "virtual": True, "times_real_time": self.times_real_time, "dataset": str(self.dataset),
-            "written": self.written, "present": self.present, "hours": self.hours, "wall_s": self.seconds,
-        }  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExciteResult(Result):
+class ExciteResult:
     """Motion files to play on a robot.
 
     Attributes:
@@ -489,7 +378,7 @@ class ExciteResult(Result):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prediction(Result):
+class Prediction:
     """Standard errors of an identified robot's parameters, before and after further motions.
 
     Attributes:

@@ -63,7 +63,7 @@ def adapt(
             f"({made.after / made.before:.2f}); robot folder {out}"
         )
         _show(screen, made)
-        screen.say(f"next: gaponet run --motion FILE --robot {robot_argument(out)} --compensate")
+        screen.next(f"gaponet run --motion FILE --robot {robot_argument(out)} --compensate")
         screen.result(made.to_dict())
         return
     if out is not None:
@@ -77,7 +77,7 @@ def adapt(
         )  # fmt: skip
     _show(screen, made)
     screen.say(f"window RMS {mrad(made.before)} → {mrad(made.after)} mrad of the fitted windows; stored in {run}")
-    screen.say(f"next: gaponet eval {run} {dataset}")
+    screen.next(f"gaponet eval {run} {dataset}")
     screen.result(made.to_dict())
 
 

@@ -71,10 +71,10 @@ def check(
         return
     made = api.check(robot, logs, unit=unit, motions=motions, payload_mass=payload_mass, threads=threads)
     drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
-    named = {m.joint for m in drift.moved}
+    named, count = {m.joint for m in drift.moved}, f"{made.recordings} recording{'s' * (made.recordings != 1)}"
     screen.table(
-        f"{made.recordings} recordings, {drift.seconds:.0f} s: largest change of each joint",
-        ["joint", "parameter", "change", "standard errors", "effect, mrad", "least that counts, mrad", ""],
+        f"{count}, {drift.seconds:.0f} s: largest change of each joint",
+        ["joint", "parameter", "change", "standard errors", "effect, mrad", "least that counts, mrad", "verdict"],
         [
             _row(m, uncertainty, drift, m.joint in named)
             for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))
@@ -83,7 +83,7 @@ def check(
     for a in drift.against:
         what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} deviations"
         screen.say(f"  {what}", "warning", "yellow")
-    screen.say(f"{made.verdict}: {made.advice}")
+    screen.say(f"{made.verdict}: {made.advice.replace('ROBOT', robot.as_posix()).replace('LOGS', logs)}")
     screen.result(made.to_dict())
     if made.verdict != "same":
         sys.stdout.flush()
@@ -124,4 +124,4 @@ def _row(m: ParameterChange, uncertainty: ParameterUncertainty, drift: Drift, co
     least = drift.min_effect.get(m.joint) or sum(drift.min_effect.values()) / len(drift.min_effect)
     by = format_change(m.field, m.by, uncertainty, m.joint)
     return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * least:.2f}",
-            "moved" if counts else ""]  # fmt: skip
+            "changed" if counts else "not significant"]  # fmt: skip

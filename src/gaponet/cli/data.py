@@ -15,12 +15,7 @@ from gaponet.robot.finding import abbreviate
 from gaponet.share.reading import open_dataset
 
 
-def _card(
-    dataset: Data,
-    licence: str | None = None,
-    source: str | None = None,
-    json: Json = False,
-) -> None:
+def _card(dataset: Data, licence: str | None = None, source: str | None = None, json: Json = False) -> None:
     """Count and measure what a dataset holds; writes card.json and CARD.md into it.
 
     Args:
@@ -79,12 +74,7 @@ def _split(
     out.result({"split": str(path), "by": by, "parts": rows})
 
 
-def _figures(
-    dataset: Source,
-    out: Path,
-    robot: Robot = None,
-    json: Json = False,
-) -> None:
+def _figures(dataset: Source, out: Path, robot: Robot = None, json: Json = False) -> None:
     """Draw the dataset: joint ranges, composition, torque and temperature.
 
     Args:
@@ -103,13 +93,7 @@ def _figures(
     screen.result({"figures": [str(path) for path in written], "left_out": left_out})
 
 
-def _export(
-    dataset: Source,
-    out: Path,
-    to: str = "lerobot",
-    robot: Robot = None,
-    json: Json = False,
-) -> None:
+def _export(dataset: Source, out: Path, to: str = "lerobot", robot: Robot = None, json: Json = False) -> None:
     """Write a dataset in another format; gaponet import reads it back as far as the format can hold it.
 
     Args:
@@ -180,9 +164,8 @@ def _labels(
     ])  # fmt: skip
     for line in labels.remarks:
         screen.say(line)
-    screen.say(
-        f"written: {out / 'labels.csv'!s}; next: gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}"
-    )
+    screen.say(f"written: {out / 'labels.csv'!s}")
+    screen.next(f"gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}")
     screen.result({"cells": labels.groups, "agreement": labels.agreement, "recordings": labels.recordings})
 
 

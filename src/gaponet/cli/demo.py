@@ -82,7 +82,7 @@ def demo(
             screen.say(sentence)
         screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
         view = f"gaponet view {dataset} --robot {robot_argument(identified)}"
-        screen.say(f"next: gaponet export {identified} --to mjcf; {view}")
+        screen.next(f"gaponet export {identified} --to mjcf; {view}")
     screen.result(result)
 
 

@@ -58,7 +58,7 @@ def excite(
         _show_prediction(screen, spec.name, made.prediction)
     masses = ", ".join(f"{p:g}" for p in made.payloads)
     screen.say(f"{len(made.motions)} motions, {made.minutes:.1f} min at {masses} kg for {spec.name}: {out!s}")
-    screen.say(f"Next: print {made.sheet}; play them (gaponet run or record --motion FILE, or your own player)")
+    screen.next(f"print {made.sheet}; play them (gaponet run or record --motion FILE, or your own player)")
     screen.result(made.to_dict())
 
 
@@ -66,7 +66,7 @@ def _show_prediction(screen: Out, name: str, prediction: Prediction) -> None:
     """Print standard errors before and after the motions, and how much more playing is useful."""
     before, after = prediction.before, prediction.after
     fields = [f for f in next(iter(before.values())) if any(by[f] > 0 for by in before.values())]
-    screen.wide_table(
+    screen.table(
         f"{name}: standard errors, now → at best",
         ["joint", *(SERVO_FIELDS[f].heading for f in fields)],
         [[j, *(" → ".join(_two_digits(by[j][f] * SERVO_FIELDS[f].factor) for by in (before, after)) for f in fields)]

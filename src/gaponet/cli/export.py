@@ -83,13 +83,14 @@ def export(
     if made.parity is not None:
         screen.say(f"{made.path}: differs by {made.parity:.1e} rad from what was trained")
     else:
-        motions = "VIRTUAL motions" if made.virtual else "validation motions"
+        motions = ("VIRTUAL" if made.virtual else "validation") + " motion" + "s" * (made.motions != 1)
         rows = [[form, mrad(error)] for form, error in made.errors.items()]
-        screen.table(f"Error over {made.motions} {motions}", ["form", "mrad"], rows)
+        screen.table(f"Mean |error| on {made.motions} {motions}", ["form", "mrad"], rows)
         for line in made.notes:
             screen.say(f"  {line}", "warning", "yellow")
-        then = f"; next, in {CHECKED_IN.get(to, to)}: python {made.check}" if made.check else ""
-        screen.say(f"{made.path}: {made.robot} for {to}{then}")
+        screen.say(f"{made.path}: {made.robot} for {to}")
+        if made.check:
+            screen.next(f"python {made.check}, in {CHECKED_IN.get(to, to)}")
     screen.result(made.to_dict())
 
 

@@ -47,8 +47,10 @@ def gap(
 def _show_steps(out: Out, result: Mapping[str, Any]) -> None:
     """Print the error after each step, in total, by joint and by payload, and its reduction in total."""
     who = "VIRTUAL robot" if result["virtual"] else "real robot"
-    kind = "held-out recordings" if result["unseen"] else "recordings, some of them used in training"
+    count = f"{result['sequences']} {'test ' * result['unseen']}recording{'s' * (result['sequences'] != 1)} of a {who}"
+    fitted = "" if result["unseen"] else ", some of them used in training"
     joints, loads, ends = result["by_joint"], result["by_payload"], ("floor", "unexplained")
+    loads = loads if len(loads) > 1 else {}
     rest = lambda part: (part["floor"]["both"], part["unexplained"])  # noqa: E731
     removed = {s: [*map(mrad, result["removed"].get(s, ()))] or ["", ""] for s in result["left"]}
     one = list(removed.values())[-1][1] == mrad(None)  # motion: no standard error
@@ -57,16 +59,18 @@ def _show_steps(out: Out, result: Mapping[str, Any]) -> None:
         [title(s), mrad(left), *removed[s][: len(columns)], *(mrad(p[s]) for p in loads.values())]
         for s, left in result["left"].items()
     ]
-    rows += [[end, mrad(of), *[""] * (len(columns) + len(loads))] for end, of in zip(ends, rest(result), strict=True)]
+    known = [(end, mrad(of)) for end, of in zip(ends, rest(result), strict=True) if of is not None]
+    rows += [[end, of, *[""] * (len(columns) + len(loads))] for end, of in known]
     out.table(
-        f"Mean |error| left after each step, mrad: {result['sequences']} {kind} of a {who}{', one motion' * one}",
+        f"Mean |error| left after each step, mrad: {count}{fitted}{', one motion' * one}",
         ["step", "left", *columns, *(f"{p} kg" for p in loads)],
         rows,
     )
     steps = list(result["left"])
-    out.table("Error left by joint", ["joint", *map(title, steps), *ends], [
-        [name, *(mrad(part["left"][s]) for s in steps), *map(mrad, rest(part))] for name, part in joints.items()
+    out.table("Error left by joint, mrad", ["joint", *map(title, steps), *(end for end, _ in known)], [
+        [name, *(mrad(part["left"][s]) for s in steps), *map(mrad, rest(part)[: len(known)])]
+        for name, part in joints.items()
     ])  # fmt: skip
     if result["floor"]["repeatability"] is None:
-        seen = "unknown, encoders too" if result["floor"]["encoder"] is None else "encoder only"
-        out.say(f"floor: {seen}; no motion was recorded twice or repeats itself: repeatability is unknown")
+        floor = "unknown" if result["floor"]["encoder"] is None else "of the encoder alone"
+        out.say(f"floor (what no model can explain): {floor}, since no motion was recorded twice")

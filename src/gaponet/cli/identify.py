@@ -14,11 +14,13 @@ from gaponet.cli import options
 from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import Out, writes
 from gaponet.report.tables import mrad, mrad_with_error
+from gaponet.robot.finding import abbreviate
 from gaponet.robot.servo_fields import PASSIVE_FIELDS, SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument
 from gaponet.robot.toml_file import MEASURED_FIELDS
 from gaponet.share.reading import open_dataset
 from gaponet.sim.metrics import standard_error
+from gaponet.sysid.uncertainty import JointSummary
 
 UNDETERMINED = "not determined by these logs"
 
@@ -34,6 +36,7 @@ def identify(
     threads: int = 0,
     budget: str | None = None,
     stops: Flag = False,
+    masses: Flag = False,
     current: Flag = False,
     details: Flag = False,
     robot: Robot = None,
@@ -69,10 +72,13 @@ def identify(
     with progress_bar("identifying") as update:
         made = api.identify(
             data, out=out, windows=windows, robot=spec, like=like, units=units, holdout_units=holdout_units,
-            terms=terms, table=table, threads=threads, budget=budget, stops=stops, progress=update,
+            terms=terms, table=table, threads=threads, budget=budget, stops=stops, masses=masses, progress=update,
         )  # fmt: skip
     _show(screen, made, details)
-    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {robot_argument(out)}")
+    if "backlash" in (terms or ()) and "backlash" not in [c.name for c in made.fit.comparisons]:
+        screen.say("backlash: no gap makes a joint's rollouts better. Only a load that changes its sign shows one")
+    screen.say(f"robot folder: {out}, after {made.seconds:.0f} s")
+    screen.next(f"gaponet gap {dataset} --robot {robot_argument(out)}")
     screen.result(made.to_dict())
 
 
@@ -95,13 +101,15 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         end = "" if fit.improved else " No fit was better, so these servos are written as they are."
         screen.say(f"Start and prior: {taken}.{end}")
     shown = [f for f in SERVO_FIELDS if any(v.get(f) for v in values.values())]
-    rows = [[j, *(_cell(v.get(f), fit.std[j].get(f), SERVO_FIELDS[f].factor) for f in shown)]
-            for j, v in values.items()]  # fmt: skip
+    rows, sources = [[j, *(_cell(v, fit.std[j], f) for f in shown)] for j, v in values.items()], list[str]()
     for servo in dict.fromkeys(filter(None, (fit.robot.servos[i] for i in fit.robot.operated_index))):
         if any(cells := [servo.text(f) if f in MEASURED_FIELDS else "" for f in shown]):
-            rows.append([f"servo {servo.name}, {servo.source}", *cells])
+            rows.append([f"servo {servo.name}", *cells])
+            sources.append(f"servo {servo.name}: {servo.source}")
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in shown)]
-    screen.wide_table("Identified servos, ± standard error", columns, rows)
+    screen.table("Identified servos, ± standard error", columns, rows)
+    for source in sources:
+        screen.say(source)
     for term in fit.comparisons:
         judges = "motions" if term.name == "torque" else "recordings"
         over = f" over {len(term.before)} {judges}" * (len(term.before) > 1)
@@ -109,6 +117,8 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         gain, error = term.gain
         moves = f"{'rises' if gain < 0 else 'falls'} by {mrad_with_error(abs(gain), error)}"
         screen.say(f"{term.name}: validation error {moves}{verdict}")
+    for sentence in (*fit.findings, *(fit.links.sentences() if fit.links else ())):
+        screen.say(f"  {sentence}")
     if fit.chosen == "torque":
         for m in fit.robot.payload_mounts:
             screen.say(
@@ -128,14 +138,16 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         if details or warning not in unknown:
             screen.say(f"  {warning}", "warning", "yellow")
     if unknown and not details:
-        joints = ", ".join(w.partition(":")[0] for w in unknown)
-        screen.say(f"not determined in part: {joints}; --details says what. Take a joint's values as a set")
+        joints = abbreviate([w.partition(":")[0] for w in unknown])
+        screen.say(f"some parameters are not determined: {joints}; --details lists them. Use a joint's values together")
 
 
-def _cell(value: float | None, std: float | None, factor: float) -> str:
-    if value is None:
+def _cell(joint: dict[str, float], errors: dict[str, float], field: str) -> str:
+    if field not in joint or (field == "stribeck_speed" and not joint["stribeck"]):
         return ""
-    return format_uncertainty(value * factor, std * factor) if std else f"{value * factor:.3g}"
+    if errors.get(field):
+        return JointSummary(joint, errors).cell(field)
+    return f"{joint[field] * SERVO_FIELDS[field].factor:.3g}"
 
 
 def _show_torque(screen: Out, made: TorqueResult, current: bool) -> None:

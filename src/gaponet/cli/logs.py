@@ -11,7 +11,6 @@ import numpy as np
 import tyro
 
 from gaponet import api
-from gaponet.api.results import DoctorResult, ImportResult
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import progress_bar
@@ -21,6 +20,8 @@ from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
+    from gaponet.data.doctor import DoctorResult
+    from gaponet.data.importer import ImportResult
     from gaponet.data.offsets import JointOffset
     from gaponet.data.store import Entry
 
@@ -29,29 +30,15 @@ MAX_ROWS = 60
 
 @like(api.import_logs)
 def import_logs(
-    src: tyro.conf.Positional[Path | None] = None,
-    robot: str = "",
-    out: Path | None = None,
-    unit_id: str | None = None,
-    payload_mass: float | None = None,
-    payload_side: str | None = None,
-    map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    format: str | None = None,
-    logs: Path | None = None,
-    position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None,
-    rate: float | None = None,
-    cut: float | None = None,
-    level: Literal["joint", "upper_body", "whole_body"] | None = None,
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
-    skip_bad: bool = False,
-    strict: bool = False,
-    allow_pickle: bool = False,
-    guess: bool = False,
-    formats: Flag = False,
-    json: Json = False,
-) -> None:
+    src: tyro.conf.Positional[Path | None] = None, robot: str = "", out: Path | None = None, unit_id: str | None = None,
+    payload_mass: float | None = None, payload_side: str | None = None,
+    map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (), format: str | None = None,
+    logs: Path | None = None, position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None, rate: float | None = None, cut: float | None = None,
+    level: Literal["joint", "upper_body", "whole_body"] | None = None, kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (), skip_bad: bool = False, strict: bool = False, allow_pickle: bool = False,
+    guess: bool = False, formats: Flag = False, json: Json = False,
+) -> None:  # fmt: skip
     """Read a robot's logs into a dataset; the same call adds what is new.
 
     A bad log refuses them all (--skip-bad leaves it out instead).
@@ -100,7 +87,6 @@ def doctor(
         fix: Print a proposal for logs.toml after the findings; nothing is applied.
         figures: Folder for a picture of each finding.
     """
-    from gaponet.data.doctor import Diagnosis
     from gaponet.robot.finding import Finding
     from gaponet.share.reading import open_dataset
 
@@ -108,7 +94,7 @@ def doctor(
     data, spec = open_dataset(dataset, robot)
     with progress_bar("examining") as update:
         diagnosis = api.doctor(data, robot=spec, progress=update)
-    out.say(f", {Diagnosis.inventory(data)}", spec.name)
+    out.say(f", {diagnosis.inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
     proposal = Finding.proposal(list(diagnosis.findings)) if fix else ""
     for line in proposal.splitlines():
@@ -120,7 +106,10 @@ def doctor(
         with lock_folder(figures, "figures"):
             drawn = draw_findings(data, spec, list(diagnosis.findings), figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")
-    out.say(f"next: gaponet doctor {dataset} --fix" if diagnosis.count("error") else f"next: gaponet gap {dataset}")
+    if diagnosis.count("error"):
+        out.next("correct the logs, import them into a new folder" if fix else f"gaponet doctor {dataset} --fix")
+    else:
+        out.next(f"gaponet gap {dataset}")
     out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": proposal,
                 "figures": [str(path) for path in drawn]} | diagnosis.to_dict())  # fmt: skip
 
@@ -190,7 +179,7 @@ def _show_import(out: Out, made: ImportResult) -> None:
     _show_offsets(out, table["fast_lag_s"], offsets)
     if offsets:
         out.say(f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data.")
-    out.say(f"Next: gaponet doctor {data.path!s}")
+    out.next(f"gaponet doctor {data.path!s}")
     out.result(table)
 
 
@@ -212,8 +201,9 @@ def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:
     shown = diagnosis.sequences[:MAX_ROWS]
     columns = ["motion", "kg", "s", "Hz", "jitter", "gap", "lag"]
     out.table("Sequences; jitter, longest gap and fast lag in ms", columns, [
-        [r["motion"], f"{r['payload_mass']:g}", f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}",
-         f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}", _span(list(r["fast_lag_s"].values()))]
+        [r["motion"] + f" ({r['repetition']})" * (r["repetition"] > 0), f"{r['payload_mass']:g}",
+         f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}", f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}",
+         _span(list(r["fast_lag_s"].values()))]
         for r in shown
     ])  # fmt: skip
     if len(shown) < len(diagnosis.sequences):
@@ -243,4 +233,4 @@ def _signed_mrad(value: float | None, band: float | None = None) -> str:
     """0.037, 0.031 → "+37 ± 31"."""
     if value is None:
         return "–"
-    return f"{value * 1e3:+.0f}" + (f" ± {band * 1e3:.0f}" if band is not None else "")
+    return f"{round(value * 1e3):+d}" + (f" ± {band * 1e3:.0f}" if band is not None else "")

@@ -35,22 +35,6 @@ ELSEWHERE = {
 }  # fmt: skip
 # Command → module:function. A module is imported when its command runs.
 COMMANDS = {name: f"gaponet.cli.{ELSEWHERE.get(name, f'{name}:{name}')}" for names in TASKS.values() for name in names}
-# Command, or command with its first argument → what replaces it.
-REMOVED = {
-    "prune": "gaponet push --prune",
-    "calibrate": "gaponet adapt",
-    "experiment unit": "gaponet experiment compare --holdout-units UNIT",
-    "experiment data": "gaponet experiment compare --models gaponet:train_share=0.25 gaponet:train_share=0.5 gaponet",
-    "formats": "gaponet import --formats",
-    "torque": "gaponet identify",
-    "show": "gaponet robot show",
-    "fleet": "gaponet check --fleet",
-    "runs": "gaponet report --list",
-    "attach": "gaponet export --to lerobot",
-    "bench real": "gaponet experiment real",
-    **{f"bench {what}": f"python benchmarks/speed.py {what}" for what in ("latency", "aligned")},
-    "bench": "gaponet experiment real",
-}
 ABOUT = "Close the gap between simulated and real motors from joint logs."
 
 
@@ -76,8 +60,8 @@ def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda
         return _say(": ".join(str(part) for part in ("File", error.filename, error.strerror or error) if part))
     except MemoryError:
         return _say("Memory: there is not enough of it for this; give less at once, or close other programs")
-    except KeyboardInterrupt:
-        print("interrupted; what was written so far is complete", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"interrupted; {str(stop) or 'what was written so far is complete'}", file=sys.stderr)
         return 128 + signal.SIGINT
     return 0
 
@@ -92,9 +76,6 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         print(_overview())
         return
     name, completing = argv[0], argv[0].startswith("--tyro-")
-    for removed in (name, " ".join(argv[:2])):
-        if removed in REMOVED:
-            raise UsageError(f"gaponet {removed} was removed; use {REMOVED[removed]}")
     if name not in COMMANDS and not completing:
         close = get_close_matches(name, COMMANDS, 1)
         guess = f"do you mean {close[0]}? " if close else ""

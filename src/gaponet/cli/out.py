@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
-MAX_COLUMNS = 4  # beside the first, of a part of a wide table
 WIDTH = 120  # letters of a line in a file or a pipe
-LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
+LABEL, NUMBER = 30, 22  # letters: labels and numbers longer than that are wrapped
+BORDER = 3  # letters between two cells
 
 
 class _Console(Console):
@@ -36,6 +36,8 @@ class _Console(Console):
 
 class Out:
     """People read stdout; with json they read stderr, and stdout carries one object."""
+
+    names_next = True  # False within a command that gives the next one itself
 
     def __init__(self, as_json: bool = False) -> None:
         self.as_json = as_json
@@ -47,31 +49,40 @@ class Out:
         """A line for people; `start` stands before the text, in this style. Neither is markup, whatever it holds."""
         self.console.print(Text.assemble((escape(start), style), escape(text)), soft_wrap=True)
 
-    def table(self, title: str, columns: list[str], rows: Iterable[list[str]]) -> None:
-        """A table for people; the first column is text, the others are right-aligned numbers, which are never cut."""
-        lines = [[escape(cell) for cell in row] for row in rows]
-        table = Table(title=Text(escape(title)), title_justify="left", title_style="bold")
-        for i, column in enumerate(columns):
-            cells = [line[i] for line in lines]
-            if i == 0:
-                table.add_column(
-                    Text(escape(column)), overflow="fold", no_wrap=max(map(len, cells), default=0) <= LABEL
-                )
-            else:
-                words = [len(word) for cell in (escape(column), *cells) for word in cell.split()]
-                table.add_column(
-                    Text(escape(column)), overflow="fold", justify="right", min_width=min(max(words, default=1), NUMBER)
-                )
-        for line in lines:
-            table.add_row(*map(Text, line))
-        self.console.print(table)
+    def next(self, command: str) -> None:
+        """The command that a person would give next; nothing within `gaponet start`, which gives it itself."""
+        if self.names_next:
+            self.say(f"next: {command}")
 
-    def wide_table(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
-        """A table in parts of at most MAX_COLUMNS columns; rows that are blank in a part are left out."""
-        for start in range(1, len(columns), MAX_COLUMNS):
-            part = slice(start, start + MAX_COLUMNS)
-            cells = [[row[0], *row[part]] for row in rows if any(row[part])]
-            self.table(title if start == 1 else "Further parameters", [columns[0], *columns[part]], cells)
+    def table(self, title: str, columns: list[str], rows: Iterable[list[str]]) -> None:
+        """A table for people, in as many parts as the screen is narrow; rows that are blank in a part are left out.
+
+        The first column and long cells are text; the others are right-aligned numbers, which are never cut or wrapped.
+        """
+        lines = [[escape(cell) for cell in row] for row in rows]
+        heads, start = [escape(column) for column in columns], 1
+        cells = [[line[i] for line in lines] for i in range(len(columns))]
+        longest = [max(map(len, column), default=0) for column in cells]
+        least = [_least_width(head, column) for head, column in zip(heads, cells, strict=True)]
+        while start < max(len(columns), 2):
+            stop = start + 1
+            while stop < len(columns) and sum(least[start : stop + 1], least[0] + 1) <= self.console.width:
+                stop += 1
+            part = [0, *range(start, min(stop, len(columns)))]
+            fits = 1 + sum(BORDER + max(len(heads[i]), longest[i]) for i in part) <= self.console.width
+            more = ", continued" * (start > 1)
+            table = Table(title=Text(escape(title) + more), title_justify="left", title_style="bold")
+            for i in part:
+                text = i == 0 or longest[i] > NUMBER
+                table.add_column(
+                    Text(heads[i]), overflow="fold", justify="left" if text else "right",
+                    width=None if fits or text else least[i] - BORDER,
+                )  # fmt: skip
+            for line in lines:
+                if len(columns) == 1 or any(line[i] for i in part[1:]):
+                    table.add_row(*(Text(line[i]) for i in part))
+            self.console.print(table)
+            start = stop
 
     def show(self, title: str, table: ResultTable) -> None:
         """A table of numbers, as `table`."""
@@ -87,6 +98,13 @@ class Out:
         if self.as_json:
             json.dump(json_compatible(value), sys.stdout, ensure_ascii=False, allow_nan=False)
             sys.stdout.write("\n")
+
+
+def _least_width(head: str, cells: list[str]) -> int:
+    """Letters that a column and its border need: cells are wrapped only where they are long, heads at any space."""
+    whole = [cell for cell in cells if len(cell) <= NUMBER]
+    words = [word for text in (head, *cells) for word in text.split()]
+    return BORDER + max(max(map(len, whole), default=1), min(max(map(len, words), default=1), NUMBER))
 
 
 def writes(kind: str) -> Callable[[Command], Command]:

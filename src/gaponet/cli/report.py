@@ -20,7 +20,7 @@ from gaponet.robot.folder import load_stored_robot
 
 
 def report(
-    run: Known = Path("."), dataset: Path | None = None, also: tuple[Path, ...] = (), robot: Robot = None,
+    run: Known = Path("."), dataset: Path | None = None, robot: Robot = None,
     list_runs: Annotated[Flag, tyro.conf.arg(name="list")] = False, json: Json = False,
 ) -> None:  # fmt: skip
     """Write one offline HTML page about an identified robot or a run.
@@ -28,7 +28,6 @@ def report(
     Args:
         list_runs: Instead, list the training runs in this folder and below, best first.
         dataset: Dataset folder to evaluate on. Default: the dataset of the last evaluation.
-        also: Further runs to compare, e.g. the MLP's.
     """
     if list_runs:
         _show_runs(Out(json), run)
@@ -38,7 +37,7 @@ def report(
 
     out = Out(json)
     with progress_bar("report") as update:
-        path = write_report(run, dataset, also, robot, update, portrait)
+        path = write_report(run, dataset, robot, update, portrait)
     out.say(f"report: {path}")
     metrics = read_metrics(run)
     show_verdict(out, metrics["methods"], str(dataset or metrics["dataset"]), run, reported=True)

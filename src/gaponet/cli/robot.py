@@ -153,9 +153,7 @@ def new(
         screen.say(f"  no picture: {error}", "   note", "cyan")
     result = check_robot(screen, made.robot, None, ())
     screen.say(f"written: {out}/robot.toml, robot.xml{', picture.png' if picture else ''}")
-    screen.say(
-        f"Next: look at robot.toml and the picture; gaponet import LOGS --robot {robot_argument(out)} --out data"
-    )
+    screen.next(f"look at robot.toml and the picture; gaponet import LOGS --robot {robot_argument(out)} --out data")
     screen.result(result | {"folder": str(out), "notes": made.notes, "picture": picture and str(picture)})
 
 
@@ -243,7 +241,7 @@ def show(
     sure = {j: summarize(known, j) for j in known.joints}
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in fields)]
-    screen.wide_table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
+    screen.table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
     for line in sentences(known):
         screen.say(line)
     if out is not None:
@@ -299,12 +297,10 @@ def servos(
             out.say(line)
     else:
         stated = {"effort_limit": "torque limit, N·m", "speed_limit": "speed limit, rad/s", "gain": "kp of 1, N·m/rad"}
-        parts = {"measured (5…95 %)": MEASURED_FIELDS[:3], "stated": tuple(stated), "more terms": MEASURED_FIELDS[3:]}
-        for what, fields in parts.items():
-            headings = [stated.get(f) or SERVO_FIELDS[f].heading for f in fields]
-            rows = [[servo.name, *(servo.text(f) for f in fields)] for servo in types]
-            title = f"Servo types, version {table.version}: {what}"
-            out.table(title, ["servo type", *headings], [row for row in rows if any(row[1:])])
+        fields = (*MEASURED_FIELDS[:3], *stated, *MEASURED_FIELDS[3:])
+        headings = [stated.get(f) or SERVO_FIELDS[f].heading for f in fields]
+        title = f"Servo types, version {table.version}; measured values: median (5…95 % of joints)"
+        out.table(title, ["servo type", *headings], [[s.name, *(s.text(f) for f in fields)] for s in types])
         for servo in types:
             counts = servo.gaponet and f"joints: {servo.joints}, robots: {servo.robots}; gaponet {servo.gaponet}"
             limits = servo.limit_source and f"limits: {servo.limit_source}"

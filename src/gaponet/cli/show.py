@@ -13,14 +13,14 @@ from gaponet.report.verdict import next_step, verdict
 
 UNITS = {"payload": ", kg", "horizon": ", s"}
 GROUPS = ("joint", "payload", "unit", "horizon", "motion")
-SHOWN = 8  # columns of the totals that a screen has room for
+SHOWN = 7  # columns of the totals that a screen has room for
 
 
 def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None, reported: bool = False) -> None:
     """Print the verdict and the next command. The folder is that of a robot or a run, or None."""
     for sentence in verdict(methods):
         out.say(sentence)
-    out.say(f"next: {next_step(methods, dataset, folder, reported)}")
+    out.next(next_step(methods, dataset, folder, reported))
 
 
 def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GROUPS) -> None:

@@ -67,29 +67,15 @@ class Inspection:
 
 
 def start(
-    model: Model,
-    logs: Logs,
-    out: Path = Path("started"),
-    unit_id: str = "lab",
-    payload_mass: float = 0.0,
-    joints: tuple[str, ...] = (),
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
-    effort_limit: tuple[str, ...] = (),
-    map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    format: str | None = None,
-    position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None,
-    rate: float | None = None,
-    cut: float | None = None,
-    skip_bad: Flag = False,
-    allow_pickle: Flag = False,
-    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "drake", "json"] = "mjcf",
-    budget: str | None = None,
-    dry_run: Flag = False,
-    anyway: Flag = False,
-    json: Json = False,
-) -> None:
+    model: Model, logs: Logs, out: Path = Path("started"), unit_id: str = "lab", payload_mass: float = 0.0,
+    joints: tuple[str, ...] = (), kp: tuple[str, ...] = (), kd: tuple[str, ...] = (),
+    effort_limit: tuple[str, ...] = (), map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    format: str | None = None, position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None, rate: float | None = None, cut: float | None = None,
+    skip_bad: Flag = False, allow_pickle: Flag = False,
+    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "drake", "json"] = "mjcf", budget: str | None = None,
+    dry_run: Flag = False, anyway: Flag = False, json: Json = False,
+) -> None:  # fmt: skip
     """All steps in one command: from model file and logs to a report.
 
     OUT/commands.sh lists the commands that ran. The same command again continues after an interruption or a question.
@@ -139,15 +125,15 @@ def start(
         try:
             inspection = inspect_inputs(model, logs, logs_toml, robot_options, read_options, guess_joints=dry_run)
         except DescriptionNeededError as error:
-            if not dry_run:
-                out.mkdir(parents=True, exist_ok=True)
-                write_text(logs_toml, error.text)
-                hint = f"{logs_toml} is a guess from these logs; check it, then give the same command again"
-                raise UsageError(f"{error}: {hint}") from None
             for line in error.text.splitlines():
                 screen.say(f"  {line}")
-            raise UsageError(f"{error}. The lines above are a guess from these logs; without --dry-run they are "
-                             f"written to {logs_toml} for you to check") from None  # fmt: skip
+            if dry_run:
+                then = f"without --dry-run they are written to {logs_toml} for you to check"
+            else:
+                then = f"they are in {logs_toml}: check those with a ?, then give the same command again"
+                with lock_folder(out, "started"):
+                    write_text(logs_toml, error.text)
+            raise UsageError(f"{error}. The lines above are a guess from these logs; {then}") from None
         _print_inspection(screen, inspection, model, logs, unit_id, payload_mass)
         commands = make_commands(inspection, model, logs, out, robot_options, import_options, cut is None)
         for words in commands:
@@ -164,6 +150,7 @@ def start(
                 record.begin(shlex.join(next(words for words in commands if words[0] == "import")[2:]))
                 _run(screen, commands, lines, record, anyway)
             screen.say(f"commands that ran: {out / COMMANDS_FILE}")
+            screen.next(f"look at {out / 'identified' / 'report.html'}")
     screen.result({
         "robot": inspection.robot.name, "joints": inspection.log.joint_names, "recordings": inspection.recordings,
         "rate_hz": inspection.rate, "logs_toml": inspection.logs_toml, "commands": lines, "ran": not dry_run,
@@ -340,25 +327,31 @@ def hash_logs(logs: Path, out: Path) -> dict[str, str]:
 
 
 def _run(screen: Out, commands: list[list[str]], lines: list[str], record: StartRecord, anyway: bool) -> None:
-    """Run the commands that have not finished on the present inputs."""
-    for words, line in zip(commands, lines, strict=True):
-        inputs = record.inputs(words[0])
-        if record.fields["done"].get(line) == inputs:
-            screen.say(line, "done before: ", "green")
-            continue
-        screen.say(line, "$ ", "bold cyan")
-        if words[0] == "doctor":
-            with progress_bar("examining") as update:
-                diagnosis = api.doctor(words[1], progress=update)
-            show_diagnosis(screen, diagnosis)
-            if diagnosis.count("error") and not anyway:
+    """Run the commands that have not finished on the present inputs; none of them names the next one."""
+    Out.names_next = False
+    try:
+        for words, line in zip(commands, lines, strict=True):
+            inputs = record.inputs(words[0])
+            if record.fields["done"].get(line) == inputs:
+                screen.say(line, "done before: ", "green")
+                continue
+            screen.say(line, "$ ", "bold cyan")
+            if words[0] == "doctor":
+                with progress_bar("examining") as update:
+                    diagnosis = api.doctor(words[1], progress=update)
+                show_diagnosis(screen, diagnosis)
+                if diagnosis.count("error") and not anyway:
+                    raise UsageError(
+                        "stopped: an error that the doctor finds is in the logs, and no fit repairs it. "
+                        f"Repair the logs or {record.out / 'logs.toml'} (see gaponet doctor {words[1]} --fix), "
+                        f"delete {words[1]}, and start again; or --anyway"
+                    )
+            elif code := main(words):
+                if code == 128 + signal.SIGINT:
+                    raise KeyboardInterrupt("the same command again goes on")
                 raise UsageError(
-                    "stopped: an error that the doctor finds is in the logs, and no fit repairs it. "
-                    f"Repair the logs or {record.out / 'logs.toml'} (gaponet doctor {words[1]} --fix proposes lines), "
-                    f"delete {words[1]}, and start again; or --anyway"
+                    f"stopped at: {line}; the message above says what to do; then give the same command again"
                 )
-        elif code := main(words):
-            if code == 128 + signal.SIGINT:
-                raise KeyboardInterrupt
-            raise UsageError(f"stopped at: {line}; the message above says what to do; then give the same command again")
-        record.finish(line, inputs)
+            record.finish(line, inputs)
+    finally:
+        Out.names_next = True

@@ -79,7 +79,8 @@ def train(
     if not gain.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"
         screen.say("that is within what motions scatter, or less than 2 %: the identified robot is as good without it")
-    screen.say(f"{kind} in {trained.model.path}; next: {step}")
+    screen.say(f"{kind} in {trained.model.path}")
+    screen.next(step)
     screen.result(trained.to_dict())
 
 

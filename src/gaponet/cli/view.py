@@ -20,26 +20,12 @@ if TYPE_CHECKING:
 
 
 def view(
-    dataset: Data,
-    model: tuple[Path, ...] = (),
-    motion: str = "",
-    unit: str = "",
-    payload_mass: float | None = None,
-    show: tuple[str, ...] = ("target", "nominal", "aligned", "recorded"),
-    render: Path | None = None,
-    port: int = 8080,
-    start: float | None = None,
-    duration: float = 8.0,
-    speed: float = 1.0,
-    magnify: float = 1.0,
-    closeup: bool = False,
-    fps: float = 20.0,
-    width: int = 960,
-    azimuth: float = 145.0,
-    elevation: float = -14.0,
-    robot: Robot = None,
+    dataset: Data, model: tuple[Path, ...] = (), motion: str = "", unit: str = "", payload_mass: float | None = None,
+    show: tuple[str, ...] = ("target", "nominal", "aligned", "recorded"), render: Path | None = None, port: int = 8080,
+    start: float | None = None, duration: float = 8.0, speed: float = 1.0, magnify: float = 1.0, closeup: bool = False,
+    fps: float = 20.0, width: int = 960, azimuth: float = 145.0, elevation: float = -14.0, robot: Robot = None,
     json: Json = False,
-) -> None:
+) -> None:  # fmt: skip
     """Watch a recording beside its simulations: browser, film.
 
     Args:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.cli.out import Out
 from gaponet.hw.control.stop import STOP_SIGNALS
@@ -35,7 +34,6 @@ def virtual(
     seconds: float | None = None,
     fault: FaultKind = "none",
     fault_at: float = 2.0,
-    heard: Path | None = None,
     link: Path | None = None,
     calibration: Path | None = None,
     frame: float | None = None,
@@ -55,7 +53,6 @@ def virtual(
         seconds: Stop after this time, s.
         fault: Fault to inject, to test the controller.
         fault_at: Time of the fault after the first command, s.
-        heard: .npz file for all received commands and the joint positions, written at the end.
         link: Serial: additional name of the pseudo-terminal, such as /tmp/so101.
         calibration: Serial: file for the calibration in the servos, in the format of lerobot-calibrate.
         frame: Serial: simulated time per goal, s, instead of real time, for programs without a clock.
@@ -65,8 +62,6 @@ def virtual(
     from gaponet.testing.so101_virtual import VirtualSO101
 
     out, spec = Out(), load_robot(robot)
-    if heard and not heard.parent.is_dir():  # said now, not when all has been heard
-        raise UsageError(f"--heard {heard}: there is no folder {heard.parent}")
     name = f"virtual-{unit}" if unit.isdigit() else unit
     physics = load_fleet(fleet, spec).unit(name)
     for number in STOP_SIGNALS:
@@ -84,11 +79,7 @@ def virtual(
             _live(arm, limit, out, f"{label}: servo bus on {arm.port}")
         return
     humanoid = VirtualH12(spec, physics, (payload_mass, payload_side), domain, interface, rate, fault, fault_at)
-    try:
-        _live(humanoid, limit, out, f"{label}: rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}")
-    finally:
-        if heard:
-            humanoid.save_heard(heard)
+    _live(humanoid, limit, out, f"{label}: rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}")
     summary = f"heard {len(humanoid.heard)} commands, refused {humanoid.refused}, late {humanoid.missed} periods"
     out.say(f"{label}: {summary}")
 

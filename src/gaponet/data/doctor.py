@@ -21,50 +21,49 @@ from gaponet.data.store import Dataset
 from gaponet.robot.finding import LEVELS, Finding
 from gaponet.robot.spec import RobotSpec
 
+CONSEQUENCES = ("blocked", "stuck", "sag")  # findings that an exchanged, mirrored or mis-scaled joint causes
+
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """Result of examining a dataset."""
+class DoctorResult:
+    """Problems of a dataset.
 
-    findings: list[Finding]  # worst first
-    sequences: list[dict[str, Any]]  # one row of numbers each, for tables
-    joints: list[dict[str, Any]]
+    Attributes:
+        findings: Problems, the worst first.
+        sequences, joints: One row of numbers per sequence and per joint.
+    """
+
+    findings: tuple[Finding, ...]
+    sequences: tuple[dict[str, Any], ...]
+    joints: tuple[dict[str, Any], ...]
 
     def count(self, level: str) -> int:
-        """Return the number of findings of a level."""
+        """Return the number of findings of a level: error, warning or note."""
         return sum(f.level == level for f in self.findings)
 
     @property
     def verdict(self) -> str:
         """The result in one sentence."""
-        errors, warnings = self.count("error"), self.count("warning")
-        if errors:
-            return f"Do not train on this yet: {errors} error(s) and {warnings} warning(s)."
-        if warnings:
-            return f"Usable. Read the {warnings} warning(s) first."
-        return "Good: nothing found that training should not see."
+        count = {level: self.count(level) for level in ("error", "warning")}
+        texts = [f"{n} {level}{'s' * (n > 1)}" for level, n in count.items() if n]
+        if count["error"]:
+            return f"Do not train on this yet: {' and '.join(texts)}."
+        return f"Usable. Read the {texts[0]} first." if texts else "Good: no error and no warning."
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the diagnosis as a dictionary for JSON."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain data."""
         return {"verdict": self.verdict} | asdict(self)
 
     @classmethod
     def of(
-        cls,
-        dataset: Dataset,
-        robot: RobotSpec,
-        *,
-        gravity_model: Gravity | None = None,
-        progress: Progress = no_progress,
-        executor: str | Executor = LOCAL,
-    ) -> Diagnosis:
+        cls, dataset: Dataset, robot: RobotSpec, *, gravity_model: Gravity | None = None,
+        progress: Progress = no_progress, executor: str | Executor = LOCAL,
+    ) -> DoctorResult:  # fmt: skip
         """Examine every sequence, and judge them together.
 
         Args:
-            robot: The dataset's robot.
             gravity_model: Gravity of the nominal model, which shows wrong zeros, signs, gains and payload labels; these
                 are not examined without it.
-            executor: Measures the sequences, if there are many; default: this machine's cores.
 
         Raises:
             DatasetError: The dataset is empty, damaged or another robot's.
@@ -73,10 +72,13 @@ class Diagnosis:
         dataset.require_sequences()
         surveys = survey_all(dataset, robot, progress, executor)
         findings = [f for check in CHECKS for f in check.run(surveys, robot)]
+        wrong = {j for f in findings if f.level == "error" and f.check in ("order", "sign", "unit") for j in f.joints}
+        findings = [f for f in findings if f.check not in CONSEQUENCES or not f.joints or not wrong >= set(f.joints)]
         if gravity_model is not None:
             findings += _examine_loads(findings, surveys, robot, gravity_model)
         findings.sort(key=lambda f: -LEVELS.index(f.level))
-        return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
+        rows = tuple(_sequence_row(s, robot) for s in surveys)
+        return DoctorResult(tuple(findings), rows, tuple(_joint_rows(surveys, robot)))
 
     @staticmethod
     def inventory(dataset: Dataset) -> str:

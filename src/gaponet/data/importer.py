@@ -23,7 +23,7 @@ from gaponet.data.journal import Findings
 from gaponet.data.log import Log, skip_bad_rows
 from gaponet.data.offsets import Gravity, JointOffset, read_offsets, record_offsets, unit_offsets
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
-from gaponet.data.signals import estimate_delay, fast_speed
+from gaponet.data.signals import FAST_COMMAND_RAD_S, estimate_delay, fast_speed
 from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import KIND, Dataset, Entry
 from gaponet.robot.spec import RobotSpec
@@ -34,55 +34,64 @@ UNSTATED_REPETITION = -1
 
 
 @dataclass(frozen=True)
-class ImportReport:
-    """Result of one import."""
+class ImportResult:
+    """Logs that were read into a dataset.
+
+    Attributes:
+        added: Sequences that were added.
+        present: Sequences of the same logs that the dataset held before.
+        offsets: Lag and static errors of the unit; None without a gravity model or with several units.
+        cut: Rows that were cut and logs that were left out, one line each.
+    """
 
     dataset: Dataset
-    entries: list[Entry]  # added
-    present: list[Entry]  # of this source, but in the dataset already, by their content
-    offsets: dict[str, JointOffset] | None  # by joint; None without a gravity model, or if there are several units
-    skipped: list[str] = field(default_factory=list)  # with skip_bad: rows cut and recordings left out, one line each
+    robot: RobotSpec
+    added: tuple[Entry, ...]
+    present: tuple[Entry, ...]
+    offsets: dict[str, JointOffset] | None
+    cut: tuple[str, ...]
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Sequences that were added, or those that were present where nothing was added."""
+        return self.added or self.present
+
+    def fast_lags(self, joint: str) -> list[float]:
+        """Lags of a joint in the sequences that command it fast, s."""
+        measured = [{name: x.get(joint) for name, x in e.findings.items()} for e in self.entries]
+        lags = [x.get("delay_s") for x in measured if (x.get("fast_speed") or 0) >= FAST_COMMAND_RAD_S]
+        return [lag for lag in lags if lag is not None]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain data."""
+        offsets = self.offsets or {}
+        return {
+            "dataset": str(self.dataset.path), "imported": [e.id for e in self.added],
+            "present": [e.id for e in self.present], "sequences": len(self.dataset),
+            "minutes": sum(e.rows * e.dt for e in self.entries) / 60,
+            "rate_hz": sorted({round(1 / e.dt, 2) for e in self.entries}),
+            "fast_lag_s": {joint: self.fast_lags(joint) for joint in self.robot.operated},
+            "delay_s": {e.id: e.findings.get("delay_s", {}) for e in self.entries},
+            "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False,
+            "cut": list(self.cut),
+        }  # fmt: skip
 
 
 def import_logs(
-    src: str | Path,
-    robot: RobotSpec,
-    unit_id: str | None,
-    payload_mass: float | None,
-    out: str | Path,
-    *,
-    payload_side: str | None = None,
-    level: str | None = None,
-    fmt: str | None = None,
-    gravity: Gravity | None = None,
-    simulator: str = "",
-    progress: Progress = no_progress,
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
-    skip_bad: bool = False,
-    cut: float | None = None,
-    **options: Any,
-) -> ImportReport:
+    src: str | Path, robot: RobotSpec, unit_id: str | None, payload_mass: float | None, out: str | Path, *,
+    payload_side: str | None = None, level: str | None = None, fmt: str | None = None, gravity: Gravity | None = None,
+    simulator: str = "", progress: Progress = no_progress, kp: tuple[str, ...] = (), kd: tuple[str, ...] = (),
+    skip_bad: bool = False, cut: float | None = None, **options: Any,
+) -> ImportResult:  # fmt: skip
     """Import every recording under a path that the dataset does not hold yet. A bad recording refuses all of them.
 
     What was written before a full disk or a kill stays, complete, and the same call adds the rest.
 
     Args:
-        src: File or folder in one of data.formats.formats().
-        unit_id: Name of the robot copy, to which offsets belong. None if the format states it.
-        payload_mass: In each hand named by payload_side, kg; 0.0 when empty. None if the format states it.
-        out: Dataset folder; created, or appended to by one process at a time.
-        payload_side: "both" (default), or the side of one payload mount.
-        level: joint, upper_body or whole_body (default).
-        fmt: Name of the format; default by looking at the files.
         gravity: Gravity of the nominal model, to measure offsets (data.offsets); default: no offsets.
         simulator: Hash of that model, recorded beside the offsets.
-        kp, kd: Gains while recording, N·m/rad and N·m·s/rad: one number, or JOINT=NUMBER for some joints; default what
-            the format states, else the robot's.
-        skip_bad: Cut bad rows and leave out recordings that cannot be read, instead of refusing all.
-        cut: Cut recordings into pieces of about this duration, s; each becomes a motion of its own.
         options: Options of data.formats.read_logs: joint_map, logs, position_unit, time_unit, rate, allow_pickle,
-            strict.
+            strict. All other arguments are those of gaponet.api.logs.import_logs, `fmt` its `format`.
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
@@ -115,7 +124,7 @@ def import_logs(
         for unit, of_unit in offsets.items():
             record_offsets(dataset, unit, of_unit, simulator)
     only = next(iter(offsets.values())) if len(offsets) == 1 else None
-    return ImportReport(dataset, added, present, only, list(dict.fromkeys(skipped or ())))
+    return ImportResult(dataset, robot, tuple(added), tuple(present), only, tuple(dict.fromkeys(skipped or ())))
 
 
 @dataclass
@@ -217,7 +226,7 @@ class _Source:
         needed = {"unit_id": "--unit-id NAME", "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)"}
         missing = [flag for name, flag in needed.items() if name not in self.labels | stated]
         if missing:
-            raise UsageError(f"{log.source}: this format does not say it: give {' and '.join(missing)}")
+            raise UsageError(f"{log.source}: this format does not state unit or payload: give {' and '.join(missing)}")
         # A relative path: no home folder gets into a dataset.
         source = Path(os.path.relpath(log.source, Path(os.path.abspath(self.src)).parent)).as_posix()
         origin = {"source": source, "source_sha256": sha256, "repetition": UNSTATED_REPETITION}
@@ -289,6 +298,5 @@ def _sha256(files: tuple[str, ...]) -> str:
     digest = hashlib.sha256()
     for file in files:
         with Path(file).open("rb") as content:
-            while block := content.read(1 << 20):
-                digest.update(block)
+            hashlib.file_digest(content, lambda: digest)
     return digest.hexdigest()

@@ -338,13 +338,11 @@ def read_split(path: str | Path, dataset: Dataset) -> Splits:
     Raises:
         DatasetError: It is no split file, a sequence is not in the dataset, or two splits share one.
     """
-    hashes = read_json(_SplitFile, Path(path), DatasetError, "make one with gaponet data split", allow_extra=True)[
-        "parts"
-    ]
+    file = read_json(_SplitFile, Path(path), DatasetError, "make one with gaponet data split", allow_extra=True)
     splits: Splits = {s: [] for s in SPLITS}
     split_of_hash: dict[str, str] = {}
     for s in SPLITS:
-        for name, digest in hashes[s].items():  # type: ignore[literal-required]
+        for name, digest in file["parts"][s].items():  # type: ignore[literal-required]
             entry = dataset.find(digest)
             if entry is None:
                 raise DatasetError(f"{path}: '{name}' is not in {dataset.path}; split that dataset anew")

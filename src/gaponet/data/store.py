@@ -5,7 +5,7 @@
     sequences.jsonl         one line per sequence: metadata, hash, delays (data.journal)
     offsets.json            static offsets of each unit as measured at import (data.offsets); not applied
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, … (data.sequence_file)
-    replays/<model>/<id>.parquet  qpos, qvel, tau of the simulator with that model hash; older versions: twins/
+    replays/<model>/<id>.parquet  qpos, qvel, tau of the simulator with that model hash
     card.json, CARD.md      counts and ranges (data.card)
     splits/<name>.json      train, validation and test sets (data.split)
 
@@ -47,7 +47,7 @@ from gaponet.robot.spec import RobotSpec
 
 FORMAT = 1
 KIND = "dataset"
-REPLAYS, OLD_REPLAYS = "replays", "twins"
+REPLAYS = "replays"
 
 
 class _Header(TypedDict):
@@ -282,9 +282,8 @@ class Dataset:
                 temporary.write_bytes(b"".join(e.line + b"\n" for e in self.entries if e not in removed))
             for entry in removed:  # if this is cut short, the files that remain are not listed
                 self._file(entry).unlink(missing_ok=True)
-                for folder in (REPLAYS, OLD_REPLAYS):
-                    for file in self.path.glob(f"{folder}/*/{entry.id}.*"):
-                        file.unlink(missing_ok=True)
+                for file in self.path.glob(f"{REPLAYS}/*/{entry.id}.*"):
+                    file.unlink(missing_ok=True)
             self._load()
         return removed
 
@@ -329,7 +328,7 @@ class Dataset:
         return self.path / "sequences" / f"{entry.id}.parquet"
 
     def _replay_file(self, entry: Entry, model: str) -> Path:
-        folders = (self._replay_root / REPLAYS, self.path / REPLAYS, self.path / OLD_REPLAYS)
+        folders = (self._replay_root / REPLAYS, self.path / REPLAYS)
         files = [folder / model / f"{entry.id}.parquet" for folder in folders]
         return next((file for file in files if file.is_file()), files[0])
 

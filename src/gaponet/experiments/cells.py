@@ -24,7 +24,6 @@ from gaponet.base.progress import Running
 from gaponet.base.structure import read_json
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.experiments.variant import Variant
-from gaponet.nn.training.config import RENAMED_FIELDS, TrainConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import model_hash
 
@@ -92,17 +91,9 @@ class Cell:
         if not file.is_file():
             raise UsageError(f"{self.folder}: is there but is no part of a comparison; choose another --out")
         stored = read_record(file)
-        stored["config"] = _with_defaults(stored["config"], json.loads(json.dumps(asdict(TrainConfig().sized()))))
         if stored != wanted:
             changed = ", ".join(k for k in wanted if stored.get(k) != wanted[k])
             raise UsageError(f"{self.folder}: belongs to a comparison with another {changed}; choose another --out")
-
-
-def _with_defaults(config: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
-    """Add the defaults of the fields that did not exist when the config was written."""
-    config = {RENAMED_FIELDS.get(name, name): value for name, value in config.items()}
-    nested = {k: _with_defaults(config[k], v) for k, v in defaults.items() if isinstance(v, dict) and k in config}
-    return defaults | config | nested
 
 
 @dataclass

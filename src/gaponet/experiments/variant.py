@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.config import RENAMED_FIELDS, TrainConfig
+from gaponet.nn.training.config import TrainConfig
 from gaponet.report.methods import IDENTIFIED
 
 KINDS: tuple[str, ...] = get_args(get_type_hints(ModelConfig)["kind"])
@@ -63,8 +63,6 @@ def parse_variant(text: str, base: TrainConfig) -> Variant:
 
 def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
     field, equals, value = setting.partition("=")
-    part, dot, name = field.partition(".")
-    field = RENAMED_FIELDS.get(part, part) + dot + name
     places = dict(_places(config))
     if not equals or field not in places:
         near = get_close_matches(field, places, 5, 0.4)

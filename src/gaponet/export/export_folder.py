@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ CHECK_FILES: dict[str, dict[str, str]] = {
     "actuator-net": ACTION_TERM
     | {"check.py": "check_mjlab.py", "check_newton.py": "check_newton.py", "actuators.py": "actuators.py"},
 }
-SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, least torque and friction; numpy or torch."""
+SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, torque limits and friction; numpy or torch."""
 
 from __future__ import annotations
 
@@ -66,9 +66,10 @@ import numpy as np
 ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the joints
 '''
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
-    array_module, servo.present, servo.exp, servo.passing_friction, servo.resting_friction, servo.friction_limit,
-    servo.servo_torque,
+    array_module, servo.present, servo.exp, servo.torque_range, servo.passing_friction, servo.resting_friction,
+    servo.friction_limit, servo.servo_torque, servo.crossed, servo.Play,
 )  # fmt: skip
+ENGINE_TERMS = {"isaaclab": ("no_load_speed",)}  # terms of the servo model that an engine's own servos have
 OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts|unit_events) import")
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 DELAY_NOTES = {
@@ -132,14 +133,14 @@ def export_robot(
     train, validation = recordings[0], comparable(recordings[1], robot, payload_mass)
     if not validation:
         raise UsageError(f"no validation motion was made with {payload_mass:g} kg and the robot's own gains")
-    plain = fit_plain_servos(robot, train, progress=progress)
+    plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
     facts = simulator_facts(robot, robot.dt, payload_mass, plain)
     motions = check_motions(validation, robot)
     facts |= {"file": ROBOT, "prefix": prefix, "virtual": validation[0].meta.virtual}
     facts["error_mrad"] = {form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))}
     errors = {"in gaponet": rollout_error(validation, robot)}
     if robot.has_servo_model:
-        errors["in gaponet, fitted without the law"] = rollout_error(validation, plain)
+        errors["in gaponet, without the servo model"] = rollout_error(validation, plain)
     file, notes = None, _notes(robot, facts, to)
     with lock_folder(out, FOLDER_KIND):
         if to == "mjcf":
@@ -152,7 +153,10 @@ def export_robot(
                 notes.append(f"{text}: now they are; ctrl of keyframes not")
         elif to == "urdf":
             assert source is not None
-            file = edit_urdf(source, out, facts, robot.operated)
+            file, other = edit_urdf(source, out, facts, robot)
+            if other:
+                notes.append(f"inertias of {', '.join(other)} were not written: their masses in the file are others")
+                plain = replace(plain, links={n: link for n, link in plain.links.items() if n not in other})
             errors[f"{file.name} alone, all else as before"] = rollout_error(validation, with_urdf_fields(plain))
         elif to != "json":
             file = out / ROBOT
@@ -167,7 +171,8 @@ def export_robot(
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     """Return effects that an engine's form of a robot lacks."""
-    notes, servos, law = [], facts["plain"].values(), ", ".join(facts["law"])
+    notes, servos = [], facts["plain"].values()
+    law = ", ".join(term for term in facts["law"] if term not in ENGINE_TERMS.get(to, ()))
     if to == "mjcf":
         for name, *stops in zip(robot.joint_names, robot.stop_low, robot.stop_high, strict=True):
             if at := " and ".join(f"{x:.2f}" for x in stops if np.isfinite(x)):
@@ -187,6 +192,8 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
         )
     if law and to in ("isaaclab", "newton", "drake", "urdf"):
         notes.append(f"the servo model ({law}) is not in {to}: the numbers were fitted without it")
+    if to == "mjlab" and robot.backlash.any():
+        notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")
     return notes
 
 
@@ -275,7 +282,7 @@ def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
     constants = (
         f"SERVO_TERMS = {SERVO_TERMS}\n"
         f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
-        f"DEADBAND_STEPS = {servo.DEADBAND_STEPS}\n"
+        f"DEADBAND_STEPS, OPENED = {servo.DEADBAND_STEPS}, {servo.OPENED}\n"
     )
     functions = [inspect.getsource(f) for f in SERVO_MODEL]
     write_text(folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + constants, *functions]))

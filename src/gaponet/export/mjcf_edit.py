@@ -150,6 +150,12 @@ class Source:
             raise RobotError(f"{self.main}: has {len(tags)} {what}; one is needed. Delete or rename the others")
         return tags[0] if tags else None
 
+    def child(self, parent: Tag, name: str) -> Tag | None:
+        """Return the first element of a name in another one, which is in no body in between."""
+        inside = [t for t in self.tags if t.file == parent.file and parent.open_end <= t.start < parent.end]
+        bodies = [t for t in inside if t.name == "body"]
+        return next((t for t in inside if t.name == name and not any(b.start < t.start < b.end for b in bodies)), None)
+
     def write_changes(self, folder: Path) -> None:
         """Write the changes as a unified diff, changes.diff."""
         edited, lines = self.edited(), list[str]()
@@ -257,7 +263,7 @@ def _radians_per_unit(model: mujoco.MjModel, joint: str) -> float:
 def _add_surroundings(
     source: Source, robot: RobotSpec, prefix: str, payload_mass: float, model: mujoco.MjModel
 ) -> None:
-    """Add the solver's tolerance, the table and the payload."""
+    """Add the solver's tolerance, the table and the payload, and write the inertias of identified links."""
     option = {"tolerance": text_of(TOLERANCE)} if model.opt.tolerance > TOLERANCE else {}
 
     def body(name: str, what: str) -> Tag:
@@ -280,6 +286,13 @@ def _add_surroundings(
                           f' pos="{text_of(*tip.pos)}" mass="0" contype="0" conaffinity="0" group="3"/>')  # fmt: skip
             words = _attributes({f: text_of(*getattr(own, f"pair_{f}")[i]) for f in ("friction", "solref", "solimp")})
             source.append("contact", f'    <pair geom1="{name}" geom2="{table}" condim="3" {words}/>\n')
+    for name, link in robot.links.items():
+        tag, values = body(prefix + name, "identified_link"), {"mass": text_of(link.mass), "pos": text_of(*link.pos)}
+        inertial = f"<inertial {_attributes(values | {'fullinertia': text_of(*link.inertia)})}/>"
+        if (own := source.child(tag, "inertial")) is not None:
+            source.replace(own, inertial)
+        else:
+            source.insert(tag, inertial)
     for mount in robot.payload_mounts:
         if mass := payload_mass + mount.mass:
             radius = (3 * mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3)
@@ -322,6 +335,10 @@ def _require(
         wanted = [*(servo[f] for f in JOINT_ATTRIBUTES), kp, bias, -kp, -servo["kd"], servo["effort_limit"]]
         if not np.allclose(actual, wanted, rtol=1e-5, atol=1e-9):
             wrong.append(f"{name}: {np.round(actual, 6)} instead of {np.round(wanted, 6)}")
+    for name, link in robot.links.items():
+        body = now.body(prefix + name)
+        if not np.allclose([*body.mass, *body.ipos], [link.mass, *link.pos], rtol=1e-5, atol=1e-9):
+            wrong.append(f"body {name}: {body.mass[0]:.6g} kg instead of {link.mass:.6g} (inertiafromgeom?)")
     if wrong:
         raise RobotError(f"{path}: the edited copy differs from the robot: {'; '.join(wrong[:3])}")
 

@@ -75,19 +75,20 @@ def fit_plain_servos(
     robot: RobotSpec,
     recordings: ListOf[Sequence],
     progress: Progress = no_progress,
+    engine_terms: tuple[str, ...] = (),
 ) -> RobotSpec:
-    """Fit the parameters of PD servos, without a servo model, to recordings.
+    """Fit the parameters of PD servos, without a servo model but for the terms that the engine has, to recordings.
 
     The result is stored in the robot folder, and read from there if nothing changed.
 
     Args:
-        robot: Identified; table, zeros and stops do not change. Returned unchanged if it has no servo model.
+        robot: Identified; table, zeros and stops do not change. Returned unchanged if the engine has its servo model.
         recordings: Motions that it was fitted to, or its own (`own_motions`).
         progress: Called with done, total and a note, as by `identify`.
     """
-    if not robot.has_servo_model:
+    without: dict[str, Any] = {name: np.array(0.0) for name in SERVO_TERMS if name not in engine_terms}
+    if not any(getattr(robot, name).any() for name in without):
         return robot
-    without: dict[str, Any] = dict.fromkeys(SERVO_TERMS, np.array(0.0))
     start = replace(robot, **without)
 
     def fit() -> dict[str, dict[str, float]]:

@@ -72,7 +72,7 @@ def servo_facts(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, An
         "armature": float(model.dof_armature[dof]), "damping": float(np.ravel(model.dof_damping[dof])[0]),
         "frictionloss": float(model.dof_frictionloss[dof]), "delay": float(robot.delay[i]),
         "offset": float(robot.offset[i]), "zero": float(robot.zero[i]), "target_speed": float(robot.target_speed[i]),
-    }  # fmt: skip
+    } | ({"no_load_speed": speed} if (speed := float(robot.no_load_speed[i])) else {})  # fmt: skip
 
 
 def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:

@@ -1,4 +1,4 @@
-"""Write a copy of a user's URDF with identified damping, friction and effort limits; nothing else changes.
+"""Write a copy of a user's URDF with identified damping, friction, effort limits and inertias; nothing else changes.
 
 URDF has no place for gains, armature, delay or offsets.
 """
@@ -13,23 +13,24 @@ import numpy as np
 
 from gaponet.base.errors import RobotError
 from gaponet.base.files import lock_folder, write_text
-from gaponet.export.mjcf_edit import Source, Tag, text_of
+from gaponet.export.mjcf_edit import Source, text_of
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.model import build_model
 
 MISSING_FIELDS = ("kp", "kd", "armature", "delay", "offset", "zero")  # of a joint, which a URDF lacks
 
 
-def edit_urdf(path: Path, out: Path, facts: dict[str, Any], operated: tuple[str, ...]) -> Path:
-    """Write a copy with the numbers of operated joints.
+def edit_urdf(path: Path, out: Path, facts: dict[str, Any], robot: RobotSpec) -> tuple[Path, list[str]]:
+    """Write a copy with the numbers of operated joints and of identified links.
 
     Args:
         path: URDF; files that it names stay where they are.
         out: Folder for the copy and changes.diff.
         facts: facts.json, with the prefix of joint names in the file.
-        operated: The joints to change.
+        robot: Robot with the joints and links to change.
 
     Returns:
-        The copy.
+        The copy, and links that stay: their mass in the file is not the nominal one, so their frame may differ too.
 
     Raises:
         RobotError: A joint is not in the file, or it is no URDF.
@@ -38,23 +39,41 @@ def edit_urdf(path: Path, out: Path, facts: dict[str, Any], operated: tuple[str,
     if source.tags[0].name != "robot":
         raise RobotError(f"{path}: begins with <{source.tags[0].name}>, so it is no URDF")
     tags = {t.attributes.get("name", ""): t for t in source.tags if t.name == "joint" and t.parent == "robot"}
-    for name in operated:
+    for name in robot.operated:
         if (tag := tags.get(prefix + name)) is None:
             raise RobotError(f"{path}: has no joint '{prefix + name}' (--prefix); it has {', '.join(tags)}")
         servo = facts["plain"][name]
         values = {"damping": text_of(servo["damping"]), "friction": text_of(servo["frictionloss"])}
-        dynamics, limit = (_within(source, tag, element) for element in ("dynamics", "limit"))
+        dynamics, limit = (source.child(tag, element) for element in ("dynamics", "limit"))
         if dynamics is not None:
             source.set(dynamics, **values)
         else:
             source.insert(tag, f'    <dynamics damping="{values["damping"]}" friction="{values["friction"]}"/>')
         if limit is not None and np.isfinite(servo["effort_limit"]):
             source.set(limit, effort=text_of(servo["effort_limit"]))
+    other = _set_links(source, robot, prefix)
     target = out / path.name
     with lock_folder(out, "engine"):
         write_text(target, source.edited()[source.main].decode("utf-8"))
     source.write_changes(out)
-    return target
+    return target, other
+
+
+def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
+    """Write the inertias of identified links whose mass is as before; return the names of others."""
+    before, other = build_model(robot.before_identification), list[str]()
+    tags = {t.attributes.get("name", ""): t for t in source.tags if t.name == "link"}
+    for name, link in robot.links.items():
+        inertial = (tag := tags.get(prefix + name)) and source.child(tag, "inertial")
+        mass = inertial and source.child(inertial, "mass")
+        if not mass or not np.isclose(float(mass.attributes["value"]), before.body(name).mass[0], rtol=1e-2):
+            other.append(name)
+            continue
+        axes = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(text_of, link.inertia), strict=True)
+        numbers = " ".join(f'{axis}="{value}"' for axis, value in axes)
+        source.replace(inertial, f'<inertial><origin xyz="{text_of(*link.pos)}"/><mass value="{text_of(link.mass)}"/>'
+                                 f"<inertia {numbers}/></inertial>")  # fmt: skip
+    return other
 
 
 def with_urdf_fields(plain: RobotSpec) -> RobotSpec:
@@ -62,8 +81,3 @@ def with_urdf_fields(plain: RobotSpec) -> RobotSpec:
     nominal = plain.before_identification
     missing = {f: getattr(nominal, f) for f in (*MISSING_FIELDS, "stop_low", "stop_high")}
     return replace(plain, **missing, nominal=nominal)
-
-
-def _within(source: Source, parent: Tag, name: str) -> Tag | None:
-    """Return the first element of a name inside another one."""
-    return next((t for t in source.tags if t.name == name and parent.open_end <= t.start < parent.end), None)

@@ -23,7 +23,7 @@ from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.adapt import FIELDS, Field, adapt
 
-FOLDERS = ("calibration", "adaptation")  # earlier name, name of today
+FOLDER = "adaptation"  # of a run
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,6 @@ class Adaptation:
         logs: Content hashes of the recordings.
         seconds: Duration of the fitted windows.
         before, after: RMS error of the fitted windows, rad.
-        payload_mass, payload_std: Payload that an earlier version estimated, and its standard error, kg.
     """
 
     unit_id: str
@@ -46,8 +45,6 @@ class Adaptation:
     seconds: float
     before: float
     after: float
-    payload_mass: Annotated[float, Interval(ge=0, le=100)] | None = None
-    payload_std: float | None = None
 
     def robot(self, simulator: RobotSpec) -> RobotSpec:
         """Return the simulator with the parameters of this unit."""
@@ -55,7 +52,7 @@ class Adaptation:
 
     def save(self, run: Path) -> Path:
         """Write RUN/adaptation/UNIT.json and return its path. It replaces an earlier file of this unit."""
-        path = run / FOLDERS[-1] / f"{re.sub(r'[^A-Za-z0-9._-]', '_', self.unit_id)}.json"
+        path = run / FOLDER / f"{re.sub(r'[^A-Za-z0-9._-]', '_', self.unit_id)}.json"
         with lock_folder(run, "run"):
             path.parent.mkdir(exist_ok=True)
             write_json(path, asdict(self))
@@ -79,14 +76,16 @@ class Adaptation:
         Raises:
             UsageError: The recordings are of several units.
         """
-        unit = _one_unit(sequences)
+        units = sorted({s.meta.unit_id for s in sequences})
+        if len(units) != 1:
+            raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
         fitted = adapt(sequences, simulator, seconds, model.corrector(simulator), progress)
         servos = {
             j: {f: float(getattr(fitted.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
             for j in simulator.operated
         }
         logs = tuple(s.content_hash() for s in sequences)
-        return Adaptation(unit, model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after)
+        return Adaptation(units[0], model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after)
 
     @classmethod
     def load(cls, run: Path, weights: str) -> dict[str, Adaptation]:
@@ -96,7 +95,7 @@ class Adaptation:
             ModelError: A file is damaged, or belongs to another model than that with these weights.
         """
         adaptations = {}
-        for path in sorted(path for name in FOLDERS for path in (run / name).glob("*.json")):
+        for path in sorted((run / FOLDER).glob("*.json")):
             adaptation = read_json(Adaptation, path, ModelError, "run gaponet adapt again")
             if adaptation.weights != weights:
                 raise ModelError(
@@ -104,11 +103,3 @@ class Adaptation:
                 )
             adaptations[adaptation.unit_id] = adaptation
         return adaptations
-
-
-def _one_unit(sequences: ListOf[Sequence]) -> str:
-    """Return the unit of these recordings; refuse those of several."""
-    units = sorted({s.meta.unit_id for s in sequences})
-    if len(units) != 1:
-        raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
-    return units[0]

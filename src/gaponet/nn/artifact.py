@@ -23,13 +23,6 @@ from gaponet.robot.spec import RobotSpec
 WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
 GAIN_TOLERANCE = 0.02  # relative, between recorded and real gains
 RATE_TOLERANCE = 0.02  # relative: a clock of 49.85 Hz counts as 50 Hz
-# Removed options that cards of earlier versions contain → the value with which such a model still works.
-REMOVED_OPTIONS = {
-    "payload_predictor": True, "context": "none", "branch": "unstacked", "branch_history": True, "fno_width": 32,
-    "fno_layers": 3, "fno_modes": 4, "coupling": "posture", "transformer_width": 64, "transformer_layers": 2,
-    "transformer_heads": 4,
-}  # fmt: skip
-RENAMED_STAGES = {"warm_start_rounds": "pretraining_rounds", "ppo_anew": "ppo_from_untrained"}  # earlier → today
 
 
 def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, Any]:
@@ -68,8 +61,6 @@ class _Stages(TypedDict):
     ppo_updates: int
     pretraining_rounds: NotRequired[tuple[int, int]]
     ppo_from_untrained: NotRequired[bool]
-    warm_start_rounds: NotRequired[tuple[int, int]]  # earlier name
-    ppo_anew: NotRequired[bool]  # earlier name
 
 
 class _Card(TypedDict):
@@ -276,18 +267,11 @@ class GapModel:
         """Read and check a card; return it and the options of its model.
 
         Raises:
-            ModelError: The file is damaged or from a newer version, or the model has a removed option.
+            ModelError: The file is damaged or from a newer version.
         """
         mend = "restore it or train again"
         read_format(_Card, file, FORMAT, ModelError, mend)
         card = read_json(dict[str, Any], file, ModelError, mend)
-        for field, value in REMOVED_OPTIONS.items():
-            if (given := card["model"].pop(field, value)) != value:
-                raise ModelError(f"{file}: trained with {field} {given}, which is no more; train again without it")
-        if card["model"].get("kind") == "inverse":  # a removed recipe for the mlp
-            card["model"]["kind"] = "mlp"
-        if stages := card.get("stages"):
-            card["stages"] = {RENAMED_STAGES.get(name, name): value for name, value in stages.items()}
         config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
         n = len(card["joint_names"])
         lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}

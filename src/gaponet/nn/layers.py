@@ -111,11 +111,6 @@ class BoundedOutput(nn.Module):
         self.register_buffer("gain", torch.tensor(1.0))
         self.register_buffer("scale", torch.tensor(1.0))
 
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
-        # Earlier checkpoints call the scale "unit", or have none.
-        state.setdefault(prefix + "scale", state.pop(prefix + "unit", torch.tensor(1.0)))
-        super()._load_from_state_dict(state, prefix, *args)
-
     def forward(self, y: Tensor) -> Tensor:
         if self.hard:
             delta = self.gain * self.scale * y

@@ -41,8 +41,6 @@ from gaponet.nn.sensor import ProbeOracle
 
 PREDICTOR_HIDDEN, BRANCH_HIDDEN, TRUNK_HIDDEN = (128, 128), (256, 256, 256), (128, 128, 128)
 REAL_STATE_SCALES = (0.05, 0.3)  # rad, rad/s, of differences between recorded and simulated state
-# Modules in checkpoints before 26 November 2026 → modules of today.
-RENAMED = {"observed": "observation_scale", "asked": "query_scale", "answers": "sensor_scale"}
 
 
 class SensorPredictor(nn.Module):
@@ -102,13 +100,6 @@ class PaperNet(DeltaNet):
         self.extra_inputs = observations + len(self.real_state_scale) * config.real_state
         self.branch = nn.Sequential(*dense(self.extra_inputs + sensors, BRANCH_HIDDEN, outputs), nn.ELU())
         self.trunk = dense(queries, TRUNK_HIDDEN, outputs, zero_output=True)
-
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *args: Any) -> None:
-        for name in [name for name in state if name.startswith(prefix)]:
-            module, _, field = name.removeprefix(prefix).partition(".")
-            if module in RENAMED:
-                state[f"{prefix}{RENAMED[module]}.{field}"] = state.pop(name)
-        super()._load_from_state_dict(state, prefix, *args)
 
     def fit_inputs(self, x: Tensor) -> None:
         super().fit_inputs(x)

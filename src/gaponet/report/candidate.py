@@ -110,10 +110,6 @@ def select_entries(
     candidate was fitted to. If all motions were used, the default is recordings that were not used. A robot folder
     without an origin counts as fitted to everything and is evaluated on everything.
 
-    Args:
-        motions: Only these motions.
-        units: Only these units.
-
     Raises:
         DatasetError: Every recording was used in training.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as ListOf
@@ -156,15 +157,14 @@ def evaluate(
         },
         "adapted_units": sorted(set(adapted) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
-        "command": _command(folders, dataset.address or dataset.path, motions),
+        "command": _command(folders, dataset.address or os.path.normpath(dataset.path), motions),
     }
     return Evaluation(result, done_runs, ctrl, deltas)
 
 
-def _command(folders: ListOf[Path], dataset: Path | str, motions: tuple[str, ...]) -> str:
+def _command(folders: ListOf[Path], dataset: str, motions: tuple[str, ...]) -> str:
     """Return the shell command that repeats an evaluation."""
-    words = ["gaponet", "eval", str(folders[0]), str(dataset)]
-    words += ["--also", *map(str, folders[1:])] if len(folders) > 1 else []
+    words = ["gaponet", "eval", str(folders[0]), dataset, *["--also"] * (len(folders) > 1), *map(str, folders[1:])]
     return shlex.join(words + (["--motions", ",".join(motions)] if motions else []))
 
 

@@ -117,7 +117,7 @@ def _steps(candidate: Candidate, causes: list[tuple[str, RobotSpec]]) -> list[tu
 
 # Fields in which an identified simulator differs from the nominal one, in the order of the steps.
 CAUSES = {cause: [f.name for f in SERVO_FIELDS.values() if f.cause == cause]
-          for cause in (*(f.cause for f in SERVO_FIELDS.values()), "hand")}  # fmt: skip
+          for cause in (*(f.cause for f in SERVO_FIELDS.values()), "hand", "links")}  # fmt: skip
 
 
 def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
@@ -131,7 +131,7 @@ def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
             for i, joint in enumerate(simulator.joint_names)
         }
         changed = robot.with_servos(servos)
-        more = {"contact": "table", "hand": "payload_mounts"}.get(cause)
+        more = {"contact": "table", "hand": "payload_mounts", "links": "links"}.get(cause)
         changed = replace(changed, **{more: getattr(simulator, more)}) if more else changed
         if model_hash(changed) != model_hash(robot):
             steps += [(cause, changed)] if cause != "friction" else [(cause, changed), ("creep", changed)]

@@ -83,7 +83,6 @@ class _Evaluated:
 def write_report(
     run: Path,
     dataset: Path | None = None,
-    also: tuple[Path, ...] = (),
     robot: str | None = None,
     progress: Progress = no_progress,
     picture: Picture | None = None,
@@ -91,15 +90,10 @@ def write_report(
     """Write report.html into a run or robot folder from its newest evaluation; evaluate first if there is none.
 
     Args:
-        run: Run of gaponet train, or robot folder of gaponet identify.
         dataset: Evaluate on this dataset first. Default: the newest evaluation, or the test motions of the dataset that
             was fitted to.
-        also: Further runs to compare, when evaluating.
         robot: Robot name or folder, if not the one that the run stores.
         picture: Draws the robot (view.portrait).
-
-    Returns:
-        The file.
 
     Raises:
         ModelError: The folder is damaged or incomplete.
@@ -108,8 +102,8 @@ def write_report(
     model = None if is_robot(run) else GapModel.load(run)
     given = None if robot is None else require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
     spec = load_robot(run) if model is None else given or load_stored_robot(run, model.card["robot"])
-    if dataset is not None or also or not (run / "trajectories.npz").is_file():
-        _evaluate(run, dataset, also, given, progress)
+    if dataset is not None or not (run / "trajectories.npz").is_file():
+        _evaluate(run, dataset, given, progress)
     evaluated = _Evaluated.read(run, model, spec)
     progress(0, 1, "drawing")
     values = _values(evaluated) | _photo(evaluated, picture)
@@ -119,9 +113,7 @@ def write_report(
     return path
 
 
-def _evaluate(
-    run: Path, dataset: Path | None, also: tuple[Path, ...], robot: RobotSpec | None, progress: Progress
-) -> None:
+def _evaluate(run: Path, dataset: Path | None, robot: RobotSpec | None, progress: Progress) -> None:
     from gaponet.report.evaluate import evaluate
 
     origin = read_origin(run) if is_robot(run) else read_config(run)
@@ -134,7 +126,7 @@ def _evaluate(
     except DatasetError as error:
         raise DatasetError(f"{error}. Say where the dataset is: gaponet report {run} --dataset DIR") from None
     robot = robot or dataset_robot(data, run)
-    evaluate([run, *also], data, robot, progress=progress).save(run)
+    evaluate([run], data, robot, progress=progress).save(run)
 
 
 def _values(e: _Evaluated) -> dict[str, Any]:

@@ -17,8 +17,6 @@ from gaponet.report.methods import IDENTIFIED, METHODS
 REPAIR_HINT = "give a complete run folder of gaponet train, or evaluate again"
 Method = Annotated[str, Predicate(lambda name: name.removeprefix(IDENTIFIED) in METHODS)]
 GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion", "by_independent_motion")
-FORMER_METHODS = {"calibrated": "adapted"}  # former name in metrics.json → name
-FORMER_STAGES = {"warm start": "pretraining"}  # former name in progress.jsonl → name
 
 
 def _is_number(text: str) -> bool:
@@ -51,7 +49,7 @@ Scores = TypedDict(  # metrics of one method, in total and by group
         "mpjae": Number, "rmse": Number, "q_dis": Number, "static": Number, "dynamic": Number, "large_0.05": Number,
         "large_0.1": Number, "correlation": Number, "by_joint": Joints, "by_payload": Payloads,
         "by_horizon": Annotated[Horizons, Len(1)], "by_motion": Motions,
-        "by_independent_motion": NotRequired[Motions],
+        "by_independent_motion": Motions,
     },
 )  # fmt: skip
 
@@ -145,8 +143,6 @@ def read_metrics(run: Path) -> dict[str, Any]:
     """Read metrics.json of a run. Every method has the groups of the nominal one; absent numbers are NaN."""
     file = run / "metrics.json"
     metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, REPAIR_HINT, allow_extra=True)}
-    for key in ("methods", "ratio_to_nominal"):
-        metrics[key] = {FORMER_METHODS.get(name, name): value for name, value in metrics[key].items()}
     methods = metrics["methods"]
     if "nominal" not in methods or not set(methods) <= set(metrics["ratio_to_nominal"]):
         raise ModelError(f"{file}: methods: nominal is missing, or a method has no ratio to it; {REPAIR_HINT}")
@@ -182,12 +178,11 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
     if not file.is_file():
         return []
     lines = file.read_bytes().split(b"\n")[:-1]
-    progress = [
+    return [
         {**parse_json(_Validation, line, f"{file}:{number}", ModelError, REPAIR_HINT, allow_extra=True)}
         for number, line in enumerate(lines, 1)
         if line.strip()
     ]
-    return [line | {"stage": FORMER_STAGES.get(str(line["stage"]), line["stage"])} for line in progress]
 
 
 class _Floor(TypedDict):

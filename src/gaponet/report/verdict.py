@@ -53,13 +53,9 @@ def network_gain(methods: Scores, own: str) -> NetworkGain:
         (name for name in WITHOUT_NETWORK if name in methods), key=lambda name: methods[name]["mpjae"]
     )  # fmt: skip
     before, after = (methods[name] for name in (base, own))
-    paired = [m["mpjae"] - _by_independent_motion(after)[name]["mpjae"]
-              for name, m in _by_independent_motion(before).items()]  # fmt: skip
+    paired = [m["mpjae"] - after["by_independent_motion"][name]["mpjae"]
+              for name, m in before["by_independent_motion"].items()]  # fmt: skip
     return NetworkGain(base, before["mpjae"] - after["mpjae"], standard_error(paired), before["mpjae"])
-
-
-def _by_independent_motion(scores: Scores) -> dict[str, Any]:
-    return dict(scores.get("by_independent_motion") or scores["by_motion"])  # earlier versions lack the first
 
 
 def verdict(methods: Scores) -> list[str]:
@@ -75,7 +71,7 @@ def verdict(methods: Scores) -> list[str]:
         error = methods["identified"]["mpjae"]
         change = f"{100 * abs(1 - error / nominal):.0f} % {'less' if error <= nominal else 'MORE'}"
         end = "." if error < nominal else ": identify again, on logs like these."
-        motions = len(_by_independent_motion(methods["identified"]))
+        motions = len(methods["identified"]["by_independent_motion"])
         count = f"{motions} independent motion{'s' * (motions != 1)}"
         sentences.append(f"After identification the error is {mrad(error)} mrad, {change}, on {count}{end}")
     return sentences + [_about_network(methods, own) for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]

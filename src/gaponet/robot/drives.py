@@ -53,12 +53,8 @@ class Drive:
 
 
 def drives(
-    model: mujoco.MjModel,
-    joints: list[str],
-    pose: np.ndarray,
-    given: dict[str, tuple[str, ...]],
-    file: str,
-) -> tuple[Drive, ...]:
+    model: mujoco.MjModel, joints: list[str], pose: np.ndarray, given: dict[str, tuple[str, ...]], file: str,
+) -> tuple[Drive, ...]:  # fmt: skip
     """Determine the drives of hinge joints.
 
     Args:

@@ -34,8 +34,10 @@ class Finding:
 
     @staticmethod
     def proposal(findings: list[Finding]) -> str:
-        """Return lines for logs.toml: corrections, and as comments the findings that it cannot correct."""
+        """Return lines for logs.toml, with the findings that they correct as comments, and the names of the others."""
         bad = [f for f in findings if f.level in ("warning", "error")]
+        if not bad:
+            return "# gaponet doctor --fix: nothing to mend.\n"
         lines = [
             "# gaponet doctor --fix: a proposal, applied to nothing. Check it, add it to the logs.toml of these logs,",
             "# import into a new folder and call the doctor again. Joints have the robot's names.",
@@ -43,13 +45,13 @@ class Finding:
         ]
         tables: Mend = {}
         for finding in bad:
-            lines += [f"# {finding.level}, {finding.check}: {finding.message}"]
+            lines += [f"# {finding.level}, {finding.check}: {finding.message}"] * bool(finding.mend)
             for table, values in finding.mend.items():
                 tables.setdefault(table, {}).update(values)
         for table, values in tables.items():
             lines += ["", f"[{table}]", *(f"{json.dumps(joint)} = {json.dumps(v)}" for joint, v in values.items())]
-        if not bad:
-            lines = ["# gaponet doctor --fix: nothing to mend."]
+        if other := ", ".join(dict.fromkeys(f.check for f in bad if not f.mend)):
+            lines = [*lines, ""] * bool(tables) + [f"# No line is known that mends: {other}. Do what the findings say."]
         return "\n".join(lines) + "\n"
 
 

@@ -55,6 +55,10 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
             text += "".join(
                 f'[identified_mount."{m.side}"]\npos = {list(m.pos)}\nmass = {m.mass!r}\n' for m in robot.payload_mounts
             )
+        text += "".join(
+            f'[identified_link."{b}"]\nmass = {x.mass!r}\npos = {list(x.pos)}\ninertia = {list(x.inertia)}\n'
+            for b, x in robot.links.items()
+        )
     xml = robot.mjcf.read_text(encoding="utf-8")
     xml = self_contained_mjcf(robot.mjcf) if FILE_REFERENCES.search(xml) else xml
     copied = {name: robot.folder / name for name in COPIED_FILES if (robot.folder / name).is_file()}

@@ -126,8 +126,10 @@ def inspect_mjcf(path: Path) -> _Inspection:
 
 def _count(path: Path, folder: Path, seen: set[Path], inspection: _Inspection, times: float) -> None:
     """Count the elements of a file and its <include>s; refuses too many."""
-    if not path.is_file() or path.stat().st_size > MAX_BYTES:
-        raise RobotError(f"{path}: is missing, not a file, or has more than {MAX_BYTES >> 20} MiB")
+    if not path.is_file():
+        raise RobotError(f"{path}: is no file, nor a robot of the package (gaponet robot list)")
+    if path.stat().st_size > MAX_BYTES:
+        raise RobotError(f"{path}: has more than {MAX_BYTES >> 20} MiB")
     try:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # an unknown encoding

@@ -12,9 +12,9 @@ from functools import partial
 from typing import Literal, get_args
 
 # Terms of the servo model that identification may add, one by one; `ServoField.term` names a field's.
-Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"]
-DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load")
-Axis = Literal["value", "log", "over kp"]
+Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder", "speed", "backlash"]
+DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load", "backlash")
+Axis = Literal["value", "log", "over kp", "inverse"]
 
 MAX_VALUE = 1e6  # of gains and torques in robot.toml
 MAX_ANGLE_RAD = 1e3
@@ -30,7 +30,8 @@ class ServoField:
         heading, factor: Heading of a column, which ends in the column's unit, and factor from SI to that unit.
         default: Value where robot.toml states none; NaN where the MJCF's value stands, None for a required value.
         limits: Least and largest value in robot.toml.
-        axis: Axis of searches and of uncertainty.json. A motion shows torques divided by kp, whatever kp is.
+        axis: Axis of searches and of uncertainty.json. A motion shows torques divided by kp, whatever kp is; and what
+            a motor loses per rad/s, which is zero without a torque-speed line.
         bounds: Lowest value, highest value and a large change on the axis; None where these depend on the robot
             (sysid/axes.py), or where no search has the field.
         guess: Value on the axis from which the search of a term begins; None where it depends on the robot.
@@ -118,6 +119,11 @@ SERVO_FIELDS: dict[str, ServoField] = {
                    prior_std=0.003, cause="servo", term="min_torque", in_servo_model=True),
         ServoField("encoder_step", "rad", "encoder, mrad", 1e3, limits=(0.0, 1.0), cause="servo", term="encoder",
                    in_servo_model=True, single_joint=True, shared=False),
+        ServoField("no_load_speed", "rad/s", "no-load speed, rad/s", axis="inverse", prior_std=0.02, cause="motor",
+                   term="speed", in_servo_model=True, advice="check effort_limit in robot.toml"),
+        ServoField("backlash", "rad", "backlash, mrad", 1e3, limits=(0.0, 1.0), bounds=(0.0, 0.1, 0.003), guess=0.004,
+                   prior_std=0.01, large_value=0.01, cause="servo", term="backlash", in_servo_model=True, shared=False,
+                   advice="check for a loose horn or a slipping gear"),
         _angle("zero", heading="zero, mrad", factor=1e3, cause="contact"),
         _angle("stop_low", heading="low stop, rad", default=math.nan, cause="contact"),
         _angle("stop_high", heading="high stop, rad", default=math.nan, cause="contact"),

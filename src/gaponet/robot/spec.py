@@ -24,9 +24,9 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.base.structure import read_toml
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
-from gaponet.robot.toml_file import PayloadMount, RobotTable, ServoTable, ServoType, Table, Tip
+from gaponet.robot.toml_file import Link, PayloadMount, RobotTable, ServoTable, ServoType, Table, Tip
 
-__all__ = ["PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "load_robot", "packaged_robots"]
+__all__ = ["Link", "PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "load_robot", "packaged_robots"]
 
 PACKAGE_FOLDER = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
@@ -64,8 +64,11 @@ class RobotSpec:
         friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's, (n).
         min_torque: Smallest torque that turns the motor, (n), N·m.
         encoder_step: Resolution of the servo's angle, (n), rad; 0 if it has no effect.
+        no_load_speed: Speed at which the motor has no torque left, (n), rad/s at the nominal supply; 0 without effect.
+        backlash: Width of the gap between motor and link, (n), rad.
         servos: Servo type of each joint, (n), of robot.toml or servos.toml; None if robot.toml names none.
         tips, table: Tips that can touch a table, and the table; all other contacts are then off.
+        links: MJCF body → identified mass, centre of mass and inertia, which replace the MJCF's.
         carries_payload: True if the simulated robot carries the payload of the recordings.
         gain_scale: Factor on kp and kd of operated joints in [[joint]]; kp and kd include it.
         contacts: True if links collide as the MJCF states. It is off by default, because links welded to the world
@@ -103,9 +106,12 @@ class RobotSpec:
     friction_external: Array = field(default_factory=lambda: np.array(0.0))
     min_torque: Array = field(default_factory=lambda: np.array(0.0))
     encoder_step: Array = field(default_factory=lambda: np.array(0.0))
+    no_load_speed: Array = field(default_factory=lambda: np.array(0.0))
+    backlash: Array = field(default_factory=lambda: np.array(0.0))
     servos: tuple[ServoType | None, ...] = ()
     tips: tuple[Tip, ...] = ()
     table: Table | None = None
+    links: dict[str, Link] = field(default_factory=dict)
     contacts: bool = False
     carries_payload: bool = True
     gain_scale: float = 1.0
@@ -386,4 +392,6 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     if moved := {side: vars(mount) for side, mount in table.identified_mount.items()}:
         mounts = tuple(dataclasses.replace(m, **moved.get(m.side, {})) for m in robot.payload_mounts)
         identified = dataclasses.replace(identified, payload_mounts=mounts, nominal=robot)
+    if table.identified_link:
+        identified = dataclasses.replace(identified, links=table.identified_link, nominal=robot)
     return identified

@@ -110,6 +110,16 @@ class _Mount:
     mass: Annotated[float, Interval(ge=0, le=100)]
 
 
+@dataclass(frozen=True)
+class Link:
+    """[identified_link.BODY]: mass (kg), centre of mass (m) and inertia about it (xx, yy, zz, xy, xz, yz in kg·m²) of
+    an MJCF body, in its frame."""
+
+    mass: Annotated[float, Interval(ge=0, le=1e4)]
+    pos: tuple[Metres, Metres, Metres]
+    inertia: Annotated[tuple[float, ...], Len(6, 6)]
+
+
 if TYPE_CHECKING:
     IdentifiedServo = Any
 else:  # [identified.JOINT]: values that replace those of the MJCF and the nominal gains
@@ -152,6 +162,7 @@ class RobotTable:
     identified: dict[str, IdentifiedServo] = field(default_factory=dict)
     identified_table: Table | None = None
     identified_mount: dict[str, _Mount] = field(default_factory=dict)
+    identified_link: dict[str, Link] = field(default_factory=dict)
     description: str = ""
     license: str = ""
     mjcf: str = "robot.xml"

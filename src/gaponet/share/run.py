@@ -18,9 +18,9 @@ from gaponet.share.remote import Index, RemoteError
 README = "README.md"
 FILES = re.compile(
     r"config\.json|split\.json|delay_offset\.json|metrics\.json|progress\.jsonl|trajectories\.npz|gap\.json|"
-    r"checkpoint\.pt|(adaptation|calibration)/[A-Za-z0-9._-]+\.json|"
+    r"checkpoint\.pt|adaptation/[A-Za-z0-9._-]+\.json|"
     r"robot/(robot\.toml|robot\.xml|collision\.toml|look\.toml|identified\.json)|"
-    r"model/(inverse/)?(card\.json|model\.onnx|weights\.npz)"
+    r"model/(card\.json|model\.onnx)"
 )
 
 

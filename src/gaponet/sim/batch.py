@@ -246,6 +246,8 @@ class BatchSim:
         if "effort_limit" in values:
             limit = values["effort_limit"]
             batch.expand("actuator_forcerange")[:, at] = np.stack([-limit, limit], axis=-1)
+            if self.servo_model is not None:
+                self.servo_model.effort[:, at] = limit
         if "delay" in values and model.nhistory:
             batch.expand("actuator_delay")[:, at] = values["delay"]
         if "zero" in values:
@@ -256,6 +258,8 @@ class BatchSim:
             self.max_change = self._max_change(speed)
         if self.servo_model is not None:
             self.servo_model.bias[:, at], self.servo_model.frictionloss[:, at] = bias[:, at, 0], values["frictionloss"]
+            self.servo_model.armature[:, at] = values["armature"]
+            self.servo_model.damping[:, at] = np.maximum(values["damping"], 0.0)
             for name in SERVO_TERMS:
                 self.servo_model.values[name][:, at] = values.get(name, 0.0)
 
@@ -278,6 +282,8 @@ class BatchSim:
             state |= {"history": self._history.buffer, "time": self._history.time}
         if self.servo_model is not None:
             state |= {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
+            if (play := self.servo_model.play) is not None:
+                state |= {"servo_gap": play.gap, "servo_rotor": play.rotor}
         return state if self.max_change is None else state | {"ctrl": self.ctrl}
 
 

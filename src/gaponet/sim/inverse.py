@@ -19,7 +19,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
-from gaponet.sim.servo import friction_limit, present
+from gaponet.sim.servo import friction_limit, present, torque_range
 
 # Agreement of two simulators: largest difference of targets, and number of random motions that are compared.
 MAX_TARGET_DIFFERENCE_RAD, COMPARED_MOTIONS = 1e-4, 32
@@ -135,15 +135,19 @@ class AnalyticInverse:
         torque = self._torque(mean(qpos), mean(before[:-1]), gain / self.dt, period.friction)
         torque += self.damping * (mean(after) - mean(before[:-1]))
         back = self.kp * (qpos - self.offset) + self.kd * (before[:-1] if self.explicit else after)
-        return self._targets(np.clip(torque, self.low, self.high), back, mean)
+        low, high = self.low, self.high
+        if (no_load := self.terms.get("no_load_speed")) is None:
+            return self._targets(np.clip(torque, low, high), back, low, high, mean)
+        low, high = torque_range(self.high, before[:-1] / no_load)
+        return self._targets(np.clip(torque, mean(low), mean(high)), back, low, high, mean)
 
-    def _targets(self, torque: Array, back: Array, mean: Callable[[Array], Array]) -> Array:
+    def _targets(self, torque: Array, back: Array, low: Array, high: Array, mean: Callable[[Array], Array]) -> Array:
         """Return targets u (num, n) for which the mean over steps of kp·u − back, (steps, num, n), within the motors'
-        limits, is torque (num, n)."""
+        limits, (n,) or (steps, num, n), is torque (num, n)."""
         out = (torque + mean(back)) / self.kp
         for _ in range(len(back)):
             requested = self.kp * out - back
-            applied = np.clip(requested, self.low, self.high)
+            applied = np.clip(requested, low, high)
             if (applied == requested).all():
                 break
             free = np.maximum(mean((applied == requested).astype(float)), 1 / len(back))

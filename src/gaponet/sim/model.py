@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
 from pathlib import Path
@@ -107,6 +108,7 @@ def build_spec(
     if not robot.contacts:
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     _set_joints(spec, robot)
+    _set_links(spec, robot)
     _add_table(spec, robot)
     for name in locked:
         freeze(spec, spec.joint(name), robot.qpos_home[robot.joint_names.index(name)])
@@ -196,6 +198,43 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             joint.limited = True
         if np.isfinite(robot.damping[i]):
             joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
+
+
+def _set_links(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
+    """Set identified masses, centres of mass and inertias in place of the MJCF's."""
+    if robot.links and spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+        for body in spec.bodies:
+            body.explicitinertial = False
+    for name, link in robot.links.items():
+        body = spec.body(name)
+        if body is None:
+            raise RobotError(f"{robot.mjcf}: an [identified_link] names body '{name}', which is missing")
+        body.explicitinertial, body.mass, body.ipos = True, link.mass, link.pos
+        body.iquat, body.inertia, body.fullinertia = (1, 0, 0, 0), (0, 0, 0), link.inertia
+
+
+# Fields of a model that follow from its links; body_sameframe is a shortcut for links whose centre is their origin.
+LINK_FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat", "body_sameframe", "body_subtreemass",
+               "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0", "pair_solref")  # fmt: skip
+
+
+def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
+    """Return a copy of a compiled model with the links of a robot, as if it were compiled with them."""
+    model = copy.copy(model)
+    for name, link in robot.links.items():
+        body = model.body(name)
+        inertia = np.array(link.inertia)[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)
+        axes = np.linalg.eigh(inertia)[1][:, ::-1].copy()  # the largest first, as compiled
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        body.inertia[:] = np.diag(axes.T @ inertia @ axes)
+        body.mass[:], body.ipos[:] = link.mass, link.pos
+        mujoco.mju_mat2Quat(body.iquat, axes.ravel())
+        model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    stiffen_friction(model)
+    _soften_table(model, robot)
+    return model
 
 
 def _remove_fixed(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:

@@ -1,8 +1,10 @@
 """Servo model: terms beyond MuJoCo's position actuator and friction loss, set before every physics step.
 
-The encoder counts in steps. A motor that turns at all has a least torque (minimum PWM). Friction is larger at rest
-(Stribeck) and grows with the torque that the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024). MuJoCo
-integrates: the model only changes the actuator's bias and the limit of friction, so friction sticks as MuJoCo's does.
+The encoder counts in steps. A motor that turns at all has a least torque (minimum PWM). Its largest torque falls with
+its speed to zero at the no-load speed (back-EMF). Friction is larger at rest (Stribeck) and grows with the torque that
+the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024). MuJoCo integrates: the model only changes the
+actuator's bias, its torque limits and the limit of friction, so friction sticks as MuJoCo's does.
+A gear with backlash parts the motor (armature, damping, friction) from the link while its gap is open.
 The model stands here twice: of arrays for numpy and torch, and of one joint for numba and Warp (`requested_torque`,
 `joint_friction`), which is faster. A MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
 """
@@ -23,12 +25,29 @@ ServoTerms = dict[str, Any]  # name of SERVO_TERMS → values that broadcast to 
 
 SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
+PLAY = SERVO_TERMS.index("backlash")
+OPENED = 1 - 1e-9  # of half the width: a gap that opens
 DEADBAND_STEPS = 0.5  # encoder steps: a motor with a least torque rests while it reads a smaller error
 
 
 def present(terms: ServoTerms) -> ServoTerms:
-    """Return the terms that are not zero everywhere, with speeds of SLOWEST at least; others are not computed."""
-    return {name: x.clip(min=SLOWEST) if name == "stribeck_speed" else x for name, x in terms.items() if x.any()}
+    """Return the terms that are not zero everywhere; others are not computed. No division by these speeds fails."""
+    active = {name: x.clip(min=SLOWEST) if name == "stribeck_speed" else x for name, x in terms.items() if x.any()}
+    if "no_load_speed" in active:
+        x = active["no_load_speed"]
+        active["no_load_speed"] = array_module(x).where(x > 0, x, float("inf"))
+    return active
+
+
+def torque_range(limit: Any, ratio: Any) -> Any:
+    """Return the least and the largest torque of a motor, N·m, at a ratio of its speed to the no-load speed.
+
+    The largest is limit · (1 − ratio), between −limit and limit: beyond the no-load speed the motor brakes. MuJoCo's
+    <dcmotor> has this range at ± its largest voltage with forcerange as current limit; so have the DC motors of Isaac
+    Lab and mjlab with saturation_effort = effort_limit.
+    """
+    inside = abs(ratio)
+    return 0.5 * limit * (inside - abs(2.0 + ratio)), 0.5 * limit * (abs(2.0 - ratio) - inside)
 
 
 def passing_friction(by_motor: Any, by_load: Any, torque: Any, load: Any) -> Any:
@@ -91,18 +110,84 @@ def joint_friction(
     return limit
 
 
+def crossed(
+    half: Any, gap: Any, rotor: Any, pressed: Any, link: Any, torque: Any, damping: Any, most: Any, mass: Any, h: Any
+) -> tuple[Any, Any]:
+    """Return the gaps (motor ahead of link), rad, and the motors' speeds, rad/s, after a step of h s; numpy arrays.
+
+    A motor that is not pressed against its link is a free rotor with dry friction of `most` N·m.
+    """
+    net = torque - damping * rotor
+    net = net + np.clip(-mass / h * rotor - net, -most, most)
+    rotor = np.where(pressed, link, rotor + h / (mass + h * damping) * net)
+    return np.clip(gap + h * (rotor - link), -half, half), rotor
+
+
+class Play:
+    """Backlash of servos in MuJoCo, numpy arrays of one shape: parts motors from links where the gaps are open.
+
+    Attributes:
+        gap: Motor ahead of link, rad.
+        rotor: Speed of the motor, rad/s. Where it differs in a closed gap, the next step transmits the impact.
+    """
+
+    def __init__(self, width: Any, armature: Any, damping: Any, kd: Any, load: Any, qvel: Any) -> None:
+        """Begin on the side that carries `load`, N·m; armature, damping and kd are the motor's."""
+        self.half, self._own, self._kd = width / 2, (armature, damping), kd
+        self.gap, self.rotor = np.where(load < 0, -self.half, self.half), qvel.copy()
+
+    def before(self, limit: Any, kp: Any, qpos: Any, qvel: Any, h: Any) -> tuple[Any, ...]:
+        """Return friction limit, armature, damping, applied torque and gear of the links for the next step of h s, and
+        what an actuator without gear needs as bias: its torque does not reach the link then."""
+        (armature, damping), closed = self._own, abs(self.gap) >= self.half
+        self._limit, self._qvel, self._impact = limit.copy(), qvel.copy(), armature * (self.rotor - qvel) / h
+        bias = np.where(closed, 0.0, -kp * qpos - self._kd * qvel)
+        return limit * closed, armature * closed, damping * closed, self._impact * closed, 1.0 * closed, bias
+
+    def after(self, qvel: Any, torque: Any, constraint: Any, h: Any, rows: Any = slice(None)) -> None:
+        """Advance the gaps of rows, from speeds, the servos' torques and the constraints' torques after a step."""
+        (armature, damping), closed, change = self._own, abs(self.gap) >= self.half, qvel - self._qvel
+        # A contact counts as friction, up to the limit of friction: under contact the gap is only approximate.
+        force = torque + self._impact - damping * qvel - (self._kd + armature / h) * change
+        force = force + np.clip(constraint, -self._limit, self._limit)
+        gap, rotor = crossed(self.half, self.gap, self.rotor, closed, qvel, torque, damping, self._limit, armature, h)
+        gap = np.where(closed & (force * gap < 0), OPENED * gap, gap)
+        self.gap[rows], self.rotor[rows] = gap[rows], rotor[rows]
+
+
+def cross_gap(
+    half: float, gap: float, rotor: float, before: float, speed: float, inertia: float, load: float, torque: float,
+    damping: float, most: float, mass: float, h: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the speeds of link and motor and the gap of one joint after a step, as `crossed` does, for numba.
+
+    Pressed, both move as one body, from `before` to `speed`, until the motor would have to pull the link. They meet
+    without rebound.
+    """
+    if abs(gap) >= half and (inertia * (speed - before) / h + load) * gap >= 0.0:
+        return speed, speed, gap
+    link = before - h / inertia * load
+    net = torque - damping * rotor
+    rotor += h / (mass + h * damping) * (net + min(max(-mass / h * rotor - net, -most), most))
+    gap += h * (rotor - link)
+    if abs(gap) < half:
+        return link, rotor, gap
+    both = (inertia * link + mass * rotor) / (inertia + mass)
+    return both, both, half if gap > 0.0 else -half
+
+
 def set_joints(
     terms: Any, deadband: float, dry: Any, own_bias: Any, gain: Any, ctrl: Any, qpos: Any, qvel: Any, torque: Any,
-    load: Any, bias: Any, limit: Any,
+    load: Any, bias: Any, limit: Any, effort: Any, force_range: Any,
 ) -> None:  # fmt: skip
-    """Fill `bias` (unless terms[…, 4:] are zero) and `limit`, (nsim, nu), as ServoModel.before does; numba compiles it.
+    """Fill `bias`, `limit`, (nsim, nu), and `force_range` as ServoModel.before does; numba compiles it.
 
     Args:
         terms: In the order of SERVO_TERMS, (nsim, nu, terms).
     """
     for i in range(len(qpos)):
         for j in range(qpos.shape[1]):
-            rest, speed, by_motor, by_load, least, step = terms[i, j]
+            rest, speed, by_motor, by_load, least, step, no_load = terms[i, j, :7]
             limit[i, j] = joint_friction(
                 dry[i, j], rest, speed, by_motor, by_load, qvel[i, j], torque[i, j], load[i, j]
             )
@@ -110,6 +195,9 @@ def set_joints(
                 kp, q = gain[i, j], qpos[i, j]
                 aim = ctrl[i, j] + own_bias[i, j] / kp
                 bias[i, j] = requested_torque(kp, aim, q, least, step, deadband) - kp * (ctrl[i, j] - q)
+            if no_load > 0.0:
+                least, most = torque_range(effort[i, j], qvel[i, j] / no_load)
+                force_range[i, j, 0], force_range[i, j, 1] = least, most
 
 
 def advance(
@@ -128,13 +216,16 @@ def advance(
         v, rows = np.ascontiguousarray(values[:, j].T), lengths[p]
         kp, dry, mass, offset, limit = v[0] * stiffer[p, j], v[2], v[3], v[4], v[6]
         rest, speed, by_motor, by_load, least, step = v[7], np.maximum(v[8], SLOWEST), v[9], v[10], v[11], v[12]
-        deadband = DEADBAND_STEPS * (least > 0)
+        deadband, no_load = DEADBAND_STEPS * (least > 0), np.where(v[13] > 0, v[13], np.inf)
+        fades = np.isfinite(no_load).any()
         brake, own = np.maximum(kd[p, j] + np.minimum(v[1], 0.0), 0.0), np.maximum(v[1], 0.0)
         # A part of each command where it changes on the way.
         late = np.arange(count).reshape(-1, 1) / count - v[5] / periods[p]
         row = np.floor(late).astype(np.int64)
         share = np.maximum((late - row - 1) * count + 1, 0.0)
         q, w = np.full(k, float(qpos[j, p, 0])), np.full(k, float(qvel[j, p, 0]))
+        half, rotor = v[7 + PLAY] / 2, w.copy()
+        gap = np.where(tables[1, j, p, 0] + tables[3, j, p, 0] * q < 0, -half, half)
         for t in range(rows - 1):
             here = tables[:, j, p, t]  # inertia, weight, pull, slope
             for part in range(count):
@@ -142,23 +233,33 @@ def advance(
                     heavy, at = here[0] + mass[c], t + row[part, c]
                     aim = (1 - share[part, c]) * ctrl[j, p, min(max(at, 0), rows - 1)] + offset[c]
                     aim += share[part, c] * ctrl[j, p, min(max(at + 1, 0), rows - 1)]
-                    load = here[3] * q[c] + here[1]
+                    load, low, high = here[3] * q[c] + here[1], -limit[c], limit[c]
+                    if fades:
+                        low, high = torque_range(limit[c], w[c] / no_load[c])
+                    wanted, most = kp[c] * (aim - q[c]), dry[c]
                     if has_terms:
-                        torque = requested_torque(kp[c], aim, q[c], least[c], step[c], deadband[c])
-                        torque = min(max(torque - brake[c] * w[c], -limit[c]), limit[c])
+                        wanted = requested_torque(kp[c], aim, q[c], least[c], step[c], deadband[c])
+                    wanted -= brake[c] * w[c]
+                    torque = min(max(wanted, low), high)
+                    if has_terms:
                         most = joint_friction(dry[c], rest[c], speed[c], by_motor[c], by_load[c], w[c], torque, load)
-                    else:
-                        torque, most = min(max(kp[c] * (aim - q[c]) - brake[c] * w[c], -limit[c]), limit[c]), dry[c]
                     net = torque - load - here[2] - own[c] * w[c]
                     net += min(max(-heavy / h * w[c] - net, -most), most)
-                    w[c] += h / (heavy + h * (own[c] + brake[c])) * net
+                    implicit = own[c] + brake[c] * (torque == wanted)  # as MuJoCo: not kd of a motor at its limit
+                    both = w[c] + h / (heavy + h * implicit) * net
+                    if half[c] > 0.0:
+                        both, rotor[c], gap[c] = cross_gap(
+                            half[c], gap[c], rotor[c], w[c], both, here[0], load + here[2], torque, own[c], most,
+                            mass[c], h,
+                        )  # fmt: skip
+                    w[c] = both
                     q[c] += h * w[c]
                     if q[c] < stops[j, 0]:
                         q[c], w[c] = stops[j, 0], max(w[c], 0.0)
                     elif q[c] > stops[j, 1]:
                         q[c], w[c] = stops[j, 1], min(w[c], 0.0)
             if touch[p, t + 1]:  # goes on from the recording
-                q[:], w[:] = qpos[j, p, t + 1], qvel[j, p, t + 1]
+                q[:], w[:], rotor[:] = qpos[j, p, t + 1], qvel[j, p, t + 1], qvel[j, p, t + 1]
             if (t + 1) % thin == 0:
                 out[:, item, (t + 1) // thin] = q - qpos[j, p, t + 1]
 
@@ -181,7 +282,8 @@ def compiled(function: Any) -> Any:
 def _extend(extending: Any) -> None:
     """Make functions of this file known to numba."""
     extending.overload(exp)(lambda x: lambda x: np.exp(x))
-    for function in (passing_friction, resting_friction, requested_torque, joint_friction):
+    functions = torque_range, passing_friction, resting_friction, requested_torque, joint_friction, cross_gap
+    for function in functions:
         extending.register_jitable(function)
 
 
@@ -191,7 +293,9 @@ class ServoModel:
     Attributes:
         values: Name of SERVO_TERMS → (nsim, nu); may be written.
         active: The terms that are present since the last reset.
-        frictionloss, bias: The MuJoCo model's own, without the servo model, (nsim, nu) N·m; may be written.
+        frictionloss, bias, effort, armature, damping: The MuJoCo model's own, without the servo model, (nsim, nu); may
+            be written.
+        play: Backlash; None where no servo has any.
         torque, load: Torque of the actuators in the last physics step, and of gravity and Coriolis forces, (nsim, nu)
             N·m. The next step follows from these and the batch's own state.
     """
@@ -208,6 +312,12 @@ class ServoModel:
             name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(SERVO_TERMS)
         }
         self.frictionloss, self.bias = self._limit.copy(), self._bias[:, :, 0].copy()
+        own = batch.expanded("actuator_forcerange")
+        limits = model.actuator_forcerange if own is None else own
+        self.effort = np.array(np.broadcast_to(limits[..., 1], self.bias.shape))
+        self._range = np.zeros((0, 0, 2))  # of torques, expanded where a term changes it
+        self.armature, self.damping = (np.zeros(self._force.shape) + x for x in (model.dof_armature, model.dof_damping))
+        self.play: Play | None = None
         self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
         self._set_joints = compiled(set_joints)
         self._take_terms()
@@ -218,6 +328,9 @@ class ServoModel:
     def _take_terms(self) -> None:
         """Take the present values of the terms for the steps to come."""
         self.active = present(self.values)
+        if "no_load_speed" in self.active or self._range.size:
+            self._range = self.batch.expand("actuator_forcerange")
+            self._range[..., 0], self._range[..., 1] = -self.effort, self.effort
         none = np.zeros(self._force.shape)
         self._packed = np.stack([self.active.get(name, none) for name in SERVO_TERMS], axis=-1)
         self._deadband = DEADBAND_STEPS * ("min_torque" in self.active)
@@ -226,34 +339,59 @@ class ServoModel:
         """Begin again for simulations `ids`, which were put into a state, under position targets (k, nu) rad."""
         self._take_terms()
         requested = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
-        self.torque[ids] = requested.clip(*np.moveaxis(self.force_range[ids], -1, 0))
+        self.torque[ids] = requested.clip(-self.effort[ids], self.effort[ids])
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         self.load[ids] = self._passing[ids]
+        if self.play is not None or "backlash" in self.active:
+            self._reset_play(ids)
 
-    @property
-    def force_range(self) -> Array:
-        """Torque limits of every simulation's actuators, (nsim, nu, 2) N·m."""
-        own = self.batch.expanded("actuator_forcerange")
-        return np.broadcast_to(self.model.actuator_forcerange, (*self._force.shape, 2)) if own is None else own
+    def _reset_play(self, ids: Array) -> None:
+        expand, bind, step = self.batch.expand, self.batch.bind, self.batch.expanded("opt.timestep")
+        self._links = (
+            expand("dof_armature"),
+            expand("dof_damping"),
+            bind("qfrc_applied"),
+            expand("actuator_gear")[..., 0],
+        )
+        self._constraint = bind("qfrc_constraint")
+        self._h = self.model.opt.timestep if step is None else np.array(step).reshape(-1, 1)
+        play = Play(self.values["backlash"], self.armature, self.damping, -self._bias[..., 2], self.load, self._qvel)
+        if self.play is not None:
+            others = np.delete(np.arange(len(play.gap)), ids)
+            play.gap[others], play.rotor[others] = self.play.gap[others], self.play.rotor[others]
+        self.play = play
 
     def before(self) -> None:
-        """Set bias and friction for the next physics step.
+        """Set bias, torque limits and friction for the next physics step.
 
         MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is under way.
         """
         gain, bias, qpos = self._gain[:, :, 0], self._bias[:, :, 0], self._qpos
         state = (self._qvel, self.torque, self.load)
+        if self.play is not None:
+            bias[:] = self.bias
         if self._set_joints is not None:
             self._set_joints(
                 self._packed, self._deadband, self.frictionloss, self.bias, gain, self._ctrl, qpos, *state, bias,
-                self._limit,
+                self._limit, self.effort, self._range,
             )  # fmt: skip
-            return
-        if "encoder_step" in self.active or "min_torque" in self.active:
-            bias[:] = servo_torque(self.active, gain, self._ctrl + self.bias / gain, qpos) - gain * (self._ctrl - qpos)
-        self._limit[:] = friction_limit(self.active, self.frictionloss, *state)
+        else:
+            if "encoder_step" in self.active or "min_torque" in self.active:
+                aim = self._ctrl + self.bias / gain
+                bias[:] = servo_torque(self.active, gain, aim, qpos) - gain * (self._ctrl - qpos)
+            if "no_load_speed" in self.active:
+                limits = torque_range(self.effort, self._qvel / self.active["no_load_speed"])
+                self._range[..., 0], self._range[..., 1] = limits
+            self._limit[:] = friction_limit(self.active, self.frictionloss, *state)
+        if self.play is not None:
+            *values, more = self.play.before(self._limit, gain, qpos, self._qvel, self._h)
+            bias += more
+            for field, value in zip((self._limit, *self._links), values, strict=True):
+                field[:] = value
 
     def after(self, ids: Any = None) -> None:
         """Store torque and load after a physics step of these simulations."""
         moved = slice(None) if ids is None else ids
         self.torque[moved], self.load[moved] = self._force[moved], self._passing[moved]
+        if self.play is not None:
+            self.play.after(self._qvel, self.torque, self._constraint, self._h, moved)

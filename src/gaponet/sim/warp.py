@@ -31,6 +31,7 @@ TARGET = {"ctrl": "ctrl"}
 
 _Floats: Any = warp.array2d(dtype=float)
 _Numbers: Any = warp.array2d(dtype=warp.types.vector(len(SERVO_TERMS), float))  # in the order of SERVO_TERMS
+_Pairs: Any = warp.array2d(dtype=warp.vec2)
 _Parameters: Any = warp.array2d(dtype=warp.types.vector(10, float))  # of an actuator's gain or bias
 
 
@@ -42,6 +43,7 @@ def _warp_function(function: Any, **others: Any) -> Any:
     return warp.func(copied)
 
 
+_range = _warp_function(servo.torque_range)
 _torque = _warp_function(servo.requested_torque)
 _friction = _warp_function(
     servo.joint_friction,
@@ -53,9 +55,12 @@ _friction = _warp_function(
 @warp.kernel(enable_backward=False)
 def _set_servos(
     terms: _Numbers, deadband: float, offset: _Floats, dry: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats,
-    qvel: _Floats, torque: _Floats, load: _Floats, bias: _Parameters, limit: _Floats,
+    qvel: _Floats, torque: _Floats, load: _Floats, bias: _Parameters, limit: _Floats, effort: _Floats, force: _Pairs,
 ) -> None:  # fmt: skip
-    """Set bias and friction of servo j of world i for the next physics step, as ServoModel.before does."""
+    """Set bias, torque limits and friction of servo j of world i for the next physics step, as ServoModel.before does.
+
+    Where a servo has a no-load speed, every world has its own torque limits `force`.
+    """
     i, j = warp.tid()
     own, kp, q = terms[i, j], gain[i, j][0], qpos[i, j]
     speed, least, step = max(own[1], servo.SLOWEST), own[4], own[5]
@@ -63,6 +68,9 @@ def _set_servos(
     if least > 0.0 or step > 0.0:
         aim = ctrl[i, j] + offset[i, j] / kp
         bias[i, j][0] = _torque(kp, aim, q, least, step, deadband) - kp * (ctrl[i, j] - q)
+    if own[6] > 0.0:
+        low, high = _range(effort[i, j], qvel[i, j] / own[6])
+        force[i, j] = warp.vec2(low, high)
 
 
 class _Worlds:
@@ -104,7 +112,8 @@ class _Worlds:
         own = [warp.array(x[rows], dtype=float) for x in (servos.bias, servos.frictionloss)]
         state = [data.ctrl, data.qpos, data.qvel, data.actuator_force, data.qfrc_bias]
         return [warp.array(terms, dtype=_Numbers.dtype), deadband, *own, model.actuator_gainprm, *state,
-                model.actuator_biasprm, model.dof_frictionloss]  # fmt: skip
+                model.actuator_biasprm, model.dof_frictionloss, warp.array(servos.effort[rows], dtype=float),
+                model.actuator_forcerange]  # fmt: skip
 
     def bind(self, name: str) -> Tensor:
         """Return a live view of a field of all worlds, (nworld, …)."""
@@ -157,8 +166,10 @@ class WarpSim:
         """device: "cuda", torch's present GPU (of several processes each has its own), or "warp-cpu", Warp's CPU.
 
         Raises:
-            UsageError: No such device.
+            UsageError: No such device, or servos with backlash.
         """
+        if sim.servo_model is not None and sim.servo_model.values["backlash"].any():
+            raise UsageError(f"{sim.robot.name}: no GPU simulates its backlash; use --device cpu, or backlash = 0")
         warp.config.log_level = warp.LOG_WARNING if device == "cuda" else warp.LOG_ERROR
         device = f"cuda:{torch.cuda.current_device()}" if device == "cuda" else "cpu"
         try:
@@ -184,9 +195,8 @@ class WarpSim:
         self._low, self._high = self.array(self.range.T)
         self._max_change = None if sim.max_change is None else self.array(sim.max_change)
         if sim.servo_model:
-            limits = np.moveaxis(np.array(sim.servo_model.force_range), -1, 0)
-            gain = sim.batch.expand("actuator_gainprm")[..., 0]
-            self._gain, self._bias, *self._limits = map(self.array, (gain, sim.servo_model.bias, *limits))
+            gain, servos = sim.batch.expand("actuator_gainprm")[..., 0], sim.servo_model
+            self._gain, self._bias, self._effort = map(self.array, (gain, servos.bias, servos.effort))
         self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
         if self._delayed:
             model = next(iter(sim.models.values()))
@@ -213,7 +223,8 @@ class WarpSim:
             self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
         if SERVO.keys() <= self._stored.keys():
             ahead = 0.0 if past is None else self.array(past)[:, 0] - self.qpos[ids]
-            self.torque[ids] = torch.clamp(self._gain[ids] * ahead + self._bias[ids], *(x[ids] for x in self._limits))
+            most = self._effort[ids]
+            self.torque[ids] = torch.clamp(self._gain[ids] * ahead + self._bias[ids], -most, most)
             load, before = self._all["qfrc_bias"], self._all["qfrc_bias"].clone()
             for worlds in self._each_rate():
                 worlds.launch(worlds.bias_forces)

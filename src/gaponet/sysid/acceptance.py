@@ -12,14 +12,16 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import hash_order
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.metrics import MIN_RELATIVE_GAIN, MIN_RELATIVE_GAIN_ONE_MOTION, Comparison
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.axes import Values
+from gaponet.sysid.links import LinkResult
 from gaponet.sysid.robot_rollouts import RobotRollouts
 from gaponet.sysid.table_contact import TableFit, tip_heights
 
 Std = dict[str, dict[str, float]]  # joint → field → standard error
+Links = dict[str, Link]  # MJCF body → mass, centre of mass and inertia
 Covariance = dict[str, tuple[list[str], Array]]  # joint → fields (P), (P, P) on the axes of uncertainty.py
 
 MIN_CROSS_VALIDATED = 4  # motions; a fit to two of three says little about a fit to all
@@ -81,6 +83,8 @@ class Identified:
         undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
         held_out: Recordings that were not fitted and the robot that was fitted without them, one pair for each fold of
             a cross-validation; `robot` itself where nothing was fitted to them afterwards.
+        findings: A sentence about the backlash of each joint that may have any.
+        links: Masses and inertias, if they were fitted and accepted.
     """
 
     robot: RobotSpec
@@ -95,6 +99,8 @@ class Identified:
     covariance: Covariance = field(default_factory=dict)
     undetermined: dict[str, tuple[str, ...]] = field(default_factory=dict)
     held_out: tuple[HeldOut, ...] = ()
+    findings: tuple[str, ...] = ()
+    links: LinkResult | None = None
 
     @property
     def improved(self) -> bool:
@@ -137,26 +143,27 @@ class Judge:
         self.names = np.array(names)  # of all motions, (motions,)
         self._sums_of: dict[tuple[int, bytes], Array] = {}
 
-    def _sums(self, candidate: ListOf[Values]) -> tuple[Array, Array]:
+    def _sums(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> tuple[Array, Array]:
         """Return the sums of |error| over counted rows, rad, and their numbers, by motion and joint, (motions, n)."""
         totals, counts = [], []
         for k, ((rollouts, motions), values) in enumerate(zip(self._folds, candidate, strict=False)):
-            key = k, b"".join(f.encode() + values[f].tobytes() for f in sorted(values))
+            own = links[k : k + 1]
+            key = k, b"".join(f.encode() + values[f].tobytes() for f in sorted(values)) + repr(own).encode()
             if key not in self._sums_of:
-                size = np.abs(rollouts.flat_errors({f: v[None] for f, v in values.items()}))[0]
+                size = np.abs(rollouts.flat_errors({f: v[None] for f, v in values.items()}, own))[0]
                 self._sums_of[key] = np.stack([size[:, rows].sum(axis=1) for rows in motions])
             totals.append(self._sums_of[key])
             counts += [rollouts.recorded[:, rows].sum(axis=1) for rows in motions]
         return np.concatenate(totals), np.stack(counts)
 
-    def errors(self, candidate: ListOf[Values]) -> Array:
-        """Return the mean |error| of each motion, (motions,) rad."""
-        total, count = self._sums(candidate)
+    def errors(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> Array:
+        """Return the mean |error| of each motion, (motions,) rad; `links` of each fold, if they are not the robot's."""
+        total, count = self._sums(candidate, links)
         return np.asarray(total.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
 
-    def errors_by_joint(self, candidate: ListOf[Values]) -> Array:
+    def errors_by_joint(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> Array:
         """Return the mean |error| of each joint, (n,) rad."""
-        total, count = self._sums(candidate)
+        total, count = self._sums(candidate, links)
         return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
 
     def compare(self, name: str, before: ListOf[Values], after: ListOf[Values]) -> Comparison:

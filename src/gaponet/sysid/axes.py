@@ -28,20 +28,33 @@ MAX_KP_LOG_CHANGE, LARGE_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.2, 0.3
 MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
 UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")  # of an unexcited joint, fitted as others move it
+MIN_INVERSE = 1e-5  # on an inverse axis; less counts as none
+MIN_LINE, LARGE_LINE_CHANGE = 0.2, 0.1  # share of the torque that a motor has lost at a joint's greatest speed
+SPEED_QUANTILE, MIN_SPEED = 0.995, 0.1  # of a joint's recorded speeds, and rad/s: the greatest is at least this
 BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
 
 
 def to_axis(field: str, value: Array, kp: Array) -> Array:
     """Return values of a field on its axis."""
     axis = SERVO_FIELDS[field].axis
+    if axis == "inverse":
+        return np.divide(1.0, value, out=np.zeros_like(value, float), where=value > 0)
     return np.log(np.maximum(value, 1e-9)) if axis == "log" else value / kp if axis == "over kp" else value
 
 
 def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
     """Return values in SI units of fields on their axes; kp is that of `x`, or given."""
     values = {f: np.exp(v) if SERVO_FIELDS[f].axis == "log" else v for f, v in x.items()}
+    for f in (f for f in x if SERVO_FIELDS[f].axis == "inverse"):
+        values[f] = np.divide(1.0, x[f], out=np.zeros_like(x[f], float), where=x[f] > MIN_INVERSE)
     kp = values.get("kp", kp)
     return {f: v * kp if SERVO_FIELDS[f].axis == "over kp" else v for f, v in values.items()}
+
+
+def greatest_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
+    """Return the greatest recorded speed of each operated joint, at least MIN_SPEED, (n,) rad/s; without outliers."""
+    speeds = [np.quantile(np.abs(s.qvel[:, robot.operated_index]), SPEED_QUANTILE, axis=0) for s in sequences]
+    return np.maximum(np.max(speeds, axis=0), MIN_SPEED)
 
 
 def first_values(robot: RobotSpec) -> Values:
@@ -111,6 +124,7 @@ class Bounds:
         first: The given robot's own values.
         start: Start of a search: with a delay, and with as much armature as the physics step resolves.
         stated: Whether all recordings state their kp.
+        inertia: Inertia of the links at the MJCF's reference pose, without armature, (n,) kg·m².
         kd: The servos' kd, (n,) N·m·s/rad. Damping may take from it, stated or not: firmware filters the velocity.
         unexcited: Joints that no command moves, (n,).
         limits: Field → lowest, highest, a large change, (n,) each, in the axes' units.
@@ -127,13 +141,15 @@ class Bounds:
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
         self.unexcited = excitation < MIN_EXCITATION_RAD
         least_inertia = kp * (MIN_STEPS_PER_RADIAN * model.opt.timestep) ** 2
-        resolved = least_inertia - (model.dof_M0 - model.dof_armature)[op]
+        self.inertia = (model.dof_M0 - model.dof_armature)[op]
+        resolved = least_inertia - self.inertia
         self.start: Values = {f: self.first[f] for f in CLASSIC} | {
             "delay": np.maximum(self.first["delay"], START_DELAY_S),
             "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),
         }
         self.start |= {f: np.where(self.unexcited, self.first[f], self.start[f]) for f in ("delay", "armature")}
         self.start |= {f: self.first[f] for f in SERVO_TERMS if self.first[f].any()}
+        slow = 1 / greatest_speeds(sequences, robot)  # s/rad
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)
         self.limits: dict[str, tuple[Array, Array, Array]] = {
@@ -143,12 +159,20 @@ class Bounds:
             "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
             "effort_limit": (0.05 * limit / kp, 5 * limit / kp, 0.2 * limit / kp),
             "encoder_step": (counts, counts, one),
+            "no_load_speed": (0 * one, 2 * slow, LARGE_LINE_CHANGE * slow),
         }
         guess = {f.name: f.guess * one for f in SERVO_FIELDS.values() if f.guess is not None}
         self.guess = from_axis(guess, kp) | {
             "effort_limit": 0.6 * limit,  # one that is too high has no slope
             "encoder_step": counts,
+            "no_load_speed": np.where(self.unexcited, 0.0, 2 / slow),
         }
+
+    def visible(self, field: str, values: Values) -> Array:
+        """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE."""
+        inverse = SERVO_FIELDS[field].axis == "inverse"
+        least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field][2] if inverse else 0.0
+        return np.where(inverse & (to_axis(field, values[field], values["kp"]) < least), 0.0, values[field])
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""

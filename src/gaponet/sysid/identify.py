@@ -7,8 +7,9 @@ the servo model (sim/servo.py) that validation motions accept. Steps:
 2. Fit all joints together in the simulator of the robot, from there and from the robot's file (robot_rollouts.py).
 3. Choose among the given robot, a delay and an offset by joint, and these fits by motions that were not fitted
    (acceptance.py); add terms of the servo model one by one. Where few motions validate, cross-validation chooses.
-4. Fit the table under the tips (table_contact.py).
-5. Compare with a fit that begins with recorded torque (torque.py), and with speed-limited targets (motion_limits.py).
+4. On request, fit masses and inertias of the links with the servos, judged as a term is (link_fit.py).
+5. Fit the table under the tips (table_contact.py).
+6. Compare with a fit that begins with recorded torque (torque.py), and with speed-limited targets (motion_limits.py).
 """
 
 from __future__ import annotations
@@ -25,9 +26,12 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Comparison
-from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Split, cross_validation
+from gaponet.sysid import backlash
+from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Links, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
+from gaponet.sysid.link_fit import LinkFit
+from gaponet.sysid.links import LinkResult
 from gaponet.sysid.motion_limits import default_terms, stop_questions, with_speed_limits, with_stops
 from gaponet.sysid.problem import (
     CHAIN_ITERATIONS,
@@ -43,6 +47,7 @@ from gaponet.sysid.servo_types import far_from_servo_type
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
 from gaponet.sysid.torque import with_torque
 
+ONE_PAYLOAD = "masses and gains are known up to a common factor: record two payloads before you trust a third"
 FOLDS = 3  # of the cross-validation
 WINDOWS = 40  # of joints by themselves
 ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
@@ -112,6 +117,7 @@ def identify(
     budget: float | None = None,
     stops: bool = False,
     folds: int = FOLDS,
+    masses: bool = False,
 ) -> Identified:
     """Fit the parameters of all operated joints.
 
@@ -129,10 +135,11 @@ def identify(
         budget: Time of the searches, s, without the table's; results are the same on every machine only without it.
         stops: Give joints that stayed behind several commands a stop there.
         folds: Folds of the cross-validation, at most; 1 for none.
+        masses: Fit masses, centres of mass and inertias of the links too.
     """
     terms = default_terms(sequences, robot) if terms is None else terms
     splits = cross_validation(sequences, validation, folds)
-    options = (splits, validation, windows, terms, table, nthread, progress, stops)
+    options = (splits, validation, windows, terms, table, nthread, progress, stops, masses)
 
     def fit(one: RobotSpec, seconds: float | None) -> Identified:
         fitted = _fit_robot(sequences, one, *options, seconds)
@@ -144,7 +151,7 @@ def identify(
 def _fit_robot(
     sequences: ListOf[Sequence], robot: RobotSpec, splits: ListOf[Split], validation: ListOf[Sequence], windows: int,
     terms: tuple[Term, ...], table: bool, nthread: int, progress: Progress, stops: bool,
-    budget: float | None,
+    masses: bool, budget: float | None,
 ) -> Identified:  # fmt: skip
     """Fit to positions, with the speed limits that the robot's servos have; arguments as of `identify`."""
     given, robot = robot, with_stops(robot, sequences)  # stops that nobody confirmed are taken back in the end
@@ -156,17 +163,26 @@ def _fit_robot(
         for train in fitted_sets
     ]
     judge = Judge([held_out or fits[0].rollouts.parts for _, held_out in splits], robot, contact, nthread)
-    searches = _SearchProgress(budget, len(terms), len(fits), progress)
+    searches = _SearchProgress(budget, len(terms) + masses, len(fits), progress)
     wholes, each = zip(*(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True)
     candidates = {name: [one[name] for one in each] for name in each[0]}
     identified = given.nominal is not None
     chosen, values = judge.best_by_joint(candidates) if identified else judge.best(candidates)
     base = values if identified or chosen != "given" else candidates["limbs"]
-    comparisons, values = _with_terms(fits, wholes, judge, terms, values, base, searches)
+    comparisons, values, gaps = _with_terms(fits, wholes, judge, terms, values, base, searches)
+    linked, links = None, list[Links]()
+    if masses:
+        start = values if any(c.accepted for c in comparisons) else base
+        comparison, linked, links, values = _with_links(wholes, judge, start, values, searches)
+        comparisons = *comparisons, comparison
     chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
     joints, whole, first = fits[-1], wholes[-1], [one.bounds.first for one in fits]
+    whole.rollouts.robot = replace(robot, links=links[-1]) if links else robot
     errors = standard_errors(whole, values[-1])
-    fitted, table_fit = with_values(robot, values[-1]) if chosen != "given" else robot, None
+    robots = [with_values(robot, v) if chosen != "given" else given for v in values]
+    if links:
+        robots = [replace(one, links=own) for one, own in zip(robots, links, strict=True)]
+    fitted, table_fit = robots[-1] if chosen != "given" else robot, None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, contact), min(h.min() for h in heights)
         tell = lambda error: searches.tell(np.inf, f"table {error * 1e3:.2f} mrad")  # noqa: E731
@@ -177,22 +193,24 @@ def _fit_robot(
         fitted = given if chosen == "given" and not (table_fit and table_fit.accepted) else fitted
     held_out = [HeldOut(list(validation), fitted)] if validation else []
     if len(splits) > 1:
-        robots = [with_values(robot, v) if chosen != "given" else given for v in values]
         held_out = [
             HeldOut(part, replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high))
             for (_, part), one in zip(splits, robots, strict=False)
         ]
+    one_payload = bool(links and robot.payload_mounts) and len({s.meta.payload_mass for s in sequences}) == 1
     warnings = (
-        *joints.bounds.warnings(values[-1], fitted_fields(values[-1])), *stop_questions(given, robot),
-        *far_from_servo_type(fitted), *errors.sentences,
+        *[ONE_PAYLOAD] * one_payload, *joints.bounds.warnings(values[-1], fitted_fields(values[-1])),
+        *stop_questions(given, robot), *far_from_servo_type(fitted), *errors.sentences,
     )  # fmt: skip
-    before, after = (float(judge.errors(v).mean()) for v in (first, values))
-    by_joint = zip(*(judge.errors_by_joint(v).tolist() for v in (first, values)), strict=True)
+    pairs = (first, ()), (values, links)
+    before, after = (float(judge.errors(*pair).mean()) for pair in pairs)
+    by_joint = zip(*(judge.errors_by_joint(*pair).tolist() for pair in pairs), strict=True)
     searches.tell(np.inf, "the fitted robot, and recorded torque")
     return Identified(
         fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit,
         dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,
-        errors.undetermined, tuple(held_out),
+        errors.undetermined, tuple(held_out), backlash.findings(robot.operated, *gaps, errors.std) if gaps else (),
+        linked,
     )  # fmt: skip
 
 
@@ -221,19 +239,47 @@ def _classic_candidates(
 def _with_terms(
     fits: ListOf[JointFit], wholes: ListOf[RobotFit], judge: Judge, terms: tuple[Term, ...], values: list[Values],
     base: list[Values], searches: _SearchProgress,
-) -> tuple[tuple[Comparison, ...], list[Values]]:  # fmt: skip
-    """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted."""
-    comparisons = list[Comparison]()
+) -> tuple[tuple[Comparison, ...], list[Values], tuple[Array, Array] | None]:  # fmt: skip
+    """Fit terms of the servo model one by one, each from `base`; add a term to the values if it is accepted.
+
+    Backlash that the robot lacks is fitted if it is worth a search. Its widths, rad, and probabilities are returned,
+    (n,).
+    """
+    comparisons, gaps = list[Comparison](), None
     for term in terms:
+        first = TERMS[term][0]
+        if term == "backlash" and ("backlash" in base[-1] or not backlash.worth_a_search(fits[-1], base[-1])):
+            continue
         each = [_fit_term(term, *one, searches) for one in zip(fits, wholes, base, strict=True)]
         richer = [together if together is not None else alone for alone, together in each]
         if each[0][1] is not None:
             richer = min([alone for alone, _ in each], richer, key=lambda v: float(judge.errors(v).mean()))
+        richer = [v | {first: fit.bounds.visible(first, v)} for fit, v in zip(fits, richer, strict=True)]
+        if term == "backlash":
+            without = fits[-1].search((), base[-1], report=lambda cost: searches.expired())
+            chance = backlash.probability(fits[-1], without, each[-1][0])
+            gaps = richer[-1]["backlash"], chance
+            richer = backlash.only_probable(values, richer, chance)
         comparisons.append(judge.compare(term, values, richer))
         if comparisons[-1].accepted:  # a term that is zero in every joint only gave the others more iterations
-            used = any(v[TERMS[term][0]].any() for v in richer)
+            used = any(v[first].any() for v in richer)
             values = base = [{f: x for f, x in v.items() if f not in TERMS[term] or used} for v in richer]
-    return tuple(comparisons), values
+    return tuple(comparisons), values, gaps
+
+
+def _with_links(
+    wholes: ListOf[RobotFit], judge: Judge, start: list[Values], values: list[Values], searches: _SearchProgress
+) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:
+    """Fit the links with the servos from `start`; return them and the servos' values if they are better."""
+    results = list[LinkResult]()
+    for whole, one in zip(wholes, start, strict=True):
+        searches.begin()
+        report = searches.report("masses", ("all joints",), whole.rollouts.rows.sum(keepdims=True))
+        results.append(LinkFit(whole, one).descend(report))
+    links, servos = [r.axes.links(r.x) for r in results], [r.values for r in results]
+    before = judge.errors(values)
+    comparison = Comparison("masses", before, judge.errors(servos, links) if results[-1].x.any() else before)
+    return (comparison, results[-1], links, servos) if comparison.accepted else (comparison, None, [], values)
 
 
 def _fit_term(

@@ -25,7 +25,7 @@ from gaponet.sim import servo
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
-from gaponet.sim.servo import friction_limit, present, servo_torque
+from gaponet.sim.servo import crossed, friction_limit, present, servo_torque, torque_range
 
 advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
@@ -198,29 +198,43 @@ class JointRollouts:
         kp, kd = v["kp"] * _filled(self.kp_ratio.T, shape), _filled(self.kd.T, shape)
         kd = np.maximum(kd + np.minimum(v["damping"], 0), 0)
         own, armature, offset, dry = np.maximum(v["damping"], 0), v["armature"], v["offset"], v["frictionloss"]
-        damping, limit = own + kd, v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
+        limit = v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
         h = _filled(self.periods / self.count, shape)
         low, high = (_filled(x[:, None], shape) for x in self.stops.T)
-        has_kd = bool(kd.any())
         q, w = _filled(self.qpos[..., 0], shape), _filled(self.qvel[..., 0], shape)
         out = np.zeros((*shape, self.counted.shape[1]), np.float32)
+        half, rotor = terms.get("backlash", np.zeros(shape)) / 2, w.copy()
+        first = self.tables[..., 0]
+        gap = np.where(first[1] + first[3] * q < 0, -half, half)
         for t in range(self.qpos.shape[2] - 1):
             inertia, weight, pull, slope = self.tables[..., t]
             heavy, slope = inertia + armature, _filled(slope, shape)
-            turn, stop = h / (heavy + h * damping), heavy / -h
+            stop = heavy / -h
             for aim in self._targets(t, values["delay"]) + offset:
-                torque = servo_torque(terms, kp, aim, q)
-                torque = np.minimum(np.maximum(torque - kd * w if has_kd else torque, -limit), limit)
+                wanted, least, most = servo_torque(terms, kp, aim, q) - kd * w, -limit, limit
+                if "no_load_speed" in terms:
+                    least, most = torque_range(limit, w / terms["no_load_speed"])
+                torque = np.minimum(np.maximum(wanted, least), most)
+                turn = h / (heavy + h * (own + kd * (torque == wanted)))
                 load = slope * q + weight
                 most = friction_limit(terms, dry, w, torque, load)
                 net = torque - load - pull - own * w
-                w = w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most))
+                before, w = w, w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most))
+                if "backlash" in terms:
+                    force = inertia * (w - before) / h + load + pull
+                    pressed = (abs(gap) >= half) & (force * gap >= 0)
+                    link = np.where(pressed, w, before - h / inertia * (load + pull))
+                    gap, rotor = crossed(half, gap, rotor, pressed, link, torque, own, most, armature, h)
+                    both = (inertia * link + armature * rotor) / heavy
+                    met = abs(gap) >= half
+                    w, rotor = np.where(met, both, link), np.where(met, both, rotor)
                 q = q + h * w
                 w = np.where(q < low, np.maximum(w, 0), np.where(q > high, np.minimum(w, 0), w))
                 q = np.minimum(np.maximum(q, low), high)
             touch = self.touch[:, t + 1]
             if touch.any():  # goes on from the recording
                 q[..., touch], w[..., touch] = self.qpos[:, touch, t + 1], self.qvel[:, touch, t + 1]
+                rotor[..., touch] = w[..., touch]
             if (t + 1) % self.thin == 0:
                 out[..., (t + 1) // self.thin] = q - self.qpos[..., t + 1]
         return out

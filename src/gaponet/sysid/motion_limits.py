@@ -21,6 +21,7 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.metrics import Comparison
 from gaponet.sysid.acceptance import Identified, held_out_errors
+from gaponet.sysid.axes import greatest_speeds
 
 MIN_PERIOD_S, MAX_LAG_S, LAGS = 0.01, 0.3, 16  # of rows that are compared; lags that are tried
 SPEED_RATIOS = np.geomspace(0.7, 1.25, 30)  # ramps that are tried, over a joint's greatest speed
@@ -33,6 +34,8 @@ MIN_BEYOND_STOP_RAD, MIN_STOP_ROWS = 0.1, 50  # that commands go beyond a stop, 
 AT_STOP_RAD = 0.005  # from the end of a joint's path
 MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
 AT_TORQUE_LIMIT, MIN_LIMITED_SHARE = 0.9, 0.01  # of the robot's limit; of a joint's rows
+FAST, DRIVEN_FAST = 0.5, 0.8  # of a joint's greatest speed; of the robot's limit, in the direction of motion
+MIN_FAST_SHARE = 0.003  # of a joint's rows
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
@@ -68,26 +71,32 @@ def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
             stop = float(getattr(stopped, name)[i])
             if np.isfinite(stop) and stop != getattr(given, name)[i]:
                 questions.append(
-                    f"{joint}: stayed at {stop:.3f} rad where commands went on towards {given.qpos_range[i, side]:.3f}:"
-                    " if that is a stop, identify with --stops; if something was in its way, leave those motions out"
+                    f"{joint}: stayed at {stop:.3f} rad where commands went {('lower', 'higher')[side]}: "
+                    "if that is a stop, identify with --stops; if something was in its way, leave those motions out"
                 )
     return questions
 
 
 def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, ...]:
-    """Return DEFAULT_TERMS, after "limit" if gains and recorded errors ask a joint for its torque limit.
+    """Return DEFAULT_TERMS, after "limit" and "speed" if gains and recorded errors ask a joint for such torques.
 
-    It is reached if the servo asks for AT_TORQUE_LIMIT of the robot's limit in MIN_LIMITED_SHARE of a joint's rows.
+    That is so if the servo asks, in MIN_LIMITED_SHARE of a joint's rows, for AT_TORQUE_LIMIT of the robot's limit; for
+    "speed", in MIN_FAST_SHARE, for DRIVEN_FAST of it while the joint moves that way at FAST of its greatest speed.
     """
     op = robot.operated_index
-    at_limit, rows = np.zeros((2, len(op)))
+    fast, limit = FAST * greatest_speeds(sequences, robot), robot.effort_limit[op]
+    reached: dict[Term, Array] = {"limit": np.zeros(len(op)), "speed": np.zeros(len(op))}
+    rows = np.zeros(len(op))
     for s in sequences:
         own = robot.with_gains(*s.meta.recorded_gains)
-        torque = np.abs(own.kp * (s.ctrl - s.qpos) - own.kd * s.qvel)[:, op]
+        torque, qvel = (own.kp * (s.ctrl - s.qpos) - own.kd * s.qvel)[:, op], s.qvel[:, op]
         recorded = np.array([j not in s.meta.unrecorded for j in robot.operated])
-        at_limit += recorded * (torque > AT_TORQUE_LIMIT * robot.effort_limit[op]).sum(axis=0)
+        reached["limit"] += recorded * (np.abs(torque) > AT_TORQUE_LIMIT * limit).sum(axis=0)
+        driven = (torque * np.sign(qvel) > DRIVEN_FAST * limit) & (np.abs(qvel) > fast)
+        reached["speed"] += recorded * driven.sum(axis=0)
         rows += len(s) * recorded
-    return ("limit", *DEFAULT_TERMS) if (at_limit > MIN_LIMITED_SHARE * rows).any() else DEFAULT_TERMS
+    shares: dict[Term, float] = {"limit": MIN_LIMITED_SHARE, "speed": MIN_FAST_SHARE}
+    return (*(t for t, share in shares.items() if (reached[t] > share * rows).any()), *DEFAULT_TERMS)
 
 
 def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:

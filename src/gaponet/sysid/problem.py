@@ -33,6 +33,7 @@ PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5, "damping": 1.0}  # of the robot fil
 PRIORS = len(PRIOR_LOG_STD)
 MIN_SHARE = 1e-3  # of the file's value; less counts as this
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
+RELATIVE_GAP_STD = 0.06  # of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py)
 UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
 MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
 
@@ -43,6 +44,7 @@ class _GainPrior:
     Its weight decreases with the residual of the best fit and increases with the residual's correlation time.
 
     Attributes:
+        log_std: Field → standard deviation of its logarithm.
         residual: RMS error of each joint's best fit so far, (n,) rad.
         correlation_time: Duration of a recording that counts as one measurement, (n,) s.
     """
@@ -51,9 +53,9 @@ class _GainPrior:
         self.residual = np.full(bounds.n, 1e-3)
         self.correlation_time = np.full(bounds.n, CORRELATION_TIME_BOUNDS_S[1])
         self._row_period = max(row_period, 0.01)
-        self._log_std = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
+        self.log_std: dict[str, float] = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
         self._servo_damping = {"damping": bounds.kd}  # beside the joint's own
-        given = {f: bounds.first[f] + self._servo_damping.get(f, 0.0) for f in self._log_std}
+        given = {f: bounds.first[f] + self._servo_damping.get(f, 0.0) for f in self.log_std}
         self._given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
 
     def error_std(self) -> Array:
@@ -64,7 +66,7 @@ class _GainPrior:
         """Return the prior's errors of candidates (k, n), (k, n, PRIORS) in ERROR_SCALE_RAD."""
         own = {f: values[f] + self._servo_damping.get(f, 0.0) for f in self._given}
         far = [
-            np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given)) * self.error_std() / self._log_std[f]
+            np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given)) * self.error_std() / self.log_std[f]
             for f, given in self._given.items()
         ]
         return np.stack(far, axis=-1)
@@ -289,6 +291,8 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     by = {f: np.stack([(a[f] - values[f]) / 1e-3 for a in ahead], axis=-1) for f in names}
     std = {f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + (np.abs(g) * lost).max(axis=1) for f, g in by.items()}
     std |= {f: np.hypot(std[f], error) for f, error in _discretisation_std(problem, values).items()}
+    if "no_load_speed" in std:  # a joint without a line: on its axis zero, but infinite in SI units
+        std["no_load_speed"] *= values["no_load_speed"] > 0
     unit = axes.unit[..., None]
     wide = unit * (cov + 1e3 * np.eye(len(names)) * lost[..., None, :]) * np.swapaxes(unit, -1, -2)
     unknown = _undetermined(problem, values, axes, std, width)
@@ -315,10 +319,14 @@ def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
 
 
 def _discretisation_std(problem: FitProblem, values: Values) -> Values:
-    """Return standard errors of damping, armature and delay by the length of a physics step, (n,)."""
+    """Return standard errors of damping, armature, delay, no-load speed and backlash by the physics step, (n,)."""
     h = UNIFORM_STD * problem.physics_step
     total = values["damping"] + problem.robot.kd[problem.robot.operated_index]
-    return {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
+    std = {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
+    if "no_load_speed" in values:  # the limit follows the speed a step late, half a step on average
+        limit = values.get("effort_limit", problem.bounds.first["effort_limit"])
+        std["no_load_speed"] = problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
+    return std | {"backlash": RELATIVE_GAP_STD * values["backlash"]} if "backlash" in values else std
 
 
 def _inverse(normal: Array, size: Array) -> Array:
@@ -348,7 +356,7 @@ def _undetermined(
             continue
         wide, also_over_kp = dict[str, str](), list[str]()
         for k, f in enumerate(names):
-            if f == "stribeck_speed" and not values["stribeck"][i]:
+            if (f == "stribeck_speed" and not values["stribeck"][i]) or (f == "no_load_speed" and not values[f][i]):
                 continue
             value, error = values[f][i], std[f][i]
             if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):

@@ -12,8 +12,9 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_TERMS
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.model import LINK_FIELDS, with_links
 from gaponet.sim.replay import Corrector, idle_limbs, rollout
 from gaponet.sysid.joint_rollouts import ROW_PERIOD_S, SETTLE_S
 
@@ -74,8 +75,9 @@ class RobotRollouts:
         self.standing = [(w, i) for w, p in enumerate(parts) for i, j in enumerate(free) if j in p.meta.unrecorded]
         self.rows = self.recorded.sum(axis=1)
 
-    def flat_errors(self, values: dict[str, Array]) -> Array:
-        """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n) as for BatchSim.set_servos."""
+    def flat_errors(self, values: dict[str, Array], links: ListOf[dict[str, Link]] = ()) -> Array:
+        """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n) as for BatchSim.set_servos.
+        Candidates may have `links` of their own, (k,)."""
         k, m = len(values["kp"]), len(self.parts)
         delay = np.array(self.robot.delay)
         delay[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
@@ -87,6 +89,15 @@ class RobotRollouts:
         sim.set_servos(self.robot.operated, {f: np.repeat(x, m, axis=0) for f, x in values.items()})
         for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
             sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
+            if sim.servo_model is not None:
+                sim.servo_model.armature[w::m, i], sim.servo_model.values["backlash"][w::m, i] = IMMOVABLE_ARMATURE, 0.0
+        if links:
+            robots = [replace(self.robot, links=one) for one in links]
+            models = [{c: with_links(model, robot) for c, model in sim.models.items()} for robot in robots]
+            for name in LINK_FIELDS:
+                rows = np.array([getattr(each[c], name) for each in models for c in conditions])
+                if rows.size:
+                    sim.batch.expand(name)[:] = rows
         return self.simulated_errors(sim)
 
     def simulated_errors(self, sim: BatchSim) -> Array:

@@ -55,8 +55,8 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
         for gain in ("kp", "kd"):
             own, theirs = (float(getattr(r, gain)[at]) for r, at in ((robot, i), (before, k)))
             servos[joint][gain] *= own / theirs if own > 0 and theirs > 0 else 1.0
-    mounts = like.payload_mounts if like.name == robot.name else robot.payload_mounts
-    return replace(robot.with_servos(servos), payload_mounts=mounts), sources
+    same = like if like.name == robot.name else robot
+    return replace(robot.with_servos(servos), payload_mounts=same.payload_mounts, links=same.links), sources
 
 
 def mirrored(joint: str) -> str:

@@ -1,8 +1,8 @@
 """Uncertainty of a robot's fitted parameters, stored as uncertainty.json in its folder.
 
 The parameters are Gaussian on axes that do not depend on a motor's gain: the logarithms of kp and stribeck_speed;
-torques, damping and armature divided by kp; other fields in SI units. The file also holds what the recordings showed by
-themselves, for comparison with later ones, and the error of motions that were not fitted.
+torques, damping and armature divided by kp; 1 / no_load_speed; other fields in SI units. The file also holds what the
+recordings showed by themselves, for comparison with later ones, and the error of motions that were not fitted.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
 PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
-UNOBSERVED_RELATIVE_ERROR = 1.0  # from which a value of zero means that no effect was seen
+UNOBSERVED_RELATIVE_ERROR = 1.0, 3.0  # from which no effect was seen: of a value of zero, of another
 MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = 0.9, 0.03  # from which parameters are known only as a set
 OLD_KEYS = {  # of known.json → of uncertainty.json
     "step": "gauss_newton_step", "step_covariance": "gauss_newton_covariance", "scatter": "overdispersion",
@@ -185,11 +185,11 @@ class JointSummary:
         return self.errors[field] / max(SERVO_FIELDS[field].large_value or abs(self.values[field]), 1e-9)
 
     def cell(self, field: str) -> str:
-        """Return the value with its uncertainty as text."""
-        factor = SERVO_FIELDS[field].factor
-        if self.relative_error(field) > UNOBSERVED_RELATIVE_ERROR and self.values[field] == 0:
-            return "none seen"
-        return format_uncertainty(self.values[field] * factor, self.errors[field] * factor)
+        """Return the value with its uncertainty as text; no uncertainty where the logs say nothing."""
+        value, relative = self.values[field] * SERVO_FIELDS[field].factor, self.relative_error(field)
+        if relative > UNOBSERVED_RELATIVE_ERROR[value != 0]:
+            return f"{value:.3g} (not seen)" if value else "none seen"
+        return format_uncertainty(value, self.errors[field] * SERVO_FIELDS[field].factor)
 
 
 def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
@@ -216,7 +216,9 @@ def format_change(field: str, change: float, uncertainty: ParameterUncertainty, 
     if record.axis == "log":
         return f"× {np.exp(change):.2f}"
     value = uncertainty.joints[joint].values[uncertainty.fields.index(field)]
-    return f"{100 * change / value:+.0f} %" if value > 1e-9 else "from none"
+    if record.axis == "inverse" and min(value, value + change) > 0:
+        return f"× {value / (value + change):.2f}"
+    return f"{max(100 * change / value, -100):+.0f} %" if value > 1e-9 else "from none"
 
 
 def table_rows(uncertainty: ParameterUncertainty, fields: tuple[str, ...]) -> list[list[str]]:
@@ -229,12 +231,12 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
     """Return the recordings, the parameters that are only known together, and the residual error, in sentences."""
     lines = []
     for s in uncertainty.sources:
-        days = ", ".join(s["days"]) or "on a day that no log names"
+        days = ", ".join(s["days"]) or "date unknown"
         logs = f"{len(s['logs'])} log{'s' * (len(s['logs']) != 1)}"
         lines.append(f"{s['made_by']}: {logs} of {s['unit']}, {s['seconds']:.0f} s, {days}")
     for joint in uncertainty.joints:
         for group in summarize(uncertainty, joint).sets:
-            lines.append(f"{joint}: {', '.join(group)} are known together; take them as a set")
+            lines.append(f"{joint}: the logs show only a combination of {', '.join(group)}: change none alone")
     joints = uncertainty.joints
     worst = max(joints, key=lambda j: joints[j].residual_rms)
     judges = "were not fitted" if uncertainty.validated else "were fitted, since no others were there"

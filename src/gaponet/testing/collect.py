@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,29 +31,40 @@ from gaponet.sysid.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.testing.fleet import Fleet
 from gaponet.testing.play import Job, library, play
 
-__all__ = ["Collection", "Recipe", "collect", "load_recipe"]
+__all__ = ["CollectResult", "Recipe", "collect", "load_recipe"]
 
 COLLECT_FILE = "collect.json"  # fleet, seed and payloads of a collected dataset
-DEFAULT_FLEET = "hard"
 TAKES_PER_JOB = (36, 144)  # least and most; more lose more when killed, fewer spend more time in numpy
 
 
 @dataclass(frozen=True)
-class Collection:
-    """Result of a collection.
+class CollectResult:
+    """Recordings of virtual robots.
 
     Attributes:
-        written: Number of new takes.
-        present: Number of takes that the dataset had before.
-        hours: Recorded time of the new takes.
-        wall_s: Wall time, s.
+        written: Recordings made now.
+        present: Recordings that were there before.
+        hours: Recorded time of `written`, h.
+        seconds: Wall time.
     """
 
-    dataset: str
+    dataset: Path
     written: int
     present: int
     hours: float
-    wall_s: float
+    seconds: float
+
+    @property
+    def times_real_time(self) -> float:
+        """Recorded time over wall time."""
+        return self.hours * 3600 / self.seconds if self.seconds > 0 else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain data."""
+        return {
+            "virtual": True, "times_real_time": self.times_real_time, "dataset": str(self.dataset),
+            "written": self.written, "present": self.present, "hours": self.hours, "wall_s": self.seconds,
+        }  # fmt: skip
 
 
 def collect(
@@ -65,22 +75,11 @@ def collect(
     seed: int = 0,
     nproc: int = 0,
     progress: Progress = no_progress,
-    replays: bool = True,
     executor: str | Executor = LOCAL,
-) -> Collection:
-    """Record every take of a recipe that the dataset at `out` lacks, with the gains of the fleet.
+) -> CollectResult:
+    """Record every take of a recipe that the dataset at `out` lacks, with its simulated replay and the fleet's gains.
 
-    Args:
-        seed: Seed of motions and of all random numbers in a take.
-        nproc: Processes; 0 for one per core, 1 for this process only. Several start new interpreters: a script that
-            calls this needs `if __name__ == "__main__":`.
-        replays: Store the simulated replay of each sequence, with resting joints locked in both.
-        executor: Where takes are played (gaponet.base.executor); no folder is shared with it.
-
-    Raises:
-        UsageError: The recipe names a motion, unit or file that does not exist.
-        DatasetError: `out` is another robot's, or was recorded with another fleet, seed or payload.
-        FolderError: `out` is no dataset, or another process writes into it.
+    Arguments and errors as of gaponet.api.collect. No folder is shared with the executor.
     """
     start = time.monotonic()
     robot = robot.with_gain_scale(fleet.gain_scale or robot.gain_scale)
@@ -103,22 +102,19 @@ def collect(
         jobs = [
             Job(robot, fleet, recipe, files, seed, tuple(part)) for part in _batches(missing, nproc or Pool.cores(1))
         ]
-        if replays:
-            pair_dataset(dataset, robot, lock_idle=True)  # of sequences whose replay a killed run did not store
-        for sequence, simulated in _play_jobs(jobs, nproc, replays, executor):
-            entry = dataset.append(sequence)
-            if simulated is not None:
-                dataset.write_replay(entry, simulated)
+        pair_dataset(dataset, robot, lock_idle=True)  # of sequences whose replay a killed run did not store
+        for sequence, simulated in _play_jobs(jobs, nproc, executor):
+            dataset.write_replay(dataset.append(sequence), simulated)
             written += 1
             seconds += sequence.duration
             progress(written, len(missing), f"{written} of {len(missing)}, {seconds / 3600:.2f} h recorded")
-    return Collection(str(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start)
+    return CollectResult(Path(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start)
 
 
 def fleet_name(dataset: Dataset) -> str:
-    """Return the name of the fleet that a dataset was collected from; DEFAULT_FLEET for another dataset."""
+    """Return the name of the fleet that a dataset was collected from; hard for another dataset."""
     path = dataset.path / COLLECT_FILE
-    return str(_read_source(path).get("fleet", DEFAULT_FLEET)) if path.is_file() else DEFAULT_FLEET
+    return str(_read_source(path).get("fleet", "hard")) if path.is_file() else "hard"
 
 
 def _read_source(path: Path) -> dict[str, Any]:
@@ -172,23 +168,18 @@ def _batches(missing: list[Take], nproc: int) -> Iterator[list[Take]]:
         yield part
 
 
-def _play_jobs(
-    jobs: list[Job], nproc: int, replays: bool, executor: str | Executor
-) -> Iterator[tuple[Sequence, SimulatedReplay | None]]:
+def _play_jobs(jobs: list[Job], nproc: int, executor: str | Executor) -> Iterator[tuple[Sequence, SimulatedReplay]]:
     """Yield sequences and their replays in the order of the jobs."""
-    work = partial(_play_job, replays=replays)
     if executor == LOCAL and (len(jobs) < 2 or (nproc or Pool.cores(1)) == 1):
         for job in jobs:
-            yield from work(job)
+            yield from _play_job(job)
         return
     with open_pool(executor, nproc, 1) as pool:
-        for played in pool.map(work, jobs):
+        for played in pool.map(_play_job, jobs):
             yield from played
 
 
-def _play_job(job: Job, replays: bool) -> list[tuple[Sequence, SimulatedReplay | None]]:
-    """Return the takes of a job and their replays, on one core."""
+def _play_job(job: Job) -> list[tuple[Sequence, SimulatedReplay]]:
+    """Return the takes of a job and their replays with resting joints locked, on one core."""
     sequences = play(job)
-    if not replays:
-        return [(s, None) for s in sequences]
     return list(zip(sequences, replay(sequences, job.robot, nthread=1, lock_idle=True), strict=True))

@@ -8,13 +8,11 @@ case. It can also simulate faults, to test the reaction of a controller.
 from __future__ import annotations
 
 from collections import deque
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.files import atomic_write
 from gaponet.hw.control.clock import MonotonicClock, no_garbage_collection
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
@@ -124,14 +122,6 @@ class VirtualH12:
         ):
             out[self._order] = (1 - share) * mine[self._order] + share * theirs
         self.live.set_gains(gains, dampers, torque=torque)
-
-    def save_heard(self, path: Path) -> None:
-        """Write the received commands as npz, an array per field."""
-        columns: dict[str, Any] = {
-            name: np.array([row[name] for row in self.heard]) for name in next(iter(self.heard), {})
-        }
-        with atomic_write(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **columns)
 
     def _send_state(self, k: int, now: float) -> None:
         wrong = self.first_command is not None and now - self.first_command >= self.fault_at

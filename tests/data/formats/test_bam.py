@@ -86,5 +86,5 @@ def test_an_arm_of_another_length_is_named(tmp_path, bench):
 
 def test_a_folder_that_is_called_like_a_recording_is_none(tmp_path):
     (tmp_path / "x.json").mkdir()
-    with pytest.raises(LogError, match="not a log this version reads"):
+    with pytest.raises(LogError, match="no log of sage"):
         detect(tmp_path)

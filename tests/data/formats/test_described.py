@@ -57,6 +57,12 @@ def test_a_sheet_says_what_names_do_not_and_every_recording_stands_in_it_once(tm
     ((name, log),) = read_logs(folder, arm)
     assert (name, log.meta["kp"]) == ("lift", [15.0, 9.0])
     assert log.meta["stated"] == {"payload_mass": 0.2, "unit_id": "b", "repetition": 1}
+    write(tmp_path / "logs", NAMES + 'manifest = "sheet.csv"\nkp = 20.0\n', "run_7.csv")
+    sheet.write_text("file,kp\nrun_7.csv,15\n")
+    with pytest.raises(LogError, match=r"run_7: logs.toml .* and the manifest contradict: kp 20.0 and 15.0"):
+        list(read_logs(folder, arm))
+    sheet.write_text("file,kp.elbow\nrun_7.csv,9\n")
+    assert [log.meta["kp"] for _, log in read_logs(folder, arm)] == [[20.0, 9.0]]  # of one joint beside that of all
     sheet.write_text("file,motion\nrun_8.csv,lift\n")
     with pytest.raises(LogError, match="run_7: no rows of the manifest"):
         list(read_logs(folder, arm))
@@ -133,7 +139,7 @@ def test_a_log_without_a_clock_has_the_rate_that_was_said(tmp_path, arm):
 
 def test_a_log_without_commands_says_what_can_still_be_done(tmp_path, arm):
     folder = write(tmp_path / "logs", NAMES, columns={k: v for k, v in theirs().items() if not k.endswith("_des")})
-    with pytest.raises(LogError, match=r"no column holds ctrl.<joint> .* What can still be done: record"):
+    with pytest.raises(LogError, match=r"no column holds ctrl.<joint> .* Record the position controller"):
         list(read_logs(folder, arm))
 
 

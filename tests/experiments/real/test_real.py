@@ -17,7 +17,7 @@ from gaponet.experiments.real.questions import questions, repeatability
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot, packaged_robots
 
-PAGE = Path(__file__).parents[3] / "docs" / "benchmark.md"
+DOCS = Path(__file__).parents[3] / "docs"
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def played(arm, tmp_path):
 
 
 def test_every_card_has_an_existing_robot_and_a_row_on_the_page():
-    cards, page = read_cards(CARDS), PAGE.read_text(encoding="utf-8")
+    cards, page = read_cards(CARDS), (DOCS / "results" / "recordings.md").read_text(encoding="utf-8")
     for card in cards.set:
         robot = load_robot(ROBOTS / card.robot if card.robot not in packaged_robots() else card.robot)
         assert set(card.joints) <= set(robot.joint_names)
@@ -89,12 +89,12 @@ def test_unknown_sets_and_questions_are_refused_and_absent_sets_skipped(tmp_path
 
 
 def test_the_method_on_the_page_runs(arm, played, tmp_path):
-    code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
+    code = re.search(r"```python\n(.*?)```", (DOCS / "benchmark.md").read_text(encoding="utf-8"), re.DOTALL)[1]
     (tmp_path / "mine.py").write_text(code)
-    name, method = load_method(f"{tmp_path / 'mine.py'}:half_gravity")
+    name, method = load_method(f"{tmp_path / 'mine.py'}:late_targets")
     (question,) = questions("new motions", played, arm, None)
     moved = method(question).positions(question.test)
-    assert name == "half_gravity"
+    assert name == "late_targets"
     assert [q.shape for q in moved] == [s.qpos.shape for s in question.test]
     with pytest.raises(UsageError, match=r"no such file; give FILE\.py:FUNCTION"):
         load_method("nothing.py:f")

@@ -1,4 +1,4 @@
-"""The controller's state machine: every event in every phase, and the same table in docs/deploy-safety.md."""
+"""The controller's state machine: every event in every phase, and the same table in docs/results/controller.md."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from gaponet.hw.control.phases import COMMANDING, ENDED, TRANSITION_TABLE, TRANSITIONS, Action, Phase, Trigger
 
-PAGE = Path(__file__).parents[3] / "docs" / "deploy-safety.md"
+PAGE = Path(__file__).parents[3] / "docs" / "results" / "controller.md"
 WAITING = (Phase.CONNECT, Phase.IDLE)
 SENDING = {Action.BLEND_IN, Action.PLAY, Action.GO_BACK, Action.RELEASE, Action.RELEASE_HERE}
 
@@ -58,5 +58,5 @@ def test_the_page_has_the_same_table():
         assert row(", ".join(phases), events, following or "the same", action.value) in page
     for trigger in Trigger:
         assert row(trigger.name.lower(), trigger.value) in page
-    states = page[page.index("## States") : page.index("## One plan before motion")]
+    states = page[page.index("## State machine") : page.index("## Tests")]
     assert sum(line.startswith("| ") for line in states) == len(TRANSITIONS) + len(Trigger) + 2

@@ -6,12 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from arm import recordings, write_arm, write_dataset
 from runs import TINY_TRAINING, differences, read_checkpoint
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.nn.training.checkpoint import RENAMED
 from gaponet.nn.training.config import Budget
 from gaponet.nn.training.trainer import Trainer
 
@@ -53,21 +51,6 @@ def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage,
     again = read_checkpoint(tmp_path / "run")
     assert differences(whole, again) == []
     assert [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").open()] == again["progress"]
-
-
-def test_a_checkpoint_with_earlier_names_is_resumed(world, tmp_path):
-    data, robot, whole = world
-    model = Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, show=stop("ppo", 6)).run()
-    assert model.card["interrupted"]
-    with pytest.raises(UsageError, match="--resume"):
-        Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS)
-    earlier = {today: name for name, today in RENAMED.items()}
-    state = {earlier.get(name, name): value for name, value in read_checkpoint(tmp_path / "run").items()}
-    state["net"]["bounded.unit"] = state["net"].pop("bounded.scale")
-    torch.save(state, tmp_path / "run" / "checkpoint.pt")
-    model = Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True).run()
-    assert not model.card["interrupted"]
-    assert differences(whole, read_checkpoint(tmp_path / "run")) == []
 
 
 def test_a_run_killed_before_its_first_checkpoint_is_begun_again(world, tmp_path):

@@ -33,13 +33,11 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     every = np.concatenate(list(lags.values()))
     period = float(np.median([1 / s.rate_hz for s in surveys]))
-    by_joint = ", ".join(
-        f"{name} {np.median(x) * 1e3:.0f} ms ({x.min() * 1e3:.0f}–{x.max() * 1e3:.0f})" for name, x in lags.items()
-    )
+    low, high = every.min(), every.max()
     text = (
-        f"state follows command after (median and range over motions at {FAST_COMMAND_RAD_S} rad/s or faster) "
-        f"{by_joint}: {every.min() / period:.0f} to {every.max() / period:.0f} control periods; the operator's history "
-        "must span it"
+        f"state follows command after {np.median(every) * 1e3:.0f} ms ({low * 1e3:.0f}–{high * 1e3:.0f} over joints and"
+        f" motions at {FAST_COMMAND_RAD_S} rad/s or faster), {low / period:.0f} to {high / period:.0f} periods: "
+        "a network's history must span it"
     )
     expected = _expected_lag(robot)
     sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
@@ -51,7 +49,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         verdict = next(words for limit, words in DEAD_TIMES if usual <= limit)
         text += (
             f". kp and damping explain all but {usual * 1e3:.0f} ms, which are dead time, friction or inertia (gaponet "
-            f"identify separates them); as dead time {verdict}"
+            f"identify separates them). A dead time of that length is {verdict}"
         )
     level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
     yield Finding(level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()})

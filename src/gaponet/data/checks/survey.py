@@ -171,10 +171,7 @@ class Survey:
 
 
 def survey_all(dataset: Dataset, robot: RobotSpec, progress: Progress, executor: str | Executor) -> list[Survey]:
-    """Return one survey per sequence, in the order of the dataset's entries.
-
-    Args:
-        executor: Measures the sequences, if there are many.
+    """Return one survey per sequence, in the order of the dataset's entries; many are measured by the executor.
 
     Raises:
         WorkerError: Workers of the executor died.

@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.survey import SPECTRUM_HZ, Survey
-from gaponet.data.signals import Response
+from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
 from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
@@ -105,7 +105,11 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
     shifts = shifts - np.nanmedian(shifts)
     scatter = max(1.48 * float(np.nanmedian(np.abs(shifts))), 1e-3)
     limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter, unknown)
-    far = [(s, late) for s, late in zip(surveys, shifts.tolist(), strict=True) if abs(late) > limit]
+    far = [
+        (s, late)
+        for s, late in zip(surveys, shifts.tolist(), strict=True)
+        if abs(late) > limit and max(s.speed) >= FAST_COMMAND_RAD_S
+    ]  # stiction delays slow motions
     for word, group in (("later", [f for f in far if f[1] > 0]), ("sooner", [f for f in far if f[1] < 0])):
         single = len(group) < MIN_RECORDINGS
         for part in [[one] for one in group] if single else [group]:
@@ -114,8 +118,8 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
             by = f"{ms[0]:.0f} ms" if single else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
             text = (
                 f"{abbreviate(labels)} {'follows its' if single else 'follow their'} commands {by} {word} than the "
-                "other recordings: clocks of command and state that are apart, another servo, or friction in slow "
-                "motions; leave them out if it is the clocks"
+                "other recordings: clocks of command and state that are apart, or another servo; leave them out if it "
+                "is the clocks"
             )
             values = {"recordings": [s.entry.id for s, _ in part], "late_s": [late for _, late in part]}
             yield Finding("warning", "lag", text, (), values)

@@ -21,7 +21,7 @@ MIN_KIND_CORRELATION = 0.7  # of the command with what else it may be
 MIN_FOLLOWING = 0.75  # correlation of velocities, from which commands are positions that a weak motor does not reach
 RATIO_BOUNDS = (0.03, 10.0)  # measured over commanded range; between 0.03 and 0.1 a joint may be stuck
 QVEL_RATIO_BOUNDS = (0.5, 2.0)
-MIN_WIDEST_COMMAND_RAD = 0.12
+MIN_WIDEST_COMMAND_RAD, MAX_READ_AS_DEGREES_RAD = 0.12, np.radians(3.3)
 
 
 def _moved(surveys: list[Survey], joint: int) -> list[Survey]:
@@ -36,7 +36,7 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         moved = s.ctrl_range > MIN_COMMAND_RAD
         motions += moved
         for i in np.flatnonzero(moved & (np.diag(s.follows) < 0.3) & (np.diag(s.opposes) < 0.6)):
-            others = np.flatnonzero((s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6)))
+            others = np.flatnonzero((s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6).any()))
             if others.size:
                 j = int(others[s.follows[i, others].argmax()])
                 candidates[int(i), j].append(float(s.follows[i, j]))
@@ -46,7 +46,8 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         a, b = robot.joint_names[own], robot.joint_names[other]
         text = (
             f"the command of {a} moves {b}, not {a} (correlation {np.median(correlations):.2f}, {len(correlations)} of "
-            f"{motions[own]} motions): names are swapped; import again with --map NAME_IN_LOG=NAME_OF_ROBOT"
+            f"{motions[own]} motions): the columns of command and state are in different orders; name the command's "
+            f'columns in logs.toml ([columns] "ctrl.{b}" = "what is ctrl.{a} now") and import again'
         )
         yield Finding("error", "order", text, (a, b))
     idle = tuple(name for name, count in zip(robot.joint_names, motions, strict=True) if not count)
@@ -161,7 +162,7 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         if ratio > RATIO_BOUNDS[1] or 0 < ratio < RATIO_BOUNDS[0]:
             text = (
                 f"{name} moves {ratio:.3g} times as far as commanded (57.3 and 0.0175 are degrees beside radians): "
-                "import again with the right units"
+                "convert the command or the state in the logs, and import again"
             )
             wrong.append(Finding("error", "unit", text, (name,), {"ratio": ratio}))
         slope = median([s.slope[i] for s in surveys if np.isfinite(s.slope[i])])
@@ -179,10 +180,17 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "the velocity out at import, it is then computed"
             )
             wrong.append(Finding("warning", "unit", text, (name,), {"ratio": ratio}))
+    small = [s.motion for s in surveys if np.abs(s.ctrl_limits).max() < MAX_READ_AS_DEGREES_RAD]
     widest = max(float(s.ctrl_range.max()) for s in surveys)
     if widest < MIN_WIDEST_COMMAND_RAD:
         text = f"no command spans more than {widest:.3f} rad: were radians read as degrees?"
         wrong.append(Finding("warning", "unit", text))
+    elif small and any("deg" in s.entry.meta.notes.get("converted_from", {}).values() for s in surveys):
+        text = (
+            f"no command of {abbreviate(small)} is further than {np.degrees(MAX_READ_AS_DEGREES_RAD):.1f}° from zero: "
+            "radians that were read as degrees, beside logs in degrees? Import them by themselves, with their unit"
+        )
+        wrong.append(Finding("error", "unit", text))
     yield from _converted(surveys, robot)
     yield from wrong or [Finding("ok", "unit", "commands, positions and velocities agree in unit")]
 
@@ -220,7 +228,10 @@ def _limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 
 def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Is one recording filed under two payloads or units?"""
+    """Is one recording filed under two payloads or units, and were all made with the same gains?"""
+    if (kinds := len({(s.entry.meta.kp, s.entry.meta.kd) for s in surveys})) > 1:
+        text = f"{kinds} sets of kp and kd while recording: each recording is simulated with its own; is that meant?"
+        yield Finding("note", "labels", text)
     ids: dict[str, list[str]] = defaultdict(list)
     for s in surveys:
         ids[s.samples].append(s.entry.id)

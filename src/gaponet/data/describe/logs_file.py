@@ -110,7 +110,7 @@ class Naming:
                     f'{path}: its name does not look like motion = "{self.text}" of {self.where}; rename it, or list '
                     "the recordings in a manifest"
                 )
-            facts |= _fields(match.groupdict(), path)
+            facts |= _agreeing(facts, _fields(match.groupdict(), path), path, f"logs.toml and {name}")
         if self.sheet is not None:
             rows = [
                 i for i, row in enumerate(self.sheet)
@@ -122,7 +122,8 @@ class Naming:
                     f"{name} under file"
                 )
             self.unused -= set(rows)
-            facts |= _fields({k: v for k, v in self.sheet[rows[0]].items() if k != "file"}, path)
+            row = _fields({k: v for k, v in self.sheet[rows[0]].items() if k != "file"}, path)
+            facts |= _agreeing(facts, row, path, "logs.toml (or a name) and the manifest")
         return facts
 
     def require_all_used(self) -> None:
@@ -130,6 +131,17 @@ class Naming:
         if self.sheet and self.unused:
             names = ", ".join(self.sheet[i]["file"] for i in sorted(self.unused))
             raise LogError(f"the manifest of {self.where} names recordings that are not there: {names}; mend the names")
+
+
+def _agreeing(facts: dict[str, Any], more: dict[str, Any], path: str, both: str) -> dict[str, Any]:
+    """Return `more`, which may say gains of single joints beside those of all, but contradict no other fact."""
+    for field in facts.keys() & more.keys():
+        first, second = facts[field], more[field]
+        if isinstance(second, dict):
+            more[field] = (first if isinstance(first, dict) else {"": first}) | second
+        elif second != first:
+            raise LogError(f"{path}: {both} contradict: {field} {first} and {second}; delete the wrong one")
+    return more
 
 
 def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool]:

@@ -27,10 +27,9 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SAY_UNITS = "--position-unit rad --time-unit s (or position_unit and time_unit in logs.toml)"
 COMMAND = "command:"  # before the names of signals that lie in a command_file
 NO_COMMANDS = (
-    "without commanded positions there is no gap to measure: a state says where the robot was, not where it was told "
-    "to go, and the commands of a robot driven by torques or velocities are no position targets, from which this "
-    "version cannot learn. What can still be done: record the position controller's targets beside the state, or play "
-    "the recorded positions again as a motion (gaponet run) with both recorded"
+    "without commanded positions there is no gap to measure. Record the position controller's targets beside the "
+    "state, or play the recorded positions again (gaponet run) and record both. If torque or current is the command: "
+    "docs/logs.md, 'Driven by torque or current'"
 )
 
 
@@ -85,14 +84,9 @@ class RawRecording:
 
     @classmethod
     def of_arrays(
-        cls,
-        file: Path,
-        arrays: dict[str, Any],
-        names: tuple[str, ...] = (),
-        name: str = "",
-        part: str = "",
+        cls, file: Path, arrays: dict[str, Any], names: tuple[str, ...] = (), name: str = "", part: str = "",
         **more: Any,
-    ) -> RawRecording:
+    ) -> RawRecording:  # fmt: skip
         """A recording of arrays in memory; those that are not one row of numbers per sample are left alone.
 
         Args:
@@ -283,7 +277,7 @@ def _require_complete(columns: Chosen, recording: RawRecording, specified: LogsF
     for need in REQUIRED:
         if need in columns:
             continue
-        explanation = f' (said to be "{specified[need]}")' if need in specified else ""  # type: ignore[literal-required]
+        explanation = f' (expected "{specified[need]}")' if need in specified else ""  # type: ignore[literal-required]
         why = f": {NO_COMMANDS}" if need == "ctrl" else ""
         raise LogError(
             f'{where}: no column holds {need}.<joint>{explanation}; there are: {recording.shown()}. Say {need} = "…" '

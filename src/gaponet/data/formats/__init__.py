@@ -91,8 +91,6 @@ def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
 
 def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
-    if not path.exists():
-        raise LogError(f"{path}: does not exist")
     matches = [fmt for fmt, where in formats().items() if attempt(where, partial(_detects, fmt, path), False)]
     others = [fmt for fmt in matches if fmt != "table"]
     if others and len(matches) > len(others):
@@ -103,8 +101,9 @@ def detect(path: Path) -> str:
         ways = " or ".join(f"--format {fmt}" for fmt in matches)
         raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in matches)}; say {ways}")
     if not matches:
-        known = "; ".join(f"{fmt}: {about(fmt)}" for fmt in formats())
-        raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
+        if (path / "dataset.json").is_file():
+            raise LogError(f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}")
+        raise LogError(f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains them)")
     return matches[0]
 
 
@@ -123,34 +122,15 @@ def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
 
 
 def read_logs(
-    path: Path,
-    robot: RobotSpec,
-    fmt: str | None = None,
-    joint_map: dict[str, str] | None = None,
-    logs: str | Path | None = None,
-    position_unit: str | None = None,
-    time_unit: str | None = None,
-    allow_pickle: bool = False,
-    rate: float | None = None,
-    strict: bool = False,
-) -> Iterator[tuple[str, Log]]:
-    """Yield (motion name, Log) for every recording under a path.
+    path: Path, robot: RobotSpec, fmt: str | None = None, joint_map: dict[str, str] | None = None,
+    logs: str | Path | None = None, position_unit: str | None = None, time_unit: str | None = None,
+    allow_pickle: bool = False, rate: float | None = None, strict: bool = False,
+) -> Iterator[tuple[str, Log]]:  # fmt: skip
+    """Yield (motion name, Log) for every recording under a path; arguments and errors as of gaponet.api.import_logs.
 
     While data.log.skip_bad_rows is open, bad rows are cut, recordings that cannot be read are left out, and both are
-    listed there.
-
-    Args:
-        fmt: One of formats(); default by looking.
-        joint_map: The log's name of a joint → the robot's; wins over logs.toml.
-        logs: A logs.toml (data.describe.logs_file); default the one in the folder of the logs.
-        position_unit, time_unit, rate: Win over logs.toml; refused where the format itself fixes them. rate, Hz, is
-            of logs without a clock.
-        strict: Refuse a recording whose velocity, torque or temperature is nonsense somewhere, instead of making up for
-            that channel there (data.describe.plausibility).
-        allow_pickle: Open pickled files, with an unpickler that makes arrays, numbers and text and nothing else.
-
-    Raises:
-        LogError, JointMismatchError, UsageError: What, where and what to do.
+    listed there. joint_map, position_unit, time_unit and rate win over logs.toml; the last three are refused where the
+    format itself fixes them.
     """
     specified, file = read_logs_file(path, logs)
     reader = _reader(path, fmt or specified.get("format"))
@@ -205,10 +185,9 @@ def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
 
 
 def _reader(path: Path, fmt: str | None) -> ModuleType:
-    reader = module(fmt or detect(path))
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    return reader
+    return module(fmt or detect(path))
 
 
 def _loaders(

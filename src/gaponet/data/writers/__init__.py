@@ -53,8 +53,7 @@ def export(
     if to not in WRITERS:
         raise UsageError(f"no writer '{to}'; use one of {', '.join(WRITERS)}")
     writer = import_module(WRITERS[to])
-    if not dataset.entries:
-        raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
+    dataset.require_sequences()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out}: exists and is not an empty folder; choose a new one")
     done = 0

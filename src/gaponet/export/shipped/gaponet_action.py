@@ -29,7 +29,7 @@ from gaponet.export.shipped.mujoco_servos import Check, read
 from gaponet.export.shipped.scene_facts import require_scene
 from gaponet.export.shipped.unit_events import columns_of, write_model
 from gaponet.export.shipped.unit_events import mjlab_units as mjlab_units
-from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque
+from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque, torque_range
 
 PROGRAM, FACTS, ROBOT = "delta.pt2", "facts.json", "robot.xml"
 
@@ -307,16 +307,16 @@ class ServoModel:
 
     def __init__(self, sim: Any, entity: Any, name: str, joints: list[str], facts: dict[str, Any]) -> None:
         column = {f: torch.tensor([facts["joints"][j].get(f, 0.0) for j in joints], device=sim.device)
-                  for f in ("kp", "offset", "frictionloss", *SERVO_TERMS)}  # fmt: skip
+                  for f in ("kp", "offset", "frictionloss", "effort_limit", *SERVO_TERMS)}  # fmt: skip
         self.sim, self.terms, model = sim, present({f: column[f] for f in SERVO_TERMS}), sim.mj_model
-        self.joints = joints
+        self.joints, self.effort = joints, column["effort_limit"]
         self.dof = torch.tensor([model.joint(f"{name}/{j}").dofadr[0] for j in joints], device=sim.device)
         self.at = torch.tensor([model.joint(f"{name}/{j}").qposadr[0] for j in joints], device=sim.device)
         self.servo = torch.tensor([model.actuator(f"{name}/{j}").id for j in joints], device=sim.device)
         self.kp, self.frictionloss, self.bias = column["kp"], column["frictionloss"], column["kp"] * column["offset"]
         if not self.terms:
             return
-        sim.expand_model_fields(("dof_frictionloss", "actuator_biasprm"))
+        sim.expand_model_fields(("dof_frictionloss", "actuator_biasprm", "actuator_forcerange"))
         self.torque = torch.zeros(sim.num_envs, len(joints), device=sim.device)
         self.load, update = torch.zeros_like(self.torque), entity.update
 
@@ -340,6 +340,7 @@ class ServoModel:
         self.kp = of_worlds(self.kp, units["kp"])
         self.bias = of_worlds(self.bias, units["kp"] * units["offset"])
         self.frictionloss = of_worlds(self.frictionloss, units["frictionloss"])
+        self.effort = of_worlds(self.effort, units["effort_limit"])
         self.terms = {name: of_worlds(column, units[name]) for name, column in self.terms.items()}
 
     def restart(self, fresh: Tensor, error: Tensor) -> None:
@@ -349,12 +350,16 @@ class ServoModel:
             self.load = torch.where(fresh[:, None], self.sim.data.qfrc_bias[:, self.dof], self.load)
 
     def before(self, ctrl: Tensor) -> None:
-        """Set friction and bias for the next physics step, under targets (num_envs, joints) rad."""
+        """Set friction, torque limits and bias for the next physics step, under targets (num_envs, joints) rad."""
         if not self.terms:
             return
         q, v = self.sim.data.qpos[:, self.at], self.sim.data.qvel[:, self.dof]
         limit = friction_limit(self.terms, self.frictionloss, v, self.torque, self.load)
         self.sim.model.dof_frictionloss[:, self.dof] = limit
+        if "no_load_speed" in self.terms:
+            speed = self.terms["no_load_speed"]
+            limits = torque_range(self.effort, torch.where(speed > 0, v / speed, 0.0))
+            self.sim.model.actuator_forcerange[:, self.servo] = torch.stack(limits, dim=-1)
         wanted = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q)
         self.sim.model.actuator_biasprm[:, self.servo, 0] = wanted - self.kp * (ctrl - q)
 
@@ -430,8 +435,8 @@ def _isaaclab_term() -> Any:
             super().__init__(cfg, env)
             self.folder, self.payload_mass = Path(cfg.folder), cfg.payload_mass
             facts = read_facts(self.folder)
-            if cfg.check and facts["law"] and "model" in facts:
-                law = ", ".join(facts["law"])
+            law = ", ".join(term for term in facts["law"] if term != "no_load_speed")
+            if cfg.check and law and "model" in facts:
                 raise ValueError(
                     f"{cfg.folder}: trained with a servo model ({law}), which Isaac Lab lacks; or give check=False"
                 )
@@ -448,19 +453,31 @@ def _isaaclab_form(facts: dict[str, Any]) -> str:
 
 
 def isaaclab_actuators(folder: str | Path) -> dict[str, Any]:
-    """Return an IdealPDActuatorCfg of the servos; `isaaclab_action` has their delays and offsets."""
-    from isaaclab.actuators import IdealPDActuatorCfg
+    """Return an IdealPDActuatorCfg of the servos, and a DCMotorCfg for each joint with a no-load speed.
+
+    `isaaclab_action` has their delays and offsets.
+    """
+    from isaaclab.actuators import DCMotorCfg, IdealPDActuatorCfg
 
     facts = read_facts(folder)
     joints = facts[_isaaclab_form(facts)]
-    column = lambda field: {name: joint[field] for name, joint in joints.items()}  # noqa: E731
     fields = {field.name for field in dataclasses.fields(IdealPDActuatorCfg)}
-    limit = "actuator_effort_limit" if "actuator_effort_limit" in fields else "effort_limit"  # Isaac Lab 3 renamed it
-    return {
-        "servos": IdealPDActuatorCfg(
-            joint_names_expr=list(joints), stiffness=column("kp"), damping=column("kd"), armature=column("armature"),
-            friction=column("frictionloss"), viscous_friction=column("damping"), **{limit: column("effort_limit")},
-        )
+    own = "actuator_" if "actuator_effort_limit" in fields else ""  # Isaac Lab 3 renamed the limits
+
+    def group(kind: Any, names: list[str], **more: float) -> Any:
+        column = lambda field: {name: joints[name][field] for name in names}  # noqa: E731
+        return kind(
+            joint_names_expr=names, stiffness=column("kp"), damping=column("kd"), armature=column("armature"),
+            friction=column("frictionloss"), viscous_friction=column("damping"),
+            **{f"{own}effort_limit": column("effort_limit")}, **more,
+        )  # fmt: skip
+
+    motors = {name: joint for name, joint in joints.items() if joint.get("no_load_speed")}
+    plain = [name for name in joints if name not in motors]
+    return ({"servos": group(IdealPDActuatorCfg, plain)} if plain else {}) | {
+        name: group(DCMotorCfg, [name], saturation_effort=joint["effort_limit"],
+                    **{f"{own}velocity_limit": joint["no_load_speed"]})
+        for name, joint in motors.items()
     }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque
+from gaponet.sim.servo import SERVO_TERMS, Play, friction_limit, present, servo_torque, torque_range
 
 CHECK_WORLDS = 3
 Motion = dict[str, Any]  # one of check.npz: ctrl, qpos, qvel (T, n) in rad and rad/s, dt in s
@@ -43,7 +43,8 @@ class Servos:
         self.model = model
         self.dof, self.qpos, self.servo = addresses(model, list(joints), prefix)
         self.kp, self.frictionloss = column["kp"], column["frictionloss"]
-        self.bias = self.kp * column["offset"]
+        self._motor, self._play_time = (column["armature"], column["damping"], column["kd"]), np.nan
+        self.bias, self.effort = self.kp * column["offset"], column["effort_limit"]
         model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = column["armature"], column["damping"]
         model.actuator_gainprm[self.servo, 0], model.actuator_biasprm[self.servo, 0] = self.kp, self.bias
         model.actuator_biasprm[self.servo, 1], model.actuator_biasprm[self.servo, 2] = -self.kp, -column["kd"]
@@ -56,17 +57,31 @@ class Servos:
         self.terms = present({name: column[name] for name in SERVO_TERMS if name in column})
 
     def before(self, data: Any) -> None:
-        """Set bias and friction for the next physics step, under data.ctrl."""
+        """Set bias, torque limits and friction for the next physics step, under data.ctrl; with backlash qfrc_applied
+        too."""
         if not self.terms:
             return
         model, torque, load = self.model, data.actuator_force[self.servo], data.qfrc_bias[self.dof]
-        model.dof_frictionloss[self.dof] = friction_limit(
-            self.terms, self.frictionloss, data.qvel[self.dof], torque, load
-        )
+        q, qvel, bias = data.qpos[self.qpos], data.qvel[self.dof], self.bias
+        limit = friction_limit(self.terms, self.frictionloss, qvel, torque, load)
+        if "no_load_speed" in self.terms:
+            limits = torque_range(self.effort, qvel / self.terms["no_load_speed"])
+            model.actuator_forcerange[self.servo] = np.stack(limits, axis=-1)
         if "encoder_step" in self.terms or "min_torque" in self.terms:
-            q, ctrl = data.qpos[self.qpos], data.ctrl[self.servo]
-            wanted = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q)
-            model.actuator_biasprm[self.servo, 0] = wanted - self.kp * (ctrl - q)
+            ctrl = data.ctrl[self.servo]
+            bias = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q) - self.kp * (ctrl - q)
+        if "backlash" in self.terms:
+            h = model.opt.timestep
+            if data.time != self._play_time:  # a new state
+                self.play = Play(self.terms["backlash"], *self._motor, load, qvel)
+            else:
+                self.play.after(qvel, torque, data.qfrc_constraint[self.dof], h)
+            limit, armature, damping, applied, gear, more = self.play.before(limit, self.kp, q, qvel, h)
+            model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = armature, damping
+            data.qfrc_applied[self.dof], model.actuator_gear[self.servo, 0] = applied, gear
+            bias, self._play_time = bias + more, data.time + h
+        model.dof_frictionloss[self.dof] = limit
+        model.actuator_biasprm[self.servo, 0] = bias
 
 
 def addresses(model: Any, joints: list[str], prefix: str = "") -> tuple[Any, Any, Any]:

@@ -20,12 +20,6 @@ StateDict = dict[str, Any]
 
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
 SHARED = ("net", "optimiser", "critic", "critic_optimiser")  # equal on all ranks
-# Fields of checkpoints before 26 November 2026 → fields of today.
-RENAMED = {
-    "best": "best_error", "trained": "best_trained_error", "trained_state": "best_trained_state", "val": "val_error",
-    "rounds_done": "pretraining_rounds", "updates": "ppo_updates", "anew": "ppo_from_untrained", "learner": "ppo",
-    "warm": "pretraining", "dataset": "dataset_hash",
-}  # fmt: skip
 
 
 @dataclass
@@ -97,9 +91,9 @@ class Checkpoint:
             UsageError: The run has other recordings or another number of ranks.
         """
         try:
-            state = _renamed(torch.load(out / CHECKPOINT, weights_only=True, map_location="cpu"))
+            state = torch.load(out / CHECKPOINT, weights_only=True, map_location="cpu")
             net.load_state_dict(state.pop("net"))
-            others = [_renamed(other) for other in state.pop("others", [])]
+            others = state.pop("others")
             if 0 < ranks.rank() <= len(others):
                 state = _with_rank_state(state, others[ranks.rank() - 1])
             torch.set_rng_state(state.pop("rng"))
@@ -110,14 +104,9 @@ class Checkpoint:
         if len(others) + 1 != ranks.world():
             n = len(others) + 1
             raise UsageError(f"{out}: was trained by {n} processes; resume with torchrun --nproc-per-node {n}")
-        if checkpoint.dataset_hash not in ("", dataset_hash):
+        if checkpoint.dataset_hash != dataset_hash:
             raise UsageError(f"{out}: was trained on other recordings than this dataset holds; train anew")
         return checkpoint
-
-
-def _renamed(state: StateDict) -> StateDict:
-    """Translate field names of earlier versions."""
-    return {RENAMED.get(name, name): value for name, value in state.items()}
 
 
 def _rank_state(state: Any) -> Any:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 MAX_BUDGET = 1e12  # control steps, or any unit of time
 MIN_STEPS = 100  # with fewer, the unit of time is probably missing
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}  # per unit
-RENAMED_FIELDS = {"warm_start": "pretraining"}  # of TrainConfig: earlier name → name of today
 
 
 @dataclass(frozen=True)

@@ -66,11 +66,7 @@ class Trainer:
 
         Args:
             robot: The simulator that the network corrects.
-            out: Run folder.
-            resume: Continue the run in out.
-            holdout_units: Units that are only in the test split.
             show: Called with the state of the run.
-            log: Any of run_folder.LOG_KINDS.
             shared: Name → result that does not depend on the kind of network, and the seconds that it took. Trainings
                 of several kinds on the same recordings fill and use it; each has the same time left for its network.
 

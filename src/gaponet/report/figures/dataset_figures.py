@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from gaponet.base.arrays import Array
-from gaponet.base.errors import DatasetError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.repeatability import MIN_MOTION_RAD
@@ -41,19 +40,9 @@ class _NoDataError(Exception):
 def write_figures(
     dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = no_progress
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write every figure for which the dataset has data.
-
-    Args:
-        dataset: At least one sequence.
-        robot: The dataset's robot.
-        out: Folder; figures of the same name are replaced.
-
-    Returns:
-        The files; and {figure: reason for its absence}.
-    """
+    """Write every figure for which the dataset has data; return the files, and {figure: reason for its absence}."""
     dataset.require_robot(robot)
-    if not dataset.entries:
-        raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
+    dataset.require_sequences()
     with lock_folder(out, "figures"):
         figures, left_out = draw_figures(dataset, robot, progress)
         return [file for name, fig in figures.items() for file in save(fig, out / name)], left_out

@@ -52,10 +52,10 @@ def waterfall(gap: dict[str, Any]) -> Figure:
     for ax in axes[:, 0]:
         ax.tick_params(axis="y", labelsize=7)
     axes[0, 0].invert_yaxis()
-    robot = f"{'VIRTUAL' if gap['virtual'] else 'real'} {gap['robot']}"
+    robot, end = f"{'VIRTUAL' if gap['virtual'] else 'real'} {gap['robot']}", "s" * (gap["sequences"] != 1)
     fig.suptitle(
-        f"{robot}, {gap['sequences']} {'held-out ' if gap['unseen'] else ''}recordings: reduction of the error by each "
-        "step (hollow: increase)\ndashed: floor, by encoder and repeatability (– unknown)",
+        f"{robot}, {gap['sequences']} {'test ' if gap['unseen'] else ''}recording{end}: reduction "
+        "of the error by each step (hollow: increase)\ndashed: floor, by encoder and repeatability (– unknown)",
         fontsize=9, x=0.01, ha="left",
     )  # fmt: skip
     return fig

@@ -1,0 +1,77 @@
+"""Backlash beside friction: whether a search for it is worth its time, and how probable it is, joint by joint.
+
+A constant load presses motor and link together and hides the gap. Where the load changes its sign, the link crosses the
+gap by itself. No friction does that, so the two can be told apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as ListOf
+
+import numpy as np
+from scipy.special import expit
+
+from gaponet.base.arrays import Array
+from gaponet.base.text import format_uncertainty
+from gaponet.sysid.axes import Values
+from gaponet.sysid.problem import JointFit
+
+SCREENED_WIDTHS_RAD = (1e-3, 2.5e-3, 5e-3, 1e-2, 2e-2)
+MIN_SCREENED_GAIN = 0.02  # of a joint's squared error, at otherwise equal values
+MIN_PROBABILITY = 0.9  # of a gap that stays in the robot
+MIN_WIDTH_RAD = 5e-4  # of a gap that is reported though it is not probable
+
+
+def worth_a_search(fit: JointFit, values: Values) -> bool:
+    """Return whether a gap of SCREENED_WIDTHS_RAD makes some joint's rollouts better, at values (n,) otherwise."""
+    widths = np.array([0.0, *SCREENED_WIDTHS_RAD])
+    candidates = {f: np.repeat(v[None], len(widths), axis=0) for f, v in values.items()}
+    candidates["backlash"] = np.repeat(widths[:, None], fit.bounds.n, axis=1)
+    square = np.square(fit.rollouts.errors(candidates)).sum(axis=(2, 3))  # (widths, n)
+    return bool((square.min(axis=0) < (1 - MIN_SCREENED_GAIN) * square[0]).any())
+
+
+def probability(fit: JointFit, without: Values, values: Values) -> Array:
+    """Return the probability of backlash by the Bayesian information criterion, (n,); both odds are equal before.
+
+    Parts of the recordings as long as the errors' correlation time count as independent.
+
+    Args:
+        without, values: Best values (n,) without and with backlash, of the same search.
+    """
+    square = [np.square(fit.rollouts.flat_errors({f: v[None] for f, v in one.items()})[0]).sum(axis=1)
+              for one in (without, values)]  # fmt: skip
+    seconds = fit.rollouts.rows * fit.rollouts.dt * fit.rollouts.thin
+    clusters = np.maximum(seconds / fit.prior.correlation_time, 1.0)
+    gain = np.log(np.maximum(square[0], 1e-12) / np.maximum(square[1], 1e-12))
+    return np.asarray(expit(0.5 * (clusters * gain - np.log(clusters))))
+
+
+def only_probable(without: ListOf[Values], values: ListOf[Values], chance: Array) -> list[Values]:
+    """Return values (n,) with backlash at the joints where it is probable, and the others' without."""
+    pairs = zip(without, values, strict=True)
+    return [{f: np.where(chance >= MIN_PROBABILITY, v, a.get(f, 0.0)) for f, v in b.items()} for a, b in pairs]
+
+
+def findings(
+    joints: ListOf[str], width: Array, chance: Array, std: Mapping[str, Mapping[str, float]]
+) -> tuple[str, ...]:
+    """Return a sentence for each joint with backlash, or with a gap that friction explains as well.
+
+    Args:
+        width, chance: Fitted gap, rad, and its probability, (n,).
+        std: Joint → field → standard error; of a robot without backlash it lacks the field.
+    """
+    sentences = []
+    for joint, gap, p in zip(joints, width.tolist(), chance.tolist(), strict=True):
+        if p >= MIN_PROBABILITY and "backlash" in std[joint]:
+            size = format_uncertainty(1e3 * gap, 1e3 * std[joint]["backlash"])
+            chance_of_it = "above 0.99" if p > 0.99 else f"{p:.2f}"
+            sentences.append(f"{joint}: backlash {size} mrad (probability {chance_of_it})")
+        elif gap > MIN_WIDTH_RAD:
+            sentences.append(
+                f"{joint}: backlash of {1e3 * gap:.1f} mrad is not distinguishable from static friction (probability "
+                f"{p:.2f}); play gaponet excite --motions steps to tell"
+            )
+    return tuple(sentences)

@@ -1,0 +1,159 @@
+"""Fit of a robot's links together with its servos, in the simulator of the whole robot.
+
+Only directions of the links' coordinates that recordings determine better than the prior are fitted; what is at right
+angles to them stays. Without payloads, nothing shows whether all masses and all gains are larger alike, and both stay.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.data.signals import differentiate, lowpass
+from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
+from gaponet.sim.model import build_model, with_links
+from gaponet.sysid import least_squares
+from gaponet.sysid.axes import CLASSIC, Axes, Values
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED
+from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, Progress
+from gaponet.sysid.links import COORDINATES, LinkAxes, LinkResult
+from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
+
+ROWS = 400  # of recordings, whose torques choose directions
+MIN_INFORMATION, MAX_DIRECTIONS = 1.0, 12  # of a direction over the prior's, and how many are fitted
+ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
+FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
+MAX_SERVO_NUMBERS, FEW_FIELDS = 36, ("kp", "armature")  # fitted with the links; of robots with more, these fields
+MIN_CHANGE = 0.1  # of a link's coordinates, in standard deviations of the prior; a smaller one is none
+MAX_CHANGE = 6.0
+MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
+
+
+class LinkFit:
+    """Fit of links and servos; `directions` are orthonormal columns (L · COORDINATES, K) that recordings determine."""
+
+    def __init__(self, whole: RobotFit, values: Values) -> None:
+        """Take a fit of servos and its values (n,)."""
+        fields = CLASSIC if whole.bounds.n * len(CLASSIC) <= MAX_SERVO_NUMBERS else FEW_FIELDS
+        self.whole, self._servos = whole, Axes(whole.bounds, fields, values)
+        self._first, self.axes, self._n = values, LinkAxes(whole.robot), whole.bounds.n
+        self._prior = copy.copy(whole.prior)
+        self._prior.log_std = PRIOR_LOG_STD  # a stated kp would shift all masses
+        self._prior.residual = FIRST_RESIDUAL_SHARE * whole.prior.residual
+        self._weigh()
+        self.directions = self._determined() if self.axes.names else np.zeros((0, 0))
+
+    def _weigh(self) -> None:
+        """Weigh each joint's errors by its residual; the prior weighs as much as errors of the mean residual."""
+        std = self._prior.error_std()
+        self._level = float(np.sqrt(np.mean(std**2)))
+        self._weight = np.clip(self._level / std, 0.3, 3.0)
+
+    def _determined(self) -> Array:
+        """Return the directions whose information in the recordings is above the prior's, from inverse dynamics.
+
+        A change of torque moves a joint by itself over kp. What gains, offsets, damping, friction and armature of the
+        joint explain as well does not count, so without payloads all masses do not change together.
+        """
+        robot, parts, op = replace(self.whole.robot, table=None), self.whole.rollouts.parts, self.whole.rollouts.op
+        every, size = max(1, sum(map(len, parts)) // ROWS), self.axes.scale.size
+        motions, torques, slopes = list[Array](), list[Array](), list[Array]()
+        for payload in dict.fromkeys((s.meta.payload_mass, s.meta.payload_side) for s in parts):
+            rows = []
+            for s in parts:
+                if (s.meta.payload_mass, s.meta.payload_side) == payload:
+                    qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ)
+                    qvel = differentiate(qpos, s.dt)
+                    rows.append(np.stack([qpos, qvel, differentiate(qvel, s.dt)])[:, ::every])
+            motions.append(np.concatenate(rows, axis=1))
+            model = build_model(robot, *payload)
+            torques.append(inverse_dynamics(model, *motions[-1])[:, op])
+            slopes.append(np.array([
+                inverse_dynamics(with_links(model, replace(robot, links=self.axes.links(x))), *motions[-1])[:, op]
+                for x in DIFFERENCE_STEP * np.eye(size)
+            ]) - torques[-1])  # fmt: skip
+        torque, (_, v, a) = np.concatenate(torques), np.concatenate(motions, axis=1)
+        kp = self._first["kp"]
+        moved = np.concatenate(slopes, axis=1) / DIFFERENCE_STEP / kp  # (10 L, rows, n) rad
+        seconds = sum(s.duration for s in parts)
+        count = seconds / self._prior.correlation_time  # independent measurements, (n,)
+        information = np.zeros((size, size))
+        for i, j in enumerate(op):
+            servo = np.stack(
+                [torque[:, i] / kp[i], np.ones(len(v)), v[:, j], a[:, j], np.tanh(v[:, j] / SLIP_SPEED)], axis=1
+            )
+            weight = np.sqrt(count[i] / len(v)) / self._prior.residual[i]
+            d, s = weight * moved[:, :, i].T, weight * servo
+            information += d.T @ d - d.T @ s @ np.linalg.pinv(s.T @ s) @ s.T @ d
+        size, vectors = np.linalg.eigh(information)
+        chosen = np.flatnonzero(size > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
+        return np.asarray(vectors[:, chosen])
+
+    def _unpacked(self, x: Array) -> tuple[Values, list[Array]]:
+        """Return servo values (k, n) and link coordinates of candidates x (k, 1, P)."""
+        servos, z = np.split(x[:, 0], [self._n * len(self._servos.names)], axis=1)
+        return self._servos.values(servos.reshape(len(x), self._n, -1)), list(z @ self.directions.T)
+
+    def errors(self, x: Array) -> Array:
+        """Return errors of candidates (k, 1, P), (k, 1, n · (rows + PRIORS) + K) in ERROR_SCALE_RAD."""
+        values, coordinates = self._unpacked(x)
+        errors = self.whole.rollouts.flat_errors(values, [self.axes.links(c) for c in coordinates]) / ERROR_SCALE_RAD
+        own = np.concatenate([errors, self._prior.errors(values)], axis=2) * self._weight[:, None]
+        z = x[:, 0, self._n * len(self._servos.names) :]
+        return np.concatenate([own.reshape(len(x), -1), self._level * z], axis=1)[:, None]
+
+    def derive(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
+        """Return `least_squares.slopes`, and retain them for the covariance."""
+        here, jac = least_squares.slopes(x, high, errors)
+        self._slopes = here[0, 0], jac[0, 0]
+        return here, jac
+
+    def _bounds(self) -> tuple[Array, Array]:
+        """Return the lowest and highest x, (1, P)."""
+        ends = np.full(self.directions.shape[1], MAX_CHANGE)
+        return np.r_[self._servos.low.ravel(), -ends][None], np.r_[self._servos.high.ravel(), ends][None]
+
+    def descend(self, report: Progress) -> LinkResult:
+        """Fit links and servos together; return them with the links' covariance."""
+        first = np.r_[self._servos.normalize(self._first).ravel(), np.zeros(self.directions.shape[1])]
+        if not self.directions.size:
+            return LinkResult(self.axes, np.zeros(self.axes.scale.size), np.eye(self.axes.scale.size), self._first)
+        low, high = self._bounds()
+        x = first[None, None]
+        for i, count in enumerate(ITERATIONS):
+            if i:
+                values, coordinates = self._unpacked(x[0][None])
+                errors = self.whole.rollouts.flat_errors(values, [self.axes.links(c) for c in coordinates])
+                cost = least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD)
+                self._prior.update_residual(cost, self.whole.rollouts.rows)
+                self._weigh()
+            x, _ = least_squares.descend(x, low, high, self.errors, count, report, MIN_COST_DECREASE, self.derive)
+        values, coordinates = self._unpacked(x[0][None])
+        own, covariance = coordinates[0].reshape(-1, COORDINATES), self._covariance()
+        z = coordinates[0] @ self.directions
+        std = np.sqrt(np.einsum("pk,pq,qk->k", self.directions, covariance, self.directions))
+        small = np.abs(own).max(axis=1, keepdims=True) < MIN_CHANGE
+        own = np.where(small | ~(np.abs(z) > MIN_SIGNIFICANCE * std).any(), 0.0, own).ravel()
+        return LinkResult(self.axes, own, covariance, {f: v[0].copy() for f, v in values.items()})
+
+    def _covariance(self) -> Array:
+        """Return the covariance of the links' coordinates at the last slopes; the prior's at right angles to these."""
+        here, jac = self._slopes
+        weight = 1 / np.sqrt(1 + here**2)
+        count, n = self.directions.shape[1], self._n
+        normal = jac.T @ (weight[:, None] * jac)
+        gradient = jac * (weight * here)[:, None]
+        rows = (len(here) - count) // n
+        mine, by_joint = (y[: n * rows].reshape(n, rows, -1) for y in (gradient, jac))
+        each = cluster_sums(mine[:, :-PRIORS], self.whole.rollouts.window)[0].sum(axis=0)
+        each -= each.mean(axis=0)
+        held = np.concatenate([*by_joint[:, -PRIORS:], jac[n * rows :]])
+        few = len(each) / max(len(each) - count, 1)
+        scatter = each.T @ each * few**2 + self._level**2 * held.T @ held
+        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        own = (inverse @ scatter @ inverse)[-count:, -count:]
+        rest = np.eye(len(self.directions)) - self.directions @ self.directions.T
+        return np.asarray(self.directions @ own @ self.directions.T + rest)

@@ -1,0 +1,124 @@
+"""Masses of links: physical whatever their coordinates, kept in the robot folder, fitted where recordings show them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import XML, commands, record, write_arm
+
+from gaponet.base.errors import RobotError
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import Link, load_robot
+from gaponet.sim.batch import MODEL_FIELDS
+from gaponet.sim.model import build_model, model_hash, with_links
+from gaponet.sysid.axes import CLASSIC, Bounds
+from gaponet.sysid.identify import identify
+from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.link_fit import LinkFit
+from gaponet.sysid.links import COORDINATES, LinkAxes
+from gaponet.sysid.problem import JointFit
+from gaponet.sysid.robot_rollouts import cut
+
+WELDED = XML.replace(
+    '<joint name="elbow"',
+    '<body name="plate" pos="0.1 0 0" euler="0 0 0.5"><geom type="box" size="0.05 0.02 0.001" mass="0.1" contype="0" '
+    'conaffinity="0"/></body><joint name="elbow"',
+)
+
+
+@pytest.fixture
+def robot(tmp_path):
+    return write_arm(tmp_path / "arm", xml=WELDED)
+
+
+def heavy(robot, factor):
+    """The robot with another mass of its fore arm."""
+    axes = LinkAxes(robot)
+    x = np.zeros(2 * COORDINATES)
+    x[COORDINATES] = np.log(factor) / 2 / axes.scale[1, 0]
+    return replace(robot, links=axes.links(x), nominal=robot)
+
+
+def test_links_are_physical_whatever_their_coordinates_and_bodies_that_are_welded_move_as_one(robot):
+    axes, rng = LinkAxes(robot), np.random.default_rng(0)
+    assert axes.names == ["upper", "fore"]
+    assert axes.links(np.zeros(2 * COORDINATES)) == {}
+    for _ in range(20):
+        model = build_model(replace(robot, links=axes.links(rng.normal(0, 4, 2 * COORDINATES))))
+        a, b, c = np.sort(model.body_inertia[[1, 2, 3]]).T
+        assert (model.body_mass[1:4] > 0).all()
+        assert (a + b >= c).all()
+    x = np.r_[np.zeros(COORDINATES), rng.normal(0, 2, COORDINATES)]
+    before, now = (build_model(replace(robot, links=axes.links(one))) for one in (0 * x, x))
+    np.testing.assert_allclose(now.body_mass[2:4] / before.body_mass[2:4], np.exp(2 * x[10] * axes.scale[1, 0]))
+    assert axes.moments(x)[1, 0] == pytest.approx(now.body_mass[2:4].sum())
+
+
+def test_a_compiled_model_with_other_links_is_the_model_that_is_compiled_with_them(robot):
+    x = np.random.default_rng(1).normal(0, 2, 2 * COORDINATES)
+    other = replace(robot, links=LinkAxes(robot).links(x))
+    for payload in (0.0, 0.3):
+        one, two = with_links(build_model(robot, payload), other), build_model(other, payload)
+        for field in sorted(MODEL_FIELDS - {"body_iquat"}):
+            value = getattr(two, field, None)
+            if isinstance(value, np.ndarray):
+                np.testing.assert_allclose(getattr(one, field), value, rtol=1e-6, atol=1e-9, err_msg=field)
+
+
+def test_a_robot_folder_has_its_links_and_the_robot_before_them(robot, tmp_path):
+    other = heavy(robot, 1.7)
+    save_robot(other, tmp_path / "out")
+    loaded = load_robot(tmp_path / "out")
+    assert loaded.links == other.links
+    assert set(loaded.links) == {"fore", "plate"}
+    assert model_hash(loaded) == model_hash(other) != model_hash(robot) == model_hash(loaded.before_identification)
+    with pytest.raises(RobotError, match=r"an \[identified_link\] names body 'hand', which is missing"):
+        build_model(replace(robot, links={"hand": Link(1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))}))
+
+
+def recorded(robot, count, rows=100, payloads=(0.0, 0.2), first=0):
+    """Motions of a robot whose servos are a tenth stiffer."""
+    payload = [payloads[i % len(payloads)] for i in range(count)]
+    return [record(robot, commands(rows, first + i), f"m{first + i}", p, kp=1.1) for i, p in enumerate(payload)]
+
+
+def link_fit(robot, train):
+    """A fit of links, from servos as they are."""
+    joints = JointFit(JointRollouts(cut(train, 4), robot, nthread=1), robot, Bounds(robot, train))
+    values = {f: v for f, v in joints.bounds.first.items() if f in CLASSIC}
+    values["kp"] = 1.1 * values["kp"]
+    joints.prior.residual = np.full(2, 0.01)
+    return LinkFit(joints.robot_fit(1), values)
+
+
+def test_recordings_show_a_heavy_link_by_its_moment_and_the_error_falls(robot):
+    true = heavy(robot, 1.6)
+    fit = link_fit(robot, recorded(true, 4, 300))
+    assert 1 <= fit.directions.shape[1] <= 6  # of 20: a planar arm shows few
+    result = fit.descend(lambda cost: None)
+    errors = [
+        np.abs(fit.whole.rollouts.flat_errors({f: v[None] for f, v in result.values.items()}, [one])).mean()
+        for one in ({}, fit.axes.links(result.x))
+    ]
+    assert errors[1] < 0.3 * errors[0]
+    before, now, std, prior = result.moments()
+    assert (abs(now[:, 0] - [1, 1.6] * before[:, 0]) < 2 * std[:, 0]).all()
+    assert (std < 1.001 * prior).all()
+    assert before[1, 4] < now[1, 4] < 1.6 * before[1, 4] + std[1, 4]
+    assert result.sentences()[-1].startswith("fore: ")
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.6])
+def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monkeypatch, factor):
+    servos = lambda self, *args, **options: self.bounds.first | {"kp": 1.1 * self.bounds.first["kp"]}  # noqa: E731
+    monkeypatch.setattr(JointFit, "search", servos)
+    monkeypatch.setattr("gaponet.sysid.problem.CHAIN_ITERATIONS", 1)
+    true = heavy(robot, factor) if factor != 1 else robot
+    train, judges = recorded(true, 4, 200), recorded(true, 3, 200, first=50)
+    fitted = identify(train, robot, judges, windows=4, terms=(), table=False, nthread=1, masses=True)
+    comparison = fitted.comparisons[-1]
+    assert comparison.name == "masses"
+    assert comparison.accepted == (factor > 1) == bool(fitted.robot.links)
+    assert bool(fitted.links) == (factor > 1)
+    assert fitted.robot.nominal is robot
+    assert fitted.held_out[0].robot is fitted.robot
