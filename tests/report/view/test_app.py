@@ -126,10 +126,15 @@ def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
 
 def test_a_name_in_the_form_is_no_option_of_the_command(page):
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
+    (page.folder / "logs" / "logs.toml").write_text("mine")
     page.unit.value = "--allow-pickle"
     page._attempt(page._read, None)
     assert "--unit-id=--allow-pickle" in page.jobs.all[-1].words
     page.jobs.cancel()
+    assert (page.folder / "logs" / "logs.toml").read_text() == "mine"
+    page._set_aside(None)
+    assert (page.folder / "logs_aside1" / "logs.toml").read_text() == "mine"
+    assert list((page.folder / "logs").iterdir()) == []
     (page.folder / "model" / "arm.xml").write_text("<mujoco/>")
     page.refresh()
     page.model.value = "model/arm.xml"

@@ -58,7 +58,7 @@ def test_the_canvas_shows_the_robot_and_it_moves_when_played_and_stands_when_not
     from browser import Browser, wait
 
     assert colour("gaponet") == "#c8102e"
-    with Browser(800, 450) as page:
+    with Browser() as page:
         page.ask("Page.navigate", url=web.address)
         wait(lambda: page.value("!!document.querySelector('canvas')"))
         wait(lambda: reddish(page.look("canvas")) > 500)

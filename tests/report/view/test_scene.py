@@ -134,10 +134,10 @@ def test_a_ground_in_the_robots_own_file_is_not_drawn_four_times(tmp_path):
 
 
 def test_a_picture_is_not_blank_and_shows_every_colour(camera):
-    picture, layout = np.asarray(camera.picture(0.4)), camera.layout
-    assert picture.shape == (layout.height, 320, 3)
-    assert layout.height % 2 == 0
-    robots = picture[layout.head : layout.head + layout.robots].astype(int)
+    picture = np.asarray(camera.picture(0.4))
+    assert picture.shape == (camera.height, 320, 3)
+    assert camera.height % 2 == 0
+    robots = picture[camera.head : camera.head + camera.robots].astype(int)
     for i, motion in enumerate(camera.scene.shown.motions):
         panel = robots[:, i * 80 : (i + 1) * 80]
         away = np.abs(panel - panel[0, 0]).max(axis=2) > 60
@@ -151,7 +151,7 @@ def test_virtual_is_written_on_virtual_pictures_only(camera, monkeypatch):
     red = {}
     for virtual in (True, False):
         monkeypatch.setattr(camera.scene, "shown", shown(camera.scene.shown.robot, virtual=virtual))
-        head = np.asarray(camera.picture(0.0))[: camera.layout.head].astype(int)
+        head = np.asarray(camera.picture(0.0))[: camera.head].astype(int)
         red[virtual] = int(((head[..., 0] - head[..., 1]) > 80).sum())
     assert red[True] > 50
     assert red[False] == 0

@@ -33,7 +33,7 @@ POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "signed_percent
 TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
 POLL_S, MAX_UNPACKED_BYTES = 0.5, 2 << 30
 PANEL_WIDTH = 560  # pixels
-STYLE = "<style>[class*=Slider-mark], .uplot, .uplot *, [class*=mantine] input {font-size: 12px !important}</style>"
+STYLE = "<style>[class*=Slider-mark], .uplot, .uplot *, input, textarea {font-size: 12px !important}</style>"
 
 
 class App:
@@ -93,8 +93,9 @@ class App:
         self.gui.add_markdown(f"Or copy them into {escape_markdown(str(self.folder / 'logs'))}.")
         self.unit, self.mass = self.gui.add_text("unit", "lab"), self.gui.add_number("payload, kg", 0.0, min=0.0)
         self.position = self.gui.add_dropdown("positions in", POSITION_UNITS)
-        self.described = self.gui.add_text("logs.toml", "", multiline=True)
+        self.described = self.gui.add_text("logs.toml", "", multiline=True, hint="empty: the logs.toml of the folder")
         self._button("Guess logs.toml from the logs", self._guess)
+        self._button("Set these logs aside", self._set_aside)
         self._button("Read the logs", self._read)
         self._text("import", "Choose the robot first. Then upload logs, and read them.")
         self.recording, self.joint = (self.gui.add_dropdown(name, ("–",)) for name in ("recording", "joint"))
@@ -103,15 +104,20 @@ class App:
         for choice in (self.recording, self.joint):
             choice.on_update(lambda _: self._draw_recording())
 
+    def _set_aside(self, _: Any) -> None:
+        aside = f"logs_aside{len([*self.folder.glob('logs_aside*')]) + 1}"
+        (self.folder / "logs").rename(self.folder / aside)
+        (self.folder / "logs").mkdir()
+        self.status.content = f"The logs are in {aside} now; logs is empty."
+
     def _guess(self, _: Any) -> None:
         kind, facts, recordings = look(self.folder / "logs")
         self.described.value = guess_logs(recordings, self._chosen_robot(), kind, dict(facts))
 
     def _read(self, _: Any) -> None:
-        robot, file = self._need("robot"), self.folder / "logs" / "logs.toml"
-        file.unlink(missing_ok=True)
-        if self.described.value.strip():
-            write_text(file, self.described.value)
+        robot = self._need("robot")
+        if self.described.value.strip():  # otherwise a file of the user's stays as it is
+            write_text(self.folder / "logs" / "logs.toml", self.described.value)
         words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}", "--out", OUT]
         words += [f"--position-unit={self.position.value}"] * (self.position.value in POSITION_UNITS[1:])
         self.jobs.start("import", "import", "logs", f"--robot={_robot_argument(robot)}", *words)

@@ -53,7 +53,7 @@ def write(camera: Camera, path: Path, progress: Callable[[int, int], None] = lam
         if suffix == ".gif":
             _write_gif(list(pictures()), temporary, 10 * hundredths)
         elif suffix == ".mp4":
-            _write_mp4(pictures(), temporary, clip.fps, (camera.layout.width, camera.layout.height))
+            _write_mp4(pictures(), temporary, clip.fps, (camera.width, camera.height))
         else:
             camera.picture(largest_error_time(camera.scene.shown, clip)).save(temporary)
     return 1 if suffix == ".png" else len(times)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import warnings
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -27,38 +26,6 @@ SIDE, HEAD = 480, 30  # pixels of one model's square and of its label
 FLOOR = mujoco.mjtGeom.mjGEOM_PLANE
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Heights of head line, robots and labels from top to bottom, pixels; scale: pixels per metre."""
-
-    width: int
-    head: int
-    robots: int
-    labels: int
-    scale: float
-
-    @property
-    def height(self) -> int:
-        """Height of the whole picture, pixels."""
-        return self.head + self.robots + self.labels
-
-    @classmethod
-    def for_scene(cls, scene: Scene, width: int) -> Layout:
-        """Return the layout that fits the robots at this width.
-
-        Raises:
-            UsageError: The width is out of range.
-        """
-        if not 160 <= width <= 3840:
-            raise UsageError(f"--width is {width}; give 160 to 3840 pixels")
-        tall = scene.box[3] - scene.box[2]
-        head, labels = (round(height * max(width / 960, 0.5)) for height in (34, 60))
-        scale = min(width / (scene.spacing * len(scene.base)), (MAX_HEIGHT * width - head - labels) / tall)
-        robots = round(1.1 * tall * scale)
-        robots += (head + robots + labels) % 2  # h264 wants even sizes
-        return cls(width, head, robots, labels, scale)
-
-
 class Camera:
     """Renders the frames of a scene. Close it, or use it in a with block."""
 
@@ -69,12 +36,23 @@ class Camera:
             clip: Its speed is printed on the picture.
             width: Width of the picture, pixels, even; the height follows from the robots.
             magnify: Printed on the picture.
+
+        Raises:
+            UsageError: The width is out of range, or nothing can be rendered here.
         """
-        self.scene, self.clip, self.magnify = scene, clip, magnify
-        self.layout = Layout.for_scene(scene, width - width % 2)
+        if not 160 <= width <= 3840:
+            raise UsageError(f"--width is {width}; give 160 to 3840 pixels")
+        self.scene, self.clip, self.magnify, self.width = scene, clip, magnify, width - width % 2
+        letters, tall = max(width / 960, 0.5), scene.box[3] - scene.box[2]
+        self.head, labels = round(34 * letters), round(60 * letters)  # pixels
+        room = MAX_HEIGHT * self.width - self.head - labels
+        self.scale = min(self.width / (scene.spacing * len(scene.base)), room / tall)  # pixels per metre
+        self.robots = round(1.1 * tall * self.scale)
+        self.robots += (self.head + self.robots + labels) % 2  # h264 wants even sizes
+        self.height = self.head + self.robots + labels
         self.lens = self._lens()
-        self.renderer = renderer(scene.model, self.layout.robots, self.layout.width)
-        self.fonts = {size: font(size * max(width / 960, 0.5)) for size in (13, 15, 17)}
+        self.renderer = renderer(scene.model, self.robots, self.width)
+        self.fonts = {size: font(size * letters) for size in (13, 15, 17)}
 
     def __enter__(self) -> Camera:
         return self
@@ -89,31 +67,29 @@ class Camera:
         self.scene.pose(time)
         self.renderer.update_scene(self.scene.data, self.lens)
         rendered = Image.fromarray(self.renderer.render())
-        image = Image.new("RGB", (self.layout.width, self.layout.height), rendered.getpixel((0, 0)))
-        image.paste(rendered, (0, self.layout.head))
+        image = Image.new("RGB", (self.width, self.height), rendered.getpixel((0, 0)))
+        image.paste(rendered, (0, self.head))
         self._write(ImageDraw.Draw(image), time)
         return image
 
     def _lens(self) -> mujoco.MjvCamera:
         """Return an orthographic camera, which shows every copy from the same side."""
-        scene, layout = self.scene, self.layout
+        scene = self.scene
         lens = mujoco.MjvCamera()
         lens.orthographic = scene.model.vis.global_.orthographic = 1  # MuJoCo 3 reads the model only
         lens.azimuth, lens.elevation = scene.view.azimuth, scene.view.elevation
         lens.lookat[:] = scene.middle
         lens.distance = 4 * scene.extent
-        scene.model.vis.global_.fovy = layout.robots / layout.scale  # m, of an orthographic picture
+        scene.model.vis.global_.fovy = self.robots / self.scale  # m, of an orthographic picture
         scene.model.vis.map.znear, scene.model.vis.map.zfar = 0.01, 20
         return lens
 
     def _write(self, draw: ImageDraw, time: float) -> None:
-        shown, layout, k = self.scene.shown, self.layout, len(self.scene.base)
         row, small, large = self.scene.row(time), self.fonts[13], self.fonts[17]
         self._head(draw, time)
-        top = layout.height - layout.labels
-        pitch = self.scene.spacing * layout.scale
-        for i, m in enumerate(shown.motions):
-            x = layout.width / 2 + (i - (k - 1) / 2) * pitch
+        top, pitch, k = self.head + self.robots, self.scene.spacing * self.scale, len(self.scene.base)
+        for i, m in enumerate(self.scene.shown.motions):
+            x = self.width / 2 + (i - (k - 1) / 2) * pitch
             draw.text((x, top), m.name, m.colour, large, anchor="ma", stroke_width=0.3, stroke_fill=m.colour)
             if m.method != "recorded":
                 text = f"{m.error[row] * 1e3:.1f} mrad now, {m.mpjae * 1e3:.1f} mean"
@@ -121,7 +97,7 @@ class Camera:
 
     def _head(self, draw: ImageDraw, time: float) -> None:
         """Write VIRTUAL where it applies, the recording on the left, and the time on the right."""
-        shown, pad, font = self.scene.shown, self.layout.head // 3, self.fonts[15]
+        shown, pad, font = self.scene.shown, self.head // 3, self.fonts[15]
         meta = shown.real.meta
         facts = [meta.robot, meta.motion, f"unit {meta.unit_id}", _payload(meta.payload_mass, meta.payload_side)]
         facts += [] if shown.seen is None else ["seen in training" if shown.seen else "held out"]
@@ -129,11 +105,11 @@ class Camera:
         clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
         left, right = SEPARATOR.join(facts), SEPARATOR.join([*clock, f"{time:6.2f} s"])
         mark = "VIRTUAL ROBOT   " if meta.virtual else ""
-        while font.getlength(mark + left + right) > self.layout.width - 4 * pad and font.size > 8:
+        while font.getlength(mark + left + right) > self.width - 4 * pad and font.size > 8:
             font = font.font_variant(size=font.size - 0.5)
         draw.text((pad, pad * 0.8), mark, ALARM, font, stroke_width=0.4, stroke_fill=ALARM)
         draw.text((pad + font.getlength(mark), pad * 0.8), left, INK, font)
-        draw.text((self.layout.width - pad, pad * 0.8), right, INK, font, anchor="ra")
+        draw.text((self.width - pad, pad * 0.8), right, INK, font, anchor="ra")
 
 
 def _payload(mass: float, side: str) -> str:
