@@ -93,6 +93,15 @@ class Problem:
             ctrl[:, j] = np.interp(times - late, times, ctrl[:, j])
         return ctrl
 
+    def changed(self, x: np.ndarray, window: int, model: mujoco.MjModel) -> mujoco.MjModel:
+        """Return a copy of a window's model with these parameters."""
+        v, one, op = self.servos(x, window), mujoco.MjModel.__copy__(model), self.op
+        one.actuator_gainprm[op, 0], one.actuator_biasprm[op, 0] = v["kp"], v["kp"] * v["offset"]
+        one.actuator_biasprm[op, 1], one.actuator_biasprm[op, 2] = -v["kp"], -v["kd"]
+        one.dof_damping[op], one.dof_frictionloss[op] = v["damping"], v["frictionloss"]
+        one.dof_armature[op] = v["armature"]
+        return one
+
     def errors(self, states: np.ndarray, window: int) -> np.ndarray:
         """Return q_sim − q_real of the joints that were recorded, (rows, n) rad, of a rollout's states."""
         cut, steps = self.cuts[window], self.steps[window]
@@ -128,22 +137,15 @@ def plain_fit(sequences: list[Sequence], robot: RobotSpec) -> RobotSpec:
 
 def fit(problem: Problem, threads: int = 2) -> RobotSpec:
     """Fit a robot by least squares."""
-    op, windows = problem.op, range(len(problem.cuts))
+    windows = range(len(problem.cuts))
     models = [spec.compile() for spec in problem.specs]
     for model in models:
         stiffen_friction(model)
     engines, pool = [mujoco.MjData(models[0]) for _ in range(threads)], Rollout(nthread=threads)
 
     def errors(x: np.ndarray) -> np.ndarray:
-        changed, controls = [], []
-        for w, model in enumerate(models):
-            v, one = problem.servos(x, w), mujoco.MjModel.__copy__(model)
-            one.actuator_gainprm[op, 0], one.actuator_biasprm[op, 0] = v["kp"], v["kp"] * v["offset"]
-            one.actuator_biasprm[op, 1], one.actuator_biasprm[op, 2] = -v["kp"], -v["kd"]
-            one.dof_damping[op], one.dof_frictionloss[op] = v["damping"], v["frictionloss"]
-            one.dof_armature[op] = v["armature"]
-            changed.append(one)
-            controls.append(problem.controls(v["delay"], w))
+        changed = [problem.changed(x, w, model) for w, model in enumerate(models)]
+        controls = [problem.controls(problem.servos(x, w)["delay"], w) for w in windows]
         states, _ = pool.rollout(changed, engines, problem.states, np.stack(controls))
         return np.concatenate([problem.errors(states[w], w).ravel() for w in windows])
 
