@@ -1,6 +1,7 @@
 """What is known of a robot: how sure its values are, from which logs, and whether later logs are still of it."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -169,11 +170,22 @@ def test_an_adaptation_writes_its_sources(arm, folder, tmp_path):
 
 
 def test_show_prints_and_draws(folder, tmp_path, capsys):
+    sentence = "elbow: backlash 6.0 ± 1.0 mrad (probability 0.93)"
+    folder = shutil.copytree(folder, tmp_path / "robot")
+    origin = {
+        "dataset": "data",
+        "parts": {"train": {}, "val": {}, "test": {}},
+        "motions": {},
+        "val_mpjae": {},
+        "findings": [sentence],
+    }
+    (folder / "identified.json").write_text(json.dumps(origin))
     assert main(["robot", "show", str(folder), "--out", str(tmp_path / "known.svg"), "--json"]) == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
     assert found["joints"]["elbow"]["standard_errors"]["kp"] > 0
     assert "± standard error" in said.err
+    assert sentence in said.err
     assert "elbow" in (tmp_path / "known.svg").read_text()
     assert main(["robot", "show", str(folder), "--out", str(tmp_path / "known.pdf")]) == 2
 

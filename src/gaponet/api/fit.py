@@ -119,7 +119,7 @@ def identify(
             raise NoGainError(fitted.no_gain_message(spec, given, after))
         save_robot(fitted.robot, folder)
         errors = {"nominal": nominal, "identified": after}
-        _save_origin(folder, data, split, {name: float(e.mean()) for name, e in errors.items()})
+        _save_origin(folder, data, split, {name: float(e.mean()) for name, e in errors.items()}, fitted.findings)
         judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
         _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, judges)
     return IdentifyResult(
@@ -174,14 +174,15 @@ def identify_torque(
 
 
 def _save_origin(
-    folder: Path, data: Dataset, split: Mapping[str, ListOf[Entry]], val_mpjae: Mapping[str, float]
-) -> None:
+    folder: Path, data: Dataset, split: Mapping[str, ListOf[Entry]], val_mpjae: Mapping[str, float],
+    findings: ListOf[str] = (),
+) -> None:  # fmt: skip
     """Write what a robot folder was identified from: dataset, recordings and motions by split, validation errors."""
     write_json(folder / PROVENANCE_FILE, {
         "dataset": data.address or os.path.relpath(data.path, folder),
         "parts": {name: {e.id: e.hash for e in entries} for name, entries in split.items()},
         "motions": {name: sorted({e.meta.motion for e in entries}) for name, entries in split.items()},
-        "val_mpjae": dict(val_mpjae),
+        "val_mpjae": dict(val_mpjae), "findings": list(findings),
     })  # fmt: skip
 
 

@@ -117,7 +117,7 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         gain, error = term.gain
         moves = f"{'rises' if gain < 0 else 'falls'} by {mrad_with_error(abs(gain), error)}"
         screen.say(f"{term.name}: validation error {moves}{verdict}")
-    for sentence in (*fit.findings, *(fit.links.sentences() if fit.links else ())):
+    for sentence in fit.findings:
         screen.say(f"  {sentence}")
     if fit.chosen == "torque":
         for m in fit.robot.payload_mounts:

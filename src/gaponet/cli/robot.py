@@ -231,6 +231,7 @@ def show(
     Args:
         out: Picture to write, .png or .svg.
     """
+    from gaponet.report.candidate import read_origin
     from gaponet.report.figures.identified_robot import draw_uncertainty
     from gaponet.robot.servo_fields import SERVO_FIELDS
     from gaponet.sysid.uncertainty import ParameterUncertainty, sentences, summarize, table_rows
@@ -242,7 +243,8 @@ def show(
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in fields)]
     screen.table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
-    for line in sentences(known):
+    findings = list((read_origin(spec.folder) or {}).get("findings", ()))
+    for line in (*findings, *sentences(known)):
         screen.say(line)
     if out is not None:
         if out.suffix not in (".png", ".svg"):
@@ -263,7 +265,7 @@ def show(
             }
             for j, c in sure.items()
         },
-        "picture": None if out is None else str(out),
+        "findings": findings, "picture": None if out is None else str(out),
     })  # fmt: skip
 
 

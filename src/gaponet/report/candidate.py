@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
 
 from typing_extensions import TypedDict
 
@@ -26,12 +26,13 @@ DATA_HINT = "data of the robot that the run was trained for"
 
 class _Origin(TypedDict):
     """Data that a robot was identified from: dataset (address, or path from the folder), recordings and motions by
-    split, and the error on validation motions, rad."""
+    split, the error on validation motions, rad, and what was learned about backlash and links."""
 
     dataset: str
     parts: SplitHashes
     motions: dict[str, tuple[str, ...]]
     val_mpjae: dict[str, float]
+    findings: NotRequired[tuple[str, ...]]
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class Identified:
         undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
         held_out: Recordings that were not fitted and the robot that was fitted without them, one pair for each fold of
             a cross-validation; `robot` itself where nothing was fitted to them afterwards.
-        findings: A sentence about the backlash of each joint that may have any.
+        findings: A sentence about each joint that may have backlash, and about each link that changed.
         links: Masses and inertias, if they were fitted and accepted.
     """
 

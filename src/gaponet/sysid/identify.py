@@ -206,11 +206,11 @@ def _fit_robot(
     before, after = (float(judge.errors(*pair).mean()) for pair in pairs)
     by_joint = zip(*(judge.errors_by_joint(*pair).tolist() for pair in pairs), strict=True)
     searches.tell(np.inf, "the fitted robot, and recorded torque")
+    findings = backlash.findings(robot.operated, *gaps, errors.std) if gaps else ()
     return Identified(
         fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit,
         dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,
-        errors.undetermined, tuple(held_out), backlash.findings(robot.operated, *gaps, errors.std) if gaps else (),
-        linked,
+        errors.undetermined, tuple(held_out), (*findings, *(linked.sentences() if linked else ())), linked,
     )  # fmt: skip
 
 
