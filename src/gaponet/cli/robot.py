@@ -243,7 +243,8 @@ def show(
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in fields)]
     screen.table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
-    findings = list((read_origin(spec.folder) or {}).get("findings", ()))
+    origin = read_origin(spec.folder)
+    findings = list(origin.get("findings", ())) if origin else []
     for line in (*findings, *sentences(known)):
         screen.say(line)
     if out is not None:
