@@ -1,6 +1,5 @@
 """The model at run time: onnxruntime answers as torch does; the loop is the corrector's."""
 
-import json
 import sys
 
 import numpy as np
@@ -100,16 +99,3 @@ def test_a_torch_export_of_other_weights_is_refused(artifact, tmp_path):
     with pytest.raises(ModelError, match=r"torch.export and .* differ by"):
         export_program(GapModel.load(folder), tmp_path, tmp_path)
     assert not (tmp_path / "delta.pt2").exists()
-
-
-def test_removed_options_of_a_card_are_accepted_only_with_the_remaining_value(artifact):
-    def written(**fields):
-        card = json.loads((artifact / "card.json").read_text())
-        card["model"] |= fields
-        (artifact / "card.json").write_text(json.dumps(card))
-        return GapModel.load(artifact)
-
-    known = {"context": "none", "branch": "unstacked", "coupling": "posture", "transformer_width": 64}
-    assert written(**known).loop().n == 2
-    with pytest.raises(ModelError, match="trained with branch stacked, which is no more; train again"):
-        written(branch="stacked")

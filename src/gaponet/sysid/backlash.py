@@ -72,6 +72,6 @@ def findings(
         elif gap > MIN_WIDTH_RAD:
             sentences.append(
                 f"{joint}: backlash of {1e3 * gap:.1f} mrad is not distinguishable from static friction (probability "
-                f"{p:.2f}); play gaponet excite --motions steps to tell"
+                f"{p:.2f}); play the creep motions of gaponet excite to tell"
             )
     return tuple(sentences)
