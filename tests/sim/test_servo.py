@@ -167,3 +167,20 @@ def test_a_zero_turns_the_arm_under_the_same_reading(tmp_path):
         mujoco.mj_forward(model, data)
         places.append(data.body("fore").xpos.copy())
     np.testing.assert_allclose(*places, atol=1e-12)
+
+
+def test_a_speed_that_is_written_moves_the_motor_behind_a_gap_and_a_new_batch_takes_its_state(arm):
+    home = np.zeros((1, 2))
+    robots = servo_model(arm), servo_model(arm, backlash=1e-9), servo_model(arm, backlash=0.02)
+    sims = [BatchSim(robot, [(0.0, "both", 0.02)], 1) for robot in robots]
+    for sim in sims:
+        sim.reset(slice(None), home, home)
+        sim.qvel[:] = 2.0
+        sim.step(home)
+    np.testing.assert_allclose(sims[1].qvel, sims[0].qvel, atol=0.05)
+    again = BatchSim(robots[2], [(0.0, "both", 0.02)], 1)
+    again.set_state(sims[2].state())
+    for sim in (again, sims[2]):
+        for target in (0.3, -0.3):
+            sim.step(home + target)
+    np.testing.assert_array_equal(again.qpos, sims[2].qpos)

@@ -32,6 +32,7 @@ Engine = Literal["json", "mujoco", "mjlab", "isaaclab"]
 FOLDER_KIND = "engine"
 FILE = "randomization.json"
 SHIPPED = Path(__file__).parent / "shipped"
+LEAST_INVERSE = 0.2  # of a drawn value on an inverse axis, over the mean
 RANGE_SAMPLES = 4096
 UNDETERMINED_STD = 0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
 MIN_ROBOTS = 3  # of a type
@@ -98,6 +99,10 @@ def sample_units(
         limit[:, i] *= np.exp(error[:, fields.index("kp")])
     bounded = [SERVO_FIELDS[f].axis != "log" and not SERVO_FIELDS[f].signed for f in fields]
     x = np.where(bounded, np.maximum(x, 0.0), x)
+    inverse = [SERVO_FIELDS[f].axis == "inverse" for f in fields]
+    optional = np.isin(fields, ("backlash", "no_load_speed"))
+    x = np.where(inverse, np.maximum(x, LEAST_INVERSE * mean), x)  # zero is no limit, which no range states
+    x = np.where(optional & (mean == 0), 0.0, x)  # a joint without the effect gets none
     sampled, value = from_axes(fields, x), from_axes(fields, mean)
     ranges: dict[str, dict[str, tuple[float, float, float]]] = {j: {} for j in joints}
     for i, joint in enumerate(joints):

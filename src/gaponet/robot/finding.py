@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gaponet.base.arrays import Array
+from gaponet.base.text import escape
 from gaponet.robot.spec import RobotSpec
 
 # note: a fact; warning: usable after a look; error: correct it before training.
@@ -45,7 +46,7 @@ class Finding:
         ]
         tables: Mend = {}
         for finding in bad:
-            lines += [f"# {finding.level}, {finding.check}: {finding.message}"] * bool(finding.mend)
+            lines += [f"# {finding.level}, {finding.check}: {escape(finding.message)}"] * bool(finding.mend)
             for table, values in finding.mend.items():
                 tables.setdefault(table, {}).update(values)
         for table, values in tables.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -53,10 +54,11 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
             text += "[identified_table]\n" + "".join(lines)
         if robot.payload_mounts != robot.nominal.payload_mounts:
             text += "".join(
-                f'[identified_mount."{m.side}"]\npos = {list(m.pos)}\nmass = {m.mass!r}\n' for m in robot.payload_mounts
+                f"[identified_mount.{_key(m.side)}]\npos = {list(m.pos)}\nmass = {m.mass!r}\n"
+                for m in robot.payload_mounts
             )
         text += "".join(
-            f'[identified_link."{b}"]\nmass = {x.mass!r}\npos = {list(x.pos)}\ninertia = {list(x.inertia)}\n'
+            f"[identified_link.{_key(b)}]\nmass = {x.mass!r}\npos = {list(x.pos)}\ninertia = {list(x.inertia)}\n"
             for b, x in robot.links.items()
         )
     xml = robot.mjcf.read_text(encoding="utf-8")
@@ -123,4 +125,9 @@ def _servo(robot: RobotSpec, joint: str) -> str:
     optional = (*SERVO_TERMS, "target_speed")  # 0 if absent
     stated = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in optional)}
     lines = [f"{name} = {value!r}\n" for name, value in stated.items()]
-    return f'[identified."{joint}"]\n' + "".join(lines)
+    return f"[identified.{_key(joint)}]\n" + "".join(lines)
+
+
+def _key(name: str) -> str:
+    """Return a name as a key of TOML."""
+    return json.dumps(name, ensure_ascii=False)

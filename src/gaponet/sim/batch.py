@@ -283,7 +283,7 @@ class BatchSim:
         if self.servo_model is not None:
             state |= {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
             if (play := self.servo_model.play) is not None:
-                state |= {"servo_gap": play.gap, "servo_rotor": play.rotor}
+                state |= {"servo_gap": play.gap, "servo_rotor": play.rotor, "servo_seen": play.seen}
         return state if self.max_change is None else state | {"ctrl": self.ctrl}
 
 

@@ -223,6 +223,8 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
     """Return a copy of a compiled model with the links of a robot, as if it were compiled with them."""
     model = copy.copy(model)
     for name, link in robot.links.items():
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
+            continue  # of a locked limb
         body = model.body(name)
         inertia = np.array(link.inertia)[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)
         axes = np.linalg.eigh(inertia)[1][:, ::-1].copy()  # the largest first, as compiled

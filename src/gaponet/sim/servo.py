@@ -129,17 +129,20 @@ class Play:
     Attributes:
         gap: Motor ahead of link, rad.
         rotor: Speed of the motor, rad/s. Where it differs in a closed gap, the next step transmits the impact.
+        seen: Speed of the link after the last step, rad/s; a speed that was written since then moves the motor too.
     """
 
     def __init__(self, width: Any, armature: Any, damping: Any, kd: Any, load: Any, qvel: Any) -> None:
         """Begin on the side that carries `load`, N·m; armature, damping and kd are the motor's."""
         self.half, self._own, self._kd = width / 2, (armature, damping), kd
-        self.gap, self.rotor = np.where(load < 0, -self.half, self.half), qvel.copy()
+        self.gap, self.rotor, self.seen = np.where(load < 0, -self.half, self.half), qvel.copy(), qvel.copy()
 
     def before(self, limit: Any, kp: Any, qpos: Any, qvel: Any, h: Any) -> tuple[Any, ...]:
         """Return friction limit, armature, damping, applied torque and gear of the links for the next step of h s, and
         what an actuator without gear needs as bias: its torque does not reach the link then."""
         (armature, damping), closed = self._own, abs(self.gap) >= self.half
+        self.rotor += qvel - self.seen
+        self.seen[:] = qvel
         self._limit, self._qvel, self._impact = limit.copy(), qvel.copy(), armature * (self.rotor - qvel) / h
         bias = np.where(closed, 0.0, -kp * qpos - self._kd * qvel)
         return limit * closed, armature * closed, damping * closed, self._impact * closed, 1.0 * closed, bias
@@ -152,7 +155,7 @@ class Play:
         force = force + np.clip(constraint, -self._limit, self._limit)
         gap, rotor = crossed(self.half, self.gap, self.rotor, closed, qvel, torque, damping, self._limit, armature, h)
         gap = np.where(closed & (force * gap < 0), OPENED * gap, gap)
-        self.gap[rows], self.rotor[rows] = gap[rows], rotor[rows]
+        self.gap[rows], self.rotor[rows], self.seen[rows] = gap[rows], rotor[rows], qvel[rows]
 
 
 def cross_gap(
@@ -324,6 +327,8 @@ class ServoModel:
         bias, limit = self._bias.copy(), self._limit.copy()
         self.before()  # compiles now, since the first step may belong to a control loop
         self._bias[:], self._limit[:] = bias, limit
+        if "backlash" in self.active:
+            self._reset_play(np.arange(len(self._force)))
 
     def _take_terms(self) -> None:
         """Take the present values of the terms for the steps to come."""
@@ -348,17 +353,15 @@ class ServoModel:
     def _reset_play(self, ids: Array) -> None:
         expand, bind, step = self.batch.expand, self.batch.bind, self.batch.expanded("opt.timestep")
         self._links = (
-            expand("dof_armature"),
-            expand("dof_damping"),
-            bind("qfrc_applied"),
-            expand("actuator_gear")[..., 0],
-        )
+            expand("dof_armature"), expand("dof_damping"), bind("qfrc_applied"), expand("actuator_gear")[..., 0],
+        )  # fmt: skip
         self._constraint = bind("qfrc_constraint")
         self._h = self.model.opt.timestep if step is None else np.array(step).reshape(-1, 1)
         play = Play(self.values["backlash"], self.armature, self.damping, -self._bias[..., 2], self.load, self._qvel)
         if self.play is not None:
             others = np.delete(np.arange(len(play.gap)), ids)
-            play.gap[others], play.rotor[others] = self.play.gap[others], self.play.rotor[others]
+            for mine, before in ((play.gap, self.play.gap), (play.rotor, self.play.rotor), (play.seen, self.play.seen)):
+                mine[others] = before[others]
         self.play = play
 
     def before(self) -> None:

@@ -69,6 +69,8 @@ def findings(
             size = format_uncertainty(1e3 * gap, 1e3 * std[joint]["backlash"])
             chance_of_it = "above 0.99" if p > 0.99 else f"{p:.2f}"
             sentences.append(f"{joint}: backlash {size} mrad (probability {chance_of_it})")
+        elif p >= MIN_PROBABILITY:
+            sentences.append(f"{joint}: validation motions do not show a gap of {1e3 * gap:.1f} mrad that fits suggest")
         elif gap > MIN_WIDTH_RAD:
             sentences.append(
                 f"{joint}: backlash of {1e3 * gap:.1f} mrad is not distinguishable from static friction (probability "

@@ -140,7 +140,11 @@ class DeltaEnv:
         conditions = [rows.conditions[g] for g in rows.group]
         sim = BatchSim(robot, conditions, nthread, rows.locked)
         if rows.unobserved.any():  # these joints stay where the recording says, as in identification
-            sim.batch.expand("dof_armature")[:] += IMMOVABLE_ARMATURE * rows.unobserved[rows.group]
+            held = IMMOVABLE_ARMATURE * rows.unobserved[rows.group]
+            sim.batch.expand("dof_armature")[:] += held
+            if sim.servo_model is not None:
+                sim.servo_model.armature += held
+                sim.servo_model.values["backlash"][held > 0] = 0.0
         self.sim: Any = sim
         if device != "cpu":
             from gaponet.sim.warp import WarpSim
