@@ -42,13 +42,43 @@ def test_names_of_uploads_cannot_lead_out_of_the_folder(tmp_path):
     logs.mkdir()
     store_upload("a.zip", archive(**{"walk/state.csv": "1", "b.csv": "2"}), logs)
     assert (logs / "walk" / "state.csv").read_text() == "1"
-    for name in ("../out.csv", "/tmp/out.csv", "a/../../out.csv", "..\\out.csv", "C:out.csv"):
-        store_upload("evil.zip", archive(**{name: "x"}), logs)
-        store_upload(name, b"x", logs)
-    assert [p for p in tmp_path.rglob("*") if p.is_file() and logs not in p.parents] == []
-    assert (logs / "out.csv").read_text() == "x"
+    for number, name in enumerate(("../out.csv", "/tmp/out.csv", "a/../../out.csv", "..\\out.csv", "C:out.csv")):
+        for kind, upload, content in (("zip", "evil.zip", archive(**{name: "x"})), ("file", name, b"x")):
+            (inside := logs / f"{kind}{number}").mkdir()
+            store_upload(upload, content, inside)
+            assert [p.read_text() for p in inside.rglob("*.csv")] == ["x"]
+        assert (inside / "out.csv").read_text() == "x"
+    assert list(tmp_path.iterdir()) == [logs]
+    assert {p.name for p in logs.iterdir() if p.name[:3] not in ("zip", "fil")} == {"walk", "b.csv"}
     with pytest.raises(UsageError, match="is not readable"):
         store_upload("a.zip", b"no archive", logs)
+
+
+def test_an_upload_is_stored_whole_over_no_file_and_through_no_link(tmp_path):
+    logs, outside = tmp_path / "logs", tmp_path / "outside"
+    logs.mkdir()
+    outside.mkdir()
+    (logs / "logs.toml").write_text("mine")
+    (logs / "link").symlink_to(outside)
+    (logs / "nothing.csv").symlink_to(outside / "nothing.csv")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
+        for name in "ab":
+            made.writestr(f"{name}.csv", "".join(f"{k * k}\n" for k in range(3000)))
+        middle = made.infolist()[1].header_offset + 200
+    broken = bytearray(packed.getvalue())
+    broken[middle : middle + 99] = b"\xff" * 99
+    for name, content, why in (
+        ("logs.toml", b"x", "exists"), ("x.zip", archive(**{"a.csv": "x", "logs.toml": "x"}), "exists"),
+        ("x.zip", archive(**{"a.csv": "x", "link/b.csv": "x"}), "a link leads out"),
+        ("nothing.csv", b"x", "a link leads out"), ("x.zip", bytes(broken), "is not readable"),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=why):
+            store_upload(name, content, logs)
+    assert {p.name for p in logs.iterdir()} == {"logs.toml", "link", "nothing.csv"}
+    assert (logs / "logs.toml").read_text() == "mine"
+    assert list(outside.iterdir()) == []
+    assert {p.name for p in tmp_path.iterdir()} == {"logs", "outside"}
 
 
 def test_a_result_is_out_of_date_when_what_it_was_made_from_is_newer(tmp_path):
@@ -141,3 +171,13 @@ def test_a_name_in_the_form_is_no_option_of_the_command(page):
     page.options["kp"].value = "--contacts"
     page._attempt(page._use_robot, None)
     assert "without a dash" in page.status.content
+
+
+def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
+    for step in ("robot", "import"):
+        finish(page.jobs, step, {}, ("robot", "check", "so101"))
+    finish(page.jobs, "doctor", {"findings": []})
+    (page.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
+    page._attempt(page._propose, None)
+    assert page.described.value.startswith('unit = "deg"\n')
+    assert "nothing to mend" in page.described.value

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import base64
 import io
+import os
 import re
+import shutil
+import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import GAPONetError, UsageError
-from gaponet.base.files import atomic_write, write_text
+from gaponet.base.files import FOLDER_MARKER, write_text
 from gaponet.base.text import escape_markdown
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import look
@@ -130,7 +134,9 @@ class App:
 
     def _propose(self, _: Any) -> None:
         findings = [Finding(**f) for f in (self._need("doctor").result or {})["findings"]]
-        self.described.value = f"{self.described.value}\n{Finding.proposal(findings)}".lstrip()
+        file = self.folder / "logs" / "logs.toml"
+        own = self.described.value or (file.read_text(encoding="utf-8") if file.is_file() else "")
+        self.described.value = f"{own}\n{Finding.proposal(findings)}".lstrip()
 
     def _gap(self) -> None:
         self._button("Measure the error", lambda _: self.jobs.start("gap", "gap", self._need("import").out))
@@ -265,18 +271,29 @@ class App:
 
 
 def store_upload(name: str, content: bytes, folder: Path) -> None:
-    """Write an uploaded file, or what a .zip holds, below a folder; names cannot lead out of it."""
-    if name.lower().endswith(".zip"):
-        try:
-            with zipfile.ZipFile(io.BytesIO(content)) as archive:
-                if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
-                    raise UsageError(f"{name}: holds more than {MAX_UNPACKED_BYTES >> 30} GiB; give it in parts")
-                archive.extractall(folder)  # which drops .. and a leading / from names
-        except (zipfile.BadZipFile, RuntimeError) as error:
-            raise UsageError(f"{name}: is not readable ({error}); pack it again, without a password") from None
-    else:
-        with atomic_write(folder / (re.split(r"[/\\:]", name)[-1].lstrip(".") or "file")) as temporary:
-            temporary.write_bytes(content)
+    """Write an uploaded file, or what a .zip holds, below a folder: all or nothing, inside it, and over no file."""
+    prefix = f"{FOLDER_MARKER}-{os.getpid()}-"
+    with tempfile.TemporaryDirectory(prefix=prefix, dir=folder.parent, ignore_cleanup_errors=True) as temporary:
+        if name.lower().endswith(".zip"):
+            try:
+                with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                    if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
+                        raise UsageError(f"{name}: holds more than {MAX_UNPACKED_BYTES >> 30} GiB; give it in parts")
+                    archive.extractall(temporary)  # which drops .. and a leading / from names
+            except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
+                raise UsageError(f"{name}: is not readable ({error}); pack it again, without a password") from None
+        else:
+            plain = re.split(r"[/\\:]", name)[-1].lstrip(".") or "file"
+            (Path(temporary) / plain).write_bytes(content)
+        places = {f: folder / f.relative_to(temporary) for f in Path(temporary).rglob("*") if f.is_file()}
+        for place in places.values():
+            if not place.resolve().is_relative_to(folder.resolve()):
+                raise UsageError(f"{place}: a link leads out of {folder.name}; nothing was stored")
+            if place.exists():
+                raise UsageError(f"{place}: exists, and nothing was stored; move it away, or rename what you upload")
+        for file, place in places.items():
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(file, place)
 
 
 def _robot_argument(job: Job) -> str:
