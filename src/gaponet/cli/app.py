@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -27,6 +29,7 @@ def app(folder: tyro.conf.Positional[Path] = Path("gaponet_app"), port: int = 80
     from gaponet.report.view.app import App
     from gaponet.report.view.server import run_until_interrupt
 
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # otherwise the running command would stay
     with lock_folder(folder, "app"):
         page = App(folder.resolve(), port)
         Out().say(f"open {page.address} in a browser; Ctrl-C ends")

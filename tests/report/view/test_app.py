@@ -2,6 +2,7 @@
 
 import io
 import json
+import threading
 import time
 import zipfile
 from types import SimpleNamespace
@@ -111,6 +112,53 @@ def test_one_command_at_a_time_and_cancelling_leaves_what_was_there(tmp_path):
     assert jobs.result("robot").number == 1
 
 
+def test_of_two_clicks_at_once_one_starts_a_command(tmp_path):
+    jobs, refused = Jobs(tmp_path), []
+
+    def click():
+        try:
+            jobs.start("robot", "robot", "list")
+        except UsageError as error:
+            refused.append(error)
+
+    clicks = [threading.Thread(target=click) for _ in range(4)]
+    for thread in clicks:
+        thread.start()
+    for thread in clicks:
+        thread.join()
+    jobs.cancel()
+    assert len(refused) == 3
+    assert len(jobs.all) == 1
+
+
+def test_a_page_opens_after_its_import_was_deleted_and_shows_all_after_an_error(tmp_path):
+    pytest.importorskip("viser")
+    finish(jobs := Jobs(tmp_path), "import", {}, ("import", "logs", "--out", "import1"))
+    finish(jobs, "notes", {})
+    (tmp_path / "jobs" / "002-notes").rename(tmp_path / "jobs" / "notes-x")
+    finish(jobs, "identify", {}, ("identify", "import1", "--out", "identify2"))
+    assert jobs.result("import") is None
+    page = App(tmp_path, 0)
+    try:
+        assert "Not done" not in page.status.content
+        (tmp_path / "import1").mkdir()  # no dataset
+        finish(jobs, "robot", {}, ("robot", "check", "so101"))
+        finish(jobs, "import", {}, ("import", "logs", "--out", "import4"))
+        (tmp_path / "import4").mkdir()
+        for _ in range(2):
+            page.status.content = ""
+            page.tick(1.0)
+            assert "Not done" in page.status.content
+        (tmp_path / "import4").rmdir()
+        page.tick(1.0)
+        assert "has ended" in page.status.content
+        page.player.advance = {}.pop
+        page.tick(0.1)
+        assert "Unexpected KeyError" in page.status.content
+    finally:
+        page.server.stop()
+
+
 @pytest.fixture
 def page(tmp_path):
     pytest.importorskip("viser")
@@ -160,8 +208,11 @@ def test_a_name_in_the_form_is_no_option_of_the_command(page):
     page.unit.value = "--allow-pickle"
     page._attempt(page._read, None)
     assert "--unit-id=--allow-pickle" in page.jobs.all[-1].words
+    page._attempt(page._set_aside, None)
+    assert "is running" in page.status.content
     page.jobs.cancel()
     assert (page.folder / "logs" / "logs.toml").read_text() == "mine"
+    (page.folder / "logs_aside2").mkdir()
     page._set_aside(None)
     assert (page.folder / "logs_aside1" / "logs.toml").read_text() == "mine"
     assert list((page.folder / "logs").iterdir()) == []

@@ -60,12 +60,12 @@ class App:
         for number, step in enumerate((self._robot, self._logs, self._check, self._gap, self._identify, self._use), 1):
             with tabs.add_tab(f"{number} {step.__name__.strip('_').capitalize()}"):
                 step()
-        self.refresh()
+        self._attempt(self.refresh)
 
     def tick(self, elapsed: float) -> None:
         """Play on, and look after the running command."""
         if self.player is not None:
-            self.player.advance(elapsed)
+            self._attempt(self.player.advance, elapsed)
         self.polled += elapsed
         if self.polled >= POLL_S:
             self.polled = 0.0
@@ -109,7 +109,8 @@ class App:
             choice.on_update(lambda _: self._draw_recording())
 
     def _set_aside(self, _: Any) -> None:
-        aside = f"logs_aside{len([*self.folder.glob('logs_aside*')]) + 1}"
+        self.jobs.require_idle()
+        aside = next(name for n in range(1, 1 << 20) if not (self.folder / (name := f"logs_aside{n}")).exists())
         (self.folder / "logs").rename(self.folder / aside)
         (self.folder / "logs").mkdir()
         self.status.content = f"The logs are in {aside} now; logs is empty."
@@ -120,6 +121,7 @@ class App:
 
     def _read(self, _: Any) -> None:
         robot = self._need("robot")
+        self.jobs.require_idle()
         if self.described.value.strip():  # otherwise a file of the user's stays as it is
             write_text(self.folder / "logs" / "logs.toml", self.described.value)
         words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}", "--out", OUT]
@@ -178,6 +180,7 @@ class App:
         self._text("export", "Identify the robot first. Then export it for your simulator.")
 
     def _store(self, event: Any, place: str) -> None:
+        self.jobs.require_idle()
         store_upload(event.target.value.name, event.target.value.content, self.folder / place)
         self.status.content = f"{escape_markdown(event.target.value.name)} is stored in {place}."
 
@@ -194,27 +197,27 @@ class App:
         self.model.options = [*packaged_robots(), *(f.relative_to(self.folder).as_posix() for f in models)]
         if self.seen == (state := (len(every), running is None)):
             return
-        self.seen = state
         if running is None:
             self.status.content = _ending(every[-1]) if every else "Six steps, from left to right."
         for step, (text, hint, pictures) in self.texts.items():
             job = self.jobs.result(step)
+            hint = (step == "identify" and self._locked()) or hint
             text.content, pictures.content = _report(job) if job else hint, self._pictures(step, job)
-            if step == "identify" and job is None and (reason := self._locked()):
-                text.content = reason
         self.fit.disabled, self.proposal.visible = bool(self._locked()), self.jobs.result("doctor") is not None
         if self.jobs.result("import"):
             data = self._dataset()
             self.recording.options, self.joint.options = [e.id for e in data.entries], data.joint_names
             self._draw_recording()
-        if running is None and every and every[-1].result and every[-1].step == "identify":
-            self.jobs.start("causes", "gap", self._need("import").out, "--robot", f"./{every[-1].out}")
+        if running is None and (last := self.jobs.result("identify")) and last.number == every[-1].number:
+            self.jobs.start("causes", "gap", self._need("import").out, "--robot", f"./{last.out}")
         elif self.player is None and self.jobs.result("robot"):
             self._play(standing(self._chosen_robot()))
+        self.seen = state  # last: after an error all is shown again
 
     def _play(self, shown: SideBySide) -> None:
-        if self.player is not None:
-            self.player.remove()
+        before, self.player = self.player, None  # `tick` advances it in another thread
+        if before is not None:
+            before.remove()
         with self.stage:
             self.player = Player(self.server, Scene(shown), Clip.from_start(shown, 0.0, 3600.0))
 
@@ -232,7 +235,7 @@ class App:
         files = [] if job is None else (job.result or {}).get("figures", [])
         if job is not None and step == "causes":
             files = [f"{self._need('identify').out}/gap.{kind}" for kind in ("svg", "png")]
-        sources = {Path(f): base64.b64encode((self.folder / f).read_bytes()).decode() for f in files}
+        sources = {p: base64.b64encode(p.read_bytes()).decode() for f in files if (p := self.folder / f).is_file()}
         html, saved = "", '<a download="{}" href="data:image/{};base64,{}">save {}</a> '
         for file, data in sources.items():
             if file.suffix == ".svg":
@@ -253,8 +256,9 @@ class App:
         """Call a function; an error is shown above the steps."""
         try:
             act(*arguments)
-        except (GAPONetError, OSError) as error:
-            self.status.content = f"**Not done.** {escape_markdown(str(error))}"
+        except Exception as error:  # whatever it is, the page and the running command go on
+            kind = "" if isinstance(error, (GAPONetError, OSError)) else f"Unexpected {type(error).__name__}: "
+            self.status.content = f"**Not done.** {kind}{escape_markdown(str(error))}"
 
     def _need(self, step: str) -> Job:
         job = self.jobs.result(step)
@@ -272,8 +276,7 @@ class App:
 
 def store_upload(name: str, content: bytes, folder: Path) -> None:
     """Write an uploaded file, or what a .zip holds, below a folder: all or nothing, inside it, and over no file."""
-    prefix = f"{FOLDER_MARKER}-{os.getpid()}-"
-    with tempfile.TemporaryDirectory(prefix=prefix, dir=folder.parent, ignore_cleanup_errors=True) as temporary:
+    with tempfile.TemporaryDirectory(prefix=f"{FOLDER_MARKER}-{os.getpid()}-", dir=folder.parent) as temporary:
         if name.lower().endswith(".zip"):
             try:
                 with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -283,14 +286,11 @@ def store_upload(name: str, content: bytes, folder: Path) -> None:
             except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
                 raise UsageError(f"{name}: is not readable ({error}); pack it again, without a password") from None
         else:
-            plain = re.split(r"[/\\:]", name)[-1].lstrip(".") or "file"
-            (Path(temporary) / plain).write_bytes(content)
+            Path(temporary, re.split(r"[/\\:]", name)[-1].lstrip(".") or "file").write_bytes(content)
         places = {f: folder / f.relative_to(temporary) for f in Path(temporary).rglob("*") if f.is_file()}
         for place in places.values():
-            if not place.resolve().is_relative_to(folder.resolve()):
-                raise UsageError(f"{place}: a link leads out of {folder.name}; nothing was stored")
-            if place.exists():
-                raise UsageError(f"{place}: exists, and nothing was stored; move it away, or rename what you upload")
+            if place.exists() or not place.resolve().is_relative_to(folder.resolve()):
+                raise UsageError(f"{place}: exists, or a link leads out of here; nothing is stored; move it away")
         for file, place in places.items():
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(file, place)
@@ -316,7 +316,7 @@ def _report(job: Job) -> str:
     for line in job.lines:
         cells = [escape_markdown(cell.strip()) for cell in line.strip("┃│").replace("┃", "│").split("│")]
         if line.startswith("┃"):
-            heading = [f"{a} {b}".strip() for a, b in zip(heading, cells, strict=True)] if heading else cells
+            heading = [f"{a} {b}".strip() for a, b in zip(heading, cells, strict=False)] if heading else cells
         elif line.startswith("┡"):
             lines += [f"| {' | '.join(heading)} |", f"| --- |{' ---: |' * (len(heading) - 1)}"]
             heading = []

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import subprocess
+import threading
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -60,11 +61,12 @@ class Jobs:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.process: subprocess.Popen[bytes] | None = None
+        self.lock = threading.Lock()  # each click has a thread
 
     @property
     def all(self) -> list[Job]:
         """Jobs in their order; the last one may be running."""
-        files = (self.folder / "jobs").glob("*-*/log.txt")
+        files = (self.folder / "jobs").glob("[0-9]*-*/log.txt")
         return sorted((Job(file.parent) for file in files), key=lambda job: job.number)
 
     @property
@@ -73,33 +75,36 @@ class Jobs:
         return self.all[-1] if self.process is not None and self.process.poll() is None else None
 
     def result(self, step: str) -> Job | None:
-        """Return the last successful job of a step, unless what it was made from is newer."""
-        last = next((job for job in reversed(self.all) if job.step == step and job.result is not None), None)
+        """Return the last successful job of a step with its folder, unless what it was made from is newer."""
+        jobs = (job for job in reversed(self.all) if job.step == step and job.result is not None)
+        last = next((job for job in jobs if "--out" not in job.words or (self.folder / job.out).exists()), None)
         if last is None or step not in NEEDS:
             return last
         before = self.result(NEEDS[step])
         return last if before is not None and before.number < last.number else None
 
     def start(self, step: str, *words: str) -> None:
-        """Start a command; the word OUT becomes the name of a new folder, of the step and the number of the job.
+        """Start a command, or raise UsageError if one runs; OUT becomes the name of a new folder: step and number."""
+        with self.lock:
+            self.require_idle()
+            number = max((job.number for job in self.all), default=0) + 1
+            folder = self.folder / "jobs" / f"{number:03d}-{step}"
+            folder.mkdir(parents=True, exist_ok=True)
+            write_json(folder / "command.json", [f"{step}{number}" if word == OUT else word for word in words])
+            with (folder / "result.json").open("wb") as out, (folder / "log.txt").open("wb") as log:
+                self.process = subprocess.Popen(
+                    module_command("gaponet", *Job(folder).words, "--json"), stdin=subprocess.DEVNULL, stdout=out,
+                    stderr=log, cwd=self.folder, env=os.environ | {LINE_INTERVAL_VARIABLE: "0.5"},
+                )  # fmt: skip
 
-        Raises:
-            UsageError: Another command runs.
-        """
-        if self.running:
-            raise UsageError(f"gaponet {self.running.words[0]} is running; wait for it, or cancel it")
-        number = max((job.number for job in self.all), default=0) + 1
-        folder = self.folder / "jobs" / f"{number:03d}-{step}"
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "command.json", [f"{step}{number}" if word == OUT else word for word in words])
-        with (folder / "result.json").open("wb") as out, (folder / "log.txt").open("wb") as log:
-            self.process = subprocess.Popen(
-                module_command("gaponet", *Job(folder).words, "--json"), stdin=subprocess.DEVNULL, stdout=out,
-                stderr=log, cwd=self.folder, env=os.environ | {LINE_INTERVAL_VARIABLE: "0.5"},
-            )  # fmt: skip
+    def require_idle(self) -> None:
+        """Raise UsageError while a command runs."""
+        if job := self.running:
+            raise UsageError(f"gaponet {job.words[0]} is running; wait for it, or cancel it")
 
     def cancel(self) -> None:
         """End the running command. Files are written whole or not at all, and each command has its own folder."""
-        if self.process is not None:
-            self.process.terminate()
-            self.process.wait()
+        with self.lock:
+            if self.process is not None:
+                self.process.terminate()
+                self.process.wait()
