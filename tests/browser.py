@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import shutil
 import subprocess
 import tempfile
+import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,24 @@ from websockets.sync.client import connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 PATIENCE = 90.0  # s, on a busy machine
+
+
+@contextlib.contextmanager
+def ticking(tick: Callable[[float], None]) -> Iterator[None]:
+    """Call `tick` with 1/30 s, 30 times a second, in a thread that ends with the block."""
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.wait(1 / 30):
+            tick(1 / 30)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 class Browser:

@@ -224,6 +224,13 @@ def test_a_name_in_the_form_is_no_option_of_the_command(page):
     assert "without a dash" in page.status.content
 
 
+def test_a_guess_does_not_replace_the_logs_toml_of_the_folder(page):
+    (page.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
+    page._attempt(page._guess, None)
+    assert "a guess would replace it" in page.status.content
+    assert not page.described.value
+
+
 def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
     for step in ("robot", "import"):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))

@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -82,17 +81,11 @@ def page(tmp_path):
     from gaponet.report.view.app import App
 
     (tmp_path / "work").mkdir()
-    opened, ended = App(tmp_path / "work", 0), threading.Event()
+    opened = App(tmp_path / "work", 0)
+    from browser import ticking
 
-    def run():
-        while not ended.wait(1 / 30):
-            opened.tick(1 / 30)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    yield opened
-    ended.set()
-    thread.join()
+    with ticking(opened.tick):
+        yield opened
     opened.jobs.cancel()
     opened.server.stop()
 

@@ -1,6 +1,5 @@
 """What a browser shows: gaponet view, and the report on a desk and on a phone. make browser."""
 
-import threading
 import time
 
 import numpy as np
@@ -30,17 +29,10 @@ def web(arm):
     served = Player(server, Scene(shown), Clip.from_start(shown, 0.0, 3.0))
     served.address = address
     served.playing.value = False
-    ended = threading.Event()
+    from browser import ticking
 
-    def play() -> None:
-        while not ended.wait(1 / 30):
-            served.advance(1 / 30)
-
-    thread = threading.Thread(target=play)
-    thread.start()
-    yield served
-    ended.set()
-    thread.join()
+    with ticking(served.advance):
+        yield served
     served.server.stop()
 
 

@@ -116,6 +116,9 @@ class App:
         self.status.content = f"The logs are in {aside} now; logs is empty."
 
     def _guess(self, _: Any) -> None:
+        file = self.folder / "logs" / "logs.toml"
+        if file.is_file() and file.read_text(encoding="utf-8") != self.described.value:
+            raise UsageError(f"{file} is there, and a guess would replace it; move it away first")
         kind, facts, recordings = look(self.folder / "logs")
         self.described.value = guess_logs(recordings, self._chosen_robot(), kind, dict(facts))
 
