@@ -5,13 +5,16 @@
 
 Arms have two joints. In a wrong file one link has 1 / 1.3 to 1 / 2 of the true mass, or its centre of mass 2 to 5 cm
 away. Half of the arms are recorded with two payloads, half with none. Seven motions of 8 s are fitted and validated;
-three new motions, and three with a payload that no fit has seen, test. The rival is plain_fit.py with mass and centre
-of mass of each link as four more parameters: the least squares that mujoco.sysid does as well.
+three new motions, and three with a payload that no fit has seen, test. The rivals are plain_fit.py with mass and centre
+of mass of each link as four more parameters, and mujoco.sysid with its pseudo-inertia of each link as ten more
+(where "mujoco[sysid]" is installed).
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib.util
 import json
 import tempfile
 import time
@@ -148,14 +151,38 @@ class MassProblem(Problem):
 
     def robot_with(self, x: np.ndarray) -> RobotSpec:
         """Return the robot with fitted servos and links."""
-        model, links = self.changed(x, 0, self.specs[0].compile()), {}
-        for name in self.bodies:
-            body, turn = model.body(name), np.zeros(9)
-            mujoco.mju_quat2Mat(turn, body.iquat)
-            full = turn.reshape(3, 3) @ np.diag(body.inertia) @ turn.reshape(3, 3).T
-            numbers = (*np.diag(full), *full[[0, 0, 1], [1, 2, 2]])
-            links[name] = Link(float(body.mass[0]), tuple(body.ipos.tolist()), tuple(map(float, numbers)))
-        return replace(super().robot_with(x[: 6 * JOINTS]), links=links)
+        model = self.changed(x, 0, self.specs[0].compile())
+        return replace(super().robot_with(x[: 6 * JOINTS]), links=links_of(model, self.bodies))
+
+
+def links_of(model: mujoco.MjModel, names: list[str]) -> dict[str, Link]:
+    """Return masses, centres and inertias of a model's bodies."""
+    links = {}
+    for name in names:
+        body, turn = model.body(name), np.zeros(9)
+        mujoco.mju_quat2Mat(turn, body.iquat)
+        full = turn.reshape(3, 3) @ np.diag(body.inertia) @ turn.reshape(3, 3).T
+        numbers = (*np.diag(full), *full[[0, 0, 1], [1, 2, 2]])
+        links[name] = Link(float(body.mass[0]), tuple(body.ipos.tolist()), tuple(map(float, numbers)))
+    return links
+
+
+def mujoco_sysid(sequences: list[Sequence], robot: RobotSpec) -> tuple[RobotSpec, np.ndarray]:
+    """Fit servos and links with mujoco.sysid; return the robot, and its 90 % intervals of the masses, (L, 2) kg."""
+    import mujoco_sysid as rival
+    from mujoco import sysid
+
+    problem, names = Problem(sequences, robot), [f"link{i}" for i in range(JOINTS)]
+    with contextlib.redirect_stdout(None):
+        params, result = rival.fit(problem, tuple(names))
+    half = sysid.calculate_intervals([result.fun], result.jac, alpha=0.1)[1]
+    spec, masses = problem.specs[0].copy(), []
+    for i, name in enumerate(names):
+        params[name].apply_modifier(spec)
+        log_mass, by = params[name].value[0], half[6 * JOINTS + 10 * i]
+        masses.append(np.exp(2 * np.array([log_mass - by, log_mass + by])))
+    fitted = replace(problem.robot_with(params.as_vector()[: 6 * JOINTS]), links=links_of(spec.compile(), names))
+    return fitted, np.array(masses)
 
 
 def play(seed: int) -> dict[str, Any]:
@@ -195,11 +222,19 @@ def play(seed: int) -> dict[str, Any]:
             judge(name, made.robot, time.process_time() - began)
         began = time.process_time()
         judge("plain, masses", fit(MassProblem([*train, *validation], robot), 1), time.process_time() - began)
+        nominal = build_model(robot)
+        mass = np.array([nominal.body(f"link{i}").mass[0] * physics.mass_scale[i] for i in range(JOINTS)])
+        if importlib.util.find_spec("colorama"):  # of mujoco[sysid]
+            began = time.process_time()
+            fitted, low_high = mujoco_sysid([*train, *validation], robot)
+            judge("mujoco.sysid", fitted, time.process_time() - began)
+            row["mujoco.sysid masses inside"] = int(((low_high[:, 0] < mass) & (mass < low_high[:, 1])).sum())
+            row["mujoco.sysid mass error"] = [fitted.links[f"link{i}"].mass / mass[i] - 1 for i in range(JOINTS)]
         row["accepted"] = made.links is not None
         if made.links is not None:
             _, now, std, prior = (x[:, :4] for x in made.links.moments())
-            nominal = build_model(robot)
-            mass = [nominal.body(f"link{i}").mass[0] * physics.mass_scale[i] for i in range(JOINTS)]
+            row["mass error"] = (now[:, 0] / mass - 1).tolist()
+            row["masses inside"] = int((np.abs(now[:, 0] - mass) < 1.645 * std[:, 0]).sum())
             true = np.stack([mass, physics.com_x, physics.com_y, physics.com_z], axis=1)
             known = std < KNOWN * prior
             row["inside"], row["known"] = int((np.abs(now - true) < 1.645 * std)[known].sum()), int(known.sum())
@@ -218,6 +253,11 @@ def table(rows: list[dict[str, Any]]) -> None:
             if not some:
                 continue
             cells = []
+            count = JOINTS * len(some)
+            held = [
+                f"{sum(r.get(k, 0) for r in some)} of {count}" for k in ("masses inside", "mujoco.sysid masses inside")
+            ]
+            print("masses within their 90 % interval, identify where accepted, mujoco.sysid:", *held)
             for key in ("test", "new payload"):
                 errors = np.array([[r[key][n] for n in names] for r in some])
                 cells += [f"{e.mean():.2f} ± {standard_error(e):.2f}" for e in errors.T]

@@ -9,6 +9,7 @@ Parameters, changes of the model, rollouts and the optimizer are those of mujoco
 - Residuals are errors in rad. The default divides each window by the norm of its own signal.
 - A rollout function delays the commands. An actuator with a delay starts from a history of zeros.
 - scipy's least squares with soft_l1 loss, as in plain_fit.py.
+- A pseudo-inertia is written by `write_inertia`. That of MuJoCo 4.0.0 compiles the model between two bodies, and fails.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from gaponet.experiments.real.questions import Question
 from gaponet.sim.model import stiffen_friction
 
 sys.path.insert(0, str(Path(__file__).parent))
-from plain_fit import EVALUATIONS, LOSS, STEP, equal_problem
+from plain_fit import EVALUATIONS, LOSS, STEP, Problem, equal_problem
 
 FIELDS = "kp", "damping", "friction", "armature", "delay", "offset"  # in the order of Problem.start
 
@@ -35,6 +36,11 @@ FIELDS = "kp", "damping", "friction", "armature", "delay", "offset"  # in the or
 def mujoco_sysid(question: Question) -> FittedSim:
     """Fit kp, damping, friction, armature, delay and offset of each operated joint with mujoco.sysid."""
     problem = equal_problem(question)
+    return FittedSim(problem.robot_with(fit(problem)[0].as_vector()))
+
+
+def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterDict, Any]:
+    """Fit servos, and the pseudo-inertia of links; return parameters and the optimizer's result."""
     robot, windows, window_of = problem.robot, [], {}
     for w, (spec, state) in enumerate(zip(problem.specs, problem.states, strict=True)):
         commands = problem.controls(np.zeros(len(problem.op)), w)
@@ -44,14 +50,19 @@ def mujoco_sysid(question: Question) -> FittedSim:
         window_of |= {id(spec): w, id(control): w, id(recorded): w}
         windows.append(sysid.ModelSequences(str(w), spec, str(w), state, control, recorded, True))
 
+    def vector(params: sysid.ParameterDict) -> np.ndarray:
+        return np.concatenate([params[field].value for field in FIELDS])
+
     def build(params: sysid.ParameterDict, spec: mujoco.MjSpec) -> mujoco.MjModel:
-        servos = problem.servos(params.as_vector(), window_of[id(spec)])
+        servos = problem.servos(vector(params), window_of[id(spec)])
         for i, name in enumerate(robot.operated):
             v = {field: float(x[i]) for field, x in servos.items()}
             actuator, joint = spec.actuator(name), spec.joint(name)
             sysid.apply_pdgain(spec, name, np.array([v["kp"], v["kd"]]))
             actuator.biasprm[0], joint.damping[0] = v["kp"] * v["offset"], v["damping"]
             joint.frictionloss, joint.armature = v["frictionloss"], v["armature"]
+        for name in links:
+            params[name].apply_modifier(spec)
         model = spec.compile()
         stiffen_friction(model)
         return model
@@ -60,7 +71,7 @@ def mujoco_sysid(question: Question) -> FittedSim:
         late = []
         for control, params in zip(control_signal, param_dicts, strict=True):  # one window, many candidates
             w = window_of[id(control)]
-            delay = problem.servos(params.as_vector(), w)["delay"]
+            delay = problem.servos(vector(params), w)["delay"]
             late.append(replace(control, data=np.append(problem.controls(delay, w), control.data[-1:], axis=0)))
         return sysid.sysid_rollout(control_signal=late, **rest)
 
@@ -74,5 +85,23 @@ def mujoco_sysid(question: Question) -> FittedSim:
     params, bounds = sysid.ParameterDict(), (problem.start, problem.low, problem.high)
     for field, start, low, high in zip(FIELDS, *(np.split(x, len(FIELDS)) for x in bounds), strict=True):
         params.add(sysid.Parameter(field, start, low, high))
-    fitted, _ = sysid.optimize(params, residuals, "scipy_parallel_fd", max_iters=EVALUATIONS, diff_step=STEP, **LOSS)
-    return FittedSim(problem.robot_with(fitted.as_vector()))
+    for name in links:
+        spec = problem.specs[0].copy()  # the parameter changes it
+        bounds = {"mass_bound_mult": np.array([0.3, 3.0]), "ipos_bound_off": np.array([-0.1, 0.1])}
+        params.add(sysid.body_inertia_param(
+            spec, spec.compile(), name, sysid.InertiaType.Pseudo, param_name=name, modifier=write_inertia, **bounds
+        ))  # fmt: skip
+    return sysid.optimize(params, residuals, "scipy_parallel_fd", max_iters=EVALUATIONS, diff_step=STEP, **LOSS)
+
+
+def write_inertia(spec: mujoco.MjSpec, param: sysid.Parameter) -> None:
+    """Write mass, centre and inertia of the body that a pseudo-inertia is named after."""
+    pi, body = sysid.model_modifier.pi_from_theta(param.value), spec.body(param.name)
+    body.explicitinertial, body.mass, body.ipos = True, pi[0], pi[1:4] / pi[0]
+    cross = sysid.model_modifier.skew(body.ipos)
+    inertia = pi[4:].reshape(3, 3) + pi[0] * cross @ cross
+    body.iquat, body.inertia, body.fullinertia = (
+        [1, 0, 0, 0],
+        [0, 0, 0],
+        inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
+    )
