@@ -82,13 +82,13 @@ def recorded(robot, count, rows=100, payloads=(0.0, 0.2), first=0):
     return [record(robot, commands(rows, first + i), f"m{first + i}", p, kp=1.1) for i, p in enumerate(payload)]
 
 
-def link_fit(robot, train):
+def link_fit(robot, train, torque_kp=None, residual=0.01):
     """A fit of links, from servos as they are."""
     joints = JointFit(JointRollouts(cut(train, 4), robot, nthread=1), robot, Bounds(robot, train))
     values = {f: v for f, v in joints.bounds.first.items() if f in CLASSIC}
     values["kp"] = 1.1 * values["kp"]
-    joints.prior.residual = np.full(2, 0.01)
-    return LinkFit(joints.robot_fit(1), values)
+    joints.prior.residual = np.full(2, residual)
+    return LinkFit(joints.robot_fit(1), values, torque_kp or {})
 
 
 def test_recordings_show_a_heavy_link_by_its_moment_and_the_error_falls(robot):
@@ -106,6 +106,15 @@ def test_recordings_show_a_heavy_link_by_its_moment_and_the_error_falls(robot):
     assert (std < 1.001 * prior).all()
     assert before[1, 4] < now[1, 4] < 1.6 * before[1, 4] + std[1, 4]
     assert result.sentences()[-1].startswith("fore: ")
+
+
+def test_a_gain_from_torque_separates_masses_from_gains_without_a_second_payload(robot):
+    train, all_masses = recorded(robot, 3, payloads=(0.0,)), np.zeros(2 * COORDINATES)
+    all_masses[[0, COORDINATES]] = np.sqrt(0.5)
+    torque = dict.fromkeys(robot.operated, (22.0, 0.1))
+    shares = [np.linalg.norm(all_masses @ link_fit(robot, train, kp, 1e-4).directions) for kp in ({}, torque)]
+    assert shares[0] < 0.4
+    assert shares[1] > 0.8
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.6])

@@ -62,10 +62,10 @@ def test_gains_are_estimated_from_torque_of_a_pd_servo_and_from_no_other(arm):
     (kp, _, kd, explained), (_, _, _, noise) = said.gains().values()
     assert (kp, kd) == (pytest.approx(7.0, rel=0.03), pytest.approx(0.3, rel=0.1))
     assert explained > 0.95 > 0.5 > noise
-    assert said.trusted
+    assert set(said.known) == {arm.operated[0]}
     assert said.robot.kp[0] == pytest.approx(7.0, rel=0.03)
     assert said.robot.kp[1] == arm.kp[1]
-    assert not TorqueFit([replace(s, tau=None) for s in made], arm).trusted
+    assert not TorqueFit([replace(s, tau=None) for s in made], arm).known
 
 
 def test_measurement_noise_does_not_lower_the_estimated_gains(arm):

@@ -45,7 +45,7 @@ from gaponet.sysid.problem import (
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.servo_types import far_from_servo_type
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
-from gaponet.sysid.torque import with_torque
+from gaponet.sysid.torque import TorqueFit, with_torque
 
 ONE_PAYLOAD = "masses and gains are known up to a common factor: record two payloads before you trust a third"
 FOLDS = 3  # of the cross-validation
@@ -173,7 +173,8 @@ def _fit_robot(
     linked, links = None, list[Links]()
     if masses:
         start = values if any(c.accepted for c in comparisons) else base
-        comparison, linked, links, values = _with_links(wholes, judge, start, values, searches)
+        gains = [{j: (g.kp, g.error) for j, g in TorqueFit(one, robot).known.items()} for one in fitted_sets]
+        comparison, linked, links, values = _with_links(wholes, judge, start, values, gains, searches)
         comparisons = *comparisons, comparison
     chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
     joints, whole, first = fits[-1], wholes[-1], [one.bounds.first for one in fits]
@@ -197,7 +198,8 @@ def _fit_robot(
             HeldOut(part, replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high))
             for (_, part), one in zip(splits, robots, strict=False)
         ]
-    one_payload = bool(links and robot.payload_mounts) and len({s.meta.payload_mass for s in sequences}) == 1
+    one_payload = bool(links and robot.payload_mounts and not gains[-1])
+    one_payload = one_payload and len({s.meta.payload_mass for s in sequences}) == 1
     warnings = (
         *[ONE_PAYLOAD] * one_payload, *joints.bounds.warnings(values[-1], fitted_fields(values[-1])),
         *stop_questions(given, robot), *far_from_servo_type(fitted), *errors.sentences,
@@ -268,14 +270,19 @@ def _with_terms(
 
 
 def _with_links(
-    wholes: ListOf[RobotFit], judge: Judge, start: list[Values], values: list[Values], searches: _SearchProgress
+    wholes: ListOf[RobotFit],
+    judge: Judge,
+    start: list[Values],
+    values: list[Values],
+    gains: list[dict[str, tuple[float, float]]],
+    searches: _SearchProgress,
 ) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:
     """Fit the links with the servos from `start`; return them and the servos' values if they are better."""
     results = list[LinkResult]()
-    for whole, one in zip(wholes, start, strict=True):
+    for whole, one, torque_kp in zip(wholes, start, gains, strict=True):
         searches.begin()
         report = searches.report("masses", ("all joints",), whole.rollouts.rows.sum(keepdims=True))
-        results.append(LinkFit(whole, one).descend(report))
+        results.append(LinkFit(whole, one, torque_kp).descend(report))
     links, servos = [r.axes.links(r.x) for r in results], [r.values for r in results]
     before = judge.errors(values)
     comparison = Comparison("masses", before, judge.errors(servos, links) if results[-1].x.any() else before)

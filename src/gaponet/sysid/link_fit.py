@@ -24,6 +24,7 @@ from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, Robo
 
 ROWS = 400  # of recordings, whose torques choose directions
 MIN_INFORMATION, MAX_DIRECTIONS = 1.0, 12  # of a direction over the prior's, and how many are fitted
+MIN_KP_LOG_STD = 0.05  # of a kp from recorded torque, whose scale is a motor constant
 ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
 FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
 MAX_SERVO_NUMBERS, FEW_FIELDS = 36, ("kp", "armature")  # fitted with the links; of robots with more, these fields
@@ -34,13 +35,16 @@ MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; e
 class LinkFit:
     """Fit of links and servos; `directions` are orthonormal columns (L · COORDINATES, K) that recordings determine."""
 
-    def __init__(self, whole: RobotFit, values: Values) -> None:
-        """Take a fit of servos and its values (n,)."""
+    def __init__(self, whole: RobotFit, values: Values, torque_kp: dict[str, tuple[float, float]]) -> None:
+        """Take a fit of servos, its values (n,), and joint → kp from torque and its standard error."""
         fields = CLASSIC if whole.bounds.n * len(CLASSIC) <= MAX_SERVO_NUMBERS else FEW_FIELDS
         self.whole, self._servos = whole, Axes(whole.bounds, fields, values)
         self._first, self.axes, self._n = values, LinkAxes(whole.robot), whole.bounds.n
         self._prior = copy.copy(whole.prior)
-        self._prior.log_std = PRIOR_LOG_STD  # a stated kp would shift all masses
+        self._prior.log_std = dict(PRIOR_LOG_STD)  # a stated kp would shift all masses
+        kp, error = np.array([torque_kp.get(j, (np.nan, np.nan)) for j in whole.robot.operated]).T
+        self._kp_std = np.maximum(error / kp, MIN_KP_LOG_STD)  # nan where torque does not state it
+        self._prior.state_kp(kp, self._kp_std)
         self._prior.residual = FIRST_RESIDUAL_SHARE * whole.prior.residual
         self._weigh()
         self.directions = self._determined() if self.axes.names else np.zeros((0, 0))
@@ -55,7 +59,7 @@ class LinkFit:
         """Return the directions whose information in the recordings is above the prior's, from inverse dynamics.
 
         A change of torque moves a joint by itself over kp. What gains, offsets, damping, friction and armature of the
-        joint explain as well does not count, so without payloads all masses do not change together.
+        joint explain as well does not count, so without payloads or recorded torque all masses do not change together.
         """
         robot, parts, op = replace(self.whole.robot, table=None), self.whole.rollouts.parts, self.whole.rollouts.op
         every, size = max(1, sum(map(len, parts)) // ROWS), self.axes.scale.size
@@ -85,7 +89,8 @@ class LinkFit:
             )
             weight = np.sqrt(count[i] / len(v)) / self._prior.residual[i]
             d, s = weight * moved[:, :, i].T, weight * servo
-            information += d.T @ d - d.T @ s @ np.linalg.pinv(s.T @ s) @ s.T @ d
+            stated = np.diag([np.nan_to_num(self._kp_std[i] ** -2), 0, 0, 0, 0])
+            information += d.T @ d - d.T @ s @ np.linalg.pinv(s.T @ s + stated) @ s.T @ d
         strength, vectors = np.linalg.eigh(information)
         chosen = np.flatnonzero(strength > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
         return np.asarray(vectors[:, chosen])

@@ -44,7 +44,7 @@ class _GainPrior:
     Its weight decreases with the residual of the best fit and increases with the residual's correlation time.
 
     Attributes:
-        log_std: Field → standard deviation of its logarithm.
+        log_std: Field → standard deviation of its logarithm, also by joint (n,).
         residual: RMS error of each joint's best fit so far, (n,) rad.
         correlation_time: Duration of a recording that counts as one measurement, (n,) s.
     """
@@ -53,7 +53,9 @@ class _GainPrior:
         self.residual = np.full(bounds.n, 1e-3)
         self.correlation_time = np.full(bounds.n, CORRELATION_TIME_BOUNDS_S[1])
         self._row_period = max(row_period, 0.01)
-        self.log_std: dict[str, float] = PRIOR_LOG_STD | ({"kp": STATED_KP_LOG_STD} if bounds.stated else {})
+        self.log_std: dict[str, float | Array] = dict(PRIOR_LOG_STD)
+        if bounds.stated:
+            self.log_std["kp"] = STATED_KP_LOG_STD
         self._servo_damping = {"damping": bounds.kd}  # beside the joint's own
         given = {f: bounds.first[f] + self._servo_damping.get(f, 0.0) for f in self.log_std}
         self._given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
@@ -70,6 +72,12 @@ class _GainPrior:
             for f, given in self._given.items()
         ]
         return np.stack(far, axis=-1)
+
+    def state_kp(self, kp: Array, log_std: Array) -> None:
+        """Let the prior of kp be around these values (n,), N·m/rad; nan where it stays."""
+        stated = np.isfinite(kp)
+        self._given = self._given | {"kp": np.where(stated, kp, self._given["kp"])}
+        self.log_std = self.log_std | {"kp": np.where(stated, log_std, self.log_std["kp"])}
 
     def update_residual(self, cost: Array, rows: Array) -> None:
         """Take the residual from the cost of each joint's best fit, (n,)."""

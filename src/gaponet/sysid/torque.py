@@ -38,6 +38,7 @@ MOUNT_PRIOR_NM_PER_M = 3.0  # price of moving the payload
 MIN_MOVE_RAD = 0.05  # of a command that excites a joint
 MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
 INSTRUMENTS = 12  # periods whose commands are instruments for measured position and speed
+MAX_LATE = 3  # periods between a command and its torque
 START_DELAY, ITERATIONS = 0.25, 10  # in 20 ms; of the fit of positions
 MAX_HAND_MASS = 5.0  # kg
 
@@ -65,7 +66,7 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
     """
     every = [*splits[0][0], *splits[0][1]]
     torques = [TorqueFit(train, given) for train, _ in splits]
-    if not all(t.trusted for t in torques) or any(s.tau is None for s in every):
+    if not all(t.known for t in torques):
         return fitted
     tried = {
         options: [HeldOut(part, t.fit(options)) for t, (_, part) in zip(torques, splits, strict=True)]
@@ -118,8 +119,8 @@ class Gains(NamedTuple):
         return self.explained > MIN_EXPLAINED and self.kp > 0 <= self.kd
 
 
-def servo_gains(recordings: ListOf[Array], last: int = 0) -> Gains:
-    """Estimate a servo's gains: torque = kp (command of the period before − position) − kd velocity.
+def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gains:
+    """Estimate a servo's gains: torque = kp (command so many periods before − position) − kd velocity.
 
     Rows are means of five. Noise of measured position and speed would lower the gains, so two-stage least squares take
     the commands of INSTRUMENTS periods as instruments (Janot, Vandanjon & Gautier 2014).
@@ -127,12 +128,13 @@ def servo_gains(recordings: ListOf[Array], last: int = 0) -> Gains:
     Args:
         recordings: Command, position, velocity and torque of the joint, (4, T) each.
         last: Only so many rows at the end of each count, as their mean, by plain least squares; 0 for all.
+        late: Periods.
     """
     sums, rows = [], []
     for ctrl, qpos, qvel, tau in recordings:
-        t = np.arange(len(tau) - 1)
+        t = np.arange(len(tau) - late)
         past = [ctrl[np.maximum(t - k, 0)] for k in range(INSTRUMENTS)]
-        channels = [ctrl[:-1] - qpos[1:], -qvel[1:], tau[1:], *past]
+        channels = [ctrl[t] - qpos[late:], -qvel[late:], tau[late:], *past]
         error, speed, torque, *commands = (np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float))
         one = np.ones_like(torque)
         x, z = np.stack([error, speed, one], axis=1), np.stack([*commands, one], axis=1)
@@ -160,7 +162,7 @@ class TorqueFit:
 
     Attributes:
         robot: The robot with gains from torque.
-        trusted: Whether gains follow from the torque of some joint, and all recordings have torque.
+        known: Joint → gains that follow from its torque; none unless all recordings have torque.
         several_payloads: Whether recordings have several payloads, which determine where these hang.
     """
 
@@ -168,10 +170,9 @@ class TorqueFit:
         """Recordings whose gains are stated are left out; the robot's payload masses are taken as true."""
         self.robot = robot
         self.sequences = [s for s in sequences if s.tau is not None and s.meta.recorded_gains[0] is None]
-        trusted = {joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.gains().items() if g.trusted}
-        self.trusted = len(self.sequences) == len(sequences) and bool(trusted)
-        if self.trusted:
-            self.robot = robot.with_servos(trusted)
+        gains = self.gains() if len(self.sequences) == len(sequences) else {}
+        self.known = {joint: g for joint, g in gains.items() if g.trusted}
+        self.robot = robot.with_servos({joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.known.items()})
         masses = {s.meta.payload_mass for s in self.sequences}
         self.several_payloads = bool(robot.payload_mounts) and len(masses) > 1
 
@@ -183,7 +184,10 @@ class TorqueFit:
             for j in _moved(s, self.robot):
                 rows = np.stack([x[:, j] for x in (s.ctrl, s.qpos, s.qvel, s.tau)])
                 parts.setdefault(self.robot.joint_names[j], []).append(rows)
-        return {joint: servo_gains(each) for joint, each in parts.items()}
+        return {
+            joint: max((servo_gains(each, late=k) for k in range(1, MAX_LATE + 1)), key=lambda g: g.explained)
+            for joint, each in parts.items()
+        }
 
     def payload_placed(self, friction: bool = False) -> RobotSpec:
         """Return the robot with the payload's place and the mass of the hand, by least squares on recorded torque.
