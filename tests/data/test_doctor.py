@@ -342,7 +342,7 @@ def test_rows_at_12_to_40_hz_are_no_error_of_clocks_and_say_which_times_are_not_
     assert "apart, and shorter delays are not known" in data.entries[0].meta.notes["why_resampled"]
     diagnosis = DoctorResult.of(data, arm)
     assert [f.message for f in diagnosis.findings if f.level == "error" or f.check in ("copied", "averaged")] == [
-        "commands come before states"
+        "no state comes before its command"
     ]
     assert "cannot be told between such rows" in found(diagnosis, "jitter", "warning").message
 

@@ -73,15 +73,15 @@ def check(
     drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
     named, count = {m.joint for m in drift.moved}, f"{made.recordings} recording{'s' * (made.recordings != 1)}"
     screen.table(
-        f"{count}, {drift.seconds:.0f} s: largest change of each joint",
-        ["joint", "parameter", "change", "standard errors", "effect, mrad", "least that counts, mrad", "verdict"],
+        f"Largest change of each joint ({count}, {drift.seconds:.0f} s)",
+        ["joint", "parameter", "change", "standard errors", "effect, mrad", "threshold, mrad", "verdict"],
         [
             _row(m, uncertainty, drift, m.joint in named)
             for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))
         ],
     )
     for a in drift.against:
-        what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} deviations"
+        what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} standard errors"
         screen.say(f"  {what}", "warning", "yellow")
     screen.say(f"{made.verdict}: {made.advice.replace('ROBOT', robot.as_posix()).replace('LOGS', logs)}")
     screen.result(made.to_dict())

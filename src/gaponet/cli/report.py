@@ -53,7 +53,7 @@ def _show_runs(screen: Out, folder: Path) -> None:
         raise UsageError(f"{folder}: no run here or below (a run has config.json and split.json); train one first")
     runs.sort(key=lambda r: r["val_ratio"] if r["val_ratio"] is not None else float("inf"))
     screen.table(
-        f"Runs in {folder}: mean |error| of whole held-out motions in free run, mrad (of nominal)",
+        f"Runs in {folder}: mean |error| of validation and test motions, mrad (of nominal)",
         ["run", "model", "seed", "minutes", "validation", "evaluated"],
         [
             [r["run"], title(r["model"]), str(r["seed"]), "" if r["seconds"] is None else f"{r['seconds'] / 60:.1f}",

@@ -242,7 +242,7 @@ def show(
     sure = {j: summarize(known, j) for j in known.joints}
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in fields)]
-    screen.table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
+    screen.table(f"Parameters of {spec.name}, ± standard error", columns, table_rows(known, fields))
     origin = read_origin(spec.folder)
     findings = list(origin.get("findings", ())) if origin else []
     for line in (*findings, *sentences(known)):

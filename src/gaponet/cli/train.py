@@ -103,7 +103,7 @@ def evaluate(
     table = result.to_dict()
     if not result.unseen:
         out.say(
-            "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"
+            "", "a model was trained or chosen on some of these motions: the errors are no test errors", "yellow"
         )
     for name, delta in table["delta"].items():
         if delta["at_limit"]:

@@ -19,7 +19,7 @@ MIN_SAG_RAD = 0.02  # static error that is reported
 MAX_DEAD_TIME_S, MAX_EXTRA_LAG_S = 0.15, 0.05  # of all joints; of one joint beyond the others
 DEAD_TIMES = (  # up to s, verdict
     (0.015, "as good as none"), (0.06, "usual for a bus and a servo's firmware"),
-    (MAX_DEAD_TIME_S, "long; hobby servos and slow buses have it"),
+    (MAX_DEAD_TIME_S, "long, as of hobby servos and slow buses"),
     (np.inf, "very long: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
 
@@ -37,7 +37,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     text = (
         f"state follows command after {np.median(every) * 1e3:.0f} ms ({low * 1e3:.0f}–{high * 1e3:.0f} over joints and"
         f" motions at {FAST_COMMAND_RAD_S} rad/s or faster), {low / period:.0f} to {high / period:.0f} periods: "
-        "a network's history must span it"
+        "the history of a network must be longer"
     )
     expected = _expected_lag(robot)
     sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
@@ -48,8 +48,8 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if dead_time:
         verdict = next(words for limit, words in DEAD_TIMES if usual <= limit)
         text += (
-            f". kp and damping explain all but {usual * 1e3:.0f} ms, which are dead time, friction or inertia (gaponet "
-            f"identify separates them). A dead time of that length is {verdict}"
+            f". kp and damping do not explain {usual * 1e3:.0f} ms of it: dead time, friction or inertia (gaponet "
+            f"identify separates them). As a dead time this is {verdict}"
         )
     level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
     yield Finding(level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()})
