@@ -59,8 +59,8 @@ def adapt(
                 progress=update,
             )  # fmt: skip
         screen.say(
-            f"error {mrad(made.before)} → {mrad(made.after)} mrad over {made.recordings} recording(s) of unit {made.unit_id} "
-            f"({made.after / made.before:.2f}); robot folder {out}"
+            f"error {mrad(made.before)} → {mrad(made.after)} mrad ({made.after / made.before:.2f} of it) on "
+            f"{made.recordings} recording(s) of unit {made.unit_id}; robot folder {out}"
         )
         _show(screen, made)
         screen.next(f"gaponet run --motion FILE --robot {robot_argument(out)} --compensate")

@@ -35,20 +35,10 @@ Logs = Annotated[
 
 @like(api.check)
 def check(
-    robot: Robot,
-    logs: Logs,
-    unit: Unit = "",
-    motions: Motions = (),
-    payload_mass: float | None = None,
-    threads: int = 0,
-    fleet: Flag = False,
-    out: Path | None = None,
-    night: str = "",
-    adapt: bool = True,
-    executor: str = "local",
-    workers: int = 0,
-    json: Json = False,
-) -> None:
+    robot: Robot, logs: Logs, unit: Unit = "", motions: Motions = (), payload_mass: float | None = None,
+    threads: int = 0, fleet: Flag = False, out: Path | None = None, night: str = "", adapt: bool = True,
+    executor: str = "local", workers: int = 0, json: Json = False,
+) -> None:  # fmt: skip
     """Is this still the robot that was identified? What changed?
 
     The exit code is 0 if the robot is unchanged, 1 if it changed, and 2 if that cannot be decided. With --fleet many

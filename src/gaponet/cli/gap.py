@@ -67,7 +67,7 @@ def _show_steps(out: Out, result: Mapping[str, Any]) -> None:
         rows,
     )
     steps = list(result["left"])
-    out.table("Mean |error| of each joint after each step, mrad", ["joint", *map(title, steps), *(end for end, _ in known)], [
+    out.table("Mean |error| by joint and step, mrad", ["joint", *map(title, steps), *(end for end, _ in known)], [
         [name, *(mrad(part["left"][s]) for s in steps), *map(mrad, rest(part)[: len(known)])]
         for name, part in joints.items()
     ])  # fmt: skip

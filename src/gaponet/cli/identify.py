@@ -139,7 +139,7 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
             screen.say(f"  {warning}", "warning", "yellow")
     if unknown and not details:
         joints = abbreviate([w.partition(":")[0] for w in unknown])
-        screen.say(f"some parameters of {joints} are not determined (--details lists them); use all values of a joint together")
+        screen.say(f"some parameters of {joints} are not determined (--details). Use all values of a joint together")
 
 
 def _cell(joint: dict[str, float], errors: dict[str, float], field: str) -> str:

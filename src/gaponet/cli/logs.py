@@ -135,8 +135,8 @@ def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
             implausible[channel].append((entry.meta.motion, rows))
     lines = [f"{', '.join(motions)}: {cut}; what follows was left out" for cut, motions in cuts.items()]
     lines += [
-        f"{channel} is implausible in {sum(rows['rows'] for _, rows in counts)} rows of {len(counts)} recordings (first "
-        f"{counts[0][1]['worst']:.4g} of {counts[0][1]['joints'][0]} in {counts[0][0]}): "
+        f"{channel} is implausible in {sum(rows['rows'] for _, rows in counts)} rows of {len(counts)} recordings "
+        f"(first {counts[0][1]['worst']:.4g} of {counts[0][1]['joints'][0]} in {counts[0][0]}): "
         f"{', '.join(dict.fromkeys(rows['done'] for _, rows in counts))}; --strict refuses them"
         for channel, counts in implausible.items()
     ]
@@ -193,7 +193,7 @@ def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, Joi
         rows.append([name, median, at_rest, _signed_mrad(joint.tracking_offset) if joint else "–"])
     out.table("Lag and errors at rest", ["joint", "lag, ms", "error at rest, mrad", "offset, mrad"], rows)
     if offsets:
-        out.say("error at rest: state − command ± stiction, mean of both directions. offset: without the sag that kp explains")
+        out.say("error at rest: state − command ± stiction, both directions. offset: without the sag that kp explains")
 
 
 def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:

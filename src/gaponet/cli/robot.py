@@ -203,11 +203,11 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple
     else:
         out.say(f": {spec.name} compiles, holds its home and is stable", "ok", "bold green")
     warnings = [f.message for f in findings if f.level in bad]
-    return as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
+    return _as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
                                 "findings": [vars(f) for f in findings]}  # fmt: skip
 
 
-def as_dict(spec: RobotSpec) -> dict[str, Any]:
+def _as_dict(spec: RobotSpec) -> dict[str, Any]:
     """The check as a dictionary that JSON can hold."""
     return {
         "name": spec.name, "dt": spec.dt, "timestep": spec.timestep,

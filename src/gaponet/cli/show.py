@@ -30,7 +30,7 @@ def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GRO
         result["robot"],
     )
     whole = totals(methods)
-    out.show("Error of each method", ResultTable(whole.name, whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
+    out.show("Error of each method", ResultTable("", whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
     for group in groups:
         if group not in ("payload", "unit") or len(methods["nominal"][f"by_{group}"]) > 1:
             out.show(f"Mean |error| by {group}{UNITS.get(group, '')}", by_group(methods, group))
