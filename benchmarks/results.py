@@ -14,7 +14,6 @@ import argparse
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -23,13 +22,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-import gaponet as gp
-from gaponet.data.store import Dataset
-from gaponet.experiments.real.methods import FittedSim, identified
 from gaponet.experiments.real.page import write_page
-from gaponet.experiments.real.questions import Question, train_val
-from gaponet.nn.artifact import GapModel
-from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "results"
@@ -40,34 +33,12 @@ README_COLUMNS = (("nominal simulator",), ("delay + offset",), ("plain script", 
 TAIL = 60  # lines of an output on the page
 
 
-def network(question: Question) -> FittedSim:
-    """Train the candidates of `gaponet train` on top of identification, briefly; validation chooses. Seed 0."""
-    assert question.work is not None
-    robot, run = identified(question).robot, question.work / "network"
-    shutil.rmtree(run, ignore_errors=True)
-    data, parts = Dataset.create(run / "recordings", robot), dict[str, dict[str, str]](test={})
-    for part, sequences in zip(("train", "val"), train_val(question), strict=True):
-        hashes = {s.content_hash(): s for s in sequences}
-        entries = [data.find(h) or data.append(s, content_hash=h) for h, s in hashes.items()]
-        parts[part] = {e.id: e.hash for e in entries}
-    (run / "parts.json").write_text(json.dumps({"parts": parts}))
-    start = PretrainingConfig(rounds=2, num_envs=128, steps=250, gradient_steps=600, rows=30_000)
-    config = TrainConfig(pretraining=start, mixed_gains=True, split=str(run / "parts.json"))
-    gp.train(data, robot=robot, out=run / "run", model="auto", budget="64000", config=config)
-    model = GapModel.load(run / "run")
-    return FittedSim(robot, model.corrector(robot), note=model.card["model"]["kind"])
-
-
 def measure(name: str, command: str, work: Path) -> bool:
     """Run a step; store its answer if it ended well, and return whether it did."""
     began, log = time.monotonic(), work / "answers" / f"{name}.txt"
     git = lambda *words: subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout  # noqa: E731
     commit = git("rev-parse", "--short=8", "HEAD").strip() + "+" * bool(git("status", "--porcelain", "-uno"))
-    (work / "bin").mkdir(exist_ok=True)
-    for word, what in (("gaponet", f"{sys.executable} -m gaponet"), ("python", sys.executable)):
-        (work / "bin" / word).write_text(f'#!/bin/sh\nexec {what} "$@"\n')
-        (work / "bin" / word).chmod(0o755)
-    paths = {"PATH": f"{work / 'bin'}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT / "src")}
+    paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT / "src")}
     with log.open("w") as file:
         code = subprocess.run(command, shell=True, cwd=ROOT, stdout=file, env=os.environ | paths).returncode
     answer = {"commit": commit, "date": date.today().isoformat(), "seconds": round(time.monotonic() - began)}
@@ -80,23 +51,29 @@ def measure(name: str, command: str, work: Path) -> bool:
 def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     """Write the pages of real robots and of steps, and README's table."""
     result = json.loads((PAGES / "real.json").read_text(encoding="utf-8"))
+    rows = {(r["set"], r["question"], r["method"]): r for r in result["rows"]}
     for answer in (a for name, a in answers.items() if name.startswith("real_")):
         new = json.loads(answer["output"])
-        sets = {r["set"] for r in new["rows"]}
-        rows = [r | {"method": LISTED["titles"].get(r["method"], r["method"])} for r in new["rows"]]
-        result["rows"] = [r for r in result["rows"] if r["set"] not in sets] + rows
-        result["measured"] |= dict.fromkeys(sets, f"{answer['commit']}, {answer['date']}")
+        for r in new["rows"]:
+            r |= {"method": LISTED["titles"].get(r["method"], r["method"]), "measured": measured(answer)}
+            rows[r["set"], r["question"], r["method"]] = r
         result |= {key: result[key] | new[key] for key in ("labels", "seconds")}
-    result["rows"].sort(key=lambda r: [*result["cards"]].index(r["set"]))
+    order = [*result["cards"]]
+    result["rows"] = sorted(rows.values(), key=lambda r: order.index(r["set"]))
     write_page(result, PAGES)
+    made: dict[str, dict[str, list[str]]] = {}
+    for r in result["rows"]:
+        made.setdefault(r["measured"], {}).setdefault(r["set"], []).append(r["method"])
     with (PAGES / "real.md").open("a", encoding="utf-8") as file:
-        file.write("\n| set | commit, date |\n| --- | --- |\n")
-        file.writelines(f"| {name} | {text} |\n" for name, text in result["measured"].items())
+        file.write("\n| measured | set: rows |\n| --- | --- |\n")
+        for when, sets in made.items():
+            text = "; ".join(f"{name}: {', '.join(dict.fromkeys(methods))}" for name, methods in sets.items())
+            file.write(f"| {when} | {text} |\n")
     page = ["# Steps of `make results`\n", "Commands of `benchmarks/results.py`, and when each was last run by it.\n"]
-    page.append("| step | command | seeds | commit | date | minutes |\n| --- | --- | --- | --- | --- | ---: |")
+    page.append("| step | command | seeds | measured | minutes |\n| --- | --- | --- | --- | ---: |")
     for name, (command, seeds) in STEPS.items():
         a = answers.get(name)
-        done = f"{a['commit']} | {a['date']} | {a['seconds'] / 60:.1f}" if a else "– | – | –"
+        done = f"{measured(a)} | {a['seconds'] / 60:.1f}" if a else "– | –"
         page.append(f"| {name} | `{filled(command, Path('WORK'), Path('DATA'))}` | {seeds} | {done} |")
     for name, a in answers.items():
         if not name.startswith("real_"):
@@ -108,13 +85,22 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     (ROOT / "README.md").write_text(table.sub(lambda m: m[1] + text, readme), encoding="utf-8")
 
 
+def measured(answer: dict[str, Any]) -> str:
+    return f"{answer['commit']}, {answer['date']}"
+
+
 def readme_rows(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the lines of README's table: the mean error of each column's method, of two rivals the better one."""
-    errors = {(f"{r['set']}, {r['question']}", r["method"]): f"{r['mrad']:.2f}" for r in rows}
+    """Return the lines of README's table: errors of each column's method, of two rivals the better one."""
+    errors = {
+        (f"{r['set']}, {r['question']}", r["method"]): (r["mrad"], f" (from {x})" if (x := r.get("from_mrad")) else "")
+        for r in rows
+    }
     lines = []
     for key, label in LISTED["readme"].items():
-        cells = [[errors[key, m] for m in methods if (key, m) in errors] for methods in README_COLUMNS]
-        lines.append(f"| {label} | " + " | ".join(min(c, key=float, default="–") for c in cells) + " |\n")
+        cells = [
+            min((errors[key, m] for m in methods if (key, m) in errors), default=None) for methods in README_COLUMNS
+        ]
+        lines.append(f"| {label} | {' | '.join(f'{c[0]:.2f}{c[1]}' if c else '–' for c in cells)} |\n")
     return lines
 
 

@@ -242,8 +242,8 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
     judges = "were not fitted" if uncertainty.validated else "were fitted, since no others were there"
     lines.append(
         f"the RMS error of motions that {judges} is {_root_mean_square(j.residual_rms for j in joints.values()):.2f} "
-        f"mrad ({worst} {1e3 * joints[worst].residual_rms:.2f}); the uncertainty of the values explains "
-        f"{_root_mean_square(j.parameter_rms for j in joints.values()):.2f}, the servo model's limits the rest"
+        f"mrad ({worst} {1e3 * joints[worst].residual_rms:.2f}). The standard errors predict "
+        f"{_root_mean_square(j.parameter_rms for j in joints.values()):.2f}; more than that is due to the servo model"
     )
     return lines
 
