@@ -53,7 +53,7 @@ def main(arguments: list[str]) -> int:
     allowed = tomllib.loads(LIMITS.read_text(encoding="utf-8")) if LIMITS.is_file() else {}
     found = {name: [len(texts) for texts in pages[name]] for name in sorted(pages)}
     if "--write" in arguments:
-        lowest = {n: [min(x) for x in zip(c, allowed.get(n, c), strict=True)] for n, c in found.items()}
+        lowest = {n: [min(x) for x in zip(c, allowed.get(n, (0, 0, 0)), strict=True)] for n, c in found.items()}
         lines = [f'"{name}" = {counts}' for name, counts in lowest.items() if any(counts)]
         LIMITS.write_text(f"# {', '.join(COLUMNS)}: see .ci/prose.py.\n" + "\n".join(lines) + "\n", encoding="utf-8")
         return 0
