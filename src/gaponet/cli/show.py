@@ -10,16 +10,16 @@ from gaponet.cli.out import Out
 from gaponet.report.tables import by_group, totals
 from gaponet.report.verdict import next_step, verdict
 
-UNITS = {"payload": ", kg", "horizon": ", s"}
+UNITS = {"payload": ", kg", "horizon": " (time since the start, s)"}
 GROUPS = ("joint", "payload", "unit", "horizon", "motion")
 SHOWN = 4  # columns of the totals that a screen has room for
 
 
-def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None, reported: bool = False) -> None:
+def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None) -> None:
     """Print the verdict and the next command. The folder is that of a robot or a run, or None."""
     for sentence in verdict(methods):
         out.say(sentence)
-    out.next(next_step(methods, dataset, folder, reported))
+    out.next(next_step(methods, dataset, folder))
 
 
 def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GROUPS) -> None:

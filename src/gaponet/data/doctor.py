@@ -48,7 +48,7 @@ class DoctorResult:
         texts = [f"{n} {level}{'s' * (n > 1)}" for level, n in count.items() if n]
         if count["error"]:
             return f"Do not train on this yet: {' and '.join(texts)}."
-        return f"Usable. Read the {texts[0]} first." if texts else "Good: no error and no warning."
+        return f"Usable. Read the {texts[0].removeprefix('1 ')} first." if texts else "Good: no error and no warning."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""

@@ -28,7 +28,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How long after the command does each joint move?"""
     lags = fast_lags(surveys, robot)
     if not lags:
-        text = f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag cannot be told from stiction"
+        text = f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag and stiction cannot be separated"
         yield Finding("note", "lag", f"{text}; add fast motions")
         return
     every = np.concatenate(list(lags.values()))
@@ -36,8 +36,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     low, high = every.min(), every.max()
     text = (
         f"state follows command after {np.median(every) * 1e3:.0f} ms ({low * 1e3:.0f}–{high * 1e3:.0f} over joints and"
-        f" motions at {FAST_COMMAND_RAD_S} rad/s or faster), {low / period:.0f} to {high / period:.0f} periods: "
-        "the history of a network must be longer"
+        f" motions at {FAST_COMMAND_RAD_S} rad/s or faster), {low / period:.0f} to {high / period:.0f} periods"
     )
     expected = _expected_lag(robot)
     sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
@@ -101,13 +100,13 @@ def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         )
         more = f"; {len(sagging) - 4} more joints above {MIN_SAG_RAD * 1e3:.0f}" if len(sagging) > 4 else ""
         text = (
-            f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. ± is stiction: so far "
-            "to either side of it a joint stays stuck"
+            f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. Within ± "
+            "(stiction) a joint can stop anywhere"
         )
         values = {f"{p:g} kg": {name: e[name].middle for name in sagging} for p, e in errors.items()}
         yield Finding("note", "sag", text, tuple(sagging), values)
     elif all(e.up + e.down == 0 for by_joint in errors.values() for e in by_joint.values()):
-        text = "the robot never rests under a constant command: sag and offsets cannot be told; add holds"
+        text = "the robot never rests under a constant command: sag and offsets are not determined; add holds"
         yield Finding("note", "sag", text)
 
 
