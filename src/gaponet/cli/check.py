@@ -17,7 +17,7 @@ from gaponet.robot.spec import load_robot
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 if TYPE_CHECKING:
-    from gaponet.sysid.evidence.drift import Drift, ParameterChange
+    from gaponet.sysid.evidence.drift import ParameterChange
 
 Robot = Annotated[
     Folder,
@@ -64,9 +64,9 @@ def check(
     named, count = {m.joint for m in drift.moved}, f"{made.recordings} recording{'s' * (made.recordings != 1)}"
     screen.table(
         f"Largest change of each joint ({count}, {drift.seconds:.0f} s)",
-        ["joint", "parameter", "change", "standard errors", "effect, mrad", "threshold, mrad", "verdict"],
+        ["joint", "parameter", "change", "standard errors", "effect, mrad", "verdict"],
         [
-            _row(m, uncertainty, drift, m.joint in named)
+            _row(m, uncertainty, m.joint in named)
             for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))
         ],
     )
@@ -108,10 +108,8 @@ def _check_fleet(
         raise SystemExit(1)
 
 
-def _row(m: ParameterChange, uncertainty: ParameterUncertainty, drift: Drift, counts: bool) -> list[str]:
+def _row(m: ParameterChange, uncertainty: ParameterUncertainty, counts: bool) -> list[str]:
     from gaponet.sysid.uncertainty import format_change
 
-    least = drift.min_effect.get(m.joint) or sum(drift.min_effect.values()) / len(drift.min_effect)
     by = format_change(m.field, m.by, uncertainty, m.joint)
-    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * least:.2f}",
-            "changed" if counts else "not significant"]  # fmt: skip
+    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", "changed" if counts else "same"]

@@ -235,8 +235,8 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
         logs = f"{len(s['logs'])} log{'s' * (len(s['logs']) != 1)}"
         lines.append(f"{s['made_by']}: {logs} of {s['unit']}, {s['seconds']:.0f} s, {days}")
     for joint in uncertainty.joints:
-        for group in summarize(uncertainty, joint).sets:
-            lines.append(f"{joint}: the logs determine only {' and '.join(group)} together; do not change one alone")
+        for *some, last in summarize(uncertainty, joint).sets:
+            lines.append(f"{joint}: the logs determine only {', '.join(some)} and {last} together; change none alone")
     joints = uncertainty.joints
     worst = max(joints, key=lambda j: joints[j].residual_rms)
     judges = "were not fitted" if uncertainty.validated else "were fitted, since no others were there"
