@@ -136,3 +136,8 @@ def test_every_step_of_the_results_page_is_a_command_of_make_results():
     for cell in cells:
         assert any(name in steps for name in re.split(r"[ ,|]+", cell)), cell
     assert set(re.findall(r"[sS]tep ([a-z]\w+_\w+)", page)) <= steps.keys()
+
+
+@pytest.mark.parametrize(("page", "limit"), [("docs/results.md", 1500), ("docs/results/did-not-work.md", 1000)])
+def test_the_results_stay_short(page, limit):
+    assert len(re.findall(r"\S*\w\S*", text(page))) <= limit
