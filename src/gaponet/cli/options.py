@@ -49,7 +49,8 @@ def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
     def decorate(command: Command) -> Command:
         own, theirs = (inspect.getdoc(f) or "" for f in (command, function))
         arguments = theirs.partition("Args:\n")[2].partition("\n\n")[0]
-        command.__doc__ = own + ("\n" if "Args:\n" in own else "\n\nArgs:\n") + arguments
+        about, _, explained = own.partition("Args:\n")
+        command.__doc__ = f"{about.rstrip()}\n\nArgs:\n{arguments}\n{explained}"  # of two explanations the last counts
         return command
 
     return decorate
