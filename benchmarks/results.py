@@ -67,7 +67,7 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     with (PAGES / "real.md").open("a", encoding="utf-8") as file:
         file.write("\n| measured | set: rows |\n| --- | --- |\n")
         for when, sets in made.items():
-            text = "; ".join(f"{name}: {', '.join(dict.fromkeys(methods))}" for name, methods in sets.items())
+            text = "; ".join(f"{name}: {' / '.join(dict.fromkeys(methods))}" for name, methods in sets.items())
             file.write(f"| {when} | {text} |\n")
     page = ["# Steps of `make results`\n", "Commands of `benchmarks/results.py`, and when each was last run by it.\n"]
     page.append("| step | command | seeds | measured | minutes |\n| --- | --- | --- | --- | ---: |")

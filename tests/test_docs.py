@@ -1,5 +1,7 @@
 """The docs say what the code is: files, public names, defaults; and the README stands alone."""
 
+import importlib
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -141,3 +143,17 @@ def test_every_step_of_the_results_page_is_a_command_of_make_results():
 @pytest.mark.parametrize(("page", "limit"), [("docs/results.md", 1500), ("docs/results/did-not-work.md", 1000)])
 def test_the_results_stay_short(page, limit):
     assert len(re.findall(r"\S*\w\S*", text(page))) <= limit
+
+
+def test_the_tables_of_real_robots_are_those_of_the_measured_rows(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    rows = json.loads((ROOT / "docs/results/real.json").read_text(encoding="utf-8"))["rows"]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for line in importlib.import_module("results").readme_rows(rows):
+        assert line in readme
+    page = text("docs/results.md").partition("### Causes")[0]
+    shares = {r["set"]: f"{r['of_nominal']:.2f}" for r in rows if r["method"] == "identification"}
+    new = {"h1_2": next(r for r in rows if (r["set"], r["method"]) == ("h1_2", "identification"))["of_nominal"]}
+    for name in ("so101", "g1_arms", "go2", "go2_other_lab", "aliengo", "z1", "xl330"):
+        assert f" {shares[name]}" in page, name
+    assert f"new commands {new['h1_2']:.2f}" in page
