@@ -159,7 +159,7 @@ def test_doctor_ends_with_a_verdict_and_what_comes_next_or_prints_one_json_objec
     capsys.readouterr()
     assert main(["doctor", str(tmp_path / "data")]) == 0
     told = capsys.readouterr().out
-    assert "so101, 1 sequences, 1 motions" in told
+    assert "so101, 1 recordings, 1 motions" in told
     verdict, next_ = told.strip().split("\n")[-2:]
     assert verdict.startswith("Usable. Read the")
     assert next_ == f"next: gaponet gap {tmp_path / 'data'}"

@@ -425,7 +425,7 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
     dataset = Dataset.create(tmp_path / "data", arm)
     dataset.append(arm_sequence(arm, *good()))
     dataset.append(arm_sequence(arm, *good(), payload=1.5, unit="b"))
-    assert DoctorResult.inventory(dataset) == "2 sequences, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
+    assert DoctorResult.inventory(dataset) == "2 recordings, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
 
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):

@@ -89,7 +89,7 @@ class DoctorResult:
         virtual = sum(e.meta.virtual for e in dataset.entries)
         kind = f", {virtual} of them VIRTUAL" if virtual else ""
         return (
-            f"{len(dataset)} sequences{kind}, {motions} motions, {dataset.hours() * 60:.1f} min; "
+            f"{len(dataset)} recordings{kind}, {motions} motions, {dataset.hours() * 60:.1f} min; "
             f"units {', '.join(units)}; payloads {', '.join(f'{p:g}' for p in payloads)} kg"
         )
 
