@@ -31,7 +31,7 @@ def paragraphs(page: str) -> list[str]:
     page = re.sub(r"^(    .*|\s*\|.*|#.*|:::.*|</?\w.*)$", "", page, flags=re.MULTILINE)
     page = re.sub(r"^\s*([-*]|\d+\.) ", "\n\n", page, flags=re.MULTILINE)
     page = re.sub(r"!?\[((?:[^][]|\[[^]]*\])*)\]\([^)]*\)|<http[^>]*>", lambda m: m[1] or "address", page)
-    page = re.sub(r"`[^`]*`", "code", page)
+    page = re.sub(r"`[^`]*`", "Code", page)  # a sentence may begin with it
     return [" ".join(p.replace("**", "").split()) for p in re.split(r"\n\s*\n", page) if p.strip()]
 
 
