@@ -25,9 +25,6 @@ def gap(
     """How far is the simulator from the robot, by joint and payload?
 
     Without --robot the nominal simulator is measured. With an identified robot the causes of the error are shown.
-
-    Args:
-        executor: Where they are replayed: local, ray or ray:ADDRESS (docs/scale.md).
     """
     out = Out(json)
     data, spec = open_dataset(dataset, robot, run)
