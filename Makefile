@@ -1,4 +1,4 @@
-# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint and types. make site: docs/ as a site.
+# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint, types, sizes and prose. make site: docs/ as a site.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test slow faults peers engines buckets browser adversary tournament fuzz hostile kills lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test slow faults peers engines buckets browser adversary tournament results fuzz hostile kills lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -69,6 +69,12 @@ adversary: setup
 tournament: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/tournament.py tournament_work --robots 10 --small
 
+# The numbers of README.md and docs/results.md, one command after the other, resumable: a day. STEPS="tournament backlash"
+# runs only these; STEPS=--list shows all, and when each ran.
+STEPS ?=
+results: setup
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/results.py results_work $(STEPS)
+
 # Changed files at random into everything that reads files: a quarter of an hour; counts as JSON, exit code 1 where one
 # ends in anything but one clear error. FUZZ="--only sage --mutants 1000 --keep failed" looks at one reader.
 FUZZ ?=
@@ -99,6 +105,7 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python .ci/size.py
+	$(BIN)/python .ci/prose.py
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-issue-forms .github/ISSUE_TEMPLATE/*.yml
 	$(BIN)/zizmor --offline --quiet .github/workflows

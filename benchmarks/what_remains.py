@@ -3,7 +3,7 @@
     python benchmarks/what_remains.py DATASET ROBOT
 
 Rows of the test motions. "At the table": the command would bring a tip below the table of robot.toml. "At rest": the
-joint's recorded speed is below 0.02 rad/s over 0.2 s. docs/results/identify_so101.md has the real SO-101's.
+joint's recorded speed is below 0.02 rad/s over 0.2 s. docs/results.md has the real SO-101's.
 """
 
 from __future__ import annotations

@@ -1,6 +1,9 @@
 """The docs say what the code is: files, public names, defaults; and the README stands alone."""
 
+import importlib
+import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -16,6 +19,7 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "gaponet"
 FOLDERS = sorted(p.name for p in SOURCE.iterdir() if p.is_dir() and any(p.glob("*.py")))
 PAGES = sorted((ROOT / "docs").glob("*.md"))
+ALL_PAGES = [*PAGES, *sorted((ROOT / "docs/results").glob("*.md"))]
 MODEL, TRAIN, START = ModelConfig(), TrainConfig(), TRAINING.pretraining
 ONLINE = ("https://github.com/gaponet/gaponet/blob/main/", "https://raw.githubusercontent.com/gaponet/gaponet/main/")
 
@@ -95,7 +99,7 @@ def test_every_link_of_the_readme_is_absolute_and_leads_to_a_file_that_is_there(
         assert (ROOT / link.removeprefix(home)).is_file(), link
 
 
-@pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "docs/results").glob("*.md"))], ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", ALL_PAGES, ids=lambda page: page.stem)
 def test_every_picture_of_a_page_is_there(page):
     """The strict build of the site looks at links alone."""
     for picture in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
@@ -106,3 +110,50 @@ def test_the_navigation_of_the_site_has_every_page():
     site = (ROOT / "zensical.toml").read_text(encoding="utf-8")
     for page in PAGES:
         assert f'"{page.name}"' in site, page.name
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings: lower case, no punctuation, hyphens for spaces."""
+    heads = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[ -]+", "-", re.sub(r"[^\w\s-]", "", head.lower())).strip("-") for head in heads}
+
+
+def test_every_link_of_a_page_leads_to_a_page_and_a_heading_that_are_there():
+    for page in ALL_PAGES:
+        for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            file, _, heading = link.partition("#")
+            if "://" in link or link.startswith("mailto:"):
+                continue
+            target = page.parent / file if file else page
+            assert target.exists(), f"{page.name}: {link}"
+            assert not heading or heading in anchors(target), f"{page.name}: {link}"
+
+
+def test_every_step_of_the_results_page_is_a_command_of_make_results():
+    page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    steps = tomllib.loads((ROOT / "benchmarks/results.toml").read_text(encoding="utf-8"))["steps"]
+    tables = [t for t in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE) if "| step" in t.partition("\n")[0]]
+    cells = [row.strip("|\n").rpartition("|")[2] for t in tables for row in t.splitlines()[2:]]
+    assert len(cells) > 15
+    for cell in cells:
+        assert any(name in steps for name in re.split(r"[ ,|]+", cell)), cell
+    assert set(re.findall(r"[sS]tep ([a-z]\w+_\w+)", page)) <= steps.keys()
+
+
+@pytest.mark.parametrize(("page", "limit"), [("docs/results.md", 1500), ("docs/results/did-not-work.md", 1000)])
+def test_the_results_stay_short(page, limit):
+    assert len(re.findall(r"\S*\w\S*", text(page))) <= limit
+
+
+def test_the_tables_of_real_robots_are_those_of_the_measured_rows(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    rows = json.loads((ROOT / "docs/results/real.json").read_text(encoding="utf-8"))["rows"]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for line in importlib.import_module("results").readme_rows(rows):
+        assert line in readme
+    page = text("docs/results.md").partition("### Causes")[0]
+    shares = {r["set"]: f"{r['of_nominal']:.2f}" for r in rows if r["method"] == "identification"}
+    new = {"h1_2": next(r for r in rows if (r["set"], r["method"]) == ("h1_2", "identification"))["of_nominal"]}
+    for name in ("so101", "g1_arms", "go2", "go2_other_lab", "aliengo", "z1", "xl330"):
+        assert f" {shares[name]}" in page, name
+    assert f"new commands {new['h1_2']:.2f}" in page

@@ -60,3 +60,14 @@ def test_without_a_checkpoint_onnx_cannot_be_written_again(run, capsys):
     (run / "checkpoint.pt").unlink()
     assert main(["export", str(run)]) == 2
     assert "no checkpoint.pt" in capsys.readouterr().err
+
+
+def test_the_help_explains_every_form_and_breaks_lines_at_the_edge_of_the_screen_only(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main(["export", "--help"])
+    lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
+    text = " ".join(lines)
+    for form in ("mjcf (plain MuJoCo)", "onnx (model.onnx", "torch (delta.pt2", "actuator-net (one", "lerobot: add"):
+        assert form in text
+    assert "urdf (damping, friction, effort limits)" in text

@@ -37,12 +37,12 @@ def logs(tmp_path):
 def test_import_says_what_came_in_and_that_nothing_was_applied_and_the_same_again_adds_nothing(logs, tmp_path, capsys):
     assert import_so101(logs, tmp_path / "data") == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "1 sequences, 0.1 min at 49.85 Hz, robot so101, unit lab, payload 0 kg" in told
+    assert "1 recordings, 0.1 min at 49.85 Hz, robot so101, unit lab, payload 0 kg" in told
     assert "nothing was applied to the data" in told
     assert "next: gaponet doctor" in told
     assert (tmp_path / "data" / "offsets.json").is_file()
     assert import_so101(logs, tmp_path / "data") == 0
-    assert "1 there already, 0 added" in capsys.readouterr().out
+    assert "1 recordings were imported before, 0 are new" in capsys.readouterr().out
     assert len(Dataset(tmp_path / "data")) == 1
 
 
@@ -142,7 +142,7 @@ def test_a_note_about_joints_begins_a_word_of_its_own(arm, tmp_path, capsys):
     table = tmp_path / "wave.csv"
     table.write_text(table_text({k: v for k, v in arm_columns().items() if "elbow" not in k}))
     assert import_arm(table, arm, tmp_path / "data", *SI) == 0
-    assert "note  elbow: not in every recording" in capsys.readouterr().out
+    assert "note  elbow: missing in some recordings" in capsys.readouterr().out
 
 
 def test_a_table_asks_for_its_units(arm, tmp_path, capsys):
@@ -159,7 +159,7 @@ def test_doctor_ends_with_a_verdict_and_what_comes_next_or_prints_one_json_objec
     capsys.readouterr()
     assert main(["doctor", str(tmp_path / "data")]) == 0
     told = capsys.readouterr().out
-    assert "so101, 1 sequences, 1 motions" in told
+    assert "so101, 1 recordings, 1 motions" in told
     verdict, next_ = told.strip().split("\n")[-2:]
     assert verdict.startswith("Usable. Read the")
     assert next_ == f"next: gaponet gap {tmp_path / 'data'}"

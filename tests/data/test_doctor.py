@@ -342,7 +342,7 @@ def test_rows_at_12_to_40_hz_are_no_error_of_clocks_and_say_which_times_are_not_
     assert "apart, and shorter delays are not known" in data.entries[0].meta.notes["why_resampled"]
     diagnosis = DoctorResult.of(data, arm)
     assert [f.message for f in diagnosis.findings if f.level == "error" or f.check in ("copied", "averaged")] == [
-        "commands come before states"
+        "no state comes before its command"
     ]
     assert "cannot be told between such rows" in found(diagnosis, "jitter", "warning").message
 
@@ -425,7 +425,7 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
     dataset = Dataset.create(tmp_path / "data", arm)
     dataset.append(arm_sequence(arm, *good()))
     dataset.append(arm_sequence(arm, *good(), payload=1.5, unit="b"))
-    assert DoctorResult.inventory(dataset) == "2 sequences, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
+    assert DoctorResult.inventory(dataset) == "2 recordings, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
 
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):

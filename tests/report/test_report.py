@@ -123,6 +123,6 @@ def test_an_identified_robot_has_a_page_without_training(evaluated, tmp_path):
     save_robot(arm.with_servos({"elbow": {"kp": 11.0}}), tmp_path / "fitted")
     page = write_report(tmp_path / "fitted", evaluated.parent / "data").read_text()
     assert "After identification the error is" in page
-    assert "not a held-out result" in page  # the folder does not say what it was identified from
+    assert "not a test result" in page  # the folder does not say what it was identified from
     assert "GAPONet" not in page
     assert "<h2>Training</h2>" not in page

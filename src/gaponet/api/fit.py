@@ -67,7 +67,7 @@ def identify(
         robot: Start of the fit, if not the robot that the dataset keeps.
         like: Identified robot whose servos are the start and the prior, by joint name, mirrored name (left, right)
             or type of servo: another arm, another unit, another robot.
-        units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
+        units: Only these, pooled: one set of parameters for all of them; default: all others than --holdout-units.
         holdout_units: Units to leave out, as in training.
         terms: Terms of the servo model to try; each is accepted only if validation motions improve. Default: stribeck
             and load, after limit if a joint reaches its stated torque limit; then backlash where a gap makes the

@@ -108,7 +108,7 @@ def evaluate(
         motions: Only these.
         robot: Another robot than the one that the dataset keeps. If it is not the simulator that the run was trained
             in, it is shown as it is, and with the run transferred into it (deploy/transfer.py).
-        units: Only recordings of these, such as the one held out from training.
+        units: Only recordings of these, such as the one left out of training.
 
     Raises:
         DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or

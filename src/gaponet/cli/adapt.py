@@ -59,8 +59,8 @@ def adapt(
                 progress=update,
             )  # fmt: skip
         screen.say(
-            f"{mrad(made.before)} → {mrad(made.after)} mrad over {made.recordings} recording(s) of unit {made.unit_id} "
-            f"({made.after / made.before:.2f}); robot folder {out}"
+            f"error {mrad(made.before)} → {mrad(made.after)} mrad ({made.after / made.before:.2f} of it) on "
+            f"{made.recordings} recording(s) of unit {made.unit_id}; robot folder {out}"
         )
         _show(screen, made)
         screen.next(f"gaponet run --motion FILE --robot {robot_argument(out)} --compensate")
@@ -86,6 +86,6 @@ def _show(screen: Out, made: AdaptResult) -> None:
     from gaponet.robot.servo_fields import SERVO_FIELDS
     from gaponet.sysid.adapt import FIELDS
 
-    screen.table(f"Unit {made.unit_id}", ["joint", *(SERVO_FIELDS[f].heading for f in FIELDS)], [
+    screen.table(f"Servos of unit {made.unit_id}", ["joint", *(SERVO_FIELDS[f].heading for f in FIELDS)], [
         [j, *(f"{v[f] * SERVO_FIELDS[f].factor:.3g}" for f in FIELDS)] for j, v in made.servos.items()
     ])  # fmt: skip

@@ -17,7 +17,7 @@ from gaponet.robot.spec import load_robot
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 if TYPE_CHECKING:
-    from gaponet.sysid.evidence.drift import Drift, ParameterChange
+    from gaponet.sysid.evidence.drift import ParameterChange
 
 Robot = Annotated[
     Folder,
@@ -35,20 +35,10 @@ Logs = Annotated[
 
 @like(api.check)
 def check(
-    robot: Robot,
-    logs: Logs,
-    unit: Unit = "",
-    motions: Motions = (),
-    payload_mass: float | None = None,
-    threads: int = 0,
-    fleet: Flag = False,
-    out: Path | None = None,
-    night: str = "",
-    adapt: bool = True,
-    executor: str = "local",
-    workers: int = 0,
-    json: Json = False,
-) -> None:
+    robot: Robot, logs: Logs, unit: Unit = "", motions: Motions = (), payload_mass: float | None = None,
+    threads: int = 0, fleet: Flag = False, out: Path | None = None, night: str = "", adapt: bool = True,
+    executor: str = "local", workers: int = 0, json: Json = False,
+) -> None:  # fmt: skip
     """Is this still the robot that was identified? What changed?
 
     The exit code is 0 if the robot is unchanged, 1 if it changed, and 2 if that cannot be decided. With --fleet many
@@ -73,15 +63,15 @@ def check(
     drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
     named, count = {m.joint for m in drift.moved}, f"{made.recordings} recording{'s' * (made.recordings != 1)}"
     screen.table(
-        f"{count}, {drift.seconds:.0f} s: largest change of each joint",
-        ["joint", "parameter", "change", "standard errors", "effect, mrad", "least that counts, mrad", "verdict"],
+        f"Largest change of each joint ({count}, {drift.seconds:.0f} s)",
+        ["joint", "parameter", "change", "standard errors", "effect, mrad", "verdict"],
         [
-            _row(m, uncertainty, drift, m.joint in named)
+            _row(m, uncertainty, m.joint in named)
             for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))
         ],
     )
     for a in drift.against:
-        what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} deviations"
+        what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} standard errors"
         screen.say(f"  {what}", "warning", "yellow")
     screen.say(f"{made.verdict}: {made.advice.replace('ROBOT', robot.as_posix()).replace('LOGS', logs)}")
     screen.result(made.to_dict())
@@ -118,10 +108,8 @@ def _check_fleet(
         raise SystemExit(1)
 
 
-def _row(m: ParameterChange, uncertainty: ParameterUncertainty, drift: Drift, counts: bool) -> list[str]:
+def _row(m: ParameterChange, uncertainty: ParameterUncertainty, counts: bool) -> list[str]:
     from gaponet.sysid.uncertainty import format_change
 
-    least = drift.min_effect.get(m.joint) or sum(drift.min_effect.values()) / len(drift.min_effect)
     by = format_change(m.field, m.by, uncertainty, m.joint)
-    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * least:.2f}",
-            "changed" if counts else "not significant"]  # fmt: skip
+    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", "changed" if counts else "same"]

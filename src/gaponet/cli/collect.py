@@ -25,7 +25,7 @@ def collect(
 ) -> None:
     """Record motions of VIRTUAL robots into a dataset.
 
-    Run again after an interruption: what is there is kept, what is missing is recorded, and the result is the same.
+    Run again after an interruption: recordings that exist stay, missing ones are recorded, and the result is the same.
     """
     screen = Out(json)
     with progress_bar("virtual recordings") as update:

@@ -24,10 +24,7 @@ def gap(
 ) -> None:  # fmt: skip
     """How far is the simulator from the robot, by joint and payload?
 
-    Sequences without a simulated replay are replayed in the nominal simulator first, and the replays stored.
-
-    Args:
-        executor: Where they are replayed: local, ray or ray:ADDRESS (docs/scale.md).
+    Without --robot the nominal simulator is measured. With an identified robot the causes of the error are shown.
     """
     out = Out(json)
     data, spec = open_dataset(dataset, robot, run)
@@ -54,7 +51,7 @@ def _show_steps(out: Out, result: Mapping[str, Any]) -> None:
     rest = lambda part: (part["floor"]["both"], part["unexplained"])  # noqa: E731
     removed = {s: [*map(mrad, result["removed"].get(s, ()))] or ["", ""] for s in result["left"]}
     one = list(removed.values())[-1][1] == mrad(None)  # motion: no standard error
-    columns = ["removed"] if one else ["removed", "± over motions"]
+    columns = ["reduced by, mrad"] if one else ["reduced by, mrad", "± standard error"]
     rows = [
         [title(s), mrad(left), *removed[s][: len(columns)], *(mrad(p[s]) for p in loads.values())]
         for s, left in result["left"].items()
@@ -62,12 +59,12 @@ def _show_steps(out: Out, result: Mapping[str, Any]) -> None:
     known = [(end, mrad(of)) for end, of in zip(ends, rest(result), strict=True) if of is not None]
     rows += [[end, of, *[""] * (len(columns) + len(loads))] for end, of in known]
     out.table(
-        f"Mean |error| left after each step, mrad: {count}{fitted}{', one motion' * one}",
-        ["step", "left", *columns, *(f"{p} kg" for p in loads)],
+        f"Mean |error| after each step: {count}{fitted}{', one motion' * one}",
+        ["step", "error, mrad", *columns, *(f"{p} kg" for p in loads)],
         rows,
     )
     steps = list(result["left"])
-    out.table("Error left by joint, mrad", ["joint", *map(title, steps), *(end for end, _ in known)], [
+    out.table("Mean |error| by joint and step, mrad", ["joint", *map(title, steps), *(end for end, _ in known)], [
         [name, *(mrad(part["left"][s]) for s in steps), *map(mrad, rest(part)[: len(known)])]
         for name, part in joints.items()
     ])  # fmt: skip

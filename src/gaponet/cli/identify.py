@@ -51,7 +51,7 @@ def identify(
     driven by torque (no position was commanded), armature, damping, friction and delay are fitted.
 
     Use the robot folder with --robot and a slash: gaponet gap DATASET --robot ./OUT. The fit starts from the gains in
-    the robot's file; gains that recordings state are not changed. If no fit is better than the robot as it is, nothing
+    the robot's file. Gains that recordings state are not changed. If no fit is better than the robot as it is, nothing
     is written and the exit status is 2.
 
     Args:
@@ -113,7 +113,7 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     for term in fit.comparisons:
         judges = "motions" if term.name == "torque" else "recordings"
         over = f" over {len(term.before)} {judges}" * (len(term.before) > 1)
-        verdict = f"{over}; {'not ' * (not term.accepted)}kept"
+        verdict = f"{over}; {'not ' * (not term.accepted)}accepted"
         gain, error = term.gain
         moves = f"{'rises' if gain < 0 else 'falls'} by {mrad_with_error(abs(gain), error)}"
         screen.say(f"{term.name}: validation error {moves}{verdict}")
@@ -130,7 +130,7 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         if touch.accepted and table is not None:
             what = f"height {table.height:.4f} m, friction {table.friction:.2f}, {table.stiffness:.0f} N/m"
         screen.say(
-            f"table: {what}; where tips are low {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "
+            f"table: {what}; error with a low tip {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "
             f"{', '.join(touch.motions)}"
         )
     unknown = [w for w in fit.warnings if UNDETERMINED in w]
@@ -139,7 +139,7 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
             screen.say(f"  {warning}", "warning", "yellow")
     if unknown and not details:
         joints = abbreviate([w.partition(":")[0] for w in unknown])
-        screen.say(f"some parameters are not determined: {joints}; --details lists them. Use a joint's values together")
+        screen.say(f"some parameters of {joints} are not determined (--details). Use all values of a joint together")
 
 
 def _cell(joint: dict[str, float], errors: dict[str, float], field: str) -> str:

@@ -41,7 +41,7 @@ def import_logs(
 ) -> None:  # fmt: skip
     """Read a robot's logs into a dataset; the same call adds what is new.
 
-    A bad log refuses them all (--skip-bad leaves it out instead).
+    If one log is bad, nothing is imported. With --skip-bad only the bad log is left out.
 
     Args:
         src: File or folder of logs.
@@ -83,7 +83,7 @@ def doctor(
     """Check a dataset: order, signs, units, rates, gaps, lag, payload.
 
     Args:
-        robot: Robot name or folder, if not the one that the dataset keeps.
+        robot: Robot name or folder, if not the one that the dataset stores.
         fix: Print a proposal for logs.toml after the findings; nothing is applied.
         figures: Folder for a picture of each finding.
     """
@@ -121,7 +121,7 @@ def _show_formats(out: Out) -> None:
     out.table("Formats that gaponet import reads", ["format", "what it is", "needs"], [
         [fmt, what, f"gaponet[{extra}]" if extra else ""] for fmt, (what, extra) in rows.items()
     ])  # fmt: skip
-    out.say("Strange columns: gaponet import LOGS --robot ROBOT --guess > LOGS/logs.toml, then look it over.")
+    out.say("Other columns: gaponet import LOGS --robot ROBOT --guess > LOGS/logs.toml; then check that file.")
     out.result({fmt: {"about": what, "extra": extra} for fmt, (what, extra) in rows.items()})
 
 
@@ -135,8 +135,8 @@ def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
             implausible[channel].append((entry.meta.motion, rows))
     lines = [f"{', '.join(motions)}: {cut}; what follows was left out" for cut, motions in cuts.items()]
     lines += [
-        f"{channel} is nonsense in {sum(rows['rows'] for _, rows in counts)} rows of {len(counts)} recordings (first "
-        f"{counts[0][1]['worst']:.4g} of {counts[0][1]['joints'][0]} in {counts[0][0]}): "
+        f"{channel} is implausible in {sum(rows['rows'] for _, rows in counts)} rows of {len(counts)} recordings "
+        f"(first {counts[0][1]['worst']:.4g} of {counts[0][1]['joints'][0]} in {counts[0][0]}): "
         f"{', '.join(dict.fromkeys(rows['done'] for _, rows in counts))}; --strict refuses them"
         for channel, counts in implausible.items()
     ]
@@ -144,7 +144,7 @@ def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
         why = f"{uneven[0].notes['rows']}; {uneven[0].notes['why_resampled']}"
         lines.append(f"{abbreviate([meta.motion for meta in uneven])}: {why}")
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
-    where = "not in every recording, taken to stand at home there; [posture] in logs.toml says where"
+    where = "missing in some recordings, assumed at the home position there; [posture] in logs.toml sets another"
     return [*lines, f"{abbreviate(lacking)}: {where}"] if lacking else lines
 
 
@@ -164,9 +164,9 @@ def _show_import(out: Out, made: ImportResult) -> None:
     payloads = ", ".join(f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries}))
     virtual = "VIRTUAL " if any(e.meta.virtual for e in entries) else ""
     if made.present:
-        out.say(f"{len(made.present)} there already, {len(made.added)} added")
+        out.say(f"{len(made.present)} recordings were imported before, {len(made.added)} are new")
     out.say(
-        f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
+        f"{len(entries)} recordings, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
         f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
     )
     for line in _notes(entries, robot):
@@ -191,16 +191,16 @@ def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, Joi
         joint = offsets.get(name)
         at_rest = _signed_mrad(joint.static_error, joint.stiction_band) if joint else "–"
         rows.append([name, median, at_rest, _signed_mrad(joint.tracking_offset) if joint else "–"])
-    out.table("Lag in fast motions, ms; errors at rest, mrad", ["joint", "lag", "at rest", "offset"], rows)
+    out.table("Lag and errors at rest", ["joint", "lag, ms", "error at rest, mrad", "offset, mrad"], rows)
     if offsets:
-        out.say("at rest: state − command, mean of both approaches, ± stiction; offset: without the nominal sag")
+        out.say("error at rest: state − command ± stiction, both directions. offset: without the sag that kp explains")
 
 
 def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:
     """Tables of sequences and joints, the findings, the verdict."""
     shown = diagnosis.sequences[:MAX_ROWS]
-    columns = ["motion", "kg", "s", "Hz", "jitter", "gap", "lag"]
-    out.table("Sequences; jitter, longest gap and fast lag in ms", columns, [
+    columns = ["motion", "kg", "s", "Hz", "jitter, ms", "longest gap, ms", "lag, ms"]
+    out.table("Recordings", columns, [
         [r["motion"] + f" ({r['repetition']})" * (r["repetition"] > 0), f"{r['payload_mass']:g}",
          f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}", f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}",
          _span(list(r["fast_lag_s"].values()))]
@@ -208,8 +208,8 @@ def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:
     ])  # fmt: skip
     if len(shown) < len(diagnosis.sequences):
         out.say(f"… and {len(diagnosis.sequences) - len(shown)} more; --json lists all")
-    columns = ["joint", "commanded, rad", "lag", "at rest", "rests"]
-    out.table("Joints; fast lag in ms, error at rest ± stiction in mrad", columns, [
+    columns = ["joint", "commanded, rad", "lag, ms", "error at rest ± stiction, mrad", "rests"]
+    out.table("Joints", columns, [
         [r["joint"], "{:.2f}…{:.2f}".format(*r["commanded_rad"]), _lag(r["lag_s"]),
          _signed_mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
         for r in diagnosis.joints

@@ -82,7 +82,11 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         raise UsageError(f"no command '{name}'; {guess}gaponet --help lists them all")
     import tyro
 
+    from gaponet.cli.options import join_lines
+
     def begun(command: Callable[..., Any]) -> Callable[..., Any]:
+        join_lines(command)
+
         @wraps(command)
         def run(*args: Any, **kwargs: Any) -> Any:
             begin()

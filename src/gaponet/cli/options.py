@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union
@@ -27,13 +28,19 @@ Known = Annotated[
     Folder,
     tyro.conf.arg(help="Robot folder of gaponet identify, or run folder of gaponet train.", metavar="ROBOT|RUN"),
 ]
-Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these.")]
+Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these motions.")]
 Robot = Annotated[
     str | None,
-    tyro.conf.arg(help="Robot name or folder, if not the one that the dataset or the run keeps.", metavar="ROBOT"),
+    tyro.conf.arg(help="Robot name or folder, if not the one that the dataset or the run stores.", metavar="ROBOT"),
 ]
 Unit = Annotated[str, tyro.conf.arg(aliases=["--unit-id"])]  # gaponet import calls it --unit-id
 Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
+
+
+def join_lines(command: Callable[..., Any]) -> None:
+    """Join the lines of each argument in the docstring of a command: tyro would show the line breaks."""
+    command = inspect.unwrap(command)
+    command.__doc__ = re.sub(r"\n {8,}", " ", inspect.getdoc(command) or "")
 
 
 def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
@@ -42,7 +49,8 @@ def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
     def decorate(command: Command) -> Command:
         own, theirs = (inspect.getdoc(f) or "" for f in (command, function))
         arguments = theirs.partition("Args:\n")[2].partition("\n\n")[0]
-        command.__doc__ = own + ("\n" if "Args:\n" in own else "\n\nArgs:\n") + arguments
+        about, _, explained = own.partition("Args:\n")
+        command.__doc__ = f"{about.rstrip()}\n\nArgs:\n{arguments}\n{explained}"  # of two explanations the last counts
         return command
 
     return decorate
@@ -54,6 +62,8 @@ def actions(**functions: Callable[..., Any]) -> Callable[[Command], Command]:
     Args:
         functions: Name of the action → function.
     """
+    for f in functions.values():
+        join_lines(f)
     kinds = [Annotated[None, tyro.conf.subcommand(name, constructor=f)] for name, f in functions.items()]
 
     def decorate(command: Command) -> Command:

@@ -11,10 +11,10 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Json, Known, Robot
 from gaponet.cli.out import Out
-from gaponet.cli.show import show_verdict
 from gaponet.nn.artifact import CARD, GapModel
 from gaponet.report.methods import method, title
 from gaponet.report.run_files import read_config, read_metrics, read_progress
+from gaponet.report.verdict import next_step, verdict
 from gaponet.report.view.portrait import portrait, prepare
 from gaponet.robot.folder import load_stored_robot
 
@@ -38,9 +38,10 @@ def report(
     out = Out(json)
     with progress_bar("report") as update:
         path = write_report(run, dataset, robot, update, portrait)
-    out.say(f"report: {path}")
     metrics = read_metrics(run)
-    show_verdict(out, metrics["methods"], str(dataset or metrics["dataset"]), run, reported=True)
+    out.say(" ".join(verdict(metrics["methods"])), "result: ", "bold green")
+    out.say(f"report: {path}")
+    out.next(next_step(metrics["methods"], str(dataset or metrics["dataset"]), run, reported=True))
     out.result({"report": str(path)})
 
 
@@ -53,7 +54,7 @@ def _show_runs(screen: Out, folder: Path) -> None:
         raise UsageError(f"{folder}: no run here or below (a run has config.json and split.json); train one first")
     runs.sort(key=lambda r: r["val_ratio"] if r["val_ratio"] is not None else float("inf"))
     screen.table(
-        f"Runs in {folder}: mean |error| of whole held-out motions in free run, mrad (of nominal)",
+        f"Runs in {folder}: mean |error| of validation and test motions, mrad (of nominal)",
         ["run", "model", "seed", "minutes", "validation", "evaluated"],
         [
             [r["run"], title(r["model"]), str(r["seed"]), "" if r["seconds"] is None else f"{r['seconds'] / 60:.1f}",

@@ -203,11 +203,11 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple
     else:
         out.say(f": {spec.name} compiles, holds its home and is stable", "ok", "bold green")
     warnings = [f.message for f in findings if f.level in bad]
-    return as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
+    return _as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
                                 "findings": [vars(f) for f in findings]}  # fmt: skip
 
 
-def as_dict(spec: RobotSpec) -> dict[str, Any]:
+def _as_dict(spec: RobotSpec) -> dict[str, Any]:
     """The check as a dictionary that JSON can hold."""
     return {
         "name": spec.name, "dt": spec.dt, "timestep": spec.timestep,
@@ -242,7 +242,7 @@ def show(
     sure = {j: summarize(known, j) for j in known.joints}
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
     columns = ["joint", *(SERVO_FIELDS[f].heading for f in fields)]
-    screen.table(f"{spec.name}, ± standard error", columns, table_rows(known, fields))
+    screen.table(f"Parameters of {spec.name}, ± standard error", columns, table_rows(known, fields))
     origin = read_origin(spec.folder)
     findings = list(origin.get("findings", ())) if origin else []
     for line in (*findings, *sentences(known)):

@@ -7,34 +7,30 @@ from typing import Any
 
 from gaponet.base.result_table import ResultTable
 from gaponet.cli.out import Out
-from gaponet.report.methods import title
 from gaponet.report.tables import by_group, totals
 from gaponet.report.verdict import next_step, verdict
 
-UNITS = {"payload": ", kg", "horizon": ", s"}
+UNITS = {"payload": ", kg", "horizon": " (time since the start, s)"}
 GROUPS = ("joint", "payload", "unit", "horizon", "motion")
-SHOWN = 7  # columns of the totals that a screen has room for
+SHOWN = 4  # columns of the totals that a screen has room for
 
 
-def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None, reported: bool = False) -> None:
+def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None) -> None:
     """Print the verdict and the next command. The folder is that of a robot or a run, or None."""
     for sentence in verdict(methods):
         out.say(sentence)
-    out.next(next_step(methods, dataset, folder, reported))
+    out.next(next_step(methods, dataset, folder))
 
 
 def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GROUPS) -> None:
     """The tables of gap and eval: totals by method, then by each group."""
     methods, kind = result["methods"], "VIRTUAL robot" if result["virtual"] else "real robot"
     out.say(
-        f", {kind}, {result['sequences']} sequences, whole-motion free run; simulator {result['simulator_hash']}",
+        f", {kind}, {result['sequences']} recordings, open-loop rollouts of whole motions",
         result["robot"],
     )
     whole = totals(methods)
-    out.show("Totals", ResultTable(whole.name, whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
-    ran = result.get("simulators", {})
-    if len(set(ran.values())) > 1:
-        out.say("; ".join(f"{title(name)} {simulator}" for name, simulator in ran.items()), "ran in: ")
+    out.show("Error of each method", ResultTable("", whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
     for group in groups:
         if group not in ("payload", "unit") or len(methods["nominal"][f"by_{group}"]) > 1:
-            out.show(f"By {group}{UNITS.get(group, '')}", by_group(methods, group))
+            out.show(f"Mean |error| by {group}{UNITS.get(group, '')}", by_group(methods, group))

@@ -235,8 +235,8 @@ def _print_inspection(
         "robot": f"{robot.name}, from {inspection.packaged or model}; kp {gains} N·m/rad",
         "logs": f"{inspection.recordings} recording(s) below {logs}; the first: {first}",
         "joints recorded": ", ".join(log.joint_names),
-        "frozen" if not inspection.packaged else "assumed to stand at home": ", ".join(absent),
-        "taken as given": f"unit {unit_id}, {payload_mass:g} kg in each hand (--unit-id, --payload-mass)",
+        "frozen" if not inspection.packaged else "assumed at the home position": ", ".join(absent),
+        "assumed": f"unit {unit_id}, {payload_mass:g} kg in each hand (--unit-id, --payload-mass)",
     }
     for label, text in rows.items():
         if text:

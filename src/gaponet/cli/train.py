@@ -102,9 +102,7 @@ def evaluate(
         )  # fmt: skip
     table = result.to_dict()
     if not result.unseen:
-        out.say(
-            "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"
-        )
+        out.say("", "a model was trained or chosen on some of these motions: the errors are no test errors", "yellow")
     for name, delta in table["delta"].items():
         if delta["at_limit"]:
             out.say(f"{title(name)}: {delta['at_limit']:.2%} of the corrections are at the limit (--model.delta-max)")

@@ -92,7 +92,7 @@ def _introduce(out: Out, meta: SequenceMeta, errors: dict[str, float], seen: boo
     kind = "VIRTUAL " if meta.virtual else ""
     out.say(f", {kind}unit {meta.unit_id}, {meta.payload_mass:g} kg; {errors_text}", meta.motion)
     if seen:
-        out.say("", "a model was trained or chosen on this recording: it is not held-out", "yellow")
+        out.say("", "a model was trained or chosen on this recording: its error is no test error", "yellow")
 
 
 def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, out: Out) -> None:

@@ -41,7 +41,7 @@ def virtual(
     """Serve a VIRTUAL robot on a real bus, for run and record.
 
     Args:
-        action: serve.
+        action: serve starts the robot.
         robot: h1_2 (DDS) or so101 (a serial bus on a pseudo-terminal).
         unit: Number or name of the robot in the fleet.
         payload_mass: kg in each hand that payload_side names.

@@ -48,7 +48,7 @@ class DoctorResult:
         texts = [f"{n} {level}{'s' * (n > 1)}" for level, n in count.items() if n]
         if count["error"]:
             return f"Do not train on this yet: {' and '.join(texts)}."
-        return f"Usable. Read the {texts[0]} first." if texts else "Good: no error and no warning."
+        return f"Usable. Read the {texts[0].removeprefix('1 ')} first." if texts else "Good: no error and no warning."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
@@ -89,7 +89,7 @@ class DoctorResult:
         virtual = sum(e.meta.virtual for e in dataset.entries)
         kind = f", {virtual} of them VIRTUAL" if virtual else ""
         return (
-            f"{len(dataset)} sequences{kind}, {motions} motions, {dataset.hours() * 60:.1f} min; "
+            f"{len(dataset)} recordings{kind}, {motions} motions, {dataset.hours() * 60:.1f} min; "
             f"units {', '.join(units)}; payloads {', '.join(f'{p:g}' for p in payloads)} kg"
         )
 

@@ -3,8 +3,7 @@
 mjlab, Newton and Isaac Lab load this form (Hwangbo et al. 2019, Science Robotics 4, eaau5872). It contains the
 identified servo exactly: a delayed target minus the present position is the error at that time minus the motion since.
 A small network is fitted to the torque that the run's network adds, kp · Δa, on rollouts that the run's network
-corrects. Engines give a joint's network neither posture nor payload, so effects of these are lost
-(docs/results/unnamed.md).
+corrects. Engines give a joint's network neither posture nor payload, so effects of these are lost.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ class ModelConfig:
     """Offset of a large probe, which depends on inertia, payload and saturation, rad."""
     sensors: Literal["off", "predicted"] = "off"
     """off: the branch input is the observation. predicted: predicted sensor values too, as in the paper; they did not
-    reduce the error (docs/results/unnamed.md)."""
+    reduce the error (docs/results/did-not-work.md)."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
     branch_hidden: Layers = (64, 64)

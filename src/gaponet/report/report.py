@@ -211,7 +211,7 @@ def warnings(card: dict[str, Any] | None, own: str, metrics: dict[str, Any]) -> 
     if metrics["virtual"]:
         out.append("The recordings come from a virtual robot: these numbers say nothing about real hardware.")
     if not metrics["unseen"]:
-        out.append("Some recordings were used in training or for choosing the model: not a held-out result.")
+        out.append("Some recordings were used in training or for choosing the model: not a test result.")
     if card is not None:
         out += _warnings_of_model(card, own, methods)
     worse = [j for j, m in methods[own]["by_joint"].items() if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]]

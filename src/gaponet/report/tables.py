@@ -38,8 +38,8 @@ def totals(
         simulators: Method → hash of its simulator, for a last column.
     """
     base = methods["nominal"]["mpjae"]
-    columns = ("method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "static, mrad", "dynamic, mrad", "Q_dis, rad·s",
-               "≥ 0.05 rad", "≥ 0.1 rad", "correlation", *["simulator"] * bool(simulators))  # fmt: skip
+    columns = ("method", "mean |error|, mrad", "of nominal", "RMSE, mrad", "static, mrad", "dynamic, mrad",
+               "Q_dis, rad·s", "≥ 0.05 rad", "≥ 0.1 rad", "correlation", *["simulator"] * bool(simulators))  # fmt: skip
     return ResultTable("totals", columns, tuple(
         (title(name), angle(m["mpjae"]), m["mpjae"] / base if base else "–", mrad(m["rmse"]), mrad(m["static"]),
          mrad(m["dynamic"]), f"{m['q_dis']:.3f}", f"{m['large_0.05'] * 100:.1f} %", f"{m['large_0.1'] * 100:.2f} %",
@@ -52,4 +52,4 @@ def by_group(methods: dict[str, Any], group: str, angle: Callable[[float], str] 
     """Return the MPJAE by joint, payload, unit, horizon or motion: a row for each, a column per method."""
     parts = [m[f"by_{group}"] for m in methods.values()]
     rows = tuple((key, *(angle(part[key]["mpjae"]) for part in parts)) for key in parts[0])
-    return ResultTable(group, ("MPJAE, mrad", *map(title, methods)), rows)
+    return ResultTable(group, ("mean |error|, mrad", *map(title, methods)), rows)

@@ -232,7 +232,7 @@ def _classic_candidates(
     searches.begin()
     report = searches.report("whole robot", names, whole.rollouts.rows)
     together = whole.descend(CLASSIC, bounds.start, (alone, bounds.start), ROBOT_ITERATIONS, report=report)
-    chains = whole.descend_chains(together, lambda names, rows: searches.report("limbs", names, rows))
+    chains = whole.descend_chains(together, lambda names, rows: searches.report("kinematic chains", names, rows))
     return whole, {
         "given": given, "limbs": chains, "joints": alone, "whole": together, "delay and offset": late,
     }  # fmt: skip

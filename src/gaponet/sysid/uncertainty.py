@@ -235,15 +235,15 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
         logs = f"{len(s['logs'])} log{'s' * (len(s['logs']) != 1)}"
         lines.append(f"{s['made_by']}: {logs} of {s['unit']}, {s['seconds']:.0f} s, {days}")
     for joint in uncertainty.joints:
-        for group in summarize(uncertainty, joint).sets:
-            lines.append(f"{joint}: the logs show only a combination of {', '.join(group)}: change none alone")
+        for *some, last in summarize(uncertainty, joint).sets:
+            lines.append(f"{joint}: the logs determine only {', '.join(some)} and {last} together; change none alone")
     joints = uncertainty.joints
     worst = max(joints, key=lambda j: joints[j].residual_rms)
     judges = "were not fitted" if uncertainty.validated else "were fitted, since no others were there"
     lines.append(
         f"the RMS error of motions that {judges} is {_root_mean_square(j.residual_rms for j in joints.values()):.2f} "
-        f"mrad ({worst} {1e3 * joints[worst].residual_rms:.2f}); the uncertainty of the values explains "
-        f"{_root_mean_square(j.parameter_rms for j in joints.values()):.2f}, the servo model's limits the rest"
+        f"mrad ({worst} {1e3 * joints[worst].residual_rms:.2f}). The standard errors predict "
+        f"{_root_mean_square(j.parameter_rms for j in joints.values()):.2f}; more than that is due to the servo model"
     )
     return lines
 

@@ -31,7 +31,7 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     text = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in rates.items())
     deviation = max(abs(s.rate_hz * robot.dt - 1) for s in surveys)
     level = "warning" if len(rates) > 1 else "note" if deviation > 0.05 else "ok"
-    hint = f"; robot.toml says {1 / robot.dt:.2f} Hz, each sequence keeps its own" if deviation > 0.001 else ""
+    hint = f"; robot.toml says {1 / robot.dt:.2f} Hz; the recorded rate is used" if deviation > 0.001 else ""
     yield Finding(level, "rate", text + hint, values={f"{r:.2f}": count for r, count in rates.items()})
     resampled = [s.motion for s in surveys if "resampled" in str(s.entry.meta.notes.get("rows", ""))]
     if resampled:
@@ -174,11 +174,11 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     ratio = np.radians(step) / np.median(step[step > 0]) if step.any() else np.zeros_like(step)
     degrees = masked_names(robot, np.abs(ratio - 1) < RESOLUTION_TOLERANCE)
     if degrees and len(degrees) < (step > 0).sum() / 2:
-        text = f"{', '.join(degrees)} is told in steps 57.3 times as coarse as other joints: degrees beside radians?"
+        text = f"{', '.join(degrees)} has steps 57.3 times as coarse as other joints: degrees beside radians?"
         yield Finding("warning", "unit", f"{text} Import again with the right unit", degrees)
     coarse = [(float(x), name) for x, name in zip(step, robot.joint_names, strict=True) if x > MAX_RESOLUTION_RAD]
     if not coarse:
-        yield Finding("ok", "resolution", f"positions are told in steps of at most {step.max() * 1e3:.2f} mrad")
+        yield Finding("ok", "resolution", f"positions change in steps of at most {step.max() * 1e3:.2f} mrad")
         return
     worst, name = max(coarse)
     text = (
@@ -225,9 +225,9 @@ CHECKS = (
     Check(_rate, "rate", ""),
     Check(_regularity, "jitter", ""),
     Check(_jumps, "jumps", "no joint jumps"),
-    Check(_nonsense, "nonsense", "no channel holds what no joint does"),
+    Check(_nonsense, "nonsense", "no value is implausible"),
     Check(_blocked, "blocked", "no joint ran into a stop"),
     Check(_saturation, "saturation", ""),
     Check(_resolution, "resolution", ""),
-    Check(_stuck, "stuck", "every channel changes when it should"),
+    Check(_stuck, "stuck", "every channel changes while its joint moves"),
 )

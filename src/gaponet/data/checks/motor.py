@@ -19,7 +19,7 @@ MIN_SAG_RAD = 0.02  # static error that is reported
 MAX_DEAD_TIME_S, MAX_EXTRA_LAG_S = 0.15, 0.05  # of all joints; of one joint beyond the others
 DEAD_TIMES = (  # up to s, verdict
     (0.015, "as good as none"), (0.06, "usual for a bus and a servo's firmware"),
-    (MAX_DEAD_TIME_S, "long; hobby servos and slow buses have it"),
+    (MAX_DEAD_TIME_S, "long, as of hobby servos and slow buses"),
     (np.inf, "very long: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
 
@@ -28,7 +28,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How long after the command does each joint move?"""
     lags = fast_lags(surveys, robot)
     if not lags:
-        text = f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag cannot be told from stiction"
+        text = f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag and stiction cannot be separated"
         yield Finding("note", "lag", f"{text}; add fast motions")
         return
     every = np.concatenate(list(lags.values()))
@@ -36,8 +36,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     low, high = every.min(), every.max()
     text = (
         f"state follows command after {np.median(every) * 1e3:.0f} ms ({low * 1e3:.0f}–{high * 1e3:.0f} over joints and"
-        f" motions at {FAST_COMMAND_RAD_S} rad/s or faster), {low / period:.0f} to {high / period:.0f} periods: "
-        "a network's history must span it"
+        f" motions at {FAST_COMMAND_RAD_S} rad/s or faster), {low / period:.0f} to {high / period:.0f} periods"
     )
     expected = _expected_lag(robot)
     sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
@@ -48,8 +47,8 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if dead_time:
         verdict = next(words for limit, words in DEAD_TIMES if usual <= limit)
         text += (
-            f". kp and damping explain all but {usual * 1e3:.0f} ms, which are dead time, friction or inertia (gaponet "
-            f"identify separates them). A dead time of that length is {verdict}"
+            f". kp and damping do not explain {usual * 1e3:.0f} ms of it: dead time, friction or inertia (gaponet "
+            f"identify separates them). As a dead time this is {verdict}"
         )
     level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
     yield Finding(level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()})
@@ -101,13 +100,13 @@ def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         )
         more = f"; {len(sagging) - 4} more joints above {MIN_SAG_RAD * 1e3:.0f}" if len(sagging) > 4 else ""
         text = (
-            f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. ± is stiction: so far "
-            "to either side of it a joint stays stuck"
+            f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. Within ± "
+            "(stiction) a joint can stop anywhere"
         )
         values = {f"{p:g} kg": {name: e[name].middle for name in sagging} for p, e in errors.items()}
         yield Finding("note", "sag", text, tuple(sagging), values)
     elif all(e.up + e.down == 0 for by_joint in errors.values() for e in by_joint.values()):
-        text = "the robot never rests under a constant command: sag and offsets cannot be told; add holds"
+        text = "the robot never rests under a constant command: sag and offsets are not determined; add holds"
         yield Finding("note", "sag", text)
 
 

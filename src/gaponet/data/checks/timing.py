@@ -73,7 +73,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "encoder itself; what is averaged is late, and fast motions are lost"
         )
         findings.append(Finding("warning", "averaged", text, (), {"width_s": width}))
-    yield from findings or [Finding("ok", "timing", "commands and states keep one time")]
+    yield from findings or [Finding("ok", "timing", "commands and states have the same clock")]
 
 
 def _standard_error(deviations: Array) -> float:

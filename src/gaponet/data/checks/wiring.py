@@ -244,8 +244,8 @@ CHECKS = (
     Check(_command, "command", "commands are positions that the joints come near"),
     Check(_order, "order", ""),
     Check(_sign, "sign", "no joint moves against its command"),
-    Check(_copied, "copied", "commands come before states"),
+    Check(_copied, "copied", "no state comes before its command"),
     Check(_unit, "unit", ""),
     Check(_limits, "range", "commands and positions stay inside the joint ranges"),
-    Check(_labels, "labels", "no recording is filed twice"),
+    Check(_labels, "labels", "no recording is stored twice"),
 )

@@ -34,8 +34,9 @@ STEM = "real"
 HEADING = """# Real robots
 
 `gaponet experiment real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in open-loop
-rollouts from the recorded start. ± is the standard error over independent motions, of differences to the nominal
-simulator paired; "floor" is what two recordings of one command differ by."""
+rollouts from the recorded start. Errors are in mrad. ± is the standard error over independent motions, of differences
+to the nominal simulator paired. "Floor" is the difference of two recordings of one command. "Identified elsewhere"
+means: on another session or unit."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:
@@ -66,10 +67,6 @@ def write_page(result: dict[str, Any], out: Path) -> list[Path]:
     write_text(out / f"{STEM}.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     parts = [HEADING, f"![Error of each method as a share of the nominal error]({STEM}.png)"]
     parts.append(result_table(rows).markdown())
-    seconds = ", ".join(f"{name} {value:,} s" for name, value in result["seconds"].items())
-    parts.append(f"From file to table, on this machine: {seconds}.")
-    for name, remarks in result["labels"].items():
-        parts += [f"Labels of {name} (`gaponet data labels`):", "\n".join(f"- {remark}" for remark in remarks)]
     write_text(out / f"{STEM}.md", "\n\n".join(parts) + "\n")
     figures = save(draw(rows, result["cards"]), out / STEM) if rows else []
     return [out / f"{STEM}.md", out / f"{STEM}.json", *figures]

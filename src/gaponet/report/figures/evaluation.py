@@ -53,7 +53,7 @@ def by_horizon(methods: dict[str, Any]) -> Figure:
     ax.set_xscale("log")
     ax.minorticks_off()
     ax.set_xticks(list(ticks), list(ticks.values()))
-    ax.set_title("MPJAE by horizon of the free run")
+    ax.set_title("MPJAE by time since the start of the rollout")
     ax.set_ylim(bottom=0)
     ax.set_ylabel("mrad")
     legend(fig)

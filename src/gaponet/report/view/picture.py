@@ -100,7 +100,7 @@ class Camera:
         shown, pad, font = self.scene.shown, self.head // 3, self.fonts[15]
         meta = shown.real.meta
         facts = [meta.robot, meta.motion, f"unit {meta.unit_id}", _payload(meta.payload_mass, meta.payload_side)]
-        facts += [] if shown.seen is None else ["seen in training" if shown.seen else "held out"]
+        facts += [] if shown.seen is None else ["seen in training" if shown.seen else "new motion"]
         clock = [f"speed {self.clip.speed:g}x"] if self.clip.speed != 1 else []
         clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
         left, right = SEPARATOR.join(facts), SEPARATOR.join([*clock, f"{time:6.2f} s"])
