@@ -271,15 +271,17 @@ def _with_links(
     wholes: ListOf[RobotFit], judge: Judge, start: list[Values], values: list[Values], searches: _SearchProgress
 ) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:
     """Fit the links with the servos from `start`; return them and the servos' values if they are better."""
-    results = list[LinkResult]()
-    for whole, one in zip(wholes, start, strict=True):
+    results, fits = list[LinkResult](), [LinkFit(*pair) for pair in zip(wholes, start, strict=True)]
+    for fit in fits:
         searches.begin()
-        report = searches.report("masses", ("all joints",), whole.rollouts.rows.sum(keepdims=True))
-        results.append(LinkFit(whole, one).descend(report))
+        report = searches.report("masses", ("all joints",), fit.whole.rollouts.rows.sum(keepdims=True))
+        results.append(fit.descend(report))
     links, servos = [r.axes.links(r.x) for r in results], [r.values for r in results]
     before = judge.errors(values)
     comparison = Comparison("masses", before, judge.errors(servos, links) if results[-1].x.any() else before)
-    return (comparison, results[-1], links, servos) if comparison.accepted else (comparison, None, [], values)
+    if not comparison.accepted:
+        return comparison, None, [], values
+    return comparison, replace(results[-1], servo_slopes=fits[-1].servo_slopes(results[-1])), links, servos
 
 
 def _fit_term(
