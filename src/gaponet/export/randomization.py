@@ -8,6 +8,7 @@ torques over kp: if kp of a unit is wrong, its torque limit is wrong by the same
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from gaponet.export.drawn_robots import RANGE_PERCENT, DrawnRobots, draw_robots
 from gaponet.export.plain_servos import comparable
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.links import LinkAxes
 from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, prior_std, to_axes
 
 Scope = Literal["today", "any-day", "any-robot"]
@@ -36,6 +38,10 @@ LEAST_INVERSE = 0.2  # of a drawn value on an inverse axis, over the mean
 RANGE_SAMPLES = 4096
 UNDETERMINED_STD = 0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
 MIN_ROBOTS = 3  # of a type
+LINKS_HELD = (
+    "a scene of Isaac Lab may place and join its bodies in another way",
+    "uncertainty.json does not say how well they are known; identify with --masses again",
+)
 
 
 @dataclass(frozen=True)
@@ -43,9 +49,10 @@ class Randomization:
     """Sampled units of a robot.
 
     Attributes:
-        units: Field → (samples, n), SI units; a row is one unit.
+        units: Field → (samples, n), SI units; a row is one unit. Of drawn links, "links" → (samples, 10 · bodies).
         ranges: Joint → field → low, value, high; 9 of 10 units lie between.
         unknown: "joint: field" of the numbers that no log determines.
+        bodies: MJCF bodies of drawn links.
         judged: The units with the servo model that recordings chose; None without recordings.
         plain: The same of the robot as fitted without its servo model.
     """
@@ -56,13 +63,15 @@ class Randomization:
     ranges: dict[str, dict[str, tuple[float, float, float]]]
     unknown: tuple[str, ...]
     notes: tuple[str, ...]
+    bodies: tuple[str, ...] = ()
     judged: DrawnRobots | None = None
     plain: DrawnRobots | None = None
 
 
 def sample_units(
-    robot: RobotSpec | Path, scope: Scope = "today", others: ListOf[Path] = (), samples: int = 256, seed: int = 0
-) -> Randomization:
+    robot: RobotSpec | Path, scope: Scope = "today", others: ListOf[Path] = (), samples: int = 256, seed: int = 0,
+    links: bool = True,
+) -> Randomization:  # fmt: skip
     """Sample units of a robot.
 
     Args:
@@ -71,6 +80,7 @@ def sample_units(
             different days. "any-robot": differences between robots of its type.
         others: Robot folders of the type, each identified from its own logs.
         samples: Number of units.
+        links: Draw the links too, where uncertainty.json has theirs; else units have the identified links.
 
     Raises:
         UsageError: Data for the scope are missing; the message says which.
@@ -93,8 +103,17 @@ def sample_units(
     x = mean + np.sqrt(1 - single) * np.einsum("sd,dnp->snp", weights, deviations)
     x = x + np.sqrt(single * np.square(deviations).sum(axis=0)) * rng.standard_normal(x.shape)
     limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
-    for i in range(len(joints)):
+    bodies, more = tuple[str, ...](), dict[str, Array]()
+    if spec.links and (of_links := uncertainty.links if links else None):
+        axes, at = LinkAxes(spec.before_identification), np.array(of_links.values)
+        apart = np.random.default_rng([seed, 1]).multivariate_normal(0 * at, of_links.covariance, count, method="eigh")
+        bodies, more = axes.bodies, {"links": np.array([axes.numbers(at + row) for row in apart[:samples]])}
+    if spec.links and not bodies:
+        notes.append(f"all units have the identified links: {LINKS_HELD[links]}")
+    for i, joint in enumerate(joints):
         error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
+        if bodies and of_links:
+            error += apart @ np.array(of_links.servo_slopes[joint]).T
         x[:, i] += error
         limit[:, i] *= np.exp(error[:, fields.index("kp")])
     bounded = [SERVO_FIELDS[f].axis != "log" and not SERVO_FIELDS[f].signed for f in fields]
@@ -110,8 +129,8 @@ def sample_units(
             low, high = np.percentile(sampled[field][:, i], RANGE_PERCENT)
             ranges[joint][field] = float(low), float(value[field][i]), float(high)
     names = tuple(f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k])
-    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit}).items()}
-    return Randomization(spec.name, scope, units, ranges, names, tuple(notes))
+    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit} | more).items()}
+    return Randomization(spec.name, scope, units, ranges, names, tuple(notes), bodies)
 
 
 def judge_units(
@@ -133,7 +152,7 @@ def judge_units(
     if robot.has_servo_model:
         plain = draw_robots(robot, made.units, (train, validation), plain=True, progress=progress)
     units = {f: np.array(v) for f, v in judged.units.items()}
-    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items()}
+    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items() if f != "links"}
     ranges = {
         joint: {f: (float(ends[f][0, i]), value, float(ends[f][1, i])) for f, (_, value, _) in by_field.items()}
         for i, (joint, by_field) in enumerate(made.ranges.items())
@@ -206,11 +225,13 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
         "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}
                    for j, by in made.ranges.items()},
-        "units": {f: np.round(v, 9) for f, v in made.units.items()}, "unknown": made.unknown, "notes": made.notes,
+        "units": _rounded(made.units), "unknown": made.unknown, "notes": made.notes,
     }  # fmt: skip
+    if made.bodies:
+        content["bodies"] = made.bodies
     if made.judged is not None and made.plain is not None:
         content |= {
-            "plain_units": {f: np.round(v, 9) for f, v in made.plain.units.items()},
+            "plain_units": _rounded(made.plain.units),
             "error_mrad": {form: {name: 1e3 * error for name, error in drawn.errors.items()}
                            for form, drawn in (("servo model", made.judged), ("plain", made.plain))},
         }  # fmt: skip
@@ -222,6 +243,11 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         shipped = "mujoco_randomization.py" if engine == "mujoco" else "unit_events.py"
         write_text(file, (SHIPPED / shipped).read_text(encoding="utf-8"))
     return file
+
+
+def _rounded(units: Mapping[str, Any]) -> dict[str, Any]:
+    """Return units for a file; links have nine digits already, and would not stay physical."""
+    return {f: v if f == "links" else np.round(v, 9) for f, v in units.items()}
 
 
 def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:

@@ -127,7 +127,8 @@ def _upper(x: Array) -> Array:
 
 
 def _upper_root(p: Array) -> Array:
-    """Return the upper triangular R with R Rᵀ = p, (4, 4)."""
+    """Return the upper triangular R with R Rᵀ = p, (4, 4); a flat link gets some thickness."""
+    p = p + 1e-9 * np.trace(p[:3, :3]) * np.diag([1, 1, 1, 0])
     return np.asarray(np.linalg.cholesky(p[::-1, ::-1])[::-1, ::-1])
 
 

@@ -141,7 +141,7 @@ class LinkFit:
         return here[0, 0], jac[0, 0]
 
     def _covariances(self, x: Array) -> tuple[Array, Array]:
-        """Return the covariances along the directions at x (P,), (K, K): by noise and prior, and by the encoders' zeros.
+        """Return covariances along the directions at x (P,), (K, K): by noise and prior, and by the encoders' zeros.
 
         A wrong zero turns gravity as another centre of mass does, and no recorded position shows which it is.
         """

@@ -25,9 +25,11 @@ from gaponet.base.text import format_uncertainty
 from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, UNCERTAINTY_FILE
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.links import LinkAxes, LinkResult
 from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
 PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
+LINK_STEP = 1e-3  # standard deviations of the prior, of a difference
 UNOBSERVED_RELATIVE_ERROR = 1.0, 3.0  # from which no effect was seen: of a value of zero, of another
 MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = 0.9, 0.03  # from which parameters are known only as a set
 OLD_KEYS = {  # of known.json → of uncertainty.json
@@ -76,6 +78,37 @@ class JointUncertainty:
     repeatability: float = 0.0
 
 
+@dataclass(frozen=True)
+class LinkUncertainty:
+    """Uncertainty of fitted links, on the axes (sim/links.py) of the robot before identification.
+
+    Attributes:
+        values: Fitted coordinates, (Q,).
+        covariance: (Q, Q).
+        servo_slopes: Joint → change of its values that goes with a change of the coordinates, (P, Q). The covariance of
+            the joint is for the links as fitted.
+    """
+
+    values: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    servo_slopes: dict[str, tuple[tuple[float, ...], ...]]
+
+    @classmethod
+    def of(cls, result: LinkResult | None, robot: RobotSpec, fields: ListOf[str]) -> LinkUncertainty | None:
+        """Return the uncertainty of a fit of links, if the robot has its links."""
+        if result is None or robot.links != result.axes.links(result.x):
+            return None
+        axes = LinkAxes(robot.before_identification)
+        values, jac = axes.coordinates(robot.links), np.eye(len(result.x))
+        if result.axes.links(0 * result.x):  # the fit began with identified links
+            ahead = [axes.coordinates(result.axes.links(result.x + LINK_STEP * row)) for row in jac]
+            jac = (np.array(ahead) - values).T / LINK_STEP
+        none = np.zeros((len(robot.operated), len(jac)))
+        slopes = np.stack([result.servo_slopes.get(f, none) @ np.linalg.inv(jac) for f in fields], axis=1)
+        by_joint = dict(zip(robot.operated, nested(slopes), strict=True))
+        return cls(nested(values), nested(jac @ result.covariance @ jac.T), by_joint)
+
+
 ArrayName = Literal["values", "covariance", "gauss_newton_step", "gauss_newton_covariance", "overdispersion"]
 
 
@@ -89,6 +122,7 @@ class ParameterUncertainty:
         sources: Recordings, from the first to the last.
         clusters: Number of parts of the recordings from which the overdispersion was estimated.
         validated: Whether the residuals are of motions that were not fitted.
+        links: Of the links, if they were fitted.
     """
 
     fields: tuple[str, ...]
@@ -96,6 +130,7 @@ class ParameterUncertainty:
     sources: tuple[Provenance, ...]
     clusters: int
     validated: bool
+    links: LinkUncertainty | None = None
 
     @classmethod
     def load(cls, robot: RobotSpec) -> ParameterUncertainty | None:
@@ -114,6 +149,13 @@ class ParameterUncertainty:
             stored = uncertainty.joints.get(joint)
             if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
                 raise RobotError(f"{file}: its values are other values than robot.toml's, at {joint}; {hint}")
+        if uncertainty.links:
+            values = LinkAxes(robot.before_identification).coordinates(robot.links)
+            if not (
+                len(values) == len(uncertainty.links.values)
+                and np.allclose(values, uncertainty.links.values, atol=0.02)
+            ):
+                raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
         return uncertainty
 
     @classmethod
@@ -125,7 +167,10 @@ class ParameterUncertainty:
 
     def save(self, folder: Path) -> None:
         """Write uncertainty.json into a robot folder."""
-        write_json(folder / UNCERTAINTY_FILE, asdict(self))
+        content = asdict(self)
+        if self.links is None:
+            del content["links"]
+        write_json(folder / UNCERTAINTY_FILE, content)
 
     def array(self, joint: str, name: ArrayName) -> Array:
         """Return an attribute of a joint as an array."""
@@ -142,6 +187,11 @@ class ParameterUncertainty:
         jac = np.stack([(ahead[f] - here[f]) / step for f in self.fields])  # (P, axes)
         own = self.array(joint, "covariance") if covariance is None else covariance
         return {f: float(v) for f, v in here.items()}, jac @ own @ jac.T
+
+
+def nested(x: Array) -> Any:
+    """Return an array as nested tuples."""
+    return tuple(nested(y) for y in x) if x.ndim else float(x)
 
 
 def _with_new_keys(table: dict[str, Any]) -> dict[str, Any]:

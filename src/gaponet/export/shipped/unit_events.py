@@ -23,6 +23,7 @@ from torch import Tensor
 MODEL_FIELDS = (
     "dof_armature", "dof_frictionloss", "dof_damping", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
 )  # fmt: skip
+BODY_FIELDS = "body_mass", "body_ipos", "body_inertia", "body_iquat", "body_subtreemass"
 DELAY_BUFFERS = "positions_delay_buffer", "velocities_delay_buffer", "efforts_delay_buffer"
 Units = dict[str, Tensor]  # field → (worlds, joints), SI units
 
@@ -32,6 +33,12 @@ def read_units(file: str | Path, form: str) -> tuple[list[str], Units]:
     """Return joints and all units, (units, joints). A robot without a servo model has one form of them."""
     drawn = json.loads(Path(file).read_text(encoding="utf-8"))
     return drawn["joints"], {field: torch.tensor(x) for field, x in drawn.get(form, drawn["units"]).items()}
+
+
+@cache
+def read_bodies(file: str | Path) -> list[str]:
+    """Return the bodies whose masses, centres of mass and inertias differ between units."""
+    return list(json.loads(Path(file).read_text(encoding="utf-8")).get("bodies", ()))
 
 
 def draw_units(file: str | Path, form: str, env: Any, env_ids: Any, rows: Any) -> tuple[Tensor, list[str], Units]:
@@ -71,12 +78,17 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
     """
     from mjlab.managers.event_manager import requires_model_fields
 
-    @requires_model_fields(*MODEL_FIELDS)
+    bodies = read_bodies(file)
+
+    @requires_model_fields(*MODEL_FIELDS, *BODY_FIELDS * bool(bodies))
     def use_units(env: Any, env_ids: Any) -> None:
         action = env.action_manager.get_term(term)
-        if servos := getattr(action, "terms", None):
-            return servos.set_units(*draw_units(file, "units", env, env_ids, rows))
-        ids, joints, units = draw_units(file, "plain_units", env, env_ids, rows)
+        servos = getattr(action, "terms", None)
+        ids, joints, units = draw_units(file, "units" if servos else "plain_units", env, env_ids, rows)
+        if bodies:
+            write_links(env.sim, ids, [f"{action.cfg.entity_name}/{name}" for name in bodies], units["links"])
+        if servos:
+            return servos.set_units(ids, joints, units)
         model, joints = env.sim.mj_model, [f"{action.cfg.entity_name}/{name}" for name in joints]
         driven = {model.joint(joint).name: servo for servo, joint in enumerate(model.actuator_trnid[:, 0])
                   if (model.actuator_trntype[servo], model.actuator_biastype[servo]) == (0, 1)}  # fmt: skip
@@ -97,6 +109,28 @@ def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: 
     model.actuator_gainprm[at, servo, 0] = kp
     model.actuator_biasprm[at, servo, 0], model.actuator_biasprm[at, servo, 1] = kp * units["offset"], -kp
     model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
+
+
+def write_links(sim: Any, env_ids: Tensor, bodies: list[str], numbers: Tensor) -> None:
+    """Write mass, centre of mass and inertia of bodies, (worlds, 10 · bodies), to the model of mjlab."""
+    model, x = sim.model, numbers.reshape(len(env_ids), len(bodies), 10)
+    at, rows = env_ids[:, None], torch.tensor([sim.mj_model.body(name).id for name in bodies], device=x.device)
+    moments, axes = torch.linalg.eigh(x[..., [4, 7, 8, 7, 5, 9, 8, 9, 6]].reshape(*x.shape[:2], 3, 3).double())
+    axes[..., 0] *= torch.linalg.det(axes).sign()[..., None]
+    model.body_mass[at, rows], model.body_ipos[at, rows] = x[..., 0], x[..., 1:4]
+    model.body_inertia[at, rows], model.body_iquat[at, rows] = moments.to(x), _quaternions(axes).to(x)
+    total = model.body_mass[env_ids].clone()
+    for body in range(total.shape[1] - 1, 0, -1):
+        total[:, sim.mj_model.body_parentid[body]] += total[:, body]
+    model.body_subtreemass[env_ids] = total
+
+
+def _quaternions(turn: Tensor) -> Tensor:
+    """Return the quaternions (…, 4) of rotation matrices (…, 3, 3): the eigenvectors of their quadratic form."""
+    a, b, c, d, e, f, g, h, i = turn.flatten(-2).unbind(-1)
+    rows = (a + e + i, h - f, c - g, d - b), (h - f, a - e - i, b + d, c + g), (c - g, b + d, e - a - i, f + h), (
+        d - b, c + g, f + h, i - a - e)  # fmt: skip
+    return torch.linalg.eigh(torch.stack([torch.stack(row, -1) for row in rows], -2))[1][..., -1]
 
 
 # ---- Isaac Lab
