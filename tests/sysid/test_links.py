@@ -108,6 +108,16 @@ def test_recordings_show_a_heavy_link_by_its_moment_and_the_error_falls(robot):
     assert result.sentences()[-1].startswith("fore: ")
 
 
+def test_a_centre_of_mass_is_no_surer_than_the_zeros_of_the_encoders(robot, monkeypatch):
+    train = recorded(replace(robot, zero=np.array([0.006, 0.006])), 4, 200)
+    fit = link_fit(robot, train)
+    result = fit.descend(lambda cost: None)
+    _, now, std, _ = result.moments()
+    arm = np.linalg.norm(fit.axes.inertials(result.x)[-1, 1:4])
+    assert std[1, 1:4].max() > 0.5 * 0.006 * arm
+    assert (abs(now[:, 4:] - LinkAxes(robot).moments(0 * result.x)[:, 4:]) < 2 * std[:, 4:]).all()
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.6])
 def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monkeypatch, factor):
     servos = lambda self, *args, **options: self.bounds.first | {"kp": 1.1 * self.bounds.first["kp"]}  # noqa: E731

@@ -193,11 +193,13 @@ def _save_uncertainty(
 ) -> None:  # fmt: skip
     """Write the parameter uncertainty of a robot folder."""
     from gaponet.sysid.evidence.evidence import estimate_uncertainty
+    from gaponet.sysid.uncertainty import LinkUncertainty
 
     for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
         (folder / name).unlink(missing_ok=True)
     robot = load_robot(folder)
-    estimate_uncertainty(robot, sequences, validation, covariance, before, held_out, links=links).save(folder)
+    made = estimate_uncertainty(robot, sequences, validation, covariance, before, held_out)
+    replace(made, links=before.links if before else LinkUncertainty.of(links, robot, made.fields)).save(folder)
 
 
 def train(

@@ -38,10 +38,6 @@ LEAST_INVERSE = 0.2  # of a drawn value on an inverse axis, over the mean
 RANGE_SAMPLES = 4096
 UNDETERMINED_STD = 0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
 MIN_ROBOTS = 3  # of a type
-LINKS_HELD = (
-    "a scene of Isaac Lab may place and join its bodies in another way",
-    "uncertainty.json does not say how well they are known; identify with --masses again",
-)
 
 
 @dataclass(frozen=True)
@@ -49,10 +45,10 @@ class Randomization:
     """Sampled units of a robot.
 
     Attributes:
-        units: Field → (samples, n), SI units; a row is one unit. Of drawn links, "links" → (samples, 10 · bodies).
+        units: Field → (samples, n), SI units, and coordinates of drawn links, (samples, Q); a row is one unit.
         ranges: Joint → field → low, value, high; 9 of 10 units lie between.
         unknown: "joint: field" of the numbers that no log determines.
-        bodies: MJCF bodies of drawn links.
+        links: Axes of drawn links.
         judged: The units with the servo model that recordings chose; None without recordings.
         plain: The same of the robot as fitted without its servo model.
     """
@@ -63,14 +59,14 @@ class Randomization:
     ranges: dict[str, dict[str, tuple[float, float, float]]]
     unknown: tuple[str, ...]
     notes: tuple[str, ...]
-    bodies: tuple[str, ...] = ()
+    links: LinkAxes | None = None
     judged: DrawnRobots | None = None
     plain: DrawnRobots | None = None
 
 
 def sample_units(
     robot: RobotSpec | Path, scope: Scope = "today", others: ListOf[Path] = (), samples: int = 256, seed: int = 0,
-    links: bool = True,
+    engine: Engine = "json",
 ) -> Randomization:  # fmt: skip
     """Sample units of a robot.
 
@@ -80,7 +76,7 @@ def sample_units(
             different days. "any-robot": differences between robots of its type.
         others: Robot folders of the type, each identified from its own logs.
         samples: Number of units.
-        links: Draw the links too, where uncertainty.json has theirs; else units have the identified links.
+        engine: Isaac Lab's units have the identified links.
 
     Raises:
         UsageError: Data for the scope are missing; the message says which.
@@ -103,17 +99,17 @@ def sample_units(
     x = mean + np.sqrt(1 - single) * np.einsum("sd,dnp->snp", weights, deviations)
     x = x + np.sqrt(single * np.square(deviations).sum(axis=0)) * rng.standard_normal(x.shape)
     limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
-    bodies, more = tuple[str, ...](), dict[str, Array]()
-    if spec.links and (of_links := uncertainty.links if links else None):
-        axes, at = LinkAxes(spec.before_identification), np.array(of_links.values)
-        apart = np.random.default_rng([seed, 1]).multivariate_normal(0 * at, of_links.covariance, count, method="eigh")
-        bodies, more = axes.bodies, {"links": np.array([axes.numbers(at + row) for row in apart[:samples]])}
-    if spec.links and not bodies:
-        notes.append(f"all units have the identified links: {LINKS_HELD[links]}")
+    links, coordinates = uncertainty.links if engine != "isaaclab" else None, dict[str, Array]()
+    if links:
+        draw = np.random.default_rng([seed, 1]).multivariate_normal
+        coordinates["links"] = draw(links.values, links.covariance, count, method="eigh")
+    elif spec.links:
+        why = "Isaac Lab may place or join bodies differently" if uncertainty.links else "no others are stored"
+        notes.append(f"all units have the identified links: {why}")
     for i, joint in enumerate(joints):
         error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
-        if bodies and of_links:
-            error += apart @ np.array(of_links.servo_slopes[joint]).T
+        if links:
+            error += (coordinates["links"] - links.values) @ np.transpose(links.servo_slopes[joint])
         x[:, i] += error
         limit[:, i] *= np.exp(error[:, fields.index("kp")])
     bounded = [SERVO_FIELDS[f].axis != "log" and not SERVO_FIELDS[f].signed for f in fields]
@@ -129,8 +125,9 @@ def sample_units(
             low, high = np.percentile(sampled[field][:, i], RANGE_PERCENT)
             ranges[joint][field] = float(low), float(value[field][i]), float(high)
     names = tuple(f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k])
-    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit} | more).items()}
-    return Randomization(spec.name, scope, units, ranges, names, tuple(notes), bodies)
+    axes = LinkAxes(spec.before_identification) if links else None
+    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit} | coordinates).items()}
+    return Randomization(spec.name, scope, units, ranges, names, tuple(notes), axes)
 
 
 def judge_units(
@@ -225,13 +222,12 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
         "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}
                    for j, by in made.ranges.items()},
-        "units": _rounded(made.units), "unknown": made.unknown, "notes": made.notes,
+        "units": _written(made.units, made.links), "unknown": made.unknown, "notes": made.notes,
     }  # fmt: skip
-    if made.bodies:
-        content["bodies"] = made.bodies
+    content |= {"bodies": made.links.bodies} if made.links else {}
     if made.judged is not None and made.plain is not None:
         content |= {
-            "plain_units": _rounded(made.plain.units),
+            "plain_units": _written(made.plain.units, made.links),
             "error_mrad": {form: {name: 1e3 * error for name, error in drawn.errors.items()}
                            for form, drawn in (("servo model", made.judged), ("plain", made.plain))},
         }  # fmt: skip
@@ -245,9 +241,10 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
     return file
 
 
-def _rounded(units: Mapping[str, Any]) -> dict[str, Any]:
-    """Return units for a file; links have nine digits already, and would not stay physical."""
-    return {f: v if f == "links" else np.round(v, 9) for f, v in units.items()}
+def _written(units: Mapping[str, Any], axes: LinkAxes | None) -> dict[str, Any]:
+    """Return units with links as MuJoCo has them, (units, bodies, 11)."""
+    written = {f: np.round(v, 9) for f, v in units.items() if f != "links"}
+    return written | ({"links": [axes.inertials(np.array(row)) for row in units["links"]]} if axes else {})
 
 
 def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:

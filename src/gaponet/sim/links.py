@@ -7,7 +7,6 @@ the robot's file and keep every link physical (Rucker and Wensing 2022). They ha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import mujoco
@@ -16,7 +15,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.text import format_uncertainty
 from gaponet.robot.spec import Link, RobotSpec
-from gaponet.sim.model import build_model
+from gaponet.sim.model import build_model, principal_axes
 
 COORDINATES = 10  # of a link: log of mass, of stretches (3), shears (3) and shifts (3)
 MASS_LOG_STD, STRETCH_STD, SHIFT_STD = np.log(1.3), 0.15, 0.15  # of the prior; shifts relative to the link's length
@@ -49,7 +48,7 @@ class LinkAxes:
                     arm = _centre(model, data, own) - data.xanchor[model.body_jntadr[root]]
                     self._arms.append(data.xmat[root].reshape(3, 3).T @ arm)
         self.scale = np.array(scale).reshape(-1, COORDINATES)
-        self.bodies = tuple(name for link in self._bodies for name, _, _ in link)
+        self.bodies = tuple(name for members in self._bodies for name, _, _ in members)
 
     def links(self, x: Array) -> dict[str, Link]:
         """Return the bodies of links that x (L · COORDINATES,) changes, and those that the robot already has."""
@@ -59,21 +58,11 @@ class LinkAxes:
                 links |= {name: _link(_upper(own) @ p @ _upper(own).T, frame) for name, frame, p in bodies}
         return links
 
-    def numbers(self, x: Array) -> Array:
-        """Return mass, centre of mass and inertia of all bodies, (10 · bodies,), in the order of `Link`."""
-        links = self.links(np.where(x == 0, 1e-12, x))  # all bodies, the file's too
-        return np.concatenate([[one.mass, *one.pos, *one.inertia] for one in (links[name] for name in self.bodies)])
-
-    def coordinates(self, links: Mapping[str, Link]) -> Array:
-        """Return x (L · COORDINATES,) of which `links` are the bodies; those that it lacks are the file's."""
-        rows = []
-        for members in self._bodies:
-            old = sum(p for _, _, p in members)
-            new = sum(f @ _pseudo_inertia(links[name]) @ f.T if name in links else p for name, f, p in members)
-            u = _upper_root(new) @ np.linalg.inv(_upper_root(old))
-            u, mass = u / u[3, 3], np.log(u[3, 3])
-            rows.append([mass, *np.log(np.diag(u)[:3]), *u[[0, 0, 1], [1, 2, 2]], *u[:3, 3]])
-        return np.asarray(np.array(rows) / self.scale).ravel()
+    def inertials(self, x: Array) -> Array:
+        """Return mass, centre of mass, principal inertia and its quaternion as MuJoCo has them, (bodies, 11)."""
+        links = self.links(np.where(x == 0, 1e-12, x))  # of all bodies, those of the file too
+        each = [links[name] for name in self.bodies]
+        return np.array([[one.mass, *one.pos, *np.concatenate(principal_axes(one))] for one in each])
 
     def moments(self, x: Array) -> Array:
         """Return mass, kg, centre of mass, m from the file's, and moment about the joint, kg·m, (L, 7); body's axes."""
@@ -83,12 +72,6 @@ class LinkAxes:
             mass, centre = p[3, 3], p[:3, 3] / p[3, 3]
             rows.append([mass, *centre, *mass * (arm + centre)])
         return np.array(rows)
-
-
-def links_of(bodies: Sequence[str], numbers: Array) -> dict[str, Link]:
-    """Return the links of bodies with `LinkAxes.numbers`, (10 · bodies,)."""
-    rows = np.reshape(numbers, (len(bodies), 10)).tolist()
-    return {name: Link(row[0], tuple(row[1:4]), tuple(row[4:])) for name, row in zip(bodies, rows, strict=True)}
 
 
 def _centre(model: mujoco.MjModel, data: mujoco.MjData, own: list[int]) -> Array:
@@ -126,20 +109,6 @@ def _upper(x: Array) -> Array:
     return np.asarray(np.exp(x[0]) * u)
 
 
-def _upper_root(p: Array) -> Array:
-    """Return the upper triangular R with R Rᵀ = p, (4, 4); a flat link gets some thickness."""
-    p = p + 1e-9 * np.trace(p[:3, :3]) * np.diag([1, 1, 1, 0])
-    return np.asarray(np.linalg.cholesky(p[::-1, ::-1])[::-1, ::-1])
-
-
-def _pseudo_inertia(link: Link) -> Array:
-    """Return the pseudo-inertia (4, 4) of a link in its body's frame."""
-    inertia, first = np.array(link.inertia)[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3), np.r_[link.pos, 1.0]
-    p = link.mass * np.outer(first, first)
-    p[:3, :3] += np.trace(inertia) / 2 * np.eye(3) - inertia
-    return np.asarray(p)
-
-
 def _link(p: Array, frame: Array) -> Link:
     """Return mass, centre and inertia in a body's frame (4, 4) of a pseudo-inertia (4, 4)."""
     back = np.linalg.inv(frame)
@@ -154,17 +123,13 @@ def _link(p: Array, frame: Array) -> Link:
 
 @dataclass(frozen=True)
 class LinkResult:
-    """Fitted coordinates x (L · COORDINATES,) of links, their covariance, and values (n,) of the servos beside them.
-
-    `servo_slopes` of an accepted fit: field → its change on its axis with which recordings hold for other coordinates,
-    (n, L · COORDINATES).
-    """
+    """Fitted coordinates x (L · COORDINATES,) of links, their covariance, and values (n,) of the servos beside them."""
 
     axes: LinkAxes
     x: Array
     covariance: Array
     values: dict[str, Array]
-    servo_slopes: dict[str, Array] = field(default_factory=dict)
+    servo_slopes: dict[str, Array] = field(default_factory=dict)  # field → its change for one of x, (n, Q)
 
     def moments(self) -> tuple[Array, Array, Array, Array]:
         """Return `LinkAxes.moments` before and now, their standard errors now and by the prior alone, (L, 7) each."""

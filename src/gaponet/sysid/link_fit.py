@@ -53,11 +53,11 @@ class LinkFit:
         self._weight = np.clip(self._level / std, 0.3, 3.0)
 
     def _determined(self) -> tuple[Array, Array]:
-        """Return the directions whose information in the recordings is above the prior's, from inverse dynamics, and
-        the covariance of the others, (10 L, 10 L).
+        """Return directions with more information than the prior's, and the covariance along others, (10 L, 10 L).
 
-        A change of torque moves a joint by itself over kp. What gains, offsets, damping, friction and armature of the
-        joint explain as well does not count, so without payloads all masses do not change together.
+        They come from inverse dynamics. A change of torque moves a joint by itself over kp. What gains, offsets,
+        damping, friction and armature of the joint explain as well does not count, so without payloads all masses do
+        not change together.
         """
         robot, parts, op = replace(self.whole.robot, table=None), self.whole.rollouts.parts, self.whole.rollouts.op
         every, size = max(1, sum(map(len, parts)) // ROWS), self.axes.scale.size
@@ -98,26 +98,21 @@ class LinkFit:
         servos, z = np.split(x[:, 0], [self._n * len(self._servos.names)], axis=1)
         return self._servos.values(servos.reshape(len(x), self._n, -1)), list(z @ self.directions.T)
 
-    def errors(self, x: Array, zero: Array | None = None) -> Array:
-        """Return errors of candidates (k, 1, P), (k, 1, n · (rows + PRIORS) + K) in ERROR_SCALE_RAD.
-
-        `zero` are zeros of the encoders, (k, n) rad, if not the robot's.
-        """
-        values, coordinates = self._unpacked(x)
-        moved = values if zero is None else values | {"zero": zero}
-        errors = self.whole.rollouts.flat_errors(moved, [self.axes.links(c) for c in coordinates]) / ERROR_SCALE_RAD
+    def errors(self, x: Array, **other: Array) -> Array:
+        """Return errors of candidates (k, 1, P), (k, 1, n · (rows + PRIORS) + K) in ERROR_SCALE_RAD."""
+        values, links = self._unpacked(x)
+        errors = self.whole.rollouts.flat_errors(values | other, [self.axes.links(c) for c in links]) / ERROR_SCALE_RAD
         own = np.concatenate([errors, self._prior.errors(values)], axis=2) * self._weight[:, None]
         z = x[:, 0, self._n * len(self._servos.names) :]
         return np.concatenate([own.reshape(len(x), -1), self._level * z], axis=1)[:, None]
 
     def descend(self, report: Progress) -> LinkResult:
         """Fit links and servos together; return them with the links' covariance."""
-        first, size = self._servos.normalize(self._first).ravel(), self.axes.scale.size
+        first = np.r_[self._servos.normalize(self._first).ravel(), np.zeros(self.directions.shape[1])]
         if not self.directions.size:
-            return LinkResult(self.axes, np.zeros(size), np.eye(size), self._first)
-        ends = np.full(self.directions.shape[1], MAX_CHANGE)
-        x, low, high = np.r_[first, 0 * ends][None, None], self._servos.low.ravel(), self._servos.high.ravel()
-        low, high = np.r_[low, -ends][None], np.r_[high, ends][None]
+            return LinkResult(self.axes, np.zeros(self.axes.scale.size), np.eye(self.axes.scale.size), self._first)
+        x, ends = first[None, None], np.full(self.directions.shape[1], MAX_CHANGE)
+        low, high = np.r_[self._servos.low.ravel(), -ends][None], np.r_[self._servos.high.ravel(), ends][None]
         for i, count in enumerate(ITERATIONS):
             if i:
                 values, coordinates = self._unpacked(x[0][None])
@@ -147,7 +142,7 @@ class LinkFit:
         """
         (here, jac), count, n = self._slopes(x), self.directions.shape[1], self._n
         zeros = self.whole.robot.zero[self.whole.rollouts.op] + ENCODER_ZERO_STD_RAD * np.eye(n)
-        by_zero = self.errors(np.repeat(x[None, None], n, axis=0), zeros)[:, 0] - here
+        by_zero = self.errors(np.repeat(x[None, None], n, axis=0), zero=zeros)[:, 0] - here
         weighted = jac / np.sqrt(1 + here**2)[:, None]
         rows = (len(here) - count) // n
         mine, by_joint = (y[: n * rows].reshape(n, rows, -1) for y in (weighted * here[:, None], jac))

@@ -29,7 +29,6 @@ from gaponet.sim.links import LinkAxes, LinkResult
 from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
 PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
-LINK_STEP = 1e-3  # standard deviations of the prior, of a difference
 UNOBSERVED_RELATIVE_ERROR = 1.0, 3.0  # from which no effect was seen: of a value of zero, of another
 MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = 0.9, 0.03  # from which parameters are known only as a set
 OLD_KEYS = {  # of known.json → of uncertainty.json
@@ -80,13 +79,10 @@ class JointUncertainty:
 
 @dataclass(frozen=True)
 class LinkUncertainty:
-    """Uncertainty of fitted links, on the axes (sim/links.py) of the robot before identification.
+    """Uncertainty of fitted links, in Q coordinates (sim/links.py) of the robot before identification.
 
-    Attributes:
-        values: Fitted coordinates, (Q,).
-        covariance: (Q, Q).
-        servo_slopes: Joint → change of its values that goes with a change of the coordinates, (P, Q). The covariance of
-            the joint is for the links as fitted.
+    The covariance of a joint is for the links as fitted. `servo_slopes` (P, Q) are the change of its values that goes
+    with other links.
     """
 
     values: tuple[float, ...]
@@ -95,18 +91,12 @@ class LinkUncertainty:
 
     @classmethod
     def of(cls, result: LinkResult | None, robot: RobotSpec, fields: ListOf[str]) -> LinkUncertainty | None:
-        """Return the uncertainty of a fit of links, if the robot has its links."""
-        if result is None or robot.links != result.axes.links(result.x):
+        """Return the uncertainty of a fit that began with the file's links, if the robot has the fitted ones."""
+        if result is None or result.axes.links(0 * result.x) or robot.links != result.axes.links(result.x):
             return None
-        axes = LinkAxes(robot.before_identification)
-        values, jac = axes.coordinates(robot.links), np.eye(len(result.x))
-        if result.axes.links(0 * result.x):  # the fit began with identified links
-            ahead = [axes.coordinates(result.axes.links(result.x + LINK_STEP * row)) for row in jac]
-            jac = (np.array(ahead) - values).T / LINK_STEP
-        none = np.zeros((len(robot.operated), len(jac)))
-        slopes = np.stack([result.servo_slopes.get(f, none) @ np.linalg.inv(jac) for f in fields], axis=1)
-        by_joint = dict(zip(robot.operated, nested(slopes), strict=True))
-        return cls(nested(values), nested(jac @ result.covariance @ jac.T), by_joint)
+        none = np.zeros((len(robot.operated), len(result.x)))
+        slopes = np.stack([result.servo_slopes.get(f, none) for f in fields], axis=1).tolist()
+        return cls(tuple(result.x.tolist()), result.covariance.tolist(), dict(zip(robot.operated, slopes, strict=True)))
 
 
 ArrayName = Literal["values", "covariance", "gauss_newton_step", "gauss_newton_covariance", "overdispersion"]
@@ -150,11 +140,9 @@ class ParameterUncertainty:
             if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
                 raise RobotError(f"{file}: its values are other values than robot.toml's, at {joint}; {hint}")
         if uncertainty.links:
-            values = LinkAxes(robot.before_identification).coordinates(robot.links)
-            if not (
-                len(values) == len(uncertainty.links.values)
-                and np.allclose(values, uncertainty.links.values, atol=0.02)
-            ):
+            stored = LinkAxes(robot.before_identification).links(np.array(uncertainty.links.values))
+            mass = {body: link.mass for body, link in robot.links.items()}
+            if not all(np.isclose(x.mass, mass.get(body, 0.0), rtol=1e-4) for body, x in stored.items()):
                 raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
         return uncertainty
 
@@ -167,10 +155,7 @@ class ParameterUncertainty:
 
     def save(self, folder: Path) -> None:
         """Write uncertainty.json into a robot folder."""
-        content = asdict(self)
-        if self.links is None:
-            del content["links"]
-        write_json(folder / UNCERTAINTY_FILE, content)
+        write_json(folder / UNCERTAINTY_FILE, {name: x for name, x in asdict(self).items() if x is not None})
 
     def array(self, joint: str, name: ArrayName) -> Array:
         """Return an attribute of a joint as an array."""
@@ -187,11 +172,6 @@ class ParameterUncertainty:
         jac = np.stack([(ahead[f] - here[f]) / step for f in self.fields])  # (P, axes)
         own = self.array(joint, "covariance") if covariance is None else covariance
         return {f: float(v) for f, v in here.items()}, jac @ own @ jac.T
-
-
-def nested(x: Array) -> Any:
-    """Return an array as nested tuples."""
-    return tuple(nested(y) for y in x) if x.ndim else float(x)
 
 
 def _with_new_keys(table: dict[str, Any]) -> dict[str, Any]:

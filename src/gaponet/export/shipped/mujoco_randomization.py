@@ -24,9 +24,8 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
     a torque limit get none, and a delay is at most as long as the servo's buffer (nsample).
     """
     form = "plain_units" if "plain_units" in drawn else "units"
-    values = {field: x for field, x in drawn[form].items() if field != "links"}
     for i, name in enumerate(drawn["joints"]):
-        unit = {field: float(values[field][row][i]) for field in values}
+        unit = {field: float(values[row][i]) for field, values in drawn[form].items() if field != "links"}
         joint = model.joint(name)
         dof, kp, limit = joint.dofadr[0], unit["kp"], unit["effort_limit"]
         model.dof_damping[dof], model.dof_frictionloss[dof] = unit["damping"], unit["frictionloss"]
@@ -44,18 +43,10 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
 
 
 def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str = "units") -> None:
-    """Give the bodies of a model the mass, centre of mass and inertia of a unit, where the file has drawn links.
-
-    `form` is "units", with the servo model, or "plain_units", without it.
-    """
-    for name, x in zip(
-        drawn.get("bodies", ()), np.reshape(drawn[form].get("links", {row: ()})[row], (-1, 10)), strict=True
-    ):
-        body, inertia = model.body(name), x[[4, 7, 8, 7, 5, 9, 8, 9, 6]].reshape(3, 3)
-        moments, axes = np.linalg.eigh(inertia)
-        axes[:, 0] *= np.sign(np.linalg.det(axes))
-        body.mass[:], body.ipos[:], body.inertia[:] = x[0], x[1:4], moments
-        mujoco.mju_mat2Quat(body.iquat, axes.ravel())
+    """Give bodies the links of a unit with the servo model ("plain_units": without it), where the file has links."""
+    for i, name in enumerate(drawn.get("bodies", ())):
+        body, x = model.body(name), drawn[form]["links"][row][i]
+        body.mass[:], body.ipos[:], body.inertia[:], body.iquat[:] = x[0], x[1:4], x[4:7], x[7:]
         model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
@@ -63,7 +54,7 @@ def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str 
 def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[str, Any]:
     """Return the facts.json of gaponet export --to mjcf with the numbers of a unit, for mujoco_servos.Servos.
 
-    Servos(model, unit_facts(facts, drawn, row)) moves a model like the unit, with its servo model, after `set_links`.
+    Servos(model, unit_facts(facts, drawn, row)) moves a model like the unit after `set_links`.
     """
     joints = {name: dict(servo) for name, servo in facts["joints"].items()}
     for i, name in enumerate(drawn["joints"]):

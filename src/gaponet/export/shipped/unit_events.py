@@ -35,12 +35,6 @@ def read_units(file: str | Path, form: str) -> tuple[list[str], Units]:
     return drawn["joints"], {field: torch.tensor(x) for field, x in drawn.get(form, drawn["units"]).items()}
 
 
-@cache
-def read_bodies(file: str | Path) -> list[str]:
-    """Return the bodies whose masses, centres of mass and inertias differ between units."""
-    return list(json.loads(Path(file).read_text(encoding="utf-8")).get("bodies", ()))
-
-
 def draw_units(file: str | Path, form: str, env: Any, env_ids: Any, rows: Any) -> tuple[Tensor, list[str], Units]:
     """Draw a unit for each of the worlds `env_ids` (indices, a slice; None for all).
 
@@ -78,7 +72,7 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
     """
     from mjlab.managers.event_manager import requires_model_fields
 
-    bodies = read_bodies(file)
+    bodies = json.loads(Path(file).read_text(encoding="utf-8")).get("bodies", [])
 
     @requires_model_fields(*MODEL_FIELDS, *BODY_FIELDS * bool(bodies))
     def use_units(env: Any, env_ids: Any) -> None:
@@ -111,26 +105,16 @@ def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: 
     model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
 
 
-def write_links(sim: Any, env_ids: Tensor, bodies: list[str], numbers: Tensor) -> None:
-    """Write mass, centre of mass and inertia of bodies, (worlds, 10 · bodies), to the model of mjlab."""
-    model, x = sim.model, numbers.reshape(len(env_ids), len(bodies), 10)
-    at, rows = env_ids[:, None], torch.tensor([sim.mj_model.body(name).id for name in bodies], device=x.device)
-    moments, axes = torch.linalg.eigh(x[..., [4, 7, 8, 7, 5, 9, 8, 9, 6]].reshape(*x.shape[:2], 3, 3).double())
-    axes[..., 0] *= torch.linalg.det(axes).sign()[..., None]
-    model.body_mass[at, rows], model.body_ipos[at, rows] = x[..., 0], x[..., 1:4]
-    model.body_inertia[at, rows], model.body_iquat[at, rows] = moments.to(x), _quaternions(axes).to(x)
+def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> None:
+    """Write mass, centre of mass and inertia of bodies to a model of mjlab, (worlds, bodies, 11)."""
+    model, parents = sim.model, sim.mj_model.body_parentid.tolist()
+    at = env_ids[:, None], torch.tensor([sim.mj_model.body(name).id for name in bodies], device=links.device)
+    model.body_mass[at], model.body_ipos[at] = links[..., 0], links[..., 1:4]
+    model.body_inertia[at], model.body_iquat[at] = links[..., 4:7], links[..., 7:]
     total = model.body_mass[env_ids].clone()
-    for body in range(total.shape[1] - 1, 0, -1):
-        total[:, sim.mj_model.body_parentid[body]] += total[:, body]
+    for body in range(len(parents) - 1, 0, -1):
+        total[:, parents[body]] += total[:, body]
     model.body_subtreemass[env_ids] = total
-
-
-def _quaternions(turn: Tensor) -> Tensor:
-    """Return the quaternions (…, 4) of rotation matrices (…, 3, 3): the eigenvectors of their quadratic form."""
-    a, b, c, d, e, f, g, h, i = turn.flatten(-2).unbind(-1)
-    rows = (a + e + i, h - f, c - g, d - b), (h - f, a - e - i, b + d, c + g), (c - g, b + d, e - a - i, f + h), (
-        d - b, c + g, f + h, i - a - e)  # fmt: skip
-    return torch.linalg.eigh(torch.stack([torch.stack(row, -1) for row in rows], -2))[1][..., -1]
 
 
 # ---- Isaac Lab

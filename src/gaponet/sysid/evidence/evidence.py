@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from gaponet.data.repeatability import repetition_difference
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.links import LinkResult
 from gaponet.sim.metrics import confidence_factor, standard_error
 from gaponet.sim.replay import replay
 from gaponet.sysid.acceptance import HeldOut
@@ -23,15 +23,7 @@ from gaponet.sysid.least_squares import slopes
 from gaponet.sysid.problem import MIN_CLUSTERS, cluster_sums
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.table_contact import contact_height, tip_heights
-from gaponet.sysid.uncertainty import (
-    JointUncertainty,
-    LinkUncertainty,
-    ParameterUncertainty,
-    Provenance,
-    nested,
-    prior_std,
-    to_axes,
-)
+from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, Provenance, prior_std, to_axes
 
 WINDOWS = 40  # of 8 s
 PLAY_TURN_RAD = 0.002  # servo error at which play has changed sides
@@ -138,7 +130,6 @@ def estimate_uncertainty(
     before: ParameterUncertainty | None = None,
     held_out: ListOf[HeldOut] = (),
     nthread: int = 0,
-    links: LinkResult | None = None,
 ) -> ParameterUncertainty:
     """Estimate the parameter uncertainty of a robot with the values that were fitted to recordings of one robot.
 
@@ -150,7 +141,6 @@ def estimate_uncertainty(
             what both uncertainties explain.
         held_out: Recordings and the robots that were fitted without them, instead of `judges`, if `robot` was fitted to
             them as well.
-        links: Fit of the links; without one, those of `before` stay.
     """
     first = first_values(robot)
     fitted_fields = (*CLASSIC, *(f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()))
@@ -185,8 +175,8 @@ def estimate_uncertainty(
         rms = float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2)))
         old_joint = before.joints[joint] if before and not (judges or held_out) else None
         joints[joint] = JointUncertainty(
-            values=nested(values[joint]), covariance=nested(covariance), gauss_newton_step=nested(step[i]),
-            gauss_newton_covariance=nested(step_covariance[i]), overdispersion=nested(overdispersion[i]),
+            values=_nested(values[joint]), covariance=_nested(covariance), gauss_newton_step=_nested(step[i]),
+            gauss_newton_covariance=_nested(step_covariance[i]), overdispersion=_nested(overdispersion[i]),
             parameter_rms=ERROR_SCALE_RAD * float(np.sqrt(variance)),
             residual_rms=max(rms, old_joint.residual_rms if old_joint else 0.0),
             residual_p90=max(_error_bound(errors[joint]), old_joint.residual_p90 if old_joint else 0.0),
@@ -201,9 +191,8 @@ def estimate_uncertainty(
         "values": {j: joints[j].values for j in joints}, "covariance": {j: joints[j].covariance for j in joints},
     }  # fmt: skip
     return ParameterUncertainty(
-        fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges or held_out),
-        before.links if before else LinkUncertainty.of(links, robot, fields),
-    )  # fmt: skip
+        fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges or held_out)
+    )
 
 
 def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Array]]:
@@ -231,3 +220,8 @@ def _error_bound(motions: ListOf[Array]) -> float:
     if freedom:
         wider = confidence_factor(freedom) * standard_error(rms) / max(float(rms.mean()), 1e-12)
     return float(np.quantile(np.concatenate(motions), BOUND_QUANTILE)) * (1 + wider)
+
+
+def _nested(x: Array) -> Any:
+    """Return an array as nested tuples."""
+    return tuple(_nested(y) for y in x) if x.ndim else float(x)
