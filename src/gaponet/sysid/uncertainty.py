@@ -140,9 +140,9 @@ class ParameterUncertainty:
             if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
                 raise RobotError(f"{file}: its values are other values than robot.toml's, at {joint}; {hint}")
         if uncertainty.links:
-            stored = LinkAxes(robot.before_identification).links(np.array(uncertainty.links.values))
+            links = LinkAxes(robot.before_identification).links(np.array(uncertainty.links.values))
             mass = {body: link.mass for body, link in robot.links.items()}
-            if not all(np.isclose(x.mass, mass.get(body, 0.0), rtol=1e-4) for body, x in stored.items()):
+            if not all(np.isclose(x.mass, mass.get(body, 0.0), rtol=1e-4) for body, x in links.items()):
                 raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
         return uncertainty
 
