@@ -82,12 +82,12 @@ def recorded(robot, count, rows=100, payloads=(0.0, 0.2), first=0):
     return [record(robot, commands(rows, first + i), f"m{first + i}", p, kp=1.1) for i, p in enumerate(payload)]
 
 
-def link_fit(robot, train):
+def link_fit(robot, train, residual=0.01):
     """A fit of links, from servos as they are."""
     joints = JointFit(JointRollouts(cut(train, 4), robot, nthread=1), robot, Bounds(robot, train))
     values = {f: v for f, v in joints.bounds.first.items() if f in CLASSIC}
     values["kp"] = 1.1 * values["kp"]
-    joints.prior.residual = np.full(2, 0.01)
+    joints.prior.residual = np.full(2, residual)
     return LinkFit(joints.robot_fit(1), values)
 
 
@@ -109,7 +109,7 @@ def test_recordings_show_a_heavy_link_by_its_moment_and_the_error_falls(robot):
 
 
 def test_a_centre_of_mass_is_no_surer_than_the_zeros_of_the_encoders(robot, monkeypatch):
-    train = recorded(replace(robot, zero=np.array([0.006, 0.006])), 4, 200)
+    train = recorded(replace(robot, zero=np.array([0.006, 0.006])), 2, 150)
     fit = link_fit(robot, train)
     result = fit.descend(lambda cost: None)
     _, now, std, _ = result.moments()
@@ -132,3 +132,14 @@ def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monk
     assert bool(fitted.links) == (factor > 1)
     assert fitted.robot.nominal is robot
     assert fitted.held_out[0].robot is fitted.robot
+
+
+def test_where_masses_and_gains_are_known_together_gains_follow_masses(robot):
+    fit = link_fit(robot, recorded(robot, 4, 200, payloads=(0.0,)), 1e-3)
+    result = fit.descend(lambda cost: None)
+    masses = np.zeros((2, COORDINATES))
+    masses[:, 0] = np.log(1.2) / 2 / fit.axes.scale[:, 0]
+    slopes = fit.servo_slopes(replace(result, x=0 * result.x))
+    np.testing.assert_allclose(slopes["kp"] @ masses.ravel(), np.log(1.2), rtol=0.15)
+    kd_over_kp = robot.kd / result.values["kp"]
+    np.testing.assert_allclose(slopes["damping"] @ masses.ravel(), kd_over_kp * np.log(1.2), rtol=0.5, atol=2e-3)

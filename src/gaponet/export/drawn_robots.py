@@ -125,10 +125,9 @@ def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
         base.with_servos({j: {f: float(v[k, i]) for f, v in servos.items()} for i, j in enumerate(base.operated)})
         for k in range(len(units["kp"]))
     ]
-    if "links" not in units:
-        return robots
-    axes = LinkAxes(base.before_identification)
-    return [replace(one, links=axes.links(row)) for one, row in zip(robots, units["links"], strict=True)]
+    if links := LinkAxes(base.before_identification).links if "links" in units else None:
+        robots = [replace(one, links=links(row)) for one, row in zip(robots, units["links"], strict=True)]
+    return robots
 
 
 def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:

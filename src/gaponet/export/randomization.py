@@ -99,17 +99,16 @@ def sample_units(
     x = mean + np.sqrt(1 - single) * np.einsum("sd,dnp->snp", weights, deviations)
     x = x + np.sqrt(single * np.square(deviations).sum(axis=0)) * rng.standard_normal(x.shape)
     limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
-    links, coordinates = uncertainty.links if engine != "isaaclab" else None, dict[str, Array]()
+    links, drawn = uncertainty.links if engine != "isaaclab" else None, dict[str, Array]()
     if links:
-        draw = np.random.default_rng([seed, 1]).multivariate_normal
-        coordinates["links"] = draw(links.values, links.covariance, count, method="eigh")
+        drawn["links"] = np.random.default_rng([seed, 1]).multivariate_normal(links.values, links.covariance, count)
     elif spec.links:
         why = "Isaac Lab may place or join bodies differently" if uncertainty.links else "no others are stored"
         notes.append(f"all units have the identified links: {why}")
     for i, joint in enumerate(joints):
         error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
         if links:
-            error += (coordinates["links"] - links.values) @ np.transpose(links.servo_slopes[joint])
+            error += (drawn["links"] - links.values) @ np.transpose(links.servo_slopes[joint])
         x[:, i] += error
         limit[:, i] *= np.exp(error[:, fields.index("kp")])
     bounded = [SERVO_FIELDS[f].axis != "log" and not SERVO_FIELDS[f].signed for f in fields]
@@ -126,7 +125,7 @@ def sample_units(
             ranges[joint][field] = float(low), float(value[field][i]), float(high)
     names = tuple(f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k])
     axes = LinkAxes(spec.before_identification) if links else None
-    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit} | coordinates).items()}
+    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit} | drawn).items()}
     return Randomization(spec.name, scope, units, ranges, names, tuple(notes), axes)
 
 

@@ -279,9 +279,9 @@ def _with_links(
     links, servos = [r.axes.links(r.x) for r in results], [r.values for r in results]
     before = judge.errors(values)
     comparison = Comparison("masses", before, judge.errors(servos, links) if results[-1].x.any() else before)
-    if not comparison.accepted:
-        return comparison, None, [], values
-    return comparison, replace(results[-1], servo_slopes=fits[-1].servo_slopes(results[-1])), links, servos
+    slopes = fits[-1].servo_slopes(results[-1]) if comparison.accepted else {}
+    accepted = comparison, replace(results[-1], servo_slopes=slopes), links, servos
+    return accepted if comparison.accepted else (comparison, None, [], values)
 
 
 def _fit_term(

@@ -163,4 +163,7 @@ class LinkFit:
         normal = jac.T @ (jac / np.sqrt(1 + here**2)[:, None])
         slopes = -np.linalg.pinv(normal[:count, :count], rcond=1e-10, hermitian=True) @ normal[:count, count:]
         slopes = slopes.reshape(*self._servos.unit.shape, -1) * self._servos.unit[..., None]
-        return dict(zip(self._servos.names, np.moveaxis(slopes, 1, 0), strict=True))
+        by_field = dict(zip(self._servos.names, np.moveaxis(slopes, 1, 0), strict=True))
+        if "damping" in by_field:  # the fitted sum with kd over kp keeps its value, and kd does not change with kp
+            by_field["damping"] += (self.whole.bounds.kd / result.values["kp"])[:, None] * by_field["kp"]
+        return by_field

@@ -79,10 +79,9 @@ class JointUncertainty:
 
 @dataclass(frozen=True)
 class LinkUncertainty:
-    """Uncertainty of fitted links, in Q coordinates (sim/links.py) of the robot before identification.
+    """Uncertainty of fitted links in Q coordinates (sim/links.py), and slopes (P, Q) of each joint's values over them.
 
-    The covariance of a joint is for the links as fitted. `servo_slopes` (P, Q) are the change of its values that goes
-    with other links.
+    The covariances of the joints are for the links as fitted.
     """
 
     values: tuple[float, ...]
