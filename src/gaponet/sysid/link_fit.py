@@ -44,7 +44,8 @@ class LinkFit:
         self._prior.log_std = PRIOR_LOG_STD  # a stated kp would shift all masses
         self._prior.residual = FIRST_RESIDUAL_SHARE * whole.prior.residual
         self._weigh()
-        self.directions, self._rest = self._determined() if self.axes.names else (np.zeros((0, 0)), np.zeros((0, 0)))
+        none: Array = np.zeros((0, 0))
+        self.directions, self._rest = self._determined() if self.axes.names else (none, none)
 
     def _weigh(self) -> None:
         """Weigh each joint's errors by its residual; the prior weighs as much as errors of the mean residual."""
