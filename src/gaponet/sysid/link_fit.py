@@ -150,8 +150,7 @@ class LinkFit:
         each = cluster_sums(mine[:, :-PRIORS], self.whole.rollouts.window)[0].sum(axis=0)
         each -= each.mean(axis=0)
         held = np.concatenate([*by_joint[:, -PRIORS:], jac[n * rows :]])
-        few = len(each) / max(len(each) - count, 1)
-        scatter = each.T @ each * few**2 + self._level**2 * held.T @ held
+        scatter = each.T @ each * (len(each) / max(len(each) - count, 1)) ** 2 + self._level**2 * held.T @ held
         inverse = np.linalg.pinv(jac.T @ weighted, rcond=1e-10, hermitian=True)
         shifted = (inverse @ weighted.T @ by_zero.T)[-count:]
         return (inverse @ scatter @ inverse)[-count:, -count:], shifted @ shifted.T

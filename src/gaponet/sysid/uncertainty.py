@@ -140,9 +140,8 @@ class ParameterUncertainty:
                 raise RobotError(f"{file}: its values are other values than robot.toml's, at {joint}; {hint}")
         if uncertainty.links:
             links = LinkAxes(robot.before_identification).links(np.array(uncertainty.links.values))
-            if not all(
-                b in robot.links and np.isclose(x.mass, robot.links[b].mass, rtol=1e-4) for b, x in links.items()
-            ):
+            mass = {body: link.mass for body, link in robot.links.items()}
+            if not all(np.isclose(x.mass, mass.get(body, 0.0), rtol=1e-4) for body, x in links.items()):
                 raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
         return uncertainty
 
