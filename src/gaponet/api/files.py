@@ -127,7 +127,7 @@ def randomization(
     from gaponet.export.randomization import judge_units, sample_units, write_randomization
 
     spec = load_robot(simulator_folder(Path(robot)))
-    made = sample_units(spec, scope, tuple(map(Path, units)))
+    made = sample_units(spec, scope, tuple(map(Path, units)), engine=engine)
     made = judge_units(made, spec, read_recordings(spec.folder, data, spec), progress)
     return write_randomization(made, engine, Path(out)), made
 

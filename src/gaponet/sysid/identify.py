@@ -278,15 +278,17 @@ def _with_links(
     searches: _SearchProgress,
 ) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:
     """Fit the links with the servos from `start`; return them and the servos' values if they are better."""
-    results = list[LinkResult]()
-    for whole, one, torque_kp in zip(wholes, start, gains, strict=True):
+    results, fits = list[LinkResult](), [LinkFit(*one) for one in zip(wholes, start, gains, strict=True)]
+    for fit in fits:
         searches.begin()
-        report = searches.report("masses", ("all joints",), whole.rollouts.rows.sum(keepdims=True))
-        results.append(LinkFit(whole, one, torque_kp).descend(report))
+        report = searches.report("masses", ("all joints",), fit.whole.rollouts.rows.sum(keepdims=True))
+        results.append(fit.descend(report))
     links, servos = [r.axes.links(r.x) for r in results], [r.values for r in results]
     before = judge.errors(values)
     comparison = Comparison("masses", before, judge.errors(servos, links) if results[-1].x.any() else before)
-    return (comparison, results[-1], links, servos) if comparison.accepted else (comparison, None, [], values)
+    slopes = fits[-1].servo_slopes(results[-1]) if comparison.accepted else {}
+    accepted = comparison, replace(results[-1], servo_slopes=slopes), links, servos
+    return accepted if comparison.accepted else (comparison, None, [], values)
 
 
 def _fit_term(

@@ -23,6 +23,7 @@ from torch import Tensor
 MODEL_FIELDS = (
     "dof_armature", "dof_frictionloss", "dof_damping", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
 )  # fmt: skip
+BODY_FIELDS = "body_mass", "body_ipos", "body_inertia", "body_iquat", "body_subtreemass"
 DELAY_BUFFERS = "positions_delay_buffer", "velocities_delay_buffer", "efforts_delay_buffer"
 Units = dict[str, Tensor]  # field → (worlds, joints), SI units
 
@@ -71,12 +72,17 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
     """
     from mjlab.managers.event_manager import requires_model_fields
 
-    @requires_model_fields(*MODEL_FIELDS)
+    bodies = json.loads(Path(file).read_text(encoding="utf-8")).get("bodies", [])
+
+    @requires_model_fields(*MODEL_FIELDS, *BODY_FIELDS * bool(bodies))
     def use_units(env: Any, env_ids: Any) -> None:
         action = env.action_manager.get_term(term)
-        if servos := getattr(action, "terms", None):
-            return servos.set_units(*draw_units(file, "units", env, env_ids, rows))
-        ids, joints, units = draw_units(file, "plain_units", env, env_ids, rows)
+        servos = getattr(action, "terms", None)
+        ids, joints, units = draw_units(file, "units" if servos else "plain_units", env, env_ids, rows)
+        if bodies:
+            write_links(env.sim, ids, [f"{action.cfg.entity_name}/{name}" for name in bodies], units["links"])
+        if servos:
+            return servos.set_units(ids, joints, units)
         model, joints = env.sim.mj_model, [f"{action.cfg.entity_name}/{name}" for name in joints]
         driven = {model.joint(joint).name: servo for servo, joint in enumerate(model.actuator_trnid[:, 0])
                   if (model.actuator_trntype[servo], model.actuator_biastype[servo]) == (0, 1)}  # fmt: skip
@@ -97,6 +103,18 @@ def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: 
     model.actuator_gainprm[at, servo, 0] = kp
     model.actuator_biasprm[at, servo, 0], model.actuator_biasprm[at, servo, 1] = kp * units["offset"], -kp
     model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
+
+
+def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> None:
+    """Write mass, centre of mass and inertia of bodies to a model of mjlab, (worlds, bodies, 11)."""
+    model, parents = sim.model, sim.mj_model.body_parentid.tolist()
+    at = env_ids[:, None], torch.tensor([sim.mj_model.body(name).id for name in bodies], device=links.device)
+    model.body_mass[at], model.body_ipos[at] = links[..., 0], links[..., 1:4]
+    model.body_inertia[at], model.body_iquat[at] = links[..., 4:7], links[..., 7:]
+    total = model.body_mass[env_ids].clone()
+    for body in range(len(parents) - 1, 0, -1):
+        total[:, parents[body]] += total[:, body]
+    model.body_subtreemass[env_ids] = total
 
 
 # ---- Isaac Lab
