@@ -16,6 +16,7 @@ from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import LINK_FIELDS, with_links
 from gaponet.sim.replay import Corrector, idle_limbs, rollout
+from gaponet.sim.temperature import recorded_temperatures, warm_friction
 from gaponet.sysid.joint_rollouts import ROW_PERIOD_S, SETTLE_S
 
 WINDOW_S = 8.0  # what is fitted to a second or two does not hold over whole motions
@@ -85,7 +86,12 @@ class RobotRollouts:
         acting = replace(self.robot, delay=delay, **plain)
         conditions = [Condition.of(s, self.robot) for s in self.parts]
         sim = BatchSim(acting, conditions * k, self.nthread, self.locked, servo_model=terms)
-        sim.set_servos(self.robot.operated, {f: np.repeat(x, m, axis=0) for f, x in values.items()})
+        warm = warm_friction(values, recorded_temperatures(self.parts, self.op).T)  # (k, n, m)
+        each = {f: np.repeat(x, m, axis=0) for f, x in values.items()}
+        each["frictionloss"] = (
+            (values["frictionloss"][..., None] * warm * np.ones(m)).swapaxes(1, 2).reshape(-1, self.n)
+        )
+        sim.set_servos(self.robot.operated, each)
         for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
             sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
             if sim.servo_model is not None:
