@@ -57,7 +57,7 @@ def draw(seed: int) -> tuple[RobotSpec, Physics, np.ndarray]:
         f'[[joint]]\nname = "j{j}"\nkp = {0.8 * kp[j]}\nkd = {0.4 * total[j]}\neffort_limit = {limit[j]}\n'
         for j in range(n)
     )
-    (folder / "robot.toml").write_text(f'name = "warm{seed}"\ndt = {DT}\ntimestep = {DT / 5}\n{joints}')
+    (folder / "robot.toml").write_text(f'name = "warm{seed}"\ndt = {DT}\ntimestep = {DT / 2}\n{joints}')
     robot, has, half = load_robot(folder), seed % 2 == 0, seed // 2 % 2 == 0
     thinning = has * np.exp(rng.uniform(np.log(3e-3), np.log(2e-2), n))
     passive = rng.uniform(0.3, 0.6) * half * has
@@ -116,6 +116,8 @@ def result(seed: int) -> dict[str, object]:
         )
     return {
         "seed": seed, "true_per_kelvin": (-thinning).tolist(), "per_kelvin": fit.robot.friction_per_kelvin.tolist(),
+        "damping_per_kelvin": fit.robot.damping_per_kelvin.tolist(),
+        "true_damping_per_kelvin": (-thinning * unit.damping).tolist(),
         "std": [fit.std[j].get("friction_per_kelvin", 0.0) for j in robot.operated], "tried": term is not None,
         "accepted": bool(term and term.accepted), "gain_rad": term.gain if term else None, "seconds": seconds,
         "temperatures": [s.temperatures for s in logs], "findings": fit.findings, "chosen": fit.chosen,

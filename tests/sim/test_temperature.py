@@ -18,7 +18,7 @@ from gaponet.sysid.motion_limits import default_terms
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
 SERVO = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.2, "armature": 0.02, "offset": 0.0, "delay": 0.0}
-WARM = {"friction_per_kelvin": -0.02, "friction_temperature": 30.0}
+WARM = {"friction_per_kelvin": -0.02, "damping_per_kelvin": -0.005, "friction_temperature": 30.0}
 
 
 def at(sequence: Sequence, celsius: float, **meta: object) -> Sequence:
@@ -31,13 +31,13 @@ def test_every_simulation_has_the_friction_of_the_recorded_temperature(tmp_path,
     robot = write_arm(tmp_path / "arm")
     (real,) = recordings(robot, 1, rows=150)
     both = dict.fromkeys(robot.joint_names, SERVO | WARM)
-    friction = 0.2 * (1 - 0.02 * (celsius - 30))
-    expected = replay([real], robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | {"frictionloss": friction})))
+    now = {"frictionloss": 0.2 * (1 - 0.02 * (celsius - 30)), "damping": 0.5 - 0.005 * (celsius - 30)}
+    expected = replay([real], robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | now)))
     warm = at(real, celsius)
     (moved,) = replay([warm], robot.with_servos(both))
     np.testing.assert_allclose(moved.qpos, expected[0].qpos, atol=1e-6)
     values = {f: np.full((1, 2), v) for f, v in (SERVO | WARM).items()}
-    plain = {f: np.full((1, 2), v) for f, v in (SERVO | {"frictionloss": friction}).items()}
+    plain = {f: np.full((1, 2), v) for f, v in (SERVO | now).items()}
     for runs in (JointRollouts([warm], robot, nthread=1), RobotRollouts([warm], robot, 1)):
         np.testing.assert_allclose(runs.flat_errors(values), runs.flat_errors(plain), atol=1e-5)
     joints = JointRollouts([warm], robot, nthread=1)

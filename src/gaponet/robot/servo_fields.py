@@ -131,6 +131,9 @@ SERVO_FIELDS: dict[str, ServoField] = {
         ServoField("friction_per_kelvin", "1/K", "friction, %/K", 1e2, limits=(-1.0, 1.0), bounds=(-0.04, 0.04, 0.01),
                    guess=-0.005, cause="temperature", term="temperature", shared=False,
                    advice="check the unit of the temperatures, °C"),
+        ServoField("damping_per_kelvin", "N·m·s/(rad·K)", "damping, mN·m·s/rad/K", 1e3, limits=(-MAX_VALUE, MAX_VALUE),
+                   axis="over kp", bounds=(-5e-3, 5e-3, 3e-4), guess=-1e-4, cause="temperature", term="temperature",
+                   shared=False),
         ServoField("friction_temperature", "°C", "friction at, °C", limits=(-MAX_CELSIUS, MAX_CELSIUS),
                    cause="temperature", term="temperature", shared=False),
         _angle("zero", heading="zero, mrad", factor=1e3, cause="contact"),
@@ -146,6 +149,7 @@ TERMS: dict[Term, tuple[str, ...]] = {
 }
 
 
-def friction_factor(per_kelvin: Any, reference: Any, temperature: Any) -> Any:
-    """Return the factor of frictionloss at temperatures, °C; arrays that broadcast."""
-    return np.maximum(1.0 + per_kelvin * (temperature - reference), MIN_FRICTION_FACTOR)
+def warmed(damping: Any, frictionloss: Any, per_kelvin: Any, damping_per_kelvin: Any, warming: Any) -> tuple[Any, Any]:
+    """Return damping and friction `warming` K above the temperature of the given ones; arrays that broadcast."""
+    factor = np.maximum(1.0 + per_kelvin * warming, MIN_FRICTION_FACTOR)
+    return damping + damping_per_kelvin * warming, frictionloss * factor

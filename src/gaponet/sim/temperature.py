@@ -1,21 +1,20 @@
-"""Friction by recorded temperature: whether recordings show it, and what identification says of it.
+"""Friction and damping by recorded temperature: whether recordings show it, and what identification says of it.
 
-Friction is frictionloss · (1 + c (T − T₀)), with the mean temperature T of a recording. A simulation without recorded
-temperatures is at the reference temperature T₀, the mean of the fitted recordings.
+Friction is frictionloss · (1 + c (T − T₀)) and damping is damping + d (T − T₀), with the mean temperature T of a
+recording. A simulation without recorded temperatures is at the reference T₀, the mean of the fitted recordings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
-from typing import Any
 
 import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.text import format_uncertainty
 from gaponet.data.sequence import Sequence
-from gaponet.robot.servo_fields import friction_factor
+from gaponet.robot.servo_fields import TERMS, warmed
 from gaponet.robot.spec import RobotSpec
 
 MIN_STD_K = 2.0  # of the temperature among recordings with equal gains and payload
@@ -28,12 +27,11 @@ def recorded_temperatures(parts: ListOf[Sequence], op: Array) -> Array:
     return np.array([none if p.temperatures is None else p.temperatures for p in parts])[:, op]
 
 
-def warm_friction(values: Mapping[str, Array], temperature: Array) -> Any:
-    """Return the factor of friction of candidates (k, n) at temperatures (n, windows) °C, (k, n, windows) or 1."""
-    if "friction_per_kelvin" not in values:
-        return 1.0
-    per_kelvin, reference = (values[f][..., None] for f in ("friction_per_kelvin", "friction_temperature"))
-    return friction_factor(per_kelvin, reference, np.where(np.isnan(temperature), reference, temperature))
+def warm_values(values: Mapping[str, Array], temperature: Array) -> tuple[Array, Array]:
+    """Return damping and friction of candidates (k, n) at temperatures (n, windows) °C, (k, n, windows) each."""
+    zero = np.zeros_like(values["kp"])[..., None]
+    terms = [values[f][..., None] if f in values else zero for f in ("damping", "frictionloss", *TERMS["temperature"])]
+    return warmed(*terms[:4], np.nan_to_num(temperature - terms[4]))
 
 
 def temperature_spread(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Array, Array]:

@@ -165,15 +165,16 @@ class Bounds:
             "no_load_speed": (0 * one, 2 * slow, LARGE_LINE_CHANGE * slow),
         }
         varies = temperature_varies(sequences, robot)
-        low, high, large = self.limits[WARM[0]]
-        self.limits[WARM[0]] = low * varies, high * varies, large
-        guess = {f.name: f.guess * one for f in SERVO_FIELDS.values() if f.guess is not None}
+        self.limits |= {f: (low * varies, high * varies, large) for f in WARM[:2]
+                        for low, high, large in [self.limits[f]]}  # fmt: skip
+        guess = {
+            f.name: f.guess * (varies if f.name in WARM else one) for f in SERVO_FIELDS.values() if f.guess is not None
+        }
         self.guess = from_axis(guess, kp) | {
             "effort_limit": 0.6 * limit,  # one that is too high has no slope
             "encoder_step": counts,
             "no_load_speed": np.where(self.unexcited, 0.0, 2 / slow),
-            WARM[0]: guess[WARM[0]] * varies,
-            WARM[1]: np.nan_to_num(recorded_temperatures(sequences, op)).mean(axis=0).round(),
+            WARM[2]: np.nan_to_num(recorded_temperatures(sequences, op)).mean(axis=0).round(),
         }
 
     def visible(self, field: str, values: Values) -> Array:

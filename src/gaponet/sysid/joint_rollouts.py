@@ -26,7 +26,7 @@ from gaponet.sim.batch import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import crossed, friction_limit, present, servo_torque, torque_range
-from gaponet.sim.temperature import recorded_temperatures, warm_friction
+from gaponet.sim.temperature import recorded_temperatures, warm_values
 
 advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
@@ -186,7 +186,7 @@ class JointRollouts:
         terms = any(values[f].any() for f in SERVO_TERMS if f in values)
         out = np.zeros((k, n * windows, self.counted.shape[1]), np.float32)
         ends = np.linspace(0, n * windows, self.nthread + 1).astype(int)
-        warm = np.broadcast_to(warm_friction(values, self.temperature), (k, n, windows))
+        warm = np.stack(warm_values(values, self.temperature))
         rest = (packed, terms, self.tables, self.ctrl, self.qpos, self.qvel, self.touch, self.lengths, self.kp_ratio,
                 self.kd, self.stops, warm, self.periods, self.count, self.thin, out)  # fmt: skip
         with ThreadPoolExecutor(self.nthread) as pool:
@@ -200,9 +200,9 @@ class JointRollouts:
         v = {name: _filled(x[:, :, None], shape) for name, x in values.items()}
         terms = present({name: v[name] for name in SERVO_TERMS if name in v})
         kp, kd = v["kp"] * _filled(self.kp_ratio.T, shape), _filled(self.kd.T, shape)
-        kd = np.maximum(kd + np.minimum(v["damping"], 0), 0)
-        own, armature, offset, dry = np.maximum(v["damping"], 0), v["armature"], v["offset"], v["frictionloss"]
-        dry = dry * np.float32(warm_friction(values, self.temperature))
+        damping, dry = (_filled(x, shape) for x in warm_values(values, self.temperature))
+        kd = np.maximum(kd + np.minimum(damping, 0), 0)
+        own, armature, offset = np.maximum(damping, 0), v["armature"], v["offset"]
         limit = v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
         h = _filled(self.periods / self.count, shape)
         low, high = (_filled(x[:, None], shape) for x in self.stops.T)

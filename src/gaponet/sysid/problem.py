@@ -235,13 +235,13 @@ class KinematicChains:
 
 def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:
     """Return the fields among values that a joint's search changes, in order; encoder_step if `encoder`."""
-    every = (*CLASSIC, "effort_limit", *SERVO_TERMS, WARM[0])
+    every = (*CLASSIC, "effort_limit", *SERVO_TERMS, *WARM[:2])
     return [f for f in every if f in values and (encoder or f != "encoder_step")]
 
 
 def robot_fields(values: Values) -> list[str]:
     """Return the fields among values that the fit in the robot's simulator changes."""
-    return [f for f in (*CLASSIC, *SERVO_TERMS, WARM[0]) if f in values and not SERVO_FIELDS[f].single_joint]
+    return [f for f in (*CLASSIC, *SERVO_TERMS, *WARM[:2]) if f in values and not SERVO_FIELDS[f].single_joint]
 
 
 @dataclass
