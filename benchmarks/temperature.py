@@ -27,7 +27,7 @@ from gaponet.sysid.identify import identify
 from gaponet.testing.physics import Physics, neutral
 from gaponet.testing.virtual_robot import VirtualRobot
 
-DT, ROWS, FITTED, VALIDATED, MOTIONS = 0.01, 400, 6, 10, 16
+DT, ROWS, FITTED, VALIDATED, MOTIONS = 0.02, 200, 6, 10, 16
 NORMAL_90, KT_PER_KELVIN, DERATING_PER_KELVIN, COUNT_RAD = 1.645, 0.001, 0.005, 2 * np.pi / 4096
 OTHER_TERMS = ("stribeck", "load", "backlash")
 XML = """<mujoco><compiler angle="radian" autolimits="true"/><option integrator="implicitfast"/>
@@ -57,7 +57,7 @@ def draw(seed: int) -> tuple[RobotSpec, Physics, np.ndarray]:
         f'[[joint]]\nname = "j{j}"\nkp = {0.8 * kp[j]}\nkd = {0.4 * total[j]}\neffort_limit = {limit[j]}\n'
         for j in range(n)
     )
-    (folder / "robot.toml").write_text(f'name = "warm{seed}"\ndt = {DT}\ntimestep = {DT / 2}\n{joints}')
+    (folder / "robot.toml").write_text(f'name = "warm{seed}"\ndt = {DT}\ntimestep = {DT / 4}\n{joints}')
     robot, has, half = load_robot(folder), seed % 2 == 0, seed // 2 % 2 == 0
     thinning = has * np.exp(rng.uniform(np.log(3e-3), np.log(2e-2), n))
     passive = rng.uniform(0.3, 0.6) * half * has
