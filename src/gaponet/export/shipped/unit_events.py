@@ -105,7 +105,7 @@ def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: 
 def apply_units(
     env: Any, env_ids: Any, asset_cfg: Any, file: str, term: str | None = "joint_pos", rows: Any = None
 ) -> None:
-    """Event term of Isaac Lab 2.3 and 3. Units are without the servo model; kd stays as it is.
+    """Event term of Isaac Lab 2.3 and 3. Of the servo model units have torque-speed lines; kd stays.
 
     Args:
         asset_cfg: SceneEntityCfg of the robot. All joints of the file are set.
