@@ -149,7 +149,7 @@ TERMS: dict[Term, tuple[str, ...]] = {
 }
 
 
-def warmed(damping: Any, frictionloss: Any, per_kelvin: Any, damping_per_kelvin: Any, warming: Any) -> tuple[Any, Any]:
+def warmed(warming: Any, damping: Any, frictionloss: Any, per_kelvin: Any, damping_per_kelvin: Any) -> tuple[Any, Any]:
     """Return damping and friction `warming` K above the temperature of the given ones; arrays that broadcast."""
     factor = np.maximum(1.0 + per_kelvin * warming, MIN_FRICTION_FACTOR)
     return damping + damping_per_kelvin * warming, frictionloss * factor

@@ -215,9 +215,8 @@ class RobotSpec:
         if temperature is None:
             return self
         warming = np.array(temperature) - self.friction_temperature
-        damping, friction = warmed(
-            self.damping, self.frictionloss, self.friction_per_kelvin, self.damping_per_kelvin, warming
-        )
+        values = self.damping, self.frictionloss, self.friction_per_kelvin, self.damping_per_kelvin
+        damping, friction = warmed(warming, *values)
         kd = np.maximum(self.kd + np.fmin(damping, 0.0), 0.0)
         return dataclasses.replace(self, frictionloss=friction, damping=np.maximum(damping, 0.0), kd=kd)
 

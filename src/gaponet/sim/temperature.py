@@ -30,13 +30,15 @@ def recorded_temperatures(parts: ListOf[Sequence], op: Array) -> Array:
 def warm_values(values: Mapping[str, Array], temperature: Array) -> tuple[Array, Array]:
     """Return damping and friction of candidates (k, n) at temperatures (n, windows) °C, (k, n, windows) each."""
     zero = np.zeros_like(values["kp"])[..., None]
-    terms = [values[f][..., None] if f in values else zero for f in ("damping", "frictionloss", *TERMS["temperature"])]
-    return warmed(*terms[:4], np.nan_to_num(temperature - terms[4]))
+    names = ("damping", "frictionloss", *TERMS["temperature"])
+    *now, reference = (values[f][..., None] if f in values else zero for f in names)
+    damping, friction = warmed(np.nan_to_num(temperature - reference), *now)
+    return damping, friction
 
 
-def temperature_spread(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Array, Array]:
-    """Return the standard deviation of each operated joint's temperature, (n,) K, in all and among recordings with
-    equal gains and payload; zero where a recording lacks it."""
+def temperature_spread(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
+    """Return the standard deviation of each operated joint's temperature in all recordings, and among those with equal
+    gains and payload, (2, n) K; zero where a recording lacks it."""
     warm = recorded_temperatures(sequences, robot.operated_index)
     alike = [(s.meta.recorded_gains, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
     among = warm.copy()
@@ -44,7 +46,7 @@ def temperature_spread(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[A
         rows = [i for i, one in enumerate(alike) if one == key]
         among[rows] -= warm[rows].mean(axis=0)
     missing = [any(j in s.meta.unrecorded for s in sequences) for j in robot.operated]
-    return tuple(np.where(missing, 0.0, np.nan_to_num(x.std(axis=0))) for x in (warm, among))
+    return np.where(missing, 0.0, np.nan_to_num([warm.std(axis=0), among.std(axis=0)]))
 
 
 def temperature_varies(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:

@@ -150,8 +150,7 @@ class Bounds:
             "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),
         }
         self.start |= {f: np.where(self.unexcited, self.first[f], self.start[f]) for f in ("delay", "armature")}
-        self.start |= {f: self.first[f] for f in SERVO_TERMS if self.first[f].any()}
-        self.start |= {f: self.first[f] for f in WARM if self.first[WARM[0]].any()}
+        self.start |= {f: self.first[f] for f in (*SERVO_TERMS, *WARM) if self.first[f].any()}
         slow = 1 / greatest_speeds(sequences, robot)  # s/rad
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)

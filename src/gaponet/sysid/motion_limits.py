@@ -100,7 +100,7 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
     shares: dict[Term, float] = {"limit": MIN_LIMITED_SHARE, "speed": MIN_FAST_SHARE}
     limited = (t for t, share in shares.items() if (reached[t] > share * rows).any())
     warm = ("temperature",) if temperature_varies(sequences, robot).any() else ()
-    return (*limited, *DEFAULT_TERMS, *warm)  # type: ignore[return-value]
+    return (*limited, *DEFAULT_TERMS, *warm)
 
 
 def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
