@@ -46,6 +46,10 @@ def test_friction_and_damping_by_temperature_are_fitted_with_their_errors(tmp_pa
     std = standard_errors(fit, values).std["turn"]
     assert 0 < std["friction_per_kelvin"] < 0.004
     assert "friction_temperature" not in std  # it is stated, not fitted
+    assert fit.bounds.visible(WARM[0], values) == values["friction_per_kelvin"]
+    small = values | {"friction_per_kelvin": np.full(1, 9e-4)}
+    assert fit.bounds.visible(WARM[0], small | {"damping_per_kelvin": np.full(1, 5e-5)}) == 0
+    assert fit.bounds.visible(WARM[0], small) == 9e-4  # damping changes by more
 
 
 def test_recordings_at_one_temperature_leave_the_term_at_zero(tmp_path):

@@ -24,6 +24,7 @@ Values = dict[str, Array]  # field → (…, n) of the operated joints
 
 CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")  # that every fit has
 WARM = TERMS["temperature"]
+MIN_PER_KELVIN = 1e-3  # 1/K, of friction by temperature and of damping; less counts as none
 START_DELAY_S = 0.02  # a start without delay has no slope over it
 MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
 MAX_KP_LOG_CHANGE, LARGE_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.2, 0.3
@@ -177,7 +178,12 @@ class Bounds:
         }
 
     def visible(self, field: str, values: Values) -> Array:
-        """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE."""
+        """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE, or of friction and
+        damping that change by less than MIN_PER_KELVIN."""
+        if field == WARM[0]:
+            total = np.maximum(values["damping"] + self.kd, 0.0)
+            slow = np.abs(values[WARM[1]]) < MIN_PER_KELVIN * total
+            return np.where(slow & (np.abs(values[field]) < MIN_PER_KELVIN), 0.0, values[field])
         inverse = SERVO_FIELDS[field].axis == "inverse"
         least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field][2] if inverse else 0.0
         return np.where(inverse & (to_axis(field, values[field], values["kp"]) < least), 0.0, values[field])
