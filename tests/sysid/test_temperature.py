@@ -54,9 +54,12 @@ def test_friction_and_damping_by_temperature_are_fitted_with_their_errors(tmp_pa
 
 def test_recordings_at_one_temperature_leave_the_term_at_zero(tmp_path):
     robot = write_arm(tmp_path / "disc", TOML, XML)
-    bounds = Bounds(robot, recorded(robot, (30.0, 30.5)))
+    parts = recorded(robot, (30.0, 30.5))
+    bounds = Bounds(robot, parts)
     assert [bounds.limits[f][1][0] for f in WARM[:2]] == [0.0, 0.0]
     assert bounds.guess["friction_per_kelvin"][0] == 0
+    low, high, _ = Bounds(robot.with_servos({"turn": SERVO | TRUE}), parts).limits["friction_per_kelvin"]
+    assert low == high == -0.02  # a robot that has the term keeps it
 
 
 def test_the_temperature_is_the_last_cause_of_the_joint_itself(tmp_path):

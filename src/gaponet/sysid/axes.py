@@ -165,8 +165,9 @@ class Bounds:
             "no_load_speed": (0 * one, 2 * slow, LARGE_LINE_CHANGE * slow),
         }
         varies = temperature_varies(sequences, robot)
-        self.limits |= {f: (low * varies, high * varies, large) for f in WARM[:2]
-                        for low, high, large in [self.limits[f]]}  # fmt: skip
+        for f in WARM[:2]:  # else the robot's own value stays
+            (low, high, large), own = self.limits[f], to_axis(f, self.first[f], kp)
+            self.limits[f] = np.where(varies, low, own), np.where(varies, high, own), large
         guess = {
             f.name: f.guess * (varies if f.name in WARM else one) for f in SERVO_FIELDS.values() if f.guess is not None
         }
