@@ -213,3 +213,22 @@ def test_units_that_follow_the_recordings_are_retained_and_stored_and_worse_ones
     assert low < value == drawn.ranges["elbow"]["kp"][1] < high
     drawn_robots.draw_robots(robot, sample_units(robot, seed=1).units, recordings)
     assert rollouts
+
+
+def test_units_for_an_engine_with_a_torque_speed_line_have_one_each(arm, tmp_path, monkeypatch):
+    monkeypatch.setattr(drawn_robots, "DRAWN", 8)
+    monkeypatch.setattr(drawn_robots, "JUDGED", 2)
+    robot = load_robot(written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3])))
+    drawn = {field: values[:8] for field, values in sample_units(robot).units.items()}
+    plain = replace(robot, no_load_speed=np.array([3.0, 0.0]))
+    robot = replace(plain, stribeck=np.full(2, 0.01), stribeck_speed=np.full(2, 0.05))
+    monkeypatch.setattr(drawn_robots, "fit_plain_servos", lambda robot, recordings, progress, terms: plain)
+    motions = [s.rows(slice(0, 100)) for s in own_motions(robot, count=2)]
+    drawn["no_load_speed"] = np.array([3.0, 0.0]) * np.random.default_rng(0).uniform(0.9, 1.1, (8, 2))
+    drawn["stribeck"] = np.full((8, 2), 0.01)
+    made = drawn_robots.draw_robots(robot, drawn, (motions[:1], motions[1:]), True, engine_terms=("no_load_speed",))
+    assert "stribeck" not in made.units
+    speed = np.array(made.units["no_load_speed"])
+    assert ((speed[:, 0] > 2.5) & (speed[:, 0] < 3.5)).all()
+    assert np.ptp(speed[:, 0]) > 0
+    assert (speed[:, 1] == 0).all()

@@ -201,6 +201,37 @@ def test_delayed_actuators_are_late_by_whole_steps_where_no_action_term_delays(f
         apply_units(environment(both, None), None, ROBOT, file + "2", term=None, rows=[0] * WORLDS)
 
 
+@pytest.mark.parametrize("executors", [False, True])
+def test_dc_motors_of_isaac_lab_get_the_torque_speed_line_of_a_unit(file, executors):
+    content = json.loads(Path(file).read_text())
+    content["plain_units"]["no_load_speed"] = [[3.0, 0.0], [4.0, 0.0], [5.0, 0.0], [6.0, 0.0]]
+    Path(file).write_text(json.dumps(content))
+
+    def motor(*names):
+        made = group(*names)
+        made._saturation_effort, made.velocity_limit = 7.0, torch.full((WORLDS, len(names)), 9.0)
+        made._vel_at_effort_lim = 2 * made.velocity_limit
+        return made
+
+    own, whole = motor("shoulder"), motor("elbow", "shoulder")
+    robot = Robot3(own, group("elbow", "head"))
+    if executors:
+        robot.actuators = type("Collection", (dict,), {"_execution_batches": [SimpleNamespace(actuator=whole)]})(
+            robot.actuators
+        )
+    apply_units(environment(robot, Action()), torch.tensor([0, 1, 4]), ROBOT, file, rows=[0, 1, 2, 3, 3, 0])
+    limit = stored(file, "shoulder")["effort_limit"]
+    for made, column in [(own, 0), (whole, 1)][: 1 + executors]:
+        assert made.velocity_limit[:, column].tolist() == [3.0, 4.0, 9.0, 9.0, 6.0, 9.0]
+        assert made._vel_at_effort_lim[:, column].tolist() == [6.0, 8.0, 18.0, 18.0, 12.0, 18.0]
+        torch.testing.assert_close(made._saturation_effort[[0, 1, 4], column], limit[[0, 1, 3]])
+        assert (made._saturation_effort[[2, 3, 5]] == 7.0).all()
+    if executors:
+        assert (whole.velocity_limit[[0, 1, 4], 0] == torch.inf).all()  # a speed of 0 is no line
+    with pytest.raises(ValueError, match="joint 'shoulder' needs a torque-speed line: take isaaclab_actuators"):
+        apply_units(environment(Robot3(group("shoulder", "elbow")), Action()), None, ROBOT, file)
+
+
 def test_a_scene_that_cannot_have_a_number_of_a_unit_is_refused(file):
     whole = group("shoulder", "elbow")
 

@@ -72,7 +72,7 @@ def identify(
         holdout_units: Units to leave out, as in training.
         terms: Terms of the servo model to try; each is accepted only if validation motions improve. Default: stribeck
             and load, after limit if a joint reaches its stated torque limit; then backlash where a gap makes the
-            rollouts better at otherwise equal values.
+            rollouts better at otherwise equal values; then temperature where it varies at equal gains and payload.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml).
         threads: 0 for all cores.
         budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.

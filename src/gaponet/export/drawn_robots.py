@@ -69,6 +69,7 @@ def draw_robots(
     recordings: tuple[ListOf[Sequence], ListOf[Sequence]],
     plain: bool = False,
     progress: Progress = no_progress,
+    engine_terms: tuple[str, ...] = (),
 ) -> DrawnRobots:
     """Choose units by training motions and judge them by validation motions.
 
@@ -78,18 +79,18 @@ def draw_robots(
         robot: Identified.
         drawn: Units of `randomization.sample_units`.
         recordings: Training and validation motions, with the robot's own gains.
-        plain: Units of the robot as fitted without its servo model.
+        plain: Units of the robot as fitted without its servo model but for `engine_terms`, which the engine has.
         progress: Called with done, total and a note.
     """
     train, validation = recordings
     note = ", without the servo model" * plain
-    base = fit_plain_servos(robot, train, progress=progress) if plain else robot
+    base = fit_plain_servos(robot, train, progress, engine_terms) if plain else robot
     first = {f: v[:DRAWN] for f, v in drawn.items()}
 
     def draw() -> DrawnRobots:
         return _draw(base, _moved(robot, base, first), train, validation, lambda i, n, s: progress(i, n, s + note))
 
-    inputs = *first.values(), np.array([len(train), len(validation)])
+    inputs = *first.values(), np.array([len(train), len(validation), len(engine_terms)])
     return stored_result(robot.folder / CACHES[plain], DrawnRobots, draw, robot, [*train, *validation], *inputs)
 
 
@@ -132,7 +133,8 @@ def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
 
 def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     """Return units that deviate from `base` as the drawn ones deviate from `robot`, every second one half as far."""
-    fields = [f for f in drawn if f not in ("effort_limit", "links") and (base is robot or f not in SERVO_TERMS)]
+    lacking = [] if base is robot else [f for f in SERVO_TERMS if not getattr(base, f).any()]
+    fields = [f for f in drawn if f not in ("effort_limit", "links", *lacking)]
     own, center = (np.stack(list(to_axes(r, fields).values())) for r in (robot, base))
     axes = np.stack([np.stack(list(to_axes(one, fields).values())) for one in robots_of(robot, drawn)])
     share = np.where(np.arange(len(axes)) % 2, NEAR, 1.0)[:, None, None]

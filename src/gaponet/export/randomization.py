@@ -134,10 +134,12 @@ def judge_units(
     robot: RobotSpec,
     recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None,
     progress: Progress = no_progress,
+    engine_terms: tuple[str, ...] = (),
 ) -> Randomization:
     """Choose the units that follow the robot's recordings, and state their errors (export/drawn_robots.py).
 
-    Units of other days and robots are left as they are: this robot's recordings cannot judge them.
+    Units of other days and robots are left as they are: this robot's recordings cannot judge them. The engine has the
+    `engine_terms` of the servo model.
     """
     mass = recordings[0][0].meta.payload_mass if recordings and recordings[0] else 0.0
     train, validation = (comparable(part, robot, mass) for part in recordings or ((), ()))
@@ -146,7 +148,7 @@ def judge_units(
         return replace(made, notes=(*made.notes, f"{why}: the units were not compared with recordings"))
     judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
     if robot.has_servo_model:
-        plain = draw_robots(robot, made.units, (train, validation), plain=True, progress=progress)
+        plain = draw_robots(robot, made.units, (train, validation), True, progress, engine_terms)
     units = {f: np.array(v) for f, v in judged.units.items()}
     ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items() if f != "links"}
     ranges = {

@@ -17,7 +17,7 @@ from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot
 from gaponet.robot.freeze import freeze, units_per_si
 from gaponet.robot.mjcf import compile_spec, read_mjcf
-from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.servo_fields import SERVO_TERMS, TERMS
 from gaponet.robot.spec import Link, RobotSpec
 
 if TYPE_CHECKING:
@@ -143,10 +143,12 @@ def model_hash(robot: RobotSpec) -> str:
     Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written.
     """
     if "_model_hash" not in vars(robot):
+        warm = [getattr(robot, name).tolist() for name in TERMS["temperature"]]
         text = [
             f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}",
             *([] if robot.carries_payload else ["carries no payload"]),
             *([f"target speed {robot.target_speed}"] * bool(robot.target_speed.any())),
+            *([f"friction per kelvin {warm}"] * any(robot.friction_per_kelvin)),
             *model_fingerprint(build_model(robot)),
         ]
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]

@@ -27,6 +27,7 @@ from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.links import LinkResult
 from gaponet.sim.metrics import Comparison
+from gaponet.sim.temperature import temperature_findings
 from gaponet.sysid import backlash
 from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Links, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
@@ -208,7 +209,8 @@ def _fit_robot(
     before, after = (float(judge.errors(*pair).mean()) for pair in pairs)
     by_joint = zip(*(judge.errors_by_joint(*pair).tolist() for pair in pairs), strict=True)
     searches.tell(np.inf, "the fitted robot, and recorded torque")
-    findings = backlash.findings(robot.operated, *gaps, errors.std) if gaps else ()
+    findings = temperature_findings(sequences, fitted, errors.std)
+    findings += backlash.findings(robot.operated, *gaps, errors.std) if gaps else ()
     return Identified(
         fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit,
         dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,

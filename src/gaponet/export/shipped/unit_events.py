@@ -123,7 +123,7 @@ def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> 
 def apply_units(
     env: Any, env_ids: Any, asset_cfg: Any, file: str, term: str | None = "joint_pos", rows: Any = None
 ) -> None:
-    """Event term of Isaac Lab 2.3 and 3. Units are without the servo model; kd stays as it is.
+    """Event term of Isaac Lab 2.3 and 3. Of the servo model units have torque-speed lines; kd stays.
 
     Args:
         asset_cfg: SceneEntityCfg of the robot. All joints of the file are set.
@@ -140,6 +140,8 @@ def apply_units(
     groups = {joint: group for group in robot.actuators.values() if not hasattr(group, "network")
               for joint in getattr(group, "joint_names", ())}  # fmt: skip
     columns_of(joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)")
+    if "no_load_speed" in units:
+        _speed_lines(robot, joints, groups, units, ids)
     if term is None:
         _delay(joints, groups, units["delay"] / env.physics_dt, ids)
     elif hasattr(action := env.action_manager.get_term(term), "set_units"):
@@ -169,6 +171,29 @@ def _write(robot: Any, what: str, columns: list[int], ids: Tensor, *values: Tens
     if write is None or len(places) < len(values):
         raise ValueError(f"{names[1]} is missing or lacks parameters: take Isaac Lab 2.3 or 3")
     write(**dict(zip(places, values, strict=False)), joint_ids=columns, env_ids=ids)
+
+
+def _speed_lines(robot: Any, joints: list[str], groups: dict[str, Any], units: Units, ids: Tensor) -> None:
+    """Set the torque-speed lines of DCMotors: torque at rest, and the speed without torque. A speed of 0 is no line.
+
+    Isaac Lab 3 computes the groups of a class as one, by an actuator of its own.
+    """
+    together = [batch.actuator for batch in getattr(robot.actuators, "_execution_batches", ())]
+    for i, joint in enumerate(joints):
+        limit, speed = units["effort_limit"][:, i], units["no_load_speed"][:, i]
+        motors = [m for m in (groups[joint], *together) if joint in m.joint_names and hasattr(m, "_saturation_effort")]
+        if not motors and (speed > 0).any():
+            raise ValueError(f"joint '{joint}' needs a torque-speed line: take isaaclab_actuators, or a DCMotorCfg")
+        for motor in motors:
+            column, top = list(motor.joint_names).index(joint), getattr(motor, "actuator_velocity_limit", None)
+            top = motor.velocity_limit if top is None else top
+            top = getattr(top, "torch", top)
+            motor._saturation_effort = (
+                torch.as_tensor(motor._saturation_effort, device=top.device).expand_as(top).clone()
+            )
+            motor._saturation_effort[ids, column] = limit
+            top[ids, column] = torch.where(speed > 0, speed, torch.inf)
+            motor._vel_at_effort_lim[ids, column] = 2 * top[ids, column]
 
 
 def _delay(joints: list[str], groups: dict[str, Any], steps: Tensor, ids: Tensor) -> None:
