@@ -1,10 +1,14 @@
 """Backlash on VIRTUAL robots: right verdicts, widths and errors, with and without a play hinge.
 
     python benchmarks/backlash.py OUT.json --robots 12 --first 0
+    python benchmarks/backlash.py OUT.json --robots 12 --hinge
 
 The robots are plain MuJoCo models. Backlash is a hinge of its own with a range of ± b/2 between the motor (armature,
 damping, friction) and the link, or a spring stands there. The encoder is on the link. One or two joints hang under
 gravity, or turn without it. Ten motions of 4 s are fitted and validated, four test.
+
+With --hinge, forms for plain MuJoCo are compared with gaponet's own simulation of the same gap instead: without a gap,
+and with a play hinge. Its servo reads the motor (also with the best offset), or the link by code in every step.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -21,7 +25,8 @@ import numpy as np
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import Batch
-from gaponet.sim.replay import motion_errors
+from gaponet.sim.model import STIFF_MOBILITY, STIFF_SOLIMP, STIFF_SOLREF, build_model
+from gaponet.sim.replay import motion_errors, replay
 from gaponet.sysid.identify import identify
 
 DT, H = 0.01, 5e-4  # s: of the logs, of the true robot's physics
@@ -175,12 +180,60 @@ def result(robot: PlayRobot, terms: tuple[str, ...] | None = None) -> dict[str, 
     }  # fmt: skip
 
 
+def hinge_result(seed: int) -> dict[str, float]:
+    """Return the error of each form of one joint with a gap, rad, from gaponet's simulation of it."""
+    robot = replace(PlayRobot.draw(seed, True, joints=1), delay=0.0, stribeck=np.zeros(1))
+    fields = ("kp", "damping", "armature", "backlash")
+    servo = {f: float(getattr(robot, f)[0]) for f in fields} | {"frictionloss": float(robot.friction[0])}
+    spec, none = robot.spec().with_servos({"j0": servo}), np.zeros(1)
+    commands = [robot.commands(k) for k in range(MOTIONS - VALIDATED)]
+    motions = [replace(robot.log(c, c, f"m{k}", k), qpos=0 * c + c[0], qvel=0 * c) for k, c in enumerate(commands)]
+    ours = np.array([one.qpos for one in replay(motions, spec)])
+    plain = np.array([one.qpos for one in replay(motions, replace(spec, backlash=none))])
+    model = build_model(spec)
+    hinges = [np.array([play_hinge(robot, spec.timestep, m, model, link) for m in motions]) for link in (False, True)]
+    forms = {"left out": plain, "motor read": hinges[0], "link read": hinges[1]}
+    forms["motor read, best offset"] = hinges[0] - np.median(hinges[0] - ours)
+    return {name: float(np.abs(path - ours)[:, 1:].mean()) for name, path in forms.items()}
+
+
+def play_hinge(robot: PlayRobot, h: float, motion: Sequence, own: mujoco.MjModel, link: bool) -> np.ndarray:
+    """Play a motion with a play hinge in plain MuJoCo at a physics step of h s; return the link's path, (T, 1) rad."""
+    model = mujoco.MjModel.from_xml_string(robot.xml(True))
+    model.opt.timestep, model.opt.tolerance = h, own.opt.tolerance
+    model.jnt_solref[1], model.dof_invweight0[:] = (2 * h, 1), STIFF_MOBILITY * model.dof_invweight0
+    model.dof_solref[:], model.dof_solimp[:] = STIFF_SOLREF, STIFF_SOLIMP
+    model.dof_frictionloss[:] = (robot.friction[0], 0.0)
+    data, rest = mujoco.MjData(model), mujoco.MjData(own)
+    rest.qpos[:] = motion.qpos[0]
+    mujoco.mj_forward(own, rest)
+    gap = np.copysign(robot.backlash[0] / 2, rest.qfrc_bias[0])
+    data.qpos[:] = motion.qpos[0, 0] + gap, -gap
+    path = np.array(motion.qpos, float)
+    for t in range(len(path) - 1):
+        for _ in range(round(DT / h)):
+            data.qfrc_applied[0] = robot.kp[0] * (motion.ctrl[t, 0] - data.qpos[0] - link * data.qpos[1])
+            mujoco.mj_step(model, data)
+        path[t + 1] = data.qpos.sum()
+    return path
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--robots", type=int, default=12)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--hinge", action="store_true")
     args, results = parser.parse_args(), []
+    if args.hinge:
+        made = [hinge_result(seed) for seed in range(args.first, args.first + args.robots)]
+        args.out.write_text(json.dumps(made, indent=1))
+        for name in made[0]:
+            errors = 1e3 * np.array([one[name] for one in made])
+            worse = sum(one[name] > one["left out"] for one in made)
+            error = errors.std(ddof=1) / np.sqrt(len(made))
+            print(f"{name}: {errors.mean():.2f} ± {error:.2f} mrad, worse than left out: {worse} of {len(made)}")
+        return
     for seed in range(args.first, args.first + args.robots):
         gap, none = (PlayRobot.draw(seed, has) for has in (True, False))
         made = {"with": result(gap), "left out": result(gap, ("stribeck", "load")), "no gap": result(none)}

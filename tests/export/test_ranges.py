@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from arm import XML, write_arm
 
-from gaponet.base.errors import NoGainError
+from gaponet.base.errors import NoGainError, RobotError
 from gaponet.cli.main import main
 from gaponet.export import drawn_robots
 from gaponet.export.plain_servos import own_motions, rollout_error
 from gaponet.export.randomization import judge_units, sample_units
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, to_axes
+from gaponet.sim.links import COORDINATES, LinkAxes
+from gaponet.sim.model import build_model
+from gaponet.sysid.uncertainty import JointUncertainty, LinkUncertainty, ParameterUncertainty, to_axes
 
 FIELDS = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
 SERVO_FIELDS = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
@@ -33,9 +35,10 @@ def source(values, unit="a", days=()):
             "values": {j: tuple(v) for j, v in values.items()}, "covariance": covariance}  # fmt: skip
 
 
-def written(arm, folder, servo=SERVO_FIELDS, errors=ERRORS, sources=1):
+def written(arm, folder, servo=SERVO_FIELDS, errors=ERRORS, sources=1, links=None):
     """A robot folder that knows its values; friction and damping err together."""
-    save_robot(arm.with_servos(dict.fromkeys(arm.joint_names, servo)), folder)
+    moved = LinkAxes(arm).links(np.array(links.values)) if links else {}
+    save_robot(replace(arm.with_servos(dict.fromkeys(arm.joint_names, servo)), links=moved), folder)
     robot = load_robot(folder)
     values = to_axes(robot, FIELDS)
     like = np.eye(6)
@@ -48,8 +51,18 @@ def written(arm, folder, servo=SERVO_FIELDS, errors=ERRORS, sources=1):
     }
     days = [{j: v + k * np.array([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0]) for j, v in values.items()} for k in range(sources)]
     said = tuple(source(v, days=(f"2026-11-{20 + k}",)) for k, v in enumerate(days[::-1]))
-    ParameterUncertainty(FIELDS, joints, said, 24, True).save(folder)
+    ParameterUncertainty(FIELDS, joints, said, 24, True, links).save(folder)
     return folder
+
+
+def heavy_links(slope=0.0):
+    """Links of the arm, each 0.5 standard deviations heavier; kp rises with the mass of the second one."""
+    covariance = np.diag(np.tile([0.04, *[1.0] * 9], 2))
+    slopes = np.zeros((2, len(FIELDS), 2 * COORDINATES))
+    slopes[:, 0, COORDINATES] = slope
+    values = np.tile([0.5, *[0.0] * 9], 2)
+    by_joint = dict(zip(("shoulder", "elbow"), slopes.tolist(), strict=True))
+    return LinkUncertainty(tuple(values), tuple(map(tuple, covariance)), by_joint)
 
 
 def exported(capsys, *words):
@@ -75,6 +88,46 @@ def test_units_scatter_as_the_values_err_and_together(arm, tmp_path, capsys):
     np.testing.assert_allclose([np.log(low / 16), np.log(high / 16)], [-0.0822, 0.0822], atol=0.006)
     assert min(np.min(made["units"][f]) for f in FIELDS if f != "offset") >= 0
     np.testing.assert_allclose(np.array(made["units"]["effort_limit"])[:, 1] / arm.effort_limit[1], kp / 16, rtol=1e-5)
+
+
+def test_drawn_links_are_physical_and_servos_follow_them(arm, tmp_path):
+    plain, alone, together = (
+        sample_units(written(arm, tmp_path / str(i), links=links))
+        for i, links in enumerate((None, heavy_links(), heavy_links(0.5)))
+    )
+    for field, values in plain.units.items():
+        np.testing.assert_array_equal(alone.units[field], values)
+    links = np.array([together.links.inertials(row) for row in together.units["links"]])
+    file = LinkAxes(arm).inertials(np.zeros(2 * COORDINATES))
+    mass, moments = np.log(links[..., 0] / file[:, 0]), np.sort(links[..., 4:7])
+    assert (moments[..., 0] + moments[..., 1] >= moments[..., 2]).all()
+    scale = 2 * LinkAxes(arm).scale[:, 0]  # of log mass
+    np.testing.assert_allclose(mass.mean(axis=0) / scale, 0.5, atol=0.05)
+    np.testing.assert_allclose(mass.std(axis=0) / scale, 0.2, rtol=0.15)
+    assert np.corrcoef(mass[:, 1], np.log(together.units["kp"][:, 0]))[0, 1] > 0.8
+    assert abs(np.corrcoef(mass[:, 0], np.log(together.units["kp"][:, 0]))[0, 1]) < 0.2
+
+
+def test_an_exported_unit_has_its_links_in_mujoco_and_isaac_lab_says_that_it_has_none(arm, tmp_path, capsys):
+    folder = written(arm, tmp_path / "known", links=heavy_links())
+    assert exported(capsys, folder, "--engine", "mujoco", "--out", tmp_path / "out")[0] == 0
+    functions, model = runpy.run_path(str(tmp_path / "out" / "mujoco_randomization.py")), mujoco.MjModel
+    moved, drawn = model.from_xml_path(str(arm.mjcf)), functions["units"](tmp_path / "out" / "randomization.json")
+    functions["apply"](moved, drawn, 7)
+    unit = sample_units(folder)
+    robot = drawn_robots.robots_of(load_robot(folder), unit.units)[7]
+    wanted = build_model(robot)
+    for name in ("body_mass", "body_ipos", "body_inertia", "body_subtreemass"):
+        np.testing.assert_allclose(getattr(moved, name), getattr(wanted, name)[:3], rtol=1e-5, atol=1e-9)
+    assert wanted.body_mass[1] != build_model(load_robot(folder)).body_mass[1]
+    assert exported(capsys, folder, "--engine", "isaaclab", "--out", tmp_path / "isaac")[0] == 0
+    content = json.loads((tmp_path / "isaac" / "randomization.json").read_text())
+    assert "links" not in content["units"]
+    assert content["notes"][0].startswith("all units have the identified links: Isaac Lab")
+    text = (folder / "robot.toml").read_text()
+    (folder / "robot.toml").write_text(re.sub(r'(fore"\]\nmass = )[\d.]+', r"\g<1>9.0", text))
+    with pytest.raises(RobotError, match="its links are other links than"):
+        ParameterUncertainty.load(load_robot(folder))
 
 
 def test_what_no_log_determines_is_said(arm, tmp_path, capsys):
@@ -160,3 +213,22 @@ def test_units_that_follow_the_recordings_are_retained_and_stored_and_worse_ones
     assert low < value == drawn.ranges["elbow"]["kp"][1] < high
     drawn_robots.draw_robots(robot, sample_units(robot, seed=1).units, recordings)
     assert rollouts
+
+
+def test_units_for_an_engine_with_a_torque_speed_line_have_one_each(arm, tmp_path, monkeypatch):
+    monkeypatch.setattr(drawn_robots, "DRAWN", 8)
+    monkeypatch.setattr(drawn_robots, "JUDGED", 2)
+    robot = load_robot(written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3])))
+    drawn = {field: values[:8] for field, values in sample_units(robot).units.items()}
+    plain = replace(robot, no_load_speed=np.array([3.0, 0.0]))
+    robot = replace(plain, stribeck=np.full(2, 0.01), stribeck_speed=np.full(2, 0.05))
+    monkeypatch.setattr(drawn_robots, "fit_plain_servos", lambda robot, recordings, progress, terms: plain)
+    motions = [s.rows(slice(0, 100)) for s in own_motions(robot, count=2)]
+    drawn["no_load_speed"] = np.array([3.0, 0.0]) * np.random.default_rng(0).uniform(0.9, 1.1, (8, 2))
+    drawn["stribeck"] = np.full((8, 2), 0.01)
+    made = drawn_robots.draw_robots(robot, drawn, (motions[:1], motions[1:]), True, engine_terms=("no_load_speed",))
+    assert "stribeck" not in made.units
+    speed = np.array(made.units["no_load_speed"])
+    assert ((speed[:, 0] > 2.5) & (speed[:, 0] < 3.5)).all()
+    assert np.ptp(speed[:, 0]) > 0
+    assert (speed[:, 1] == 0).all()

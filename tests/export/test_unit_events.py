@@ -27,6 +27,9 @@ def file(tmp_path):
     plain = {field: x.tolist() for field, x in units.items()}
     with_model = {field: (-x).tolist() for field, x in units.items()}
     content = {"joints": ["shoulder", "elbow"], "units": with_model, "plain_units": plain}
+    links = torch.rand(UNITS, 2, 11, generator=torch.Generator().manual_seed(0)).tolist()
+    with_model["links"] = plain["links"] = links
+    content["bodies"] = ["upper", "fore"]
     (tmp_path / "randomization.json").write_text(json.dumps(content))
     return str(tmp_path / "randomization.json")
 
@@ -127,7 +130,8 @@ def environment(robot, term):
 
 def stored(file, joint):
     content = json.loads(Path(file).read_text())
-    return {f: torch.tensor(x)[:, content["joints"].index(joint)] for f, x in content["plain_units"].items()}
+    plain = {f: x for f, x in content["plain_units"].items() if f != "links"}
+    return {f: torch.tensor(x)[:, content["joints"].index(joint)] for f, x in plain.items()}
 
 
 ROBOT = SimpleNamespace(name="robot")
@@ -197,6 +201,37 @@ def test_delayed_actuators_are_late_by_whole_steps_where_no_action_term_delays(f
         apply_units(environment(both, None), None, ROBOT, file + "2", term=None, rows=[0] * WORLDS)
 
 
+@pytest.mark.parametrize("executors", [False, True])
+def test_dc_motors_of_isaac_lab_get_the_torque_speed_line_of_a_unit(file, executors):
+    content = json.loads(Path(file).read_text())
+    content["plain_units"]["no_load_speed"] = [[3.0, 0.0], [4.0, 0.0], [5.0, 0.0], [6.0, 0.0]]
+    Path(file).write_text(json.dumps(content))
+
+    def motor(*names):
+        made = group(*names)
+        made._saturation_effort, made.velocity_limit = 7.0, torch.full((WORLDS, len(names)), 9.0)
+        made._vel_at_effort_lim = 2 * made.velocity_limit
+        return made
+
+    own, whole = motor("shoulder"), motor("elbow", "shoulder")
+    robot = Robot3(own, group("elbow", "head"))
+    if executors:
+        robot.actuators = type("Collection", (dict,), {"_execution_batches": [SimpleNamespace(actuator=whole)]})(
+            robot.actuators
+        )
+    apply_units(environment(robot, Action()), torch.tensor([0, 1, 4]), ROBOT, file, rows=[0, 1, 2, 3, 3, 0])
+    limit = stored(file, "shoulder")["effort_limit"]
+    for made, column in [(own, 0), (whole, 1)][: 1 + executors]:
+        assert made.velocity_limit[:, column].tolist() == [3.0, 4.0, 9.0, 9.0, 6.0, 9.0]
+        assert made._vel_at_effort_lim[:, column].tolist() == [6.0, 8.0, 18.0, 18.0, 12.0, 18.0]
+        torch.testing.assert_close(made._saturation_effort[[0, 1, 4], column], limit[[0, 1, 3]])
+        assert (made._saturation_effort[[2, 3, 5]] == 7.0).all()
+    if executors:
+        assert (whole.velocity_limit[[0, 1, 4], 0] == torch.inf).all()  # a speed of 0 is no line
+    with pytest.raises(ValueError, match="joint 'shoulder' needs a torque-speed line: take isaaclab_actuators"):
+        apply_units(environment(Robot3(group("shoulder", "elbow")), Action()), None, ROBOT, file)
+
+
 def test_a_scene_that_cannot_have_a_number_of_a_unit_is_refused(file):
     whole = group("shoulder", "elbow")
 
@@ -221,6 +256,7 @@ def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
     servos = '<position joint="robot/elbow" kp="1"/><position joint="robot/shoulder" kp="1"/>'
     xml = XML.replace('name="shoulder"', 'name="robot/shoulder"').replace('name="elbow"', 'name="robot/elbow"')
+    xml = xml.replace('name="upper"', 'name="robot/upper"').replace('name="fore"', 'name="robot/fore"')
     scene = mujoco.MjModel.from_xml_string(xml.replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>"))
     event = mjlab_units(file, rows=[0, 1, 2, 3, 3, 3])
     fields = {f: torch.tensor(getattr(scene, f)).float() for f in event.fields}
@@ -237,6 +273,15 @@ def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_
     assert float(worlds["dof_frictionloss"][3, dof]) == pytest.approx(unit["frictionloss"])
     assert float(worlds["actuator_biasprm"][3, 0, 0]) == pytest.approx(unit["kp"] * unit["offset"])
     assert worlds["actuator_forcerange"][3, 0].tolist() == pytest.approx([-unit["effort_limit"], unit["effort_limit"]])
+    link = torch.tensor(json.loads(Path(file).read_text())["plain_units"]["links"])[3]
+    for i, name in enumerate(("upper", "fore")):
+        one = [
+            worlds[f"body_{f}"][3, scene.body(f"robot/{name}").id].reshape(-1)
+            for f in ("mass", "ipos", "inertia", "iquat")
+        ]
+        torch.testing.assert_close(torch.cat(one), link[i])
+    torch.testing.assert_close(worlds["body_subtreemass"][3, :2], link[:, 0].sum().expand(2))
+    assert worlds["body_mass"][0, 1] == float(scene.body_mass[1])  # a world that was not reset
     scene.actuator_biastype[:] = 0
     with pytest.raises(ValueError, match="has joint 'robot/shoulder'; joints with position servos:"):
         event(env, None)

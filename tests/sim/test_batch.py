@@ -8,7 +8,7 @@ import pytest
 from arm import XML, write_arm
 
 from gaponet.base.errors import UsageError
-from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS, TERMS
 from gaponet.sim.batch import BatchSim, OneByOne, speed_limited
 from gaponet.sim.model import build_model
 
@@ -160,7 +160,7 @@ OTHER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("field", sorted(set(SERVO_FIELDS) - set(STOP_FIELDS)))
+@pytest.mark.parametrize("field", sorted(set(SERVO_FIELDS) - {*STOP_FIELDS, *TERMS["temperature"]}))
 def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     """One joint's value changes; the other joint keeps the robot's own."""
     robot = write_arm(tmp_path, xml=XML.replace('range="-1.5 1.5"', 'range="-1.5 1.5" ref="0.1"'))

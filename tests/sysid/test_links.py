@@ -117,6 +117,16 @@ def test_a_gain_from_torque_separates_masses_from_gains_without_a_second_payload
     assert shares[1] > 0.8
 
 
+def test_a_centre_of_mass_is_no_surer_than_the_zeros_of_the_encoders(robot, monkeypatch):
+    train = recorded(replace(robot, zero=np.array([0.006, 0.006])), 2, 150)
+    fit = link_fit(robot, train)
+    result = fit.descend(lambda cost: None)
+    _, now, std, _ = result.moments()
+    arm = np.linalg.norm(fit.axes.inertials(result.x)[-1, 1:4])
+    assert std[1, 1:4].max() > 0.5 * 0.006 * arm
+    assert (abs(now[:, 4:] - LinkAxes(robot).moments(0 * result.x)[:, 4:]) < 2 * std[:, 4:]).all()
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.6])
 def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monkeypatch, factor):
     servos = lambda self, *args, **options: self.bounds.first | {"kp": 1.1 * self.bounds.first["kp"]}  # noqa: E731
@@ -131,3 +141,14 @@ def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monk
     assert bool(fitted.links) == (factor > 1)
     assert fitted.robot.nominal is robot
     assert fitted.held_out[0].robot is fitted.robot
+
+
+def test_where_masses_and_gains_are_known_together_gains_follow_masses(robot):
+    fit = link_fit(robot, recorded(robot, 4, 200, payloads=(0.0,)), residual=1e-3)
+    result = fit.descend(lambda cost: None)
+    masses = np.zeros((2, COORDINATES))
+    masses[:, 0] = np.log(1.2) / 2 / fit.axes.scale[:, 0]
+    slopes = fit.servo_slopes(replace(result, x=0 * result.x))
+    np.testing.assert_allclose(slopes["kp"] @ masses.ravel(), np.log(1.2), rtol=0.15)
+    kd_over_kp = robot.kd / result.values["kp"]
+    np.testing.assert_allclose(slopes["damping"] @ masses.ravel(), kd_over_kp * np.log(1.2), rtol=0.5, atol=2e-3)

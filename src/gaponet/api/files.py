@@ -123,12 +123,13 @@ def randomization(
         UsageError: The uncertainty, days or robots are missing.
         NoGainError: The units follow the recordings worse than ± 20 % on each number.
     """
+    from gaponet.export.export_folder import ENGINE_TERMS
     from gaponet.export.plain_servos import read_recordings
     from gaponet.export.randomization import judge_units, sample_units, write_randomization
 
     spec = load_robot(simulator_folder(Path(robot)))
-    made = sample_units(spec, scope, tuple(map(Path, units)))
-    made = judge_units(made, spec, read_recordings(spec.folder, data, spec), progress)
+    made = sample_units(spec, scope, tuple(map(Path, units)), engine=engine)
+    made = judge_units(made, spec, read_recordings(spec.folder, data, spec), progress, ENGINE_TERMS.get(engine, ()))
     return write_randomization(made, engine, Path(out)), made
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.config import ModelKind
     from gaponet.nn.training.config import Status, TrainConfig
+    from gaponet.sim.links import LinkResult
     from gaponet.sysid.acceptance import Covariance, HeldOut
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
@@ -71,7 +72,7 @@ def identify(
         holdout_units: Units to leave out, as in training.
         terms: Terms of the servo model to try; each is accepted only if validation motions improve. Default: stribeck
             and load, after limit if a joint reaches its stated torque limit; then backlash where a gap makes the
-            rollouts better at otherwise equal values.
+            rollouts better at otherwise equal values; then temperature where it varies at equal gains and payload.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml).
         threads: 0 for all cores.
         budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.
@@ -121,7 +122,7 @@ def identify(
         errors = {"nominal": nominal, "identified": after}
         _save_origin(folder, data, split, {name: float(e.mean()) for name, e in errors.items()}, fitted.findings)
         judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
-        _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, judges)
+        _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, judges, fitted.links)
     return IdentifyResult(
         robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began,
         taken_from=taken,
@@ -188,14 +189,17 @@ def _save_origin(
 
 def _save_uncertainty(
     folder: Path, sequences: list[Sequence], validation: list[Sequence], covariance: Covariance,
-    before: ParameterUncertainty | None, held_out: ListOf[HeldOut] = (),
+    before: ParameterUncertainty | None, held_out: ListOf[HeldOut] = (), links: LinkResult | None = None,
 ) -> None:  # fmt: skip
     """Write the parameter uncertainty of a robot folder."""
     from gaponet.sysid.evidence.evidence import estimate_uncertainty
+    from gaponet.sysid.uncertainty import LinkUncertainty
 
     for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
         (folder / name).unlink(missing_ok=True)
-    estimate_uncertainty(load_robot(folder), sequences, validation, covariance, before, held_out).save(folder)
+    robot = load_robot(folder)
+    made = estimate_uncertainty(robot, sequences, validation, covariance, before, held_out)
+    replace(made, links=before.links if before else LinkUncertainty.of(links, robot, made.fields)).save(folder)
 
 
 def train(

@@ -141,6 +141,11 @@ class Sequence:
         """s."""
         return len(self) * self.dt
 
+    @property
+    def temperatures(self) -> tuple[float, ...] | None:
+        """Mean temperature of each joint, (n) °C; None if it was not recorded."""
+        return None if self.temperature is None else tuple(self.temperature.mean(axis=0, dtype=float).round(1).tolist())
+
     def rows(self, part: slice) -> Sequence:
         """The same recording, only these rows."""
         cut = {name: value[part] for name in ARRAYS if (value := getattr(self, name)) is not None}

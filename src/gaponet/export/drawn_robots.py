@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,8 @@ from gaponet.data.sequence import Sequence
 from gaponet.export.plain_servos import fit_plain_servos, rollout_error, stored_result
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.uncertainty import from_axes, to_axes
+from gaponet.sim.links import LinkAxes
+from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, to_axes
 
 RANGE_PERCENT = 5, 95
 Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
@@ -39,7 +40,7 @@ class DrawnRobots:
     """Units of one form of a robot: with its servo model, or fitted without it.
 
     Attributes:
-        units: Field → (retained units, n) in SI units; a row is one unit.
+        units: Field → (retained units, n) in SI units, and coordinates of drawn links; a row is one unit.
         errors: "exported", "units", "one by one" (each number from the range of 9 of 10 units) and "by hand" → mean
             |error| on validation motions, rad.
     """
@@ -68,6 +69,7 @@ def draw_robots(
     recordings: tuple[ListOf[Sequence], ListOf[Sequence]],
     plain: bool = False,
     progress: Progress = no_progress,
+    engine_terms: tuple[str, ...] = (),
 ) -> DrawnRobots:
     """Choose units by training motions and judge them by validation motions.
 
@@ -77,18 +79,18 @@ def draw_robots(
         robot: Identified.
         drawn: Units of `randomization.sample_units`.
         recordings: Training and validation motions, with the robot's own gains.
-        plain: Units of the robot as fitted without its servo model.
+        plain: Units of the robot as fitted without its servo model but for `engine_terms`, which the engine has.
         progress: Called with done, total and a note.
     """
     train, validation = recordings
     note = ", without the servo model" * plain
-    base = fit_plain_servos(robot, train, progress=progress) if plain else robot
+    base = fit_plain_servos(robot, train, progress, engine_terms) if plain else robot
     first = {f: v[:DRAWN] for f, v in drawn.items()}
 
     def draw() -> DrawnRobots:
         return _draw(base, _moved(robot, base, first), train, validation, lambda i, n, s: progress(i, n, s + note))
 
-    inputs = *first.values(), np.array([len(train), len(validation)])
+    inputs = *first.values(), np.array([len(train), len(validation), len(engine_terms)])
     return stored_result(robot.folder / CACHES[plain], DrawnRobots, draw, robot, [*train, *validation], *inputs)
 
 
@@ -105,11 +107,12 @@ def _draw(
     costs = errors_of(_windows(train), robots_of(base, drawn), "units on training motions")
     best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(costs)), 1)])
     units, rng = {field: values[best] for field, values in drawn.items()}, np.random.default_rng(0)
-    low, high = (np.array([np.percentile(v, side, axis=0) for v in units.values()]) for side in RANGE_PERCENT)
+    servos = [values for field, values in units.items() if field != "links"]
+    low, high = (np.array([np.percentile(v, side, axis=0) for v in servos]) for side in RANGE_PERCENT)
     alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
     robots = {
         "exported": [base], "units": robots_of(base, units)[:JUDGED],
-        "one by one": robots_of(base, dict(zip(units, alone, strict=True))), "by hand": _by_hand(base, rng),
+        "one by one": robots_of(base, dict(zip(units, alone, strict=False))), "by hand": _by_hand(base, rng),
     }  # fmt: skip
     judged = iter(errors_of(validation, [r for kind in robots.values() for r in kind], "robots on validation motions"))
     errors = {kind: float(np.mean([next(judged) for _ in several])) for kind, several in robots.items()}
@@ -118,16 +121,20 @@ def _draw(
 
 def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
     """Return a robot for each row of units."""
-    count = len(next(iter(units.values())))
-    return [
-        base.with_servos({j: {f: float(v[k, i]) for f, v in units.items()} for i, j in enumerate(base.operated)})
-        for k in range(count)
+    servos = {field: values for field, values in units.items() if field != "links"}
+    robots = [
+        base.with_servos({j: {f: float(v[k, i]) for f, v in servos.items()} for i, j in enumerate(base.operated)})
+        for k in range(len(units["kp"]))
     ]
+    if links := LinkAxes(base.before_identification).links if "links" in units else None:
+        robots = [replace(one, links=links(row)) for one, row in zip(robots, units["links"], strict=True)]
+    return robots
 
 
 def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     """Return units that deviate from `base` as the drawn ones deviate from `robot`, every second one half as far."""
-    fields = [f for f in drawn if f != "effort_limit" and (base is robot or f not in SERVO_TERMS)]
+    lacking = [] if base is robot else [f for f in SERVO_TERMS if not getattr(base, f).any()]
+    fields = [f for f in drawn if f not in ("effort_limit", "links", *lacking)]
     own, center = (np.stack(list(to_axes(r, fields).values())) for r in (robot, base))
     axes = np.stack([np.stack(list(to_axes(one, fields).values())) for one in robots_of(robot, drawn)])
     share = np.where(np.arange(len(axes)) % 2, NEAR, 1.0)[:, None, None]
@@ -136,6 +143,8 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     units: Units = dict(from_axes(fields, np.where(signed, x, np.maximum(x, 0.0))))
     op = robot.operated_index
     units["effort_limit"] = base.effort_limit[op] * units["kp"] / base.kp[op]
+    if links := ParameterUncertainty.require(robot).links if "links" in drawn else None:
+        units["links"] = np.array(links.values) + share[:, :, 0] * (drawn["links"] - np.array(links.values))
     return units
 
 

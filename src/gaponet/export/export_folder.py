@@ -182,6 +182,9 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     if robot.target_speed.any():
         ramps = ", ".join(f"{n} {v:.3g}" for n, v in zip(robot.joint_names, robot.target_speed, strict=True) if v)
         notes.append(f"servos' own ramps ({ramps} rad/s) are in no engine: limit targets so, as in check.npz")
+    if robot.friction_per_kelvin.any():
+        warm = ", ".join(f"{t:.0f}" for t in robot.friction_temperature[robot.operated_index])
+        notes.append(f"friction and damping are those at {warm} °C: no engine has a temperature")
     if to in DELAY_NOTES and any(s["delay"] for s in servos):
         notes.append(DELAY_NOTES[to])
     if to == "urdf":

@@ -8,6 +8,7 @@ torques over kp: if kp of a unit is wrong, its torque limit is wrong by the same
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from gaponet.export.drawn_robots import RANGE_PERCENT, DrawnRobots, draw_robots
 from gaponet.export.plain_servos import comparable
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.links import LinkAxes
 from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, prior_std, to_axes
 
 Scope = Literal["today", "any-day", "any-robot"]
@@ -43,9 +45,10 @@ class Randomization:
     """Sampled units of a robot.
 
     Attributes:
-        units: Field → (samples, n), SI units; a row is one unit.
+        units: Field → (samples, n), SI units, and coordinates of drawn links, (samples, Q); a row is one unit.
         ranges: Joint → field → low, value, high; 9 of 10 units lie between.
         unknown: "joint: field" of the numbers that no log determines.
+        links: Axes of drawn links.
         judged: The units with the servo model that recordings chose; None without recordings.
         plain: The same of the robot as fitted without its servo model.
     """
@@ -56,13 +59,15 @@ class Randomization:
     ranges: dict[str, dict[str, tuple[float, float, float]]]
     unknown: tuple[str, ...]
     notes: tuple[str, ...]
+    links: LinkAxes | None = None
     judged: DrawnRobots | None = None
     plain: DrawnRobots | None = None
 
 
 def sample_units(
-    robot: RobotSpec | Path, scope: Scope = "today", others: ListOf[Path] = (), samples: int = 256, seed: int = 0
-) -> Randomization:
+    robot: RobotSpec | Path, scope: Scope = "today", others: ListOf[Path] = (), samples: int = 256, seed: int = 0,
+    engine: Engine = "json",
+) -> Randomization:  # fmt: skip
     """Sample units of a robot.
 
     Args:
@@ -71,6 +76,7 @@ def sample_units(
             different days. "any-robot": differences between robots of its type.
         others: Robot folders of the type, each identified from its own logs.
         samples: Number of units.
+        engine: Isaac Lab's units have the identified links.
 
     Raises:
         UsageError: Data for the scope are missing; the message says which.
@@ -93,8 +99,16 @@ def sample_units(
     x = mean + np.sqrt(1 - single) * np.einsum("sd,dnp->snp", weights, deviations)
     x = x + np.sqrt(single * np.square(deviations).sum(axis=0)) * rng.standard_normal(x.shape)
     limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
-    for i in range(len(joints)):
+    links, drawn = uncertainty.links if engine != "isaaclab" else None, dict[str, Array]()
+    if links:
+        drawn["links"] = np.random.default_rng([seed, 1]).multivariate_normal(links.values, links.covariance, count)
+    elif spec.links:
+        why = "Isaac Lab may place or join bodies differently" if uncertainty.links else "no others are stored"
+        notes.append(f"all units have the identified links: {why}")
+    for i, joint in enumerate(joints):
         error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
+        if links:
+            error += (drawn["links"] - links.values) @ np.transpose(links.servo_slopes[joint])
         x[:, i] += error
         limit[:, i] *= np.exp(error[:, fields.index("kp")])
     bounded = [SERVO_FIELDS[f].axis != "log" and not SERVO_FIELDS[f].signed for f in fields]
@@ -110,8 +124,9 @@ def sample_units(
             low, high = np.percentile(sampled[field][:, i], RANGE_PERCENT)
             ranges[joint][field] = float(low), float(value[field][i]), float(high)
     names = tuple(f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k])
-    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit}).items()}
-    return Randomization(spec.name, scope, units, ranges, names, tuple(notes))
+    axes = LinkAxes(spec.before_identification) if links else None
+    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit} | drawn).items()}
+    return Randomization(spec.name, scope, units, ranges, names, tuple(notes), axes)
 
 
 def judge_units(
@@ -119,10 +134,12 @@ def judge_units(
     robot: RobotSpec,
     recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None,
     progress: Progress = no_progress,
+    engine_terms: tuple[str, ...] = (),
 ) -> Randomization:
     """Choose the units that follow the robot's recordings, and state their errors (export/drawn_robots.py).
 
-    Units of other days and robots are left as they are: this robot's recordings cannot judge them.
+    Units of other days and robots are left as they are: this robot's recordings cannot judge them. The engine has the
+    `engine_terms` of the servo model.
     """
     mass = recordings[0][0].meta.payload_mass if recordings and recordings[0] else 0.0
     train, validation = (comparable(part, robot, mass) for part in recordings or ((), ()))
@@ -131,9 +148,9 @@ def judge_units(
         return replace(made, notes=(*made.notes, f"{why}: the units were not compared with recordings"))
     judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
     if robot.has_servo_model:
-        plain = draw_robots(robot, made.units, (train, validation), plain=True, progress=progress)
+        plain = draw_robots(robot, made.units, (train, validation), True, progress, engine_terms)
     units = {f: np.array(v) for f, v in judged.units.items()}
-    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items()}
+    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items() if f != "links"}
     ranges = {
         joint: {f: (float(ends[f][0, i]), value, float(ends[f][1, i])) for f, (_, value, _) in by_field.items()}
         for i, (joint, by_field) in enumerate(made.ranges.items())
@@ -206,11 +223,12 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
         "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}
                    for j, by in made.ranges.items()},
-        "units": {f: np.round(v, 9) for f, v in made.units.items()}, "unknown": made.unknown, "notes": made.notes,
+        "units": _written(made.units, made.links), "unknown": made.unknown, "notes": made.notes,
     }  # fmt: skip
+    content |= {"bodies": made.links.bodies} if made.links else {}
     if made.judged is not None and made.plain is not None:
         content |= {
-            "plain_units": {f: np.round(v, 9) for f, v in made.plain.units.items()},
+            "plain_units": _written(made.plain.units, made.links),
             "error_mrad": {form: {name: 1e3 * error for name, error in drawn.errors.items()}
                            for form, drawn in (("servo model", made.judged), ("plain", made.plain))},
         }  # fmt: skip
@@ -222,6 +240,12 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         shipped = "mujoco_randomization.py" if engine == "mujoco" else "unit_events.py"
         write_text(file, (SHIPPED / shipped).read_text(encoding="utf-8"))
     return file
+
+
+def _written(units: Mapping[str, Any], axes: LinkAxes | None) -> dict[str, Any]:
+    """Return units with links as MuJoCo has them, (units, bodies, 11)."""
+    written = {f: np.round(v, 9) for f, v in units.items() if f != "links"}
+    return written | ({"links": [axes.inertials(np.array(row)) for row in units["links"]]} if axes else {})
 
 
 def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:

@@ -35,6 +35,7 @@ METHODS = {  # title, colour
     "load": ("friction by load", "#17543c"),
     "servo": ("least torque, encoder", "#113f2d"),
     "motor": ("torque by speed", "#0b2a1e"),
+    "temperature": ("friction by temperature", "#b3402a"),
     "contact": ("table, stops, zeros", "#6b4f2a"),
     "hand": ("where payloads hang, the hand", "#8d6e44"),
     "links": ("masses of the links", "#7a9a4d"),

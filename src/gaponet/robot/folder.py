@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import lock_folder, write_text
-from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, TERMS
 from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_robots
 
 STORED_ROBOT = "robot"  # subfolder of a run or a dataset
@@ -122,7 +122,7 @@ def _with_gains(text: str, robot: RobotSpec) -> str:
 def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     values = {name: float(getattr(robot, name)[i]) for name in SERVO_FIELDS}
-    optional = (*SERVO_TERMS, "target_speed")  # 0 if absent
+    optional = (*SERVO_TERMS, *TERMS["temperature"], "target_speed")  # 0 if absent
     stated = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in optional)}
     lines = [f"{name} = {value!r}\n" for name, value in stated.items()]
     return f"[identified.{_key(joint)}]\n" + "".join(lines)

@@ -9,15 +9,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
+
+import numpy as np
 
 # Terms of the servo model that identification may add, one by one; `ServoField.term` names a field's.
-Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder", "speed", "backlash"]
+Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder", "speed", "backlash", "temperature"]
 DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load", "backlash")
 Axis = Literal["value", "log", "over kp", "inverse"]
 
 MAX_VALUE = 1e6  # of gains and torques in robot.toml
 MAX_ANGLE_RAD = 1e3
+MAX_CELSIUS = 400.0
+MIN_FRICTION_FACTOR = 0.1  # of a temperature: friction does not vanish
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,14 @@ SERVO_FIELDS: dict[str, ServoField] = {
         ServoField("backlash", "rad", "backlash, mrad", 1e3, limits=(0.0, 1.0), bounds=(0.0, 0.1, 0.003), guess=0.004,
                    prior_std=0.01, large_value=0.01, cause="servo", term="backlash", in_servo_model=True, shared=False,
                    advice="check for a loose horn or a slipping gear"),
+        ServoField("friction_per_kelvin", "1/K", "friction, %/K", 1e2, limits=(-1.0, 1.0), bounds=(-0.04, 0.04, 0.01),
+                   guess=-0.005, cause="temperature", term="temperature", shared=False,
+                   advice="check the unit of the temperatures, °C"),
+        ServoField("damping_per_kelvin", "N·m·s/(rad·K)", "damping, mN·m·s/rad/K", 1e3, limits=(-MAX_VALUE, MAX_VALUE),
+                   axis="over kp", bounds=(-5e-3, 5e-3, 3e-4), guess=-1e-4, cause="temperature", term="temperature",
+                   shared=False),
+        ServoField("friction_temperature", "°C", "friction at, °C", limits=(-MAX_CELSIUS, MAX_CELSIUS),
+                   cause="temperature", term="temperature", shared=False),
         _angle("zero", heading="zero, mrad", factor=1e3, cause="contact"),
         _angle("stop_low", heading="low stop, rad", default=math.nan, cause="contact"),
         _angle("stop_high", heading="high stop, rad", default=math.nan, cause="contact"),
@@ -135,3 +147,9 @@ STOP_FIELDS = ("stop_low", "stop_high")
 TERMS: dict[Term, tuple[str, ...]] = {
     term: tuple(f.name for f in SERVO_FIELDS.values() if f.term == term) for term in get_args(Term)
 }
+
+
+def warmed(warming: Any, damping: Any, frictionloss: Any, per_kelvin: Any, damping_per_kelvin: Any) -> tuple[Any, Any]:
+    """Return damping and friction `warming` K above the temperature of the given ones; arrays that broadcast."""
+    factor = np.maximum(1.0 + per_kelvin * warming, MIN_FRICTION_FACTOR)
+    return damping + damping_per_kelvin * warming, frictionloss * factor

@@ -23,7 +23,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.base.structure import read_toml
-from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, warmed
 from gaponet.robot.toml_file import Link, PayloadMount, RobotTable, ServoTable, ServoType, Table, Tip
 
 __all__ = ["Link", "PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "load_robot", "packaged_robots"]
@@ -66,6 +66,9 @@ class RobotSpec:
         encoder_step: Resolution of the servo's angle, (n), rad; 0 if it has no effect.
         no_load_speed: Speed at which the motor has no torque left, (n), rad/s at the nominal supply; 0 without effect.
         backlash: Width of the gap between motor and link, (n), rad.
+        friction_per_kelvin, damping_per_kelvin: Relative change of frictionloss, (n), 1/K, and change of damping, (n),
+            N·m·s/(rad·K); 0 without effect.
+        friction_temperature: Temperature at which frictionloss and damping hold, (n), °C.
         servos: Servo type of each joint, (n), of robot.toml or servos.toml; None if robot.toml names none.
         tips, table: Tips that can touch a table, and the table; all other contacts are then off.
         links: MJCF body → identified mass, centre of mass and inertia, which replace the MJCF's.
@@ -108,6 +111,9 @@ class RobotSpec:
     encoder_step: Array = field(default_factory=lambda: np.array(0.0))
     no_load_speed: Array = field(default_factory=lambda: np.array(0.0))
     backlash: Array = field(default_factory=lambda: np.array(0.0))
+    friction_per_kelvin: Array = field(default_factory=lambda: np.array(0.0))
+    damping_per_kelvin: Array = field(default_factory=lambda: np.array(0.0))
+    friction_temperature: Array = field(default_factory=lambda: np.array(0.0))
     servos: tuple[ServoType | None, ...] = ()
     tips: tuple[Tip, ...] = ()
     table: Table | None = None
@@ -203,6 +209,16 @@ class RobotSpec:
         nominal = dataclasses.replace(nominal, kp=new_kp, kd=new_kd)
         own = self.nominal and nominal
         return dataclasses.replace(self, kp=self.kp * kp_ratio, kd=new_kd * kd_ratio, nominal=own)
+
+    def at_temperature(self, temperature: tuple[float, ...] | None) -> RobotSpec:
+        """Return the robot with friction and damping at joint temperatures, (n) °C; None: at friction_temperature."""
+        if temperature is None:
+            return self
+        warming = np.array(temperature) - self.friction_temperature
+        values = self.damping, self.frictionloss, self.friction_per_kelvin, self.damping_per_kelvin
+        damping, friction = warmed(warming, *values)
+        kd = np.maximum(self.kd + np.fmin(damping, 0.0), 0.0)
+        return dataclasses.replace(self, frictionloss=friction, damping=np.maximum(damping, 0.0), kd=kd)
 
     def with_gain_scale(self, scale: float) -> RobotSpec:
         """Return the same robot with the operated joints set to `scale` times the kp and kd of [[joint]]."""

@@ -105,20 +105,25 @@ def speed_limited(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> 
 
 
 class Condition(NamedTuple):
-    """Condition of a recording: payload, control period, and gains (n) where they are not the robot's own."""
+    """Condition of a recording: payload, control period, and gains (n) where they are not the robot's own.
+
+    Also the mean temperature of each joint (n), °C, if it was recorded and changes the robot's friction.
+    """
 
     payload_mass: float
     payload_side: str
     dt: float
     kp: tuple[float, ...] | None = None
     kd: tuple[float, ...] | None = None
+    temperature: tuple[float, ...] | None = None
 
     @classmethod
     def of(cls, sequence: Sequence, robot: RobotSpec) -> Condition:
         """Return the condition of a recording of this robot."""
         meta, gains = sequence.meta, sequence.meta.recorded_gains
-        other = () if robot.with_gains(*gains) is robot else gains
-        return cls(meta.payload_mass, meta.payload_side, sequence.dt, *other)
+        other = (None, None) if robot.with_gains(*gains) is robot else gains
+        warm = robot.friction_per_kelvin.any() and sequence.temperature is not None
+        return cls(meta.payload_mass, meta.payload_side, sequence.dt, *other, sequence.temperatures if warm else None)
 
 
 class BatchSim:
@@ -139,7 +144,7 @@ class BatchSim:
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
         conditions = [Condition(*c) for c in conditions]
-        robots = {c: robot.with_gains(c.kp, c.kd) for c in dict.fromkeys(conditions)}
+        robots = {c: robot.with_gains(c.kp, c.kd).at_temperature(c.temperature) for c in dict.fromkeys(conditions)}
         self.models = {c: build_model(r, *c[:3], locked, physics_only=True) for c, r in robots.items()}
         first = self.models[conditions[0]]
         kp_ratio = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}

@@ -7,7 +7,7 @@ the robot's file and keep every link physical (Rucker and Wensing 2022). They ha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.text import format_uncertainty
 from gaponet.robot.spec import Link, RobotSpec
-from gaponet.sim.model import build_model
+from gaponet.sim.model import build_model, principal_axes
 
 COORDINATES = 10  # of a link: log of mass, of stretches (3), shears (3) and shifts (3)
 MASS_LOG_STD, STRETCH_STD, SHIFT_STD = np.log(1.3), 0.15, 0.15  # of the prior; shifts relative to the link's length
@@ -27,7 +27,7 @@ class LinkAxes:
     """Coordinates of links, in standard deviations of their prior, (…, L · COORDINATES); zero is the robot's file.
 
     A link is a body with a joint and those that are welded to it, without payloads. `names` are those of the bodies
-    with joints; `scale` are the standard deviations of the prior, (L, COORDINATES).
+    with joints, `bodies` those of all; `scale` are the standard deviations of the prior, (L, COORDINATES).
     """
 
     def __init__(self, robot: RobotSpec) -> None:
@@ -48,6 +48,7 @@ class LinkAxes:
                     arm = _centre(model, data, own) - data.xanchor[model.body_jntadr[root]]
                     self._arms.append(data.xmat[root].reshape(3, 3).T @ arm)
         self.scale = np.array(scale).reshape(-1, COORDINATES)
+        self.bodies = tuple(name for members in self._bodies for name, _, _ in members)
 
     def links(self, x: Array) -> dict[str, Link]:
         """Return the bodies of links that x (L · COORDINATES,) changes, and those that the robot already has."""
@@ -56,6 +57,12 @@ class LinkAxes:
             if own.any():
                 links |= {name: _link(_upper(own) @ p @ _upper(own).T, frame) for name, frame, p in bodies}
         return links
+
+    def inertials(self, x: Array) -> Array:
+        """Return mass, centre of mass, principal inertia and its quaternion as MuJoCo has them, (bodies, 11)."""
+        links = self.links(np.where(x == 0, 1e-12, x))  # of all bodies, those of the file too
+        each = [links[name] for name in self.bodies]
+        return np.array([[one.mass, *one.pos, *np.concatenate(principal_axes(one))] for one in each])
 
     def moments(self, x: Array) -> Array:
         """Return mass, kg, centre of mass, m from the file's, and moment about the joint, kg·m, (L, 7); body's axes."""
@@ -122,6 +129,7 @@ class LinkResult:
     x: Array
     covariance: Array
     values: dict[str, Array]
+    servo_slopes: dict[str, Array] = field(default_factory=dict)  # field → its change for one of x, (n, Q)
 
     def moments(self) -> tuple[Array, Array, Array, Array]:
         """Return `LinkAxes.moments` before and now, their standard errors now and by the prior alone, (L, 7) each."""

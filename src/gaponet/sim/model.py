@@ -17,8 +17,8 @@ from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot
 from gaponet.robot.freeze import freeze, units_per_si
 from gaponet.robot.mjcf import compile_spec, read_mjcf
-from gaponet.robot.servo_fields import SERVO_TERMS
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.servo_fields import SERVO_TERMS, TERMS
+from gaponet.robot.spec import Link, RobotSpec
 
 if TYPE_CHECKING:
     from mujoco.batch import Batch
@@ -143,10 +143,12 @@ def model_hash(robot: RobotSpec) -> str:
     Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written.
     """
     if "_model_hash" not in vars(robot):
+        warm = [getattr(robot, name).tolist() for name in TERMS["temperature"]]
         text = [
             f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}",
             *([] if robot.carries_payload else ["carries no payload"]),
             *([f"target speed {robot.target_speed}"] * bool(robot.target_speed.any())),
+            *([f"friction per kelvin {warm}"] * any(robot.friction_per_kelvin)),
             *model_fingerprint(build_model(robot)),
         ]
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
@@ -219,6 +221,15 @@ LINK_FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat", "body_sam
                "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0", "pair_solref")  # fmt: skip
 
 
+def principal_axes(link: Link) -> tuple[Array, Array]:
+    """Return a link's principal moments of inertia, the largest first as compiled, and their axes as a quaternion."""
+    inertia, quat = np.array(link.inertia)[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3), np.zeros(4)
+    axes = np.linalg.eigh(inertia)[1][:, ::-1].copy()
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    mujoco.mju_mat2Quat(quat, axes.ravel())
+    return np.diag(axes.T @ inertia @ axes), quat
+
+
 def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
     """Return a copy of a compiled model with the links of a robot, as if it were compiled with them."""
     model = copy.copy(model)
@@ -226,12 +237,7 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
             continue  # of a locked limb
         body = model.body(name)
-        inertia = np.array(link.inertia)[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)
-        axes = np.linalg.eigh(inertia)[1][:, ::-1].copy()  # the largest first, as compiled
-        axes[:, 0] *= np.sign(np.linalg.det(axes))
-        body.inertia[:] = np.diag(axes.T @ inertia @ axes)
-        body.mass[:], body.ipos[:] = link.mass, link.pos
-        mujoco.mju_mat2Quat(body.iquat, axes.ravel())
+        body.mass[:], body.ipos[:], (body.inertia[:], body.iquat[:]) = link.mass, link.pos, principal_axes(link)
         model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     mujoco.mj_setConst(model, mujoco.MjData(model))
     stiffen_friction(model)

@@ -205,7 +205,8 @@ def set_joints(
 
 def advance(
     first: int, last: int, values: Any, has_terms: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
-    lengths: Any, stiffer: Any, kd: Any, stops: Any, periods: Any, count: int, thin: int, out: Any,
+    lengths: Any, stiffer: Any, kd: Any, stops: Any, warm: Any, periods: Any, count: int, thin: int,
+    out: Any,
 ) -> None:  # fmt: skip
     """Fill out[:, first:last] (k, n·windows, rows) with q_sim − q_real; arrays as JointRollouts keeps them.
 
@@ -217,11 +218,12 @@ def advance(
         j, p = item // windows, item % windows
         h = periods[p] / count
         v, rows = np.ascontiguousarray(values[:, j].T), lengths[p]
-        kp, dry, mass, offset, limit = v[0] * stiffer[p, j], v[2], v[3], v[4], v[6]
+        kp, mass, offset, limit = v[0] * stiffer[p, j], v[3], v[4], v[6]
+        damping, dry = warm[0, :, j, p], warm[1, :, j, p]
         rest, speed, by_motor, by_load, least, step = v[7], np.maximum(v[8], SLOWEST), v[9], v[10], v[11], v[12]
         deadband, no_load = DEADBAND_STEPS * (least > 0), np.where(v[13] > 0, v[13], np.inf)
         fades = np.isfinite(no_load).any()
-        brake, own = np.maximum(kd[p, j] + np.minimum(v[1], 0.0), 0.0), np.maximum(v[1], 0.0)
+        brake, own = np.maximum(kd[p, j] + np.minimum(damping, 0.0), 0.0), np.maximum(damping, 0.0)
         # A part of each command where it changes on the way.
         late = np.arange(count).reshape(-1, 1) / count - v[5] / periods[p]
         row = np.floor(late).astype(np.int64)

@@ -15,13 +15,16 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
-from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
+from gaponet.sim.temperature import recorded_temperatures, temperature_varies
 
 Values = dict[str, Array]  # field → (…, n) of the operated joints
 
 CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")  # that every fit has
+WARM = TERMS["temperature"]
+MIN_PER_KELVIN = 1e-3  # 1/K, of friction by temperature and of damping; less counts as none
 START_DELAY_S = 0.02  # a start without delay has no slope over it
 MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
 MAX_KP_LOG_CHANGE, LARGE_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.2, 0.3
@@ -61,7 +64,7 @@ def first_values(robot: RobotSpec) -> Values:
     """Return the robot's own values, (n,) each. Damping is the MJCF's; below zero it is taken from the servo's kd."""
     model, op = build_model(replace(robot, table=None)), robot.operated_index
     passive = {f: np.array(getattr(model, f"dof_{f}")[op]) for f in ("damping", "frictionloss", "armature")}
-    return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS)}
+    return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS, *WARM)}
 
 
 def identified_joints(robot: RobotSpec) -> set[str]:
@@ -148,7 +151,7 @@ class Bounds:
             "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),
         }
         self.start |= {f: np.where(self.unexcited, self.first[f], self.start[f]) for f in ("delay", "armature")}
-        self.start |= {f: self.first[f] for f in SERVO_TERMS if self.first[f].any()}
+        self.start |= {f: self.first[f] for f in (*SERVO_TERMS, *WARM) if self.first[f].any()}
         slow = 1 / greatest_speeds(sequences, robot)  # s/rad
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)
@@ -161,15 +164,27 @@ class Bounds:
             "encoder_step": (counts, counts, one),
             "no_load_speed": (0 * one, 2 * slow, LARGE_LINE_CHANGE * slow),
         }
-        guess = {f.name: f.guess * one for f in SERVO_FIELDS.values() if f.guess is not None}
+        varies = temperature_varies(sequences, robot)
+        for f in WARM[:2]:  # else the robot's own value stays
+            (low, high, large), own = self.limits[f], to_axis(f, self.first[f], kp)
+            self.limits[f] = np.where(varies, low, own), np.where(varies, high, own), large
+        guess = {
+            f.name: f.guess * (varies if f.name in WARM else one) for f in SERVO_FIELDS.values() if f.guess is not None
+        }
         self.guess = from_axis(guess, kp) | {
             "effort_limit": 0.6 * limit,  # one that is too high has no slope
             "encoder_step": counts,
             "no_load_speed": np.where(self.unexcited, 0.0, 2 / slow),
+            WARM[2]: np.nan_to_num(recorded_temperatures(sequences, op)).mean(axis=0).round(),
         }
 
     def visible(self, field: str, values: Values) -> Array:
-        """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE."""
+        """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE, or of friction and
+        damping that change by less than MIN_PER_KELVIN."""
+        if field == WARM[0]:
+            total = np.maximum(values["damping"] + self.kd, 0.0)
+            slow = np.abs(values[WARM[1]]) < MIN_PER_KELVIN * total
+            return np.where(slow & (np.abs(values[field]) < MIN_PER_KELVIN), 0.0, values[field])
         inverse = SERVO_FIELDS[field].axis == "inverse"
         least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field][2] if inverse else 0.0
         return np.where(inverse & (to_axis(field, values[field], values["kp"]) < least), 0.0, values[field])

@@ -27,6 +27,7 @@ from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.links import LinkResult
 from gaponet.sim.metrics import Comparison
+from gaponet.sim.temperature import temperature_findings
 from gaponet.sysid import backlash
 from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Links, Split, cross_validation
 from gaponet.sysid.axes import CLASSIC, Bounds, Values, with_values
@@ -208,7 +209,8 @@ def _fit_robot(
     before, after = (float(judge.errors(*pair).mean()) for pair in pairs)
     by_joint = zip(*(judge.errors_by_joint(*pair).tolist() for pair in pairs), strict=True)
     searches.tell(np.inf, "the fitted robot, and recorded torque")
-    findings = backlash.findings(robot.operated, *gaps, errors.std) if gaps else ()
+    findings = temperature_findings(sequences, fitted, errors.std)
+    findings += backlash.findings(robot.operated, *gaps, errors.std) if gaps else ()
     return Identified(
         fitted, before, after, chosen, warnings, errors.std, comparisons, table_fit,
         dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,
@@ -278,15 +280,17 @@ def _with_links(
     searches: _SearchProgress,
 ) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:
     """Fit the links with the servos from `start`; return them and the servos' values if they are better."""
-    results = list[LinkResult]()
-    for whole, one, torque_kp in zip(wholes, start, gains, strict=True):
+    results, fits = list[LinkResult](), [LinkFit(*one) for one in zip(wholes, start, gains, strict=True)]
+    for fit in fits:
         searches.begin()
-        report = searches.report("masses", ("all joints",), whole.rollouts.rows.sum(keepdims=True))
-        results.append(LinkFit(whole, one, torque_kp).descend(report))
+        report = searches.report("masses", ("all joints",), fit.whole.rollouts.rows.sum(keepdims=True))
+        results.append(fit.descend(report))
     links, servos = [r.axes.links(r.x) for r in results], [r.values for r in results]
     before = judge.errors(values)
     comparison = Comparison("masses", before, judge.errors(servos, links) if results[-1].x.any() else before)
-    return (comparison, results[-1], links, servos) if comparison.accepted else (comparison, None, [], values)
+    slopes = fits[-1].servo_slopes(results[-1]) if comparison.accepted else {}
+    accepted = comparison, replace(results[-1], servo_slopes=slopes), links, servos
+    return accepted if comparison.accepted else (comparison, None, [], values)
 
 
 def _fit_term(

@@ -26,6 +26,7 @@ from gaponet.sim.batch import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import crossed, friction_limit, present, servo_torque, torque_range
+from gaponet.sim.temperature import recorded_temperatures, warm_values
 
 advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
@@ -98,6 +99,7 @@ class JointRollouts:
         acting = [robot.with_gains(*p.meta.recorded_gains) for p in parts]
         self.kp_ratio = np.array([(r.kp / robot.kp)[self.op] for r in acting])
         self.kd = np.array([r.kd[self.op] for r in acting])
+        self.temperature = recorded_temperatures(parts, self.op).T  # (n, windows) °C
 
     def _counted(self) -> Array:
         """Return the rows that count, (windows, rows): after the start has settled, away from contacts."""
@@ -165,7 +167,8 @@ class JointRollouts:
 
         Args:
             values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and any of
-                effort_limit and SERVO_TERMS, (k, n) each. A damping below zero is taken from the servo's own kd.
+                effort_limit, SERVO_TERMS and those of temperature, (k, n) each. A damping below zero is taken from the
+                servo's own kd.
         """
         out = self._compiled(values) if advance is not None else self._arrays(values)
         return np.asarray(out * (self.counted & self.recorded[..., None]))
@@ -183,8 +186,9 @@ class JointRollouts:
         terms = any(values[f].any() for f in SERVO_TERMS if f in values)
         out = np.zeros((k, n * windows, self.counted.shape[1]), np.float32)
         ends = np.linspace(0, n * windows, self.nthread + 1).astype(int)
+        warm = np.stack(warm_values(values, self.temperature))
         rest = (packed, terms, self.tables, self.ctrl, self.qpos, self.qvel, self.touch, self.lengths, self.kp_ratio,
-                self.kd, self.stops, self.periods, self.count, self.thin, out)  # fmt: skip
+                self.kd, self.stops, warm, self.periods, self.count, self.thin, out)  # fmt: skip
         with ThreadPoolExecutor(self.nthread) as pool:
             list(pool.map(lambda a, b: advance(a, b, *rest), ends[:-1].tolist(), ends[1:].tolist()))
         return out.reshape(k, n, windows, -1)
@@ -196,8 +200,9 @@ class JointRollouts:
         v = {name: _filled(x[:, :, None], shape) for name, x in values.items()}
         terms = present({name: v[name] for name in SERVO_TERMS if name in v})
         kp, kd = v["kp"] * _filled(self.kp_ratio.T, shape), _filled(self.kd.T, shape)
-        kd = np.maximum(kd + np.minimum(v["damping"], 0), 0)
-        own, armature, offset, dry = np.maximum(v["damping"], 0), v["armature"], v["offset"], v["frictionloss"]
+        damping, dry = (_filled(x, shape) for x in warm_values(values, self.temperature))
+        kd = np.maximum(kd + np.minimum(damping, 0), 0)
+        own, armature, offset = np.maximum(damping, 0), v["armature"], v["offset"]
         limit = v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
         h = _filled(self.periods / self.count, shape)
         low, high = (_filled(x[:, None], shape) for x in self.stops.T)

@@ -19,7 +19,7 @@ from gaponet.sim.model import build_model, with_links
 from gaponet.sysid import least_squares
 from gaponet.sysid.axes import CLASSIC, Axes, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED
-from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, Progress
+from gaponet.sysid.least_squares import DIFFERENCE_STEP, Progress
 from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
 
 ROWS = 400  # of recordings, whose torques choose directions
@@ -29,6 +29,7 @@ ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
 FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
 MAX_SERVO_NUMBERS, FEW_FIELDS = 36, ("kp", "armature")  # fitted with the links; of robots with more, these fields
 MIN_CHANGE, MAX_CHANGE = 0.1, 6.0  # of a link's coordinates, in standard deviations of the prior; less is none
+ENCODER_ZERO_STD_RAD = 0.006  # a third of a degree, as a joint's zero at its stop is set by hand
 MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
 
 
@@ -47,7 +48,8 @@ class LinkFit:
         self._prior.state_kp(kp, self._kp_std)
         self._prior.residual = FIRST_RESIDUAL_SHARE * whole.prior.residual
         self._weigh()
-        self.directions = self._determined() if self.axes.names else np.zeros((0, 0))
+        none: Array = np.zeros((0, 0))
+        self.directions, self._rest = self._determined() if self.axes.names else (none, none)
 
     def _weigh(self) -> None:
         """Weigh each joint's errors by its residual; the prior weighs as much as errors of the mean residual."""
@@ -55,11 +57,12 @@ class LinkFit:
         self._level = float(np.sqrt(np.mean(std**2)))
         self._weight = np.clip(self._level / std, 0.3, 3.0)
 
-    def _determined(self) -> Array:
-        """Return the directions whose information in the recordings is above the prior's, from inverse dynamics.
+    def _determined(self) -> tuple[Array, Array]:
+        """Return directions with more information than the prior's, and the covariance along others, (10 L, 10 L).
 
-        A change of torque moves a joint by itself over kp. What gains, offsets, damping, friction and armature of the
-        joint explain as well does not count, so without payloads or recorded torque all masses do not change together.
+        They come from inverse dynamics. A change of torque moves a joint by itself over kp. What gains, offsets,
+        damping, friction and armature of the joint explain as well does not count, so without payloads or recorded
+        torque all masses do not change together.
         """
         robot, parts, op = replace(self.whole.robot, table=None), self.whole.rollouts.parts, self.whole.rollouts.op
         every, size = max(1, sum(map(len, parts)) // ROWS), self.axes.scale.size
@@ -93,26 +96,21 @@ class LinkFit:
             information += d.T @ d - d.T @ s @ np.linalg.pinv(s.T @ s + stated) @ s.T @ d
         strength, vectors = np.linalg.eigh(information)
         chosen = np.flatnonzero(strength > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
-        return np.asarray(vectors[:, chosen])
+        rest = np.delete(vectors / np.sqrt(np.maximum(strength, MIN_INFORMATION)), chosen, axis=1)
+        return vectors[:, chosen], rest @ rest.T
 
     def _unpacked(self, x: Array) -> tuple[Values, list[Array]]:
         """Return servo values (k, n) and link coordinates of candidates x (k, 1, P)."""
         servos, z = np.split(x[:, 0], [self._n * len(self._servos.names)], axis=1)
         return self._servos.values(servos.reshape(len(x), self._n, -1)), list(z @ self.directions.T)
 
-    def errors(self, x: Array) -> Array:
+    def errors(self, x: Array, **other: Array) -> Array:
         """Return errors of candidates (k, 1, P), (k, 1, n · (rows + PRIORS) + K) in ERROR_SCALE_RAD."""
-        values, coordinates = self._unpacked(x)
-        errors = self.whole.rollouts.flat_errors(values, [self.axes.links(c) for c in coordinates]) / ERROR_SCALE_RAD
+        values, links = self._unpacked(x)
+        errors = self.whole.rollouts.flat_errors(values | other, [self.axes.links(c) for c in links]) / ERROR_SCALE_RAD
         own = np.concatenate([errors, self._prior.errors(values)], axis=2) * self._weight[:, None]
         z = x[:, 0, self._n * len(self._servos.names) :]
         return np.concatenate([own.reshape(len(x), -1), self._level * z], axis=1)[:, None]
-
-    def derive(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
-        """Return `least_squares.slopes`, and retain them for the covariance."""
-        here, jac = least_squares.slopes(x, high, errors)
-        self._slopes = here[0, 0], jac[0, 0]
-        return here, jac
 
     def descend(self, report: Progress) -> LinkResult:
         """Fit links and servos together; return them with the links' covariance."""
@@ -128,30 +126,49 @@ class LinkFit:
                 cost = least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD)
                 self._prior.update_residual(cost, self.whole.rollouts.rows)
                 self._weigh()
-            x, _ = least_squares.descend(x, low, high, self.errors, count, report, MIN_COST_DECREASE, self.derive)
+            x, _ = least_squares.descend(x, low, high, self.errors, count, report, MIN_COST_DECREASE)
         values, coordinates = self._unpacked(x[0][None])
-        own, covariance = coordinates[0].reshape(-1, COORDINATES), self._covariance()
+        own, (by_noise, by_zeros) = coordinates[0].reshape(-1, COORDINATES), self._covariances(x[0, 0])
         z = coordinates[0] @ self.directions
-        std = np.sqrt(np.einsum("pk,pq,qk->k", self.directions, covariance, self.directions))
         small = np.abs(own).max(axis=1, keepdims=True) < MIN_CHANGE
-        changed = np.where(small | ~(np.abs(z) > MIN_SIGNIFICANCE * std).any(), 0.0, own).ravel()
+        none = (np.abs(z) <= MIN_SIGNIFICANCE * np.sqrt(np.diag(by_noise))).all()
+        changed = np.where(small | none, 0.0, own).ravel()
+        covariance = self.directions @ (by_noise + by_zeros) @ self.directions.T + self._rest
         return LinkResult(self.axes, changed, covariance, {f: v[0].copy() for f, v in values.items()})
 
-    def _covariance(self) -> Array:
-        """Return the covariance of the links' coordinates at the last slopes; the prior's at right angles to these."""
-        here, jac = self._slopes
-        weight = 1 / np.sqrt(1 + here**2)
-        count, n = self.directions.shape[1], self._n
-        normal = jac.T @ (weight[:, None] * jac)
-        gradient = jac * (weight * here)[:, None]
+    def _slopes(self, x: Array) -> tuple[Array, Array]:
+        """Return errors at x (P,) and their differences over x, (m,) and (m, P)."""
+        here, jac = least_squares.slopes(x[None, None], np.full((1, len(x)), np.inf), self.errors)
+        return here[0, 0], jac[0, 0]
+
+    def _covariances(self, x: Array) -> tuple[Array, Array]:
+        """Return covariances along the directions at x (P,), (K, K): by noise and prior, and by the encoders' zeros.
+
+        A wrong zero turns gravity as another centre of mass does, and no recorded position shows which it is.
+        """
+        (here, jac), count, n = self._slopes(x), self.directions.shape[1], self._n
+        zeros = self.whole.robot.zero[self.whole.rollouts.op] + ENCODER_ZERO_STD_RAD * np.eye(n)
+        by_zero = self.errors(np.repeat(x[None, None], n, axis=0), zero=zeros)[:, 0] - here
+        weighted = jac / np.sqrt(1 + here**2)[:, None]
         rows = (len(here) - count) // n
-        mine, by_joint = (y[: n * rows].reshape(n, rows, -1) for y in (gradient, jac))
+        mine, by_joint = (y[: n * rows].reshape(n, rows, -1) for y in (weighted * here[:, None], jac))
         each = cluster_sums(mine[:, :-PRIORS], self.whole.rollouts.window)[0].sum(axis=0)
         each -= each.mean(axis=0)
         held = np.concatenate([*by_joint[:, -PRIORS:], jac[n * rows :]])
-        few = len(each) / max(len(each) - count, 1)
-        scatter = each.T @ each * few**2 + self._level**2 * held.T @ held
-        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
-        own = (inverse @ scatter @ inverse)[-count:, -count:]
-        rest = np.eye(len(self.directions)) - self.directions @ self.directions.T
-        return np.asarray(self.directions @ own @ self.directions.T + rest)
+        scatter = each.T @ each * (len(each) / max(len(each) - count, 1)) ** 2 + self._level**2 * held.T @ held
+        inverse = np.linalg.pinv(jac.T @ weighted, rcond=1e-10, hermitian=True)
+        shifted = (inverse @ weighted.T @ by_zero.T)[-count:]
+        return (inverse @ scatter @ inverse)[-count:, -count:], shifted @ shifted.T
+
+    def servo_slopes(self, result: LinkResult) -> dict[str, Array]:
+        """Return how the servos follow the links: field → its change on its axis for one of x, (n, L · COORDINATES)."""
+        whole, count = copy.copy(self), self._servos.unit.size
+        whole.directions = np.eye(len(result.x))
+        here, jac = whole._slopes(np.r_[self._servos.normalize(result.values).ravel(), result.x])
+        normal = jac.T @ (jac / np.sqrt(1 + here**2)[:, None])
+        slopes = -np.linalg.pinv(normal[:count, :count], rcond=1e-10, hermitian=True) @ normal[:count, count:]
+        slopes = slopes.reshape(*self._servos.unit.shape, -1) * self._servos.unit[..., None]
+        by_field = dict(zip(self._servos.names, np.moveaxis(slopes, 1, 0), strict=True))
+        if "damping" in by_field:  # the fitted sum with kd over kp keeps its value, and kd does not change with kp
+            by_field["damping"] += (self.whole.bounds.kd / result.values["kp"])[:, None] * by_field["kp"]
+        return by_field

@@ -20,6 +20,7 @@ from gaponet.robot.servo_fields import DEFAULT_TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.metrics import Comparison
+from gaponet.sim.temperature import temperature_varies
 from gaponet.sysid.acceptance import Identified, held_out_errors
 from gaponet.sysid.axes import greatest_speeds
 
@@ -78,7 +79,8 @@ def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
 
 
 def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, ...]:
-    """Return DEFAULT_TERMS, after "limit" and "speed" if gains and recorded errors ask a joint for such torques.
+    """Return DEFAULT_TERMS, after "limit" and "speed" if gains and recorded errors ask a joint for such torques, and
+    before "temperature" if recordings vary it.
 
     That is so if the servo asks, in MIN_LIMITED_SHARE of a joint's rows, for AT_TORQUE_LIMIT of the robot's limit; for
     "speed", in MIN_FAST_SHARE, for DRIVEN_FAST of it while the joint moves that way at FAST of its greatest speed.
@@ -96,7 +98,9 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
         reached["speed"] += recorded * driven.sum(axis=0)
         rows += len(s) * recorded
     shares: dict[Term, float] = {"limit": MIN_LIMITED_SHARE, "speed": MIN_FAST_SHARE}
-    return (*(t for t, share in shares.items() if (reached[t] > share * rows).any()), *DEFAULT_TERMS)
+    limited = (t for t, share in shares.items() if (reached[t] > share * rows).any())
+    warm = ("temperature",) if temperature_varies(sequences, robot).any() else ()
+    return (*limited, *DEFAULT_TERMS, *warm)
 
 
 def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:

@@ -15,7 +15,7 @@ from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
 from gaponet.sysid.acceptance import Covariance, Std
-from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, Axes, Bounds, Values
+from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, WARM, Axes, Bounds, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import Errors, Progress, agreed_slopes, better_half, descend
 from gaponet.sysid.robot_rollouts import RobotRollouts
@@ -243,13 +243,13 @@ class KinematicChains:
 
 def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:
     """Return the fields among values that a joint's search changes, in order; encoder_step if `encoder`."""
-    every = (*CLASSIC, "effort_limit", *SERVO_TERMS)
+    every = (*CLASSIC, "effort_limit", *SERVO_TERMS, *WARM[:2])
     return [f for f in every if f in values and (encoder or f != "encoder_step")]
 
 
 def robot_fields(values: Values) -> list[str]:
     """Return the fields among values that the fit in the robot's simulator changes."""
-    return [f for f in (*CLASSIC, *SERVO_TERMS) if f in values and not SERVO_FIELDS[f].single_joint]
+    return [f for f in (*CLASSIC, *SERVO_TERMS, *WARM[:2]) if f in values and not SERVO_FIELDS[f].single_joint]
 
 
 @dataclass

@@ -16,6 +16,7 @@ from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import LINK_FIELDS, with_links
 from gaponet.sim.replay import Corrector, idle_limbs, rollout
+from gaponet.sim.temperature import recorded_temperatures, warm_values
 from gaponet.sysid.joint_rollouts import ROW_PERIOD_S, SETTLE_S
 
 WINDOW_S = 8.0  # what is fitted to a second or two does not hold over whole motions
@@ -83,9 +84,14 @@ class RobotRollouts:
         terms = any(values[f].any() for f in SERVO_TERMS if f in values)
         plain: dict[str, Any] = {} if terms else dict.fromkeys(SERVO_TERMS, np.array(0.0))
         acting = replace(self.robot, delay=delay, **plain)
-        conditions = [Condition.of(s, self.robot) for s in self.parts]
+        conditions = [Condition.of(s, self.robot)._replace(temperature=None) for s in self.parts]
         sim = BatchSim(acting, conditions * k, self.nthread, self.locked, servo_model=terms)
-        sim.set_servos(self.robot.operated, {f: np.repeat(x, m, axis=0) for f, x in values.items()})
+        each = {f: np.repeat(x, m, axis=0) for f, x in values.items()}
+        warm = warm_values(values, recorded_temperatures(self.parts, self.op).T)
+        each |= {
+            f: x.swapaxes(1, 2).reshape(-1, self.n) for f, x in zip(("damping", "frictionloss"), warm, strict=True)
+        }
+        sim.set_servos(self.robot.operated, each)
         for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
             sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
             if sim.servo_model is not None:

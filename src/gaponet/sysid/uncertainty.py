@@ -25,6 +25,7 @@ from gaponet.base.text import format_uncertainty
 from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, UNCERTAINTY_FILE
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.links import LinkAxes, LinkResult
 from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
 PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
@@ -76,6 +77,27 @@ class JointUncertainty:
     repeatability: float = 0.0
 
 
+@dataclass(frozen=True)
+class LinkUncertainty:
+    """Uncertainty of fitted links in Q coordinates (sim/links.py), and slopes (P, Q) of each joint's values over them.
+
+    The covariances of the joints are for the links as fitted.
+    """
+
+    values: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    servo_slopes: dict[str, tuple[tuple[float, ...], ...]]
+
+    @classmethod
+    def of(cls, result: LinkResult | None, robot: RobotSpec, fields: ListOf[str]) -> LinkUncertainty | None:
+        """Return the uncertainty of a fit that began with the file's links, if the robot has the fitted ones."""
+        if result is None or result.axes.links(0 * result.x) or robot.links != result.axes.links(result.x):
+            return None
+        none = np.zeros((len(robot.operated), len(result.x)))
+        slopes = np.stack([result.servo_slopes.get(f, none) for f in fields], axis=1).tolist()
+        return cls(tuple(result.x.tolist()), result.covariance.tolist(), dict(zip(robot.operated, slopes, strict=True)))
+
+
 ArrayName = Literal["values", "covariance", "gauss_newton_step", "gauss_newton_covariance", "overdispersion"]
 
 
@@ -89,6 +111,7 @@ class ParameterUncertainty:
         sources: Recordings, from the first to the last.
         clusters: Number of parts of the recordings from which the overdispersion was estimated.
         validated: Whether the residuals are of motions that were not fitted.
+        links: Of the links, if they were fitted.
     """
 
     fields: tuple[str, ...]
@@ -96,6 +119,7 @@ class ParameterUncertainty:
     sources: tuple[Provenance, ...]
     clusters: int
     validated: bool
+    links: LinkUncertainty | None = None
 
     @classmethod
     def load(cls, robot: RobotSpec) -> ParameterUncertainty | None:
@@ -114,6 +138,11 @@ class ParameterUncertainty:
             stored = uncertainty.joints.get(joint)
             if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
                 raise RobotError(f"{file}: its values are other values than robot.toml's, at {joint}; {hint}")
+        if uncertainty.links:
+            links = LinkAxes(robot.before_identification).links(np.array(uncertainty.links.values))
+            mass = {body: link.mass for body, link in robot.links.items()}
+            if not all(np.isclose(x.mass, mass.get(body, 0.0), rtol=1e-4) for body, x in links.items()):
+                raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
         return uncertainty
 
     @classmethod
@@ -125,7 +154,7 @@ class ParameterUncertainty:
 
     def save(self, folder: Path) -> None:
         """Write uncertainty.json into a robot folder."""
-        write_json(folder / UNCERTAINTY_FILE, asdict(self))
+        write_json(folder / UNCERTAINTY_FILE, {name: x for name, x in asdict(self).items() if x is not None})
 
     def array(self, joint: str, name: ArrayName) -> Array:
         """Return an attribute of a joint as an array."""

@@ -23,9 +23,9 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
     The unit is one without the servo model, where the file has these. kd of the servos does not change, servos without
     a torque limit get none, and a delay is at most as long as the servo's buffer (nsample).
     """
-    values = drawn.get("plain_units", drawn["units"])
+    form = "plain_units" if "plain_units" in drawn else "units"
     for i, name in enumerate(drawn["joints"]):
-        unit = {field: float(values[field][row][i]) for field in values}
+        unit = {field: float(values[row][i]) for field, values in drawn[form].items() if field != "links"}
         joint = model.joint(name)
         dof, kp, limit = joint.dofadr[0], unit["kp"], unit["effort_limit"]
         model.dof_damping[dof], model.dof_frictionloss[dof] = unit["damping"], unit["frictionloss"]
@@ -39,15 +39,24 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
                     model.actuator_forcerange[servo] = -limit, limit
                 if samples := int(model.actuator_history[servo, 0]):
                     model.actuator_delay[servo] = min(unit["delay"], (samples - 2) * model.opt.timestep)
+    set_links(model, drawn, row, form)
+
+
+def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str = "units") -> None:
+    """Give bodies the links of a unit with the servo model ("plain_units": without it), where the file has links."""
+    for i, name in enumerate(drawn.get("bodies", ())):
+        body, x = model.body(name), drawn[form]["links"][row][i]
+        body.mass[:], body.ipos[:], body.inertia[:], body.iquat[:] = x[0], x[1:4], x[4:7], x[7:]
+        model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[str, Any]:
     """Return the facts.json of gaponet export --to mjcf with the numbers of a unit, for mujoco_servos.Servos.
 
-    Servos(model, unit_facts(facts, drawn, row)) moves a model like the unit, with its servo model.
+    Servos(model, unit_facts(facts, drawn, row)) moves a model like the unit after `set_links`.
     """
     joints = {name: dict(servo) for name, servo in facts["joints"].items()}
     for i, name in enumerate(drawn["joints"]):
-        joints[name] |= {field: float(values[row][i]) for field, values in drawn["units"].items()}
+        joints[name] |= {field: float(values[row][i]) for field, values in drawn["units"].items() if field != "links"}
     return facts | {"joints": joints}

@@ -23,6 +23,7 @@ from torch import Tensor
 MODEL_FIELDS = (
     "dof_armature", "dof_frictionloss", "dof_damping", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
 )  # fmt: skip
+BODY_FIELDS = "body_mass", "body_ipos", "body_inertia", "body_iquat", "body_subtreemass"
 DELAY_BUFFERS = "positions_delay_buffer", "velocities_delay_buffer", "efforts_delay_buffer"
 Units = dict[str, Tensor]  # field → (worlds, joints), SI units
 
@@ -71,12 +72,17 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
     """
     from mjlab.managers.event_manager import requires_model_fields
 
-    @requires_model_fields(*MODEL_FIELDS)
+    bodies = json.loads(Path(file).read_text(encoding="utf-8")).get("bodies", [])
+
+    @requires_model_fields(*MODEL_FIELDS, *BODY_FIELDS * bool(bodies))
     def use_units(env: Any, env_ids: Any) -> None:
         action = env.action_manager.get_term(term)
-        if servos := getattr(action, "terms", None):
-            return servos.set_units(*draw_units(file, "units", env, env_ids, rows))
-        ids, joints, units = draw_units(file, "plain_units", env, env_ids, rows)
+        servos = getattr(action, "terms", None)
+        ids, joints, units = draw_units(file, "units" if servos else "plain_units", env, env_ids, rows)
+        if bodies:
+            write_links(env.sim, ids, [f"{action.cfg.entity_name}/{name}" for name in bodies], units["links"])
+        if servos:
+            return servos.set_units(ids, joints, units)
         model, joints = env.sim.mj_model, [f"{action.cfg.entity_name}/{name}" for name in joints]
         driven = {model.joint(joint).name: servo for servo, joint in enumerate(model.actuator_trnid[:, 0])
                   if (model.actuator_trntype[servo], model.actuator_biastype[servo]) == (0, 1)}  # fmt: skip
@@ -99,13 +105,25 @@ def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: 
     model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
 
 
+def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> None:
+    """Write mass, centre of mass and inertia of bodies to a model of mjlab, (worlds, bodies, 11)."""
+    model, parents = sim.model, sim.mj_model.body_parentid.tolist()
+    at = env_ids[:, None], torch.tensor([sim.mj_model.body(name).id for name in bodies], device=links.device)
+    model.body_mass[at], model.body_ipos[at] = links[..., 0], links[..., 1:4]
+    model.body_inertia[at], model.body_iquat[at] = links[..., 4:7], links[..., 7:]
+    total = model.body_mass[env_ids].clone()
+    for body in range(len(parents) - 1, 0, -1):
+        total[:, parents[body]] += total[:, body]
+    model.body_subtreemass[env_ids] = total
+
+
 # ---- Isaac Lab
 
 
 def apply_units(
     env: Any, env_ids: Any, asset_cfg: Any, file: str, term: str | None = "joint_pos", rows: Any = None
 ) -> None:
-    """Event term of Isaac Lab 2.3 and 3. Units are without the servo model; kd stays as it is.
+    """Event term of Isaac Lab 2.3 and 3. Of the servo model units have torque-speed lines; kd stays.
 
     Args:
         asset_cfg: SceneEntityCfg of the robot. All joints of the file are set.
@@ -122,6 +140,8 @@ def apply_units(
     groups = {joint: group for group in robot.actuators.values() if not hasattr(group, "network")
               for joint in getattr(group, "joint_names", ())}  # fmt: skip
     columns_of(joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)")
+    if "no_load_speed" in units:
+        _speed_lines(robot, joints, groups, units, ids)
     if term is None:
         _delay(joints, groups, units["delay"] / env.physics_dt, ids)
     elif hasattr(action := env.action_manager.get_term(term), "set_units"):
@@ -151,6 +171,29 @@ def _write(robot: Any, what: str, columns: list[int], ids: Tensor, *values: Tens
     if write is None or len(places) < len(values):
         raise ValueError(f"{names[1]} is missing or lacks parameters: take Isaac Lab 2.3 or 3")
     write(**dict(zip(places, values, strict=False)), joint_ids=columns, env_ids=ids)
+
+
+def _speed_lines(robot: Any, joints: list[str], groups: dict[str, Any], units: Units, ids: Tensor) -> None:
+    """Set the torque-speed lines of DCMotors: torque at rest, and the speed without torque. A speed of 0 is no line.
+
+    Isaac Lab 3 computes the groups of a class as one, by an actuator of its own.
+    """
+    together = [batch.actuator for batch in getattr(robot.actuators, "_execution_batches", ())]
+    for i, joint in enumerate(joints):
+        limit, speed = units["effort_limit"][:, i], units["no_load_speed"][:, i]
+        motors = [m for m in (groups[joint], *together) if joint in m.joint_names and hasattr(m, "_saturation_effort")]
+        if not motors and (speed > 0).any():
+            raise ValueError(f"joint '{joint}' needs a torque-speed line: take isaaclab_actuators, or a DCMotorCfg")
+        for motor in motors:
+            column, top = list(motor.joint_names).index(joint), getattr(motor, "actuator_velocity_limit", None)
+            top = motor.velocity_limit if top is None else top
+            top = getattr(top, "torch", top)
+            motor._saturation_effort = (
+                torch.as_tensor(motor._saturation_effort, device=top.device).expand_as(top).clone()
+            )
+            motor._saturation_effort[ids, column] = limit
+            top[ids, column] = torch.where(speed > 0, speed, torch.inf)
+            motor._vel_at_effort_lim[ids, column] = 2 * top[ids, column]
 
 
 def _delay(joints: list[str], groups: dict[str, Any], steps: Tensor, ids: Tensor) -> None:
