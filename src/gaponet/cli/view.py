@@ -64,9 +64,9 @@ def view(
     if render is not None:
         _film(scene, clip, render, width, magnify, out)
     else:
-        from gaponet.report.view.player import serve
+        from gaponet.report.view.app import serve_dataset
 
-        serve(scene, clip, port, magnify, out.say)
+        serve_dataset(data, scene, clip, port, magnify, out.say)
     out.result({
         "sequence": entry.id, "virtual": entry.meta.virtual, "seen": shown.seen, "start": clip.start,
         "duration": clip.duration, "mpjae": errors, "render": None if render is None else str(render),

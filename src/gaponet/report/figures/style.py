@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
+from gaponet.base.arrays import Array
 from gaponet.base.files import atomic_write
 from gaponet.base.text import escape
 
@@ -91,6 +92,19 @@ def legend(fig: Figure, title: str = "") -> None:
         ncols=max(1, min(len(handles), int(fig.get_figwidth() / width))), columnspacing=1.1, handlelength=1.4,
         title=title or None, alignment="left", title_fontproperties={"weight": "bold", "size": 9},
     )  # fmt: skip
+
+
+@styled
+def draw_curves(time: Array, curves: Mapping[str, tuple[Array, str]], label: str) -> Figure:
+    """Draw values over time, s; curves: name → values and colour."""
+    fig = figure(7.0, 3.2)
+    ax = fig.subplots()
+    for name, (values, colour) in curves.items():
+        ax.plot(time, values, color=colour, label=name)
+    ax.set_xlabel("time, s")
+    ax.set_ylabel(label)
+    legend(fig)
+    return fig
 
 
 def joint_label(joint: str, wrapped: bool = True) -> str:

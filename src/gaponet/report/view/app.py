@@ -7,6 +7,8 @@ import io
 import os
 import re
 import shutil
+import signal
+import sys
 import tempfile
 import zipfile
 import zlib
@@ -23,11 +25,12 @@ from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import look
 from gaponet.data.store import Dataset
 from gaponet.report.methods import colour
+from gaponet.report.verdict import NetworkGain
 from gaponet.report.view.jobs import OUT, PROGRESS_LINE, Job, Jobs
 from gaponet.report.view.player import Player, draw_curves
 from gaponet.report.view.scene import Scene
-from gaponet.report.view.server import open_server
-from gaponet.report.view.side_by_side import Clip, SideBySide, side_by_side, standing
+from gaponet.report.view.server import open_server, run_until_interrupt
+from gaponet.report.view.side_by_side import Clip, side_by_side, standing
 from gaponet.robot.finding import Finding
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
 from gaponet.sim.dataset_robot import dataset_robot
@@ -35,9 +38,22 @@ from gaponet.sim.dataset_robot import dataset_robot
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "signed_percent")
 TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
+NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
+ENGINES = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}  # that apply parameter sets
 POLL_S, MAX_UNPACKED_BYTES = 0.5, 2 << 30
 PANEL_WIDTH = 560  # pixels
-STYLE = "<style>[class*=Slider-mark], .uplot, .uplot *, input, textarea {font-size: 12px !important}</style>"
+STYLE = """<style>
+html {font-size: 92.5% !important}
+[class*=Slider-mark], .uplot, .uplot *, input, textarea {font-size: 12px !important}
+table {display: block; overflow-x: auto}
+@media (max-width: 576px) {[style*="width: 20em"] {width: 100vw !important}}
+</style>
+<img alt="" src="data:," style="display:none" onerror="
+if (matchMedia('(prefers-color-scheme: dark)').matches && !location.search) location.search = 'darkMode';
+setTimeout(() => {
+  const step = [...document.querySelectorAll('[role=tab]')].find(e => e.innerText[0] == location.hash[1]);
+  step?.click(); step?.dispatchEvent(new KeyboardEvent('keydown', {key: 'Enter', bubbles: true}));
+}, 500)">"""  # the second part: dark where the system is dark; #4 after the address opens step 4
 
 
 class App:
@@ -50,7 +66,7 @@ class App:
         self.gui = self.server.gui
         self.texts: dict[str, tuple[Any, str, Any]] = {}  # step → text, hint, pictures
         self.player: Player | None = None
-        for name in ("logs", "model"):
+        for name in ("logs", "model", "new_logs"):
             (folder / name).mkdir(exist_ok=True)
         self.gui.main_panel.set_width(PANEL_WIDTH)
         self.gui.add_html(STYLE)
@@ -122,14 +138,14 @@ class App:
         kind, facts, recordings = look(self.folder / "logs")
         self.described.value = guess_logs(recordings, self._chosen_robot(), kind, dict(facts))
 
-    def _read(self, _: Any) -> None:
+    def _read(self, _: Any, step: str = "import", logs: str = "logs") -> None:
         robot = self._need("robot")
         self.jobs.require_idle()
         if self.described.value.strip():  # otherwise a file of the user's stays as it is
-            write_text(self.folder / "logs" / "logs.toml", self.described.value)
+            write_text(self.folder / logs / "logs.toml", self.described.value)
         words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}", "--out", OUT]
         words += [f"--position-unit={self.position.value}"] * (self.position.value in POSITION_UNITS[1:])
-        self.jobs.start("import", "import", "logs", f"--robot={_robot_argument(robot)}", *words)
+        self.jobs.start(step, "import", logs, f"--robot={robot.out}", *words)
 
     def _check(self) -> None:
         start = lambda _: self.jobs.start("doctor", "doctor", self._need("import").out, "--figures", OUT)  # noqa: E731
@@ -152,7 +168,9 @@ class App:
     def _show(self, _: Any) -> None:
         data, identified = self._dataset(), self.jobs.result("identify")
         robot = dataset_robot(data) if identified is None else load_robot(self.folder / identified.out)
-        self._play(side_by_side(data, next(e for e in data.entries if e.id == self.recording.value), robot))
+        entry = next(e for e in data.entries if e.id == self.recording.value)
+        runs = [self.folder / network.out] if (network := self._network()) else []
+        self.play(Scene(shown := side_by_side(data, entry, robot, runs)), Clip.from_start(shown, 0.0, 3600.0))
 
     def _identify(self) -> None:
         self.limit = self.gui.add_text("time limit", "", hint="such as 60s or 4m; empty for none")
@@ -177,10 +195,47 @@ class App:
 
     def _use(self) -> None:
         self.target = self.gui.add_dropdown("for", TARGETS)
-        self._button("Export", lambda _: self.jobs.start(
-            "export", "export", self._need("identify").out, "--to", str(self.target.value), "--out", OUT
-        ))  # fmt: skip
+        self._button("Export", self._export)
         self._text("export", "Identify the robot first. Then export it for your simulator.")
+        self._button("Parameter sets for training", self._randomize)
+        self._text("randomization", "Policies are trained on robots that these logs cannot tell from yours.")
+        self._button("Upload new logs, of another day or unit", lambda e: self._store(e, "new_logs"), upload=True)
+        self._button("Read the new logs", lambda _: self._need("identify") and self._read(_, "new", "new_logs"))
+        self._text("new", "Identify the robot first. Unit, payload, positions and logs.toml are those of step Logs.")
+        self._button("Check whether the robot changed", lambda _: self._compare("check"))
+        self._text("check", "Read new logs first. Then check whether the identified robot still fits them.")
+        self._button("Calibrate with the new logs", lambda _: self._compare("adapt", "--out", OUT))
+        self._text("adapt", "Read new logs first. The calibrated robot is then exported.")
+        self.budget = self.gui.add_text("training time", "10m", hint="such as 10m")
+        self._button("Train a network", self._train)
+        self._text("train", "A network can be exported if motions of the validation show that it helps.")
+
+    def _robot_folder(self) -> str:
+        """Return the calibrated robot, or else the identified one."""
+        return (self.jobs.result("adapt") or self._need("identify")).out
+
+    def _export(self, _: Any) -> None:
+        target = str(self.target.value)
+        holder = self._need("train").out if target in NETWORK_TARGETS else self._robot_folder()
+        self.jobs.start("export", "export", holder, "--to", target, "--out", OUT)
+
+    def _randomize(self, _: Any) -> None:
+        words = ("--engine", ENGINES.get(str(self.target.value), "json"), "--out", OUT)
+        self.jobs.start("randomization", "export", self._robot_folder(), "--to", "randomization", *words)
+
+    def _compare(self, step: str, *words: str) -> None:
+        self.jobs.start(step, step, self._need("identify").out, self._need("new").out, *words)
+
+    def _train(self, _: Any) -> None:
+        words = (f"--robot={self._need('identify').out}", f"--budget={self.budget.value}", "--out", OUT)
+        self.jobs.start("train", "train", self._need("import").out, *words)
+
+    def _network(self) -> Job | None:
+        """Return the training if its network helps on validation motions."""
+        job = self.jobs.result("train")
+        error = ((job and job.result) or {}).get("val_mpjae", {})
+        gain = error and NetworkGain("", error["added"], error.get("error") or np.nan, error["start"])
+        return job if gain and gain.helps else None
 
     def _store(self, event: Any, place: str) -> None:
         self.jobs.require_idle()
@@ -206,23 +261,25 @@ class App:
             job = self.jobs.result(step)
             hint = (step == "identify" and self._locked()) or hint
             text.content, pictures.content = _report(job) if job else hint, self._pictures(step, job)
+        self.target.options = TARGETS + NETWORK_TARGETS * (self._network() is not None)
         self.fit.disabled, self.proposal.visible = bool(self._locked()), self.jobs.result("doctor") is not None
         if self.jobs.result("import"):
             data = self._dataset()
             self.recording.options, self.joint.options = [e.id for e in data.entries], data.joint_names
             self._draw_recording()
         if running is None and (last := self.jobs.result("identify")) and last.number == every[-1].number:
-            self.jobs.start("causes", "gap", self._need("import").out, "--robot", f"./{last.out}")
+            self.jobs.start("causes", "gap", self._need("import").out, "--robot", last.out)
         elif self.player is None and self.jobs.result("robot"):
-            self._play(standing(self._chosen_robot()))
+            self.play(Scene(shown := standing(self._chosen_robot())), Clip.from_start(shown, 0.0, 3600.0))
         self.seen = state  # last: after an error all is shown again
 
-    def _play(self, shown: SideBySide) -> None:
+    def play(self, scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
+        """Show a scene in place of the one before."""
         before, self.player = self.player, None  # `tick` advances it in another thread
         if before is not None:
             before.remove()
         with self.stage:
-            self.player = Player(self.server, Scene(shown), Clip.from_start(shown, 0.0, 3600.0))
+            self.player = Player(self.server, scene, clip, magnify)
 
     def _draw_recording(self) -> None:
         """Draw target and measured position of the chosen joint in the chosen recording."""
@@ -270,7 +327,7 @@ class App:
         return job
 
     def _chosen_robot(self) -> RobotSpec:
-        name = _robot_argument(self._need("robot"))
+        name = self._need("robot").out
         return load_robot(name if name in packaged_robots() else self.folder / name)
 
     def _dataset(self) -> Dataset:
@@ -299,11 +356,6 @@ def store_upload(name: str, content: bytes, folder: Path) -> None:
             shutil.move(file, place)
 
 
-def _robot_argument(job: Job) -> str:
-    """Return the value of --robot for the robot of the first step."""
-    return job.words[2] if job.words[1] == "check" else f"./{job.out}"
-
-
 def _ending(job: Job) -> str:
     """Return how a command ended, in Markdown."""
     if job.result is not None:
@@ -315,17 +367,43 @@ def _ending(job: Job) -> str:
 
 def _report(job: Job) -> str:
     """Return what a command printed, in Markdown, and the command."""
-    lines, heading = list[str](), list[str]()
+    lines = list[str]()
     for line in job.lines:
-        cells = [escape_markdown(cell.strip()) for cell in line.strip("┃│").replace("┃", "│").split("│")]
-        if line.startswith("┃"):
-            heading = [f"{a} {b}".strip() for a, b in zip(heading, cells, strict=False)] if heading else cells
-        elif line.startswith("┡"):
-            lines += [f"| {' | '.join(heading)} |", f"| --- |{' ---: |' * (len(heading) - 1)}"]
-            heading = []
-        elif line.startswith("│"):
-            lines.append(f"| {' | '.join(cells)} |")
-        elif line[:1] not in ("┏", "└") and not PROGRESS_LINE.match(line) and not line.startswith("     ok "):
-            bold = "**" * line.lstrip().startswith(("error ", "warning "))
-            lines += ["", f"{bold}{' '.join(cells)}{bold}"]
+        text = re.sub("[┃│]", "|", escape_markdown(line.strip()))
+        if line.startswith("┡"):
+            lines.append(f"| --- |{' ---: |' * line.count('╇')}")
+        elif line.startswith(("┃", "│")):
+            lines.append(text)
+        elif text and not line.startswith(("┏", "└", "     ok ")) and not PROGRESS_LINE.match(line):
+            bold = "**" * text.startswith(("error ", "warning "))
+            lines += ["", f"{bold}{text}{bold}"]
     return "\n".join([*lines, "", f"To repeat it in the folder of this page: {escape_markdown(job.command)}"])
+
+
+def serve(page: App, say: Callable[[str], None], step: str = "") -> None:
+    """Serve a page until Ctrl-C; `step` is the number of the step that is shown first."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # otherwise the running command would stay
+    say(f"open {page.address}{step and '#' + step} in a browser; Ctrl-C ends")
+    try:
+        run_until_interrupt(page.server, page.tick)
+    finally:
+        page.jobs.cancel()
+
+
+def serve_dataset(
+    data: Dataset, scene: Scene, clip: Clip, port: int, magnify: float, say: Callable[[str], None]
+) -> None:
+    """Serve a dataset and a scene of it at step Gap. The page's folder stays if a command has written into it."""
+    folder = Path(tempfile.mkdtemp(prefix="gaponet_view_"))
+    jobs = Jobs(folder)
+    jobs.add("robot", "robot", "check", str(scene.shown.robot.folder.resolve()), result="{}")
+    jobs.add("import", "data", "card", str(data.path.resolve()), result="{}")
+    page = App(folder, port)
+    page.play(scene, clip, magnify)
+    try:
+        serve(page, say, "4")
+    finally:
+        if len(jobs.all) > 2:
+            say(f"results are in {folder}; to go on: gaponet app {folder}")
+        else:
+            shutil.rmtree(folder)

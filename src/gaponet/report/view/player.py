@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import mujoco
@@ -11,7 +13,6 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.text import escape_markdown
 from gaponet.report.view.scene import Scene
-from gaponet.report.view.server import open_server, run_until_interrupt
 from gaponet.report.view.side_by_side import Clip, largest_error_time
 
 CURVE_ROWS = 1000  # of a chart
@@ -114,22 +115,27 @@ class Player:
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:
-    """Return a new chart over time (T), s; curves: name → values (T) and colour."""
+    """Return a new chart over time (T), s, above a button that saves it; curves: name → values (T) and colour."""
     from viser.uplot import Scale, Series
 
-    rows = np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int))
-    return gui.add_uplot(
+    rows, colours = np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int)), [c for _, c in curves.values()]
+    chart = gui.add_uplot(
         (time[rows], *(values[rows] for values, _ in curves.values())),
-        (Series(label="time, s"), *(Series(label=n, stroke=colour, width=2) for n, (_, colour) in curves.items())),
+        (Series(label="time, s"), *(Series(label=n, stroke=c, width=2) for n, c in zip(curves, colours, strict=True))),
         title=title, aspect=2.2, scales={"x": Scale(time=False)},
     )  # fmt: skip
 
+    def save_chart(event: Any) -> None:
+        from gaponet.report.figures.style import draw_curves, save
 
-def serve(scene: Scene, clip: Clip, port: int, magnify: float, say: Callable[[str], None]) -> None:
-    """Serve one scene until Ctrl-C."""
-    server, address = open_server("gaponet view", port)
-    say(f"open {address} in a browser; Ctrl-C ends")
-    run_until_interrupt(server, Player(server, scene, clip, magnify).advance)
+        now, *values = chart.data
+        figure = draw_curves(now, dict(zip(curves, zip(values, colours, strict=True), strict=True)), chart.title)
+        with TemporaryDirectory() as folder:
+            for file in save(figure, Path(folder) / "curves"):
+                event.client.send_file_download(file.name, file.read_bytes())
+
+    gui.add_button("Save the curves: PNG, SVG").on_click(save_chart)
+    return chart
 
 
 def surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
