@@ -170,9 +170,15 @@ def page(tmp_path):
 
 
 def test_nothing_starts_before_what_it_needs_and_the_page_says_what(page):
-    for act, hint in ((page._read, "Choose a robot"), (page._show, "Choose the robot"), (page._fit, "Check the rec")):
+    for act, hint in (
+        (page._read, "Choose a robot"),
+        (page._show, "Choose the robot"),
+        (lambda _: page._fit(), "Check the rec"),
+    ):
         page._attempt(act, None)
         assert hint in page.status.content
+    page._attempt(page._fit)
+    assert "Check the rec" in page.status.content
     assert page.fit.disabled
     assert page.jobs.all == []
 
@@ -183,7 +189,7 @@ def test_identification_is_locked_while_the_check_finds_an_error(page):
     finding = {"level": "error", "check": "sign", "message": "elbow moves against its command"}
     finish(page.jobs, "doctor", {"findings": [finding]})
     assert "Locked: the check finds an error (sign)" in page._locked()
-    page._attempt(page._fit, None)
+    page._attempt(page._fit)
     assert "Locked" in page.status.content
     finish(page.jobs, "doctor", {"findings": [finding | {"level": "warning"}]})
     assert page._locked() == ""

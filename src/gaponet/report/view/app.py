@@ -12,7 +12,8 @@ import sys
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from gaponet.report.view.jobs import OUT, PROGRESS_LINE, Job, Jobs
 from gaponet.report.view.player import Player, draw_curves
 from gaponet.report.view.scene import Scene
 from gaponet.report.view.server import open_server, run_until_interrupt
-from gaponet.report.view.side_by_side import Clip, side_by_side, standing
+from gaponet.report.view.side_by_side import Clip, SideBySide, side_by_side, standing
 from gaponet.robot.finding import Finding
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
 from gaponet.sim.dataset_robot import dataset_robot
@@ -42,18 +43,7 @@ NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
 ENGINES = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}  # that apply parameter sets
 POLL_S, MAX_UNPACKED_BYTES = 0.5, 2 << 30
 PANEL_WIDTH = 560  # pixels
-STYLE = """<style>
-html {font-size: 92.5% !important}
-[class*=Slider-mark], .uplot, .uplot *, input, textarea {font-size: 12px !important}
-table {display: block; overflow-x: auto}
-@media (max-width: 576px) {[style*="width: 20em"] {width: 100vw !important}}
-</style>
-<img alt="" src="data:," style="display:none" onerror="
-if (matchMedia('(prefers-color-scheme: dark)').matches && !location.search) location.search = 'darkMode';
-setTimeout(() => {
-  const step = [...document.querySelectorAll('[role=tab]')].find(e => e.innerText[0] == location.hash[1]);
-  step?.click(); step?.dispatchEvent(new KeyboardEvent('keydown', {key: 'Enter', bubbles: true}));
-}, 500)">"""  # the second part: dark where the system is dark; #4 after the address opens step 4
+STYLE = files("gaponet.report").joinpath("templates", "app.html")
 
 
 class App:
@@ -69,7 +59,7 @@ class App:
         for name in ("logs", "model", "new_logs"):
             (folder / name).mkdir(exist_ok=True)
         self.gui.main_panel.set_width(PANEL_WIDTH)
-        self.gui.add_html(STYLE)
+        self.gui.add_html(STYLE.read_text(encoding="utf-8"))
         self.status, self.bar = self.gui.add_markdown(""), self.gui.add_progress_bar(0.0)
         self.cancel = self._button("Cancel", lambda _: self.jobs.cancel())
         tabs = self.gui.add_tab_group()
@@ -91,9 +81,7 @@ class App:
 
     def _robot(self) -> None:
         self.model = self.gui.add_dropdown("robot", packaged_robots())
-        self._button(
-            "Upload a model: MJCF, URDF, or a .zip with its meshes", lambda e: self._store(e, "model"), upload=True
-        )
+        self._upload("Upload a model: MJCF, URDF, or a .zip with its meshes", "model")
         hints = {"joints": "names; empty for all that the model drives", "kp": "N·m/rad", "kd": "N·m·s/rad"}
         self.options = {name: self.gui.add_text(name, "", hint=hint) for name, hint in hints.items()}
         self._button("Use this robot", self._use_robot)
@@ -109,7 +97,7 @@ class App:
             self.jobs.start("robot", "robot", "new", name, "--out", OUT, *(w for k in given for w in (k, *given[k])))
 
     def _logs(self) -> None:
-        self._button("Upload a log, or a .zip of logs", lambda e: self._store(e, "logs"), upload=True)
+        self._upload("Upload a log, or a .zip of logs", "logs")
         self.gui.add_markdown(f"Or copy them into {escape_markdown(str(self.folder / 'logs'))}.")
         self.unit, self.mass = self.gui.add_text("unit", "lab"), self.gui.add_number("payload, kg", 0.0, min=0.0)
         self.position = self.gui.add_dropdown("positions in", POSITION_UNITS)
@@ -148,8 +136,7 @@ class App:
         self.jobs.start(step, "import", logs, f"--robot={robot.out}", *words)
 
     def _check(self) -> None:
-        start = lambda _: self.jobs.start("doctor", "doctor", self._need("import").out, "--figures", OUT)  # noqa: E731
-        self._button("Check the recordings", start)
+        self._run("Check the recordings", "doctor", lambda: ("doctor", self._need("import").out, "--figures", OUT))
         self.proposal = self._button("Write a proposal for logs.toml into step Logs", self._propose)
         self._text("doctor", "Read the logs first. Then check them.")
 
@@ -160,7 +147,7 @@ class App:
         self.described.value = f"{own}\n{Finding.proposal(findings)}".lstrip()
 
     def _gap(self) -> None:
-        self._button("Measure the error", lambda _: self.jobs.start("gap", "gap", self._need("import").out))
+        self._run("Measure the error", "gap", lambda: ("gap", self._need("import").out))
         self._button("Show the recording of step Logs beside its simulation", self._show)
         self.stage = self.gui.add_folder(None)
         self._text("gap", "Read the logs first. Then measure how far the simulator is from the robot.")
@@ -170,20 +157,20 @@ class App:
         robot = dataset_robot(data) if identified is None else load_robot(self.folder / identified.out)
         entry = next(e for e in data.entries if e.id == self.recording.value)
         runs = [self.folder / network.out] if (network := self._network()) else []
-        self.play(Scene(shown := side_by_side(data, entry, robot, runs)), Clip.from_start(shown, 0.0, 3600.0))
+        self.play(side_by_side(data, entry, robot, runs))
 
     def _identify(self) -> None:
         self.limit = self.gui.add_text("time limit", "", hint="such as 60s or 4m; empty for none")
         self.table = self.gui.add_checkbox("look for a table under the robot", True)
-        self.fit = self._button("Identify", self._fit)
+        self.fit = self._run("Identify", "identify", self._fit)
         self._text("identify", "Check the recordings first. Identification is locked while the check finds an error.")
         self._text("causes", "")
 
-    def _fit(self, _: Any) -> None:
+    def _fit(self) -> list[str]:
         if reason := self._locked():
             raise UsageError(reason)
         words = [f"--budget={time}" for time in self.limit.value.split()[:1]] + ["--no-table"] * (not self.table.value)
-        self.jobs.start("identify", "identify", self._need("import").out, "--out", OUT, *words)
+        return ["identify", self._need("import").out, "--out", OUT, *words]
 
     def _locked(self) -> str:
         """Return why identification may not start; "" if it may."""
@@ -194,53 +181,37 @@ class App:
         return errors and f"Locked: the check finds an error ({errors}). Step Check says what to do."
 
     def _use(self) -> None:
-        self.target = self.gui.add_dropdown("for", TARGETS)
-        self._button("Export", self._export)
+        out, self.target = lambda step: self._need(step).out, self.gui.add_dropdown("for", TARGETS)
+        robot = lambda: (self.jobs.result("adapt") or self._need("identify")).out  # noqa: E731
+        network = lambda: str(self.target.value) in NETWORK_TARGETS  # noqa: E731
+        self._run("Export", "export", lambda: (
+            "export", out("train") if network() else robot(), "--to", str(self.target.value), "--out", OUT
+        ))  # fmt: skip
         self._text("export", "Identify the robot first. Then export it for your simulator.")
-        self._button("Parameter sets for training", self._randomize)
-        self._text("randomization", "Policies are trained on robots that these logs cannot tell from yours.")
-        self._button("Upload new logs, of another day or unit", lambda e: self._store(e, "new_logs"), upload=True)
-        self._button("Read the new logs", lambda _: self._need("identify") and self._read(_, "new", "new_logs"))
+        self._run("Parameter sets for training", "randomization", lambda: (
+            "export", robot(), "--to", "randomization", "--engine", ENGINES.get(str(self.target.value), "json"),
+            "--out", OUT,
+        ))  # fmt: skip
+        self._text("randomization", "A policy is then trained on robots that these logs cannot tell from yours.")
+        self._upload("Upload new logs, of another day or unit", "new_logs")
+        self._button("Read the new logs", lambda _: self._read(self._need("identify"), "new", "new_logs"))
         self._text("new", "Identify the robot first. Unit, payload, positions and logs.toml are those of step Logs.")
-        self._button("Check whether the robot changed", lambda _: self._compare("check"))
+        self._run("Check whether the robot changed", "check", lambda: ("check", out("identify"), out("new")))
         self._text("check", "Read new logs first. Then check whether the identified robot still fits them.")
-        self._button("Calibrate with the new logs", lambda _: self._compare("adapt", "--out", OUT))
+        self._run("Calibrate with the new logs", "adapt", lambda: ("adapt", out("identify"), out("new"), "--out", OUT))
         self._text("adapt", "Read new logs first. The calibrated robot is then exported.")
-        self.budget = self.gui.add_text("training time", "10m", hint="such as 10m")
-        self._button("Train a network", self._train)
-        self._text("train", "A network can be exported if motions of the validation show that it helps.")
-
-    def _robot_folder(self) -> str:
-        """Return the calibrated robot, or else the identified one."""
-        return (self.jobs.result("adapt") or self._need("identify")).out
-
-    def _export(self, _: Any) -> None:
-        target = str(self.target.value)
-        holder = self._need("train").out if target in NETWORK_TARGETS else self._robot_folder()
-        self.jobs.start("export", "export", holder, "--to", target, "--out", OUT)
-
-    def _randomize(self, _: Any) -> None:
-        words = ("--engine", ENGINES.get(str(self.target.value), "json"), "--out", OUT)
-        self.jobs.start("randomization", "export", self._robot_folder(), "--to", "randomization", *words)
-
-    def _compare(self, step: str, *words: str) -> None:
-        self.jobs.start(step, step, self._need("identify").out, self._need("new").out, *words)
-
-    def _train(self, _: Any) -> None:
-        words = (f"--robot={self._need('identify').out}", f"--budget={self.budget.value}", "--out", OUT)
-        self.jobs.start("train", "train", self._need("import").out, *words)
+        self.budget = self.gui.add_text("training time", "10m")
+        self._run("Train a network", "train", lambda: (
+            "train", out("import"), f"--robot={out('identify')}", f"--budget={self.budget.value}", "--out", OUT
+        ))  # fmt: skip
+        self._text("train", "A network can be exported if validation says that it helps.")
 
     def _network(self) -> Job | None:
         """Return the training if its network helps on validation motions."""
         job = self.jobs.result("train")
-        error = ((job and job.result) or {}).get("val_mpjae", {})
-        gain = error and NetworkGain("", error["added"], error.get("error") or np.nan, error["start"])
-        return job if gain and gain.helps else None
-
-    def _store(self, event: Any, place: str) -> None:
-        self.jobs.require_idle()
-        store_upload(event.target.value.name, event.target.value.content, self.folder / place)
-        self.status.content = f"{escape_markdown(event.target.value.name)} is stored in {place}."
+        error = (job.result or {})["val_mpjae"] if job is not None else {}
+        gain = NetworkGain("", error.get("added", 0.0), error.get("error") or np.nan, error.get("start", 0.0))
+        return job if gain.helps else None
 
     # What the page shows: only what the files say.
 
@@ -270,11 +241,13 @@ class App:
         if running is None and (last := self.jobs.result("identify")) and last.number == every[-1].number:
             self.jobs.start("causes", "gap", self._need("import").out, "--robot", last.out)
         elif self.player is None and self.jobs.result("robot"):
-            self.play(Scene(shown := standing(self._chosen_robot())), Clip.from_start(shown, 0.0, 3600.0))
+            self.play(standing(self._chosen_robot()))
         self.seen = state  # last: after an error all is shown again
 
-    def play(self, scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
-        """Show a scene in place of the one before."""
+    def play(self, shown: Scene | SideBySide, clip: Clip | None = None, magnify: float = 1.0) -> None:
+        """Show a scene, or motions, in place of what was shown before."""
+        scene = shown if isinstance(shown, Scene) else Scene(shown)
+        clip = clip or Clip.from_start(scene.shown, 0.0, 3600.0)
         before, self.player = self.player, None  # `tick` advances it in another thread
         if before is not None:
             before.remove()
@@ -307,10 +280,24 @@ class App:
         """Add the place of a step's result; `hint` stands there before."""
         self.texts[step] = self.gui.add_markdown(hint), hint, self.gui.add_html("")
 
-    def _button(self, label: str, act: Callable[[Any], None], upload: bool = False) -> Any:
-        button = (self.gui.add_upload_button if upload else self.gui.add_button)(label)
-        (button.on_upload if upload else button.on_click)(lambda event: self._attempt(act, event))
+    def _button(self, label: str, act: Callable[[Any], None]) -> Any:
+        button = self.gui.add_button(label)
+        button.on_click(lambda event: self._attempt(act, event))
         return button
+
+    def _run(self, label: str, step: str, words: Callable[[], Iterable[str]]) -> Any:
+        """Add a button that starts the command of a step."""
+        return self._button(label, lambda _: self.jobs.start(step, *words()))
+
+    def _upload(self, label: str, place: str) -> None:
+        """Add a button that stores a file in a folder of the page."""
+
+        def store(event: Any) -> None:
+            self.jobs.require_idle()
+            store_upload(event.target.value.name, event.target.value.content, self.folder / place)
+            self.status.content = f"{escape_markdown(event.target.value.name)} is stored in {place}."
+
+        self.gui.add_upload_button(label).on_upload(lambda event: self._attempt(store, event))
 
     def _attempt(self, act: Callable[..., None], *arguments: Any) -> None:
         """Call a function; an error is shown above the steps."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.text import escape_markdown
+from gaponet.report.methods import colour, title
 from gaponet.report.view.scene import Scene
 from gaponet.report.view.side_by_side import Clip, largest_error_time
 
@@ -32,8 +33,8 @@ class Player:
         self.server, self.scene, self.clip = server, scene, clip
         self.root = server.scene.add_frame("/robots", show_axes=False)
         self.frames = self._bodies()
-        self._labels()
         self._aim()
+        self.copies = {title(m.method): m for m in scene.shown.motions if m.method != "recorded"}
         shown, worst = scene.shown, largest_error_time(scene.shown, clip)
         meta, gui = shown.real.meta, server.gui
         self.folder = gui.add_folder(None)
@@ -46,8 +47,8 @@ class Player:
             self.worst = gui.add_button(f"Worst moment: {worst:.2f} s")
             self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
             self.table = gui.add_markdown("")
-            copies = {m.name: (1e3 * m.error, m.colour) for m in shown.motions if m.method != "recorded"}
-            draw_curves(gui, np.arange(len(shown.real)) * shown.real.dt, copies, "mean |error|, mrad")
+            curves = {name: (1e3 * m.error, colour(m.method)) for name, m in self.copies.items()}
+            draw_curves(gui, np.arange(len(shown.real)) * shown.real.dt, curves, "mean |error|, mrad")
 
         @self.worst.on_click
         def _(_: Any) -> None:
@@ -64,8 +65,7 @@ class Player:
             for body, frame in self.frames.items():
                 frame.position, frame.wxyz = scene.data.xpos[body], scene.data.xquat[body]
         row = scene.row(now)
-        errors = [(m.name, m.error[row] * 1e3, m.mpjae * 1e3) for m in scene.shown.motions if m.method != "recorded"]
-        rows = "\n".join(f"| {name} | {e:.1f} | {mean:.1f} |" for name, e, mean in errors)
+        rows = "\n".join(f"| {n} | {1e3 * m.error[row]:.1f} | {1e3 * m.mpjae:.1f} |" for n, m in self.copies.items())
         self.table.content = f"| mean error, mrad | now | whole motion |\n| --- | ---: | ---: |\n{rows}"
 
     def advance(self, elapsed: float) -> None:
@@ -92,19 +92,17 @@ class Player:
             frames[body] = self.server.scene.add_frame(name, show_axes=False)
             for g in geoms:
                 vertices, faces = surface(model, int(g))
-                colour = (255 * model.geom_rgba[g, :3]).astype(int)
+                rgb = (255 * model.geom_rgba[g, :3]).astype(int)
                 self.server.scene.add_mesh_simple(
-                    f"{name}/{g}", vertices, faces, color=colour, opacity=float(model.geom_rgba[g, 3]),
+                    f"{name}/{g}", vertices, faces, color=rgb, opacity=float(model.geom_rgba[g, 3]),
                     position=model.geom_pos[g], wxyz=model.geom_quat[g],
                 )  # fmt: skip
         across = float(2.5 * self.scene.extent)
         self.server.scene.add_grid("/robots/floor", across, across, position=(0, 0, self.scene.floor))
-        return frames
-
-    def _labels(self) -> None:
         above = self.scene.view.axes[1] * 1.08 * self.scene.box[3]
         for m, base in zip(self.scene.shown.motions, self.scene.base, strict=True):
-            self.server.scene.add_label(f"/robots/label_{m.method}", m.name, position=base + above)
+            self.server.scene.add_label(f"/robots/label_{m.method}", title(m.method), position=base + above)
+        return frames
 
     def _aim(self) -> None:
         across, up = self.scene.view.axes
