@@ -203,10 +203,9 @@ def robot_label(entries: list[Entry]) -> str:
 
 def describe_provenance(dataset: Dataset) -> str:
     """Return a sentence that says on which robot the recordings were made."""
-    virtual = [e.meta.virtual for e in dataset.entries]
-    if not any(virtual):
-        return f"Recordings of a real {dataset.robot_name}."
-    some = "" if all(virtual) else "Partly "
+    label = robot_label(dataset.entries)
+    if label == dataset.robot_name:
+        return f"Recordings of a real {label}."
     fleets = sorted({e.meta.source for e in dataset.entries if e.meta.virtual and "fleet" in e.meta.source})
     names = f" ({', '.join(fleets)})" if fleets else ""
-    return f"{some}VIRTUAL {dataset.robot_name}{names}: these numbers say nothing about real hardware."
+    return f"{label[0].upper()}{label[1:]}{names}: these numbers say nothing about real hardware."

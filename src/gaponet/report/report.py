@@ -71,12 +71,9 @@ class _Evaluated(NamedTuple):
 
 
 def write_report(
-    run: Path,
-    dataset: Path | None = None,
-    robot: str | None = None,
-    progress: Progress = no_progress,
+    run: Path, dataset: Path | None = None, robot: str | None = None, progress: Progress = no_progress,
     picture: Picture | None = None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Write report.html into a run or robot folder from its newest evaluation; evaluate first if there is none.
 
     Args:
@@ -122,14 +119,15 @@ def _evaluate(run: Path, dataset: Path | None, robot: RobotSpec | None, progress
 def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
     """Return the values of the template."""
     from gaponet.report.figures import evaluation as draw
+    from gaponet.report.figures.style import joint_label
 
     methods, name = e.metrics["methods"], title(e.own)
     bars = [
-        page_figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
+        page_figure(draw.by_group(methods, "joint", joint_label), "Mean |q_sim − q_robot| of each operated joint."),
         page_figure(draw.by_horizon(methods), "Error in the last half of the time since the common start."),
     ]
     if len(methods["nominal"]["by_payload"]) > 1:
-        bars.append(page_figure(draw.by_payload(methods), "Payload in each hand."))
+        bars.append(page_figure(draw.by_group(methods, "payload", "{} kg".format), "Payload in each hand."))
     joint_columns, joint_rows = _by_joint(e)
     shown, trajectories = e.metrics["shown"], []
     drawn = draw.trajectories(e.arrays, shown, e.robot.operated, list(methods))

@@ -32,17 +32,9 @@ QUANTILE_90 = 1.645  # standard deviations on each side of a 90 % interval
 MAX_INTERVAL = 3.0  # of the joints' range; a wider interval is drawn as unknown
 
 
-def by_joint(methods: dict[str, Any]) -> Figure:
-    """Draw the MPJAE of each method by joint."""
-    return _bars(methods, "by_joint", "MPJAE by joint", joint_label)
-
-
-def by_payload(methods: dict[str, Any]) -> Figure:
-    """Draw the MPJAE of each method by payload."""
-    return _bars(methods, "by_payload", "MPJAE by payload", "{} kg".format)
-
-
-def _bars(methods: dict[str, Any], group: str, heading: str, label: Callable[[str], str]) -> Figure:
+def by_group(methods: dict[str, Any], group: str, label: Callable[[str], str]) -> Figure:
+    """Draw the MPJAE of each method by joint or payload; label names a bar's group."""
+    group, heading = f"by_{group}", f"MPJAE by {group}"
     keys = list(methods["nominal"][group])
     values = {
         title(n): (colour(n), [MeanStd.from_values([m[group][k]["mpjae"]], 1e3) for k in keys])

@@ -23,7 +23,7 @@ NEEDS = {
     "export": "identify", "randomization": "identify", "train": "identify", "new": "identify", "check": "new",
     "adapt": "new",
 }  # fmt: skip
-ENVIRONMENT = {LINE_INTERVAL_VARIABLE: "0.5", "COLUMNS": "9999"}  # s; letters: no table is divided
+WIDE = {LINE_INTERVAL_VARIABLE: "0.5", "COLUMNS": "9999"}  # s; letters, so that no table is divided
 OUT = "\0"  # word that `start` replaces by the name of a new folder
 PROGRESS_LINE = re.compile(r"^\w+: (\d+) %, \d+ s(?:, (.*))?$")
 
@@ -107,7 +107,7 @@ class Jobs:
             with (folder / "result.json").open("wb") as out, (folder / "log.txt").open("wb") as log:
                 self.process = subprocess.Popen(
                     module_command("gaponet", *Job(folder).words, "--json"), stdin=subprocess.DEVNULL, stdout=out,
-                    stderr=log, cwd=self.folder, env=os.environ | ENVIRONMENT,
+                    stderr=log, cwd=self.folder, env=os.environ | WIDE,
                 )  # fmt: skip
 
     def require_idle(self) -> None:

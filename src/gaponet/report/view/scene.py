@@ -59,13 +59,9 @@ class Scene:
     """
 
     def __init__(
-        self,
-        shown: SideBySide,
-        view: View = View(),
-        rows: slice = slice(None),
-        flat: bool = False,
+        self, shown: SideBySide, view: View = View(), rows: slice = slice(None), flat: bool = False,
         closeup: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Build the model and fit the picture.
 
         Args:

@@ -159,11 +159,7 @@ def select_entry(
 
 
 def side_by_side(
-    dataset: Dataset,
-    entry: Entry,
-    robot: RobotSpec,
-    runs: ListOf[Path] = (),
-    progress: Progress = no_progress,
+    dataset: Dataset, entry: Entry, robot: RobotSpec, runs: ListOf[Path] = (), progress: Progress = no_progress
 ) -> SideBySide:
     """Replay a recording in the nominal simulator, in identified ones, and with each run's exported model.
 
