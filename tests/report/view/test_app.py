@@ -7,11 +7,16 @@ import time
 import zipfile
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from arm import recordings
 
 from gaponet.base.errors import UsageError
-from gaponet.report.view.app import App, _report, store_upload
+from gaponet.data.store import Dataset
+from gaponet.report.view import app
+from gaponet.report.view.app import TARGETS, App, _report, store_upload
 from gaponet.report.view.jobs import OUT, Jobs
+from gaponet.report.view.player import draw_curves
 
 
 def archive(**files):
@@ -245,3 +250,86 @@ def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
     page._attempt(page._propose, None)
     assert page.described.value.startswith('unit = "deg"\n')
     assert "nothing to mend" in page.described.value
+
+
+@pytest.fixture
+def clicked(monkeypatch):
+    """Buttons of the next page by label, and the commands that they start."""
+    acts, words, add = {}, [], App._button
+
+    def noted(self, label, act):
+        acts[label] = act
+        return add(self, label, act)
+
+    monkeypatch.setattr(App, "_button", noted)
+    monkeypatch.setattr(Jobs, "start", lambda self, step, *command: words.append(command))
+    return acts, words
+
+
+def test_step_use_exports_the_calibrated_robot_and_a_network_only_if_it_helps(clicked, page):
+    acts, words = clicked
+    for step in ("robot", "import", "identify", "new", "adapt"):
+        finish(page.jobs, step, {}, (step, "x", "y", "--out", step))
+        (page.folder / step).mkdir(exist_ok=True)
+        if step == "identify":
+            acts["Export"](None)
+            finish(page.jobs, "train", {"val_mpjae": {"added": 1e-4, "error": 2e-4, "start": 0.01}})
+            page.seen = ()
+            page._attempt(page.refresh)
+            assert page.target.options == TARGETS
+            finish(page.jobs, "train", {"val_mpjae": {"added": 2e-3, "error": 2e-4, "start": 0.01}})
+        if step == "new":
+            acts["Check whether the robot changed"](None)
+            acts["Calibrate with the new logs"](None)
+    page.target.value = "mjlab"
+    for label in ("Export", "Parameter sets for training", "Train a network"):
+        acts[label](None)
+    assert page._network() is not None
+    assert [" ".join(w).replace(OUT, "OUT") for w in words] == [
+        "export ./identify --to mjcf --out OUT",
+        "check ./identify ./new",
+        "adapt ./identify ./new --out OUT",
+        "export ./adapt --to mjlab --out OUT",
+        "export ./adapt --to randomization --engine mjlab --out OUT",
+        "train ./import --robot=./identify --budget=10m --out OUT",
+    ]
+
+
+def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(arm, tmp_path, monkeypatch):
+    pytest.importorskip("viser")
+    data, said, pages = Dataset.create(tmp_path / "data", arm), [], []
+    for sequence in recordings(arm, 2, rows=60):
+        data.append(sequence)
+    shown = app.side_by_side(data, data.entries[1], arm)
+
+    def once(server, tick):
+        tick(1.0)
+        pages.append(tick.__self__)
+        server.stop()
+
+    monkeypatch.setattr(app, "run_until_interrupt", once)
+    monkeypatch.setattr(app.signal, "signal", lambda *_: None)
+    app.serve_dataset(data, app.Scene(shown), app.Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append)
+    (page,) = pages
+    assert said == [f"open {page.address}#4 in a browser; Ctrl-C ends"]
+    assert page.recording.options == tuple(e.id for e in data.entries)
+    assert "differences drawn 2×" in page.player.title.content
+    assert not page.folder.exists()
+
+
+def test_a_large_file_is_stored_whole(tmp_path):
+    (tmp_path / "logs").mkdir()
+    store_upload("large.csv", bytes(200 << 20), tmp_path / "logs")
+    assert (tmp_path / "logs" / "large.csv").stat().st_size == 200 << 20
+
+
+def test_curves_are_saved_as_the_page_shows_them(page):
+    pytest.importorskip("matplotlib")
+    sent = {}
+    client = SimpleNamespace(send_file_download=lambda name, content: sent.update({name: content}))
+    chart = draw_curves(page.gui, np.arange(3.0), {"<b>x</b>": (np.zeros(3), "#00838f")}, "rad")
+    save = next(h for h in page.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "").startswith("Save"))
+    assert chart.title == "rad"
+    save._impl.update_cb[-1](SimpleNamespace(client=client))
+    assert sent["curves.svg"].startswith(b"<?xml")
+    assert sent["curves.png"].startswith(b"\x89PNG")

@@ -21,11 +21,11 @@ FIND = (
 class Clicker:
     """What a person does with the page."""
 
-    def __init__(self, browser, address):
+    def __init__(self, browser, address, step=""):
         from browser import wait
 
         self.browser, self.wait = browser, wait
-        browser.ask("Page.navigate", url=f"{address}?fixedDpr=0.15")  # few pixels: software draws them
+        browser.ask("Page.navigate", url=f"{address}?fixedDpr=0.15{step}")  # few pixels: software draws them
         browser.ask("DOM.enable")
         wait(lambda: "1 Robot" in self.text())
 
@@ -64,7 +64,7 @@ class Clicker:
         assert self.wait(lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)"))
 
     def write(self, label, text):
-        self.wait(lambda: self.browser.value(f"({self.field(label)}[0].focus(), true)"))
+        self.wait(lambda: self.browser.value(f"({self.field(label)}[0].select(), true)"))
         self.browser.ask("Input.insertText", text=text)
 
     def upload(self, label, file):
@@ -132,7 +132,8 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
         assert first.complaints() == []
     assert page.jobs.running.words[0] == "identify"  # the page is closed
     with Browser(1000, 700) as second:
-        at = Clicker(second, page.address)
+        at = Clicker(second, page.address, "#4")
+        at.sees("Measure the error")  # step Gap is open
         at.sees("gaponet gap has ended")
         at.tab("5 Identify")
         at.sees("mrad (one motion) → identified")

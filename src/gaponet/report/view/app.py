@@ -160,7 +160,7 @@ class App:
         self.play(side_by_side(data, entry, robot, runs))
 
     def _identify(self) -> None:
-        self.limit = self.gui.add_text("time limit", "", hint="such as 60s or 4m; empty for none")
+        self.limit = self.gui.add_text("time limit", "4m", hint="such as 60s or 4m; empty for none")
         self.table = self.gui.add_checkbox("look for a table under the robot", True)
         self.fit = self._run("Identify", "identify", self._fit)
         self._text("identify", "Check the recordings first. Identification is locked while the check finds an error.")

@@ -37,12 +37,12 @@ class Player:
         self.copies = {title(m.method): m for m in scene.shown.motions if m.method != "recorded"}
         shown, worst = scene.shown, largest_error_time(scene.shown, clip)
         meta, gui = shown.real.meta, server.gui
-        self.folder = gui.add_folder(None)
+        self.folder = gui.add_folder(None, visible=len(shown.real) > 2)  # otherwise nothing moves
         with self.folder:
             heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
             heading += escape_markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
             self.title = gui.add_markdown(heading + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
-            self.playing = gui.add_checkbox("play", len(shown.real) > 2)
+            self.playing = gui.add_checkbox("play", self.folder.visible)
             self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, shown.real.dt, clip.start)
             self.worst = gui.add_button(f"Worst moment: {worst:.2f} s")
             self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
@@ -109,7 +109,7 @@ class Player:
         self.server.initial_camera.fov = np.radians(45)
         for camera in (self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())):
             camera.look_at = self.scene.middle
-            camera.position = self.scene.middle + 2.6 * self.scene.extent * np.cross(across, up)
+            camera.position = self.scene.middle + 3.4 * self.scene.extent * np.cross(across, up)
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:
