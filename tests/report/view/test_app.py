@@ -216,9 +216,9 @@ def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
 def test_a_name_in_the_form_is_no_option_of_the_command(page):
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
     (page.folder / "logs" / "logs.toml").write_text("mine")
-    page.unit.value = "--allow-pickle"
+    page.unit.value, page.cut.value = "--allow-pickle", 8.0
     page._attempt(page._read, None)
-    assert "--unit-id=--allow-pickle" in page.jobs.all[-1].words
+    assert {"--unit-id=--allow-pickle", "--cut=8"} < set(page.jobs.all[-1].words)
     page._attempt(page._set_aside, None)
     assert "is running" in page.status.content
     page.jobs.cancel()

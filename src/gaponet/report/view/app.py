@@ -101,6 +101,7 @@ class App:
         self.gui.add_markdown(f"Or copy them into {escape_markdown(str(self.folder / 'logs'))}.")
         self.unit, self.mass = self.gui.add_text("unit", "lab"), self.gui.add_number("payload, kg", 0.0, min=0.0)
         self.position = self.gui.add_dropdown("positions in", POSITION_UNITS)
+        self.cut = self.gui.add_number("cut into pieces, s", 0.0, min=0.0, hint="0: not cut; 3 motions are needed")
         self.described = self.gui.add_text("logs.toml", "", multiline=True, hint="empty: the logs.toml of the folder")
         self._button("Guess logs.toml from the logs", self._guess)
         self._button("Set these logs aside", self._set_aside)
@@ -112,12 +113,12 @@ class App:
         for choice in (self.recording, self.joint):
             choice.on_update(lambda _: self._draw_recording())
 
-    def _set_aside(self, _: Any) -> None:
+    def _set_aside(self, _: Any, place: str = "logs") -> None:
         self.jobs.require_idle()
-        aside = next(name for n in range(1, 1 << 20) if not (self.folder / (name := f"logs_aside{n}")).exists())
-        (self.folder / "logs").rename(self.folder / aside)
-        (self.folder / "logs").mkdir()
-        self.status.content = f"The logs are in {aside} now; logs is empty."
+        aside = next(name for n in range(1, 1 << 20) if not (self.folder / (name := f"{place}_aside{n}")).exists())
+        (self.folder / place).rename(self.folder / aside)
+        (self.folder / place).mkdir()
+        self.status.content = f"The logs are in {aside} now; {place} is empty."
 
     def _guess(self, _: Any) -> None:
         file = self.folder / "logs" / "logs.toml"
@@ -133,6 +134,7 @@ class App:
             write_text(self.folder / logs / "logs.toml", self.described.value)
         words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}", "--out", OUT]
         words += [f"--position-unit={self.position.value}"] * (self.position.value in POSITION_UNITS[1:])
+        words += [f"--cut={self.cut.value:g}"] * (self.cut.value > 0)
         self.jobs.start(step, "import", logs, f"--robot={robot.out}", *words)
 
     def _check(self) -> None:
@@ -194,6 +196,7 @@ class App:
         ))  # fmt: skip
         self._text("randomization", "A policy is then trained on robots that these logs cannot tell from yours.")
         self._upload("Upload new logs, of another day or unit", "new_logs")
+        self._button("Set these new logs aside", lambda _: self._set_aside(_, "new_logs"))
         self._button("Read the new logs", lambda _: self._read(self._need("identify"), "new", "new_logs"))
         self._text("new", "Identify the robot first. Unit, payload, positions and logs.toml are those of step Logs.")
         self._run("Check whether the robot changed", "check", lambda: ("check", out("identify"), out("new")))
@@ -310,7 +313,7 @@ class App:
     def _need(self, step: str) -> Job:
         job = self.jobs.result(step)
         if job is None:
-            raise UsageError(self.texts[step][1])
+            raise UsageError(f"{step}: there is no result yet. {self.texts[step][1]}")
         return job
 
     def _chosen_robot(self) -> RobotSpec:
