@@ -9,12 +9,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from arm import recordings
+from arm import recordings, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
 from gaponet.report.view import app
-from gaponet.report.view.app import TARGETS, App, _report, store_upload
+from gaponet.report.view.app import TARGETS, App, _ending, _report, store_upload
 from gaponet.report.view.jobs import OUT, Jobs
 from gaponet.report.view.player import draw_curves
 
@@ -333,3 +333,25 @@ def test_curves_are_saved_as_the_page_shows_them(page):
     save._impl.update_cb[-1](SimpleNamespace(client=client))
     assert sent["curves.svg"].startswith(b"<?xml")
     assert sent["curves.png"].startswith(b"\x89PNG")
+
+
+@pytest.mark.browser  # four processes
+def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
+    write_arm(page.folder / "arm")
+    finish(page.jobs, "robot", {}, ("robot", "new", "x", "--out", "arm"))
+    page.described.value = 'time = "t"\ntime_unit = "s"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
+    page.position.value = "rad"
+    time_s = np.arange(300) * 0.02
+    for joints, scale, why in (
+        ((), 1.0, "no log of"), (("hip", "knee"), 1.0, "names joints hip, knee, which robot 'arm' does not have"),
+        (("shoulder", "elbow"), 57.3, "these look like degrees"), (("shoulder",), 1.0, "has ended"),
+    ):  # fmt: skip
+        swing = [0.8 * scale * np.sin(time_s)] * len(joints)
+        columns = ["t", *(f"{j}_des" for j in joints), *(f"{j}_pos" for j in joints)]
+        if joints:
+            rows = np.column_stack([time_s, *swing, *swing])
+            np.savetxt(page.folder / "logs" / "m.csv", rows, delimiter=",", header=",".join(columns), comments="")
+        page._attempt(page._read, None)
+        wait_for(page.jobs)
+        assert why in _ending(page.jobs.all[-1])
+    assert "elbow: not in every recording" in _report(page.jobs.all[-1])
