@@ -1,7 +1,4 @@
-"""Candidates of an evaluation: an identified robot folder, or a run, whose model corrects a simulator.
-
-Recordings of VIRTUAL robots are called virtual wherever their numbers appear.
-"""
+"""Candidates of an evaluation: an identified robot folder, or a run, whose model corrects a simulator."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Figures of a dataset: joint ranges, composition, torque and temperature, and the doctor's findings.
-
-Recordings are selected by fixed rules.
-"""
+"""Figures of a dataset and of the doctor's findings. Recordings are selected by fixed rules."""
 
 from __future__ import annotations
 

@@ -40,7 +40,6 @@ MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "signed_percent")
 TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
-ENGINES = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}  # that apply parameter sets
 POLL_S, MAX_UNPACKED_BYTES = 0.5, 2 << 30
 PANEL_WIDTH = 560  # pixels
 STYLE = files("gaponet.report").joinpath("templates", "app.html")
@@ -185,13 +184,14 @@ class App:
     def _use(self) -> None:
         out, self.target = lambda step: self._need(step).out, self.gui.add_dropdown("for", TARGETS)
         robot = lambda: (self.jobs.result("adapt") or self._need("identify")).out  # noqa: E731
+        engines = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}  # that apply parameter sets
         network = lambda: str(self.target.value) in NETWORK_TARGETS  # noqa: E731
         self._run("Export", "export", lambda: (
             "export", out("train") if network() else robot(), "--to", str(self.target.value), "--out", OUT
         ))  # fmt: skip
         self._text("export", "Identify the robot first. Then export it for your simulator.")
         self._run("Parameter sets for training", "randomization", lambda: (
-            "export", robot(), "--to", "randomization", "--engine", ENGINES.get(str(self.target.value), "json"),
+            "export", robot(), "--to", "randomization", "--engine", engines.get(str(self.target.value), "json"),
             "--out", OUT,
         ))  # fmt: skip
         self._text("randomization", "A policy is then trained on robots that these logs cannot tell from yours.")

@@ -23,16 +23,12 @@ NEEDS = {
     "export": "identify", "randomization": "identify", "train": "identify", "new": "identify", "check": "new",
     "adapt": "new",
 }  # fmt: skip
-WIDE = {LINE_INTERVAL_VARIABLE: "0.5", "COLUMNS": "9999"}  # s; letters, so that no table is divided
 OUT = "\0"  # word that `start` replaces by the name of a new folder
 PROGRESS_LINE = re.compile(r"^\w+: (\d+) %, \d+ s(?:, (.*))?$")
 
 
 class Job:
-    """One command and its files: step, words after `gaponet`, and what it printed.
-
-    `out` is the folder that it writes, or the robot or dataset that it looks at.
-    """
+    """One command and its files; `out` is the folder that it writes, or the robot or dataset that it looks at."""
 
     def __init__(self, folder: Path) -> None:
         number, _, self.step = folder.name.partition("-")
@@ -107,7 +103,8 @@ class Jobs:
             with (folder / "result.json").open("wb") as out, (folder / "log.txt").open("wb") as log:
                 self.process = subprocess.Popen(
                     module_command("gaponet", *Job(folder).words, "--json"), stdin=subprocess.DEVNULL, stdout=out,
-                    stderr=log, cwd=self.folder, env=os.environ | WIDE,
+                    stderr=log, cwd=self.folder,
+                    env=os.environ | {LINE_INTERVAL_VARIABLE: "0.5", "COLUMNS": "9999"},  # s; no table is divided
                 )  # fmt: skip
 
     def require_idle(self) -> None:

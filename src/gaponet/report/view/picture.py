@@ -1,7 +1,4 @@
-"""Pictures and films of a scene, and pictures of models in a row: rendered off screen by MuJoCo, labelled by Pillow.
-
-A film is a GIF through Pillow, or an MP4 through imageio-ffmpeg.
-"""
+"""Pictures and films of a scene, and of models in a row: MuJoCo renders, Pillow labels, imageio-ffmpeg writes MP4."""
 
 from __future__ import annotations
 

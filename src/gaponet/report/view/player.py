@@ -91,7 +91,7 @@ class Player:
             name = "/robots/" + model.body(body).name.replace("/", "_")
             frames[body] = self.server.scene.add_frame(name, show_axes=False)
             for g in geoms:
-                vertices, faces = surface(model, int(g))
+                vertices, faces = _surface(model, int(g))
                 rgb = (255 * model.geom_rgba[g, :3]).astype(int)
                 self.server.scene.add_mesh_simple(
                     f"{name}/{g}", vertices, faces, color=rgb, opacity=float(model.geom_rgba[g, 3]),
@@ -136,7 +136,7 @@ def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], 
     return chart
 
 
-def surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
+def _surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
     """Return vertices (k, 3), m in the geom's frame, and triangles (m, 3)."""
     from trimesh import creation
 
