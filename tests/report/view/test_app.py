@@ -235,6 +235,19 @@ def test_a_name_in_the_form_is_no_option_of_the_command(page):
     assert "without a dash" in page.status.content
 
 
+def test_a_command_that_is_being_started_is_not_called_cancelled(page):
+    with page.jobs.lock:
+        page.jobs.add("robot", "robot", "list")
+        watching = threading.Thread(target=page.refresh)
+        watching.start()
+        watching.join(0.3)
+        assert "no result" not in page.status.content
+        page.jobs.started = page.jobs.all[-1].folder
+        page.jobs.process = SimpleNamespace(poll=lambda: None, terminate=lambda: None, wait=lambda: None)
+    watching.join()
+    assert "**gaponet robot**, 0 %" in page.status.content
+
+
 def test_a_guess_does_not_replace_the_logs_toml_of_the_folder(page):
     (page.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
     page._attempt(page._guess, None)

@@ -220,7 +220,8 @@ class App:
 
     def refresh(self) -> None:
         """Show the running command; when one starts or ends, also the results and what may be done next."""
-        running, every = self.jobs.running, self.jobs.all
+        with self.jobs.lock:  # a job that is being started is neither running nor ended
+            running, every = self.jobs.running, self.jobs.all
         self.bar.visible = self.cancel.visible = running is not None
         if running is not None:
             self.bar.value, note = running.progress()
