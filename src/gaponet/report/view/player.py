@@ -105,11 +105,11 @@ class Player:
         return frames
 
     def _aim(self) -> None:
-        across, up = self.scene.view.axes
+        (across, up), far = self.scene.view.axes, 2.2 + 1.2 / len(self.scene.base)  # one robot may point at the camera
         self.server.initial_camera.fov = np.radians(45)
         for camera in (self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())):
             camera.look_at = self.scene.middle
-            camera.position = self.scene.middle + 3.4 * self.scene.extent * np.cross(across, up)
+            camera.position = self.scene.middle + far * self.scene.extent * np.cross(across, up)
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:
