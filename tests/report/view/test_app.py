@@ -324,7 +324,7 @@ def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(arm, 
     monkeypatch.setattr(app.signal, "signal", lambda *_: None)
     app.serve_dataset(data, app.Scene(shown), app.Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append)
     (page,) = pages
-    assert said == [f"open {page.address}#4 in a browser; Ctrl-C ends"]
+    assert said == [f"open {page.address}?step=4 in a browser; Ctrl-C ends"]
     assert page.recording.options == tuple(e.id for e in data.entries)
     assert "differences drawn 2×" in page.player.title.content
     assert not page.folder.exists()

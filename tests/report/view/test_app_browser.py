@@ -132,7 +132,7 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
         assert first.complaints() == []
     assert page.jobs.running.words[0] == "identify"  # the page is closed
     with Browser(1000, 700) as second:
-        at = Clicker(second, page.address, "#4")
+        at = Clicker(second, page.address, "&step=4")
         at.sees("Measure the error")  # step Gap is open
         at.sees("gaponet gap has ended")
         at.tab("5 Identify")

@@ -374,7 +374,7 @@ def _report(job: Job) -> str:
 def serve(page: App, say: Callable[[str], None], step: str = "") -> None:
     """Serve a page until Ctrl-C; `step` is the number of the step that is shown first."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # otherwise the running command would stay
-    say(f"open {page.address}{step and '#' + step} in a browser; Ctrl-C ends")
+    say(f"open {page.address}{step and '?step=' + step} in a browser; Ctrl-C ends")
     try:
         run_until_interrupt(page.server, page.tick)
     finally:
