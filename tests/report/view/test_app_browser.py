@@ -155,3 +155,26 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
     alone, ours = map(float, re.search(r"alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups())
     assert alone == pytest.approx(ours, rel=0.05)
     print(said)
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+def test_the_page_fits_a_desk_and_a_phone_is_readable_and_dark_where_the_system_is(page, width, scheme):
+    from browser import Browser, wait
+
+    with Browser(max(width, 500), 720) as browser:
+        metrics = {"width": width, "height": 720, "deviceScaleFactor": 1, "mobile": width < 500}
+        browser.ask("Emulation.setDeviceMetricsOverride", **metrics)
+        browser.ask("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        at = Clicker(browser, page.address, "&step=6")
+        scheme_now = "document.documentElement.dataset.mantineColorScheme"
+        wait(lambda: browser.value(scheme_now) == scheme and "Train a network" in at.text())  # a dark page loads twice
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        letters = (
+            "[...document.querySelectorAll('button, label, p, td, input, [role=tab]')].filter(e => e.offsetParent)"
+        )
+        assert browser.value(f"{letters}.every(e => parseFloat(getComputedStyle(e).fontSize) >= 12)")
+        if width > 500:  # the row of steps works from the keyboard
+            browser.value("document.querySelector('[role=tab][aria-selected=true]').focus()")
+            browser.ask("Input.dispatchKeyEvent", type="keyDown", key="ArrowLeft", code="ArrowLeft")
+            at.sees("look for a table")
+        assert browser.complaints() == []
