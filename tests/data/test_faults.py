@@ -6,7 +6,7 @@ from faulty import FAULTS, all_of, examine, recordings
 
 from gaponet.base.errors import GAPONetError
 from gaponet.data.store import Dataset
-from gaponet.report.figures.draw_findings import draw_findings
+from gaponet.report.figures.dataset_figures import draw_findings
 from gaponet.robot.finding import Finding
 from gaponet.robot.spec import load_robot
 

@@ -11,8 +11,8 @@ from gaponet.base.result_table import MeanStd, ResultTable, format_cell
 from gaponet.data.store import Dataset
 from gaponet.experiments.result import Result, command_line, facts
 from gaponet.experiments.result_files import write, write_report
+from gaponet.report.candidate import describe_provenance
 from gaponet.report.figures.style import figure
-from gaponet.report.provenance import describe_provenance
 
 
 def drawing():

@@ -12,7 +12,7 @@ from gaponet.data.repeatability import Repetitions
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.report.candidate import Candidate
-from gaponet.report.figures.identified_robot import waterfall
+from gaponet.report.figures.evaluation import waterfall
 from gaponet.report.gap import CAUSES, cause_steps, error_floor, gap_by_step, reductions
 from gaponet.report.methods import title
 from gaponet.report.run_files import read_gap

@@ -76,7 +76,7 @@ def _gap_by_cause(
     dataset: Dataset | Place, robot: RobotSpec | None, folder: Path | None, motions: tuple[str, ...], progress: Progress
 ) -> GapResult:
     from gaponet.report.candidate import Candidate
-    from gaponet.report.figures.identified_robot import write_gap
+    from gaponet.report.figures.evaluation import write_gap
     from gaponet.report.gap import gap_by_step
 
     data, spec = as_dataset(dataset, robot, folder)

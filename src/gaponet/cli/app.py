@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -26,14 +24,7 @@ def app(folder: tyro.conf.Positional[Path] = Path("gaponet_app"), port: int = 80
     """
     if find_spec("viser") is None:
         raise UsageError("gaponet app needs viser; run: pip install 'gaponet[view,report]'")
-    from gaponet.report.view.app import App
-    from gaponet.report.view.server import run_until_interrupt
+    from gaponet.report.view.app import App, serve
 
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # otherwise the running command would stay
     with lock_folder(folder, "app"):
-        page = App(folder.resolve(), port)
-        Out().say(f"open {page.address} in a browser; Ctrl-C ends")
-        try:
-            run_until_interrupt(page.server, page.tick)
-        finally:
-            page.jobs.cancel()
+        serve(App(folder.resolve(), port), Out().say)

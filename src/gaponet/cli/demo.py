@@ -16,7 +16,7 @@ from gaponet.cli.out import Out, writes
 from gaponet.cli.show import show_methods
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 from gaponet.report.verdict import verdict
-from gaponet.report.view.portrait import portrait, prepare
+from gaponet.report.view.gl import prepare
 from gaponet.robot.spec import load_robot, robot_argument
 
 # Many small rounds: minutes, not hours.
@@ -46,6 +46,7 @@ def demo(
     prepare()  # before mujoco is imported
     from gaponet.cli.identify import identify
     from gaponet.report.report import write_report
+    from gaponet.report.view.picture import portrait
 
     screen, began = Out(json), time.monotonic()
     dataset, identified, run = out / "dataset", out / "robot", out / "network"

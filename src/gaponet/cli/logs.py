@@ -101,7 +101,7 @@ def doctor(
         out.say(line)
     drawn: list[Path] = []
     if figures is not None:
-        from gaponet.report.figures.draw_findings import draw_findings
+        from gaponet.report.figures.dataset_figures import draw_findings
 
         with lock_folder(figures, "figures"):
             drawn = draw_findings(data, spec, list(diagnosis.findings), figures)

@@ -15,7 +15,7 @@ from gaponet.nn.artifact import CARD, GapModel
 from gaponet.report.methods import method, title
 from gaponet.report.run_files import read_config, read_metrics, read_progress
 from gaponet.report.verdict import next_step, verdict
-from gaponet.report.view.portrait import portrait, prepare
+from gaponet.report.view.gl import prepare
 from gaponet.robot.folder import load_stored_robot
 
 
@@ -34,6 +34,7 @@ def report(
         return
     prepare()
     from gaponet.report.report import write_report
+    from gaponet.report.view.picture import portrait
 
     out = Out(json)
     with progress_bar("report") as update:

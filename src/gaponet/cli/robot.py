@@ -131,7 +131,7 @@ def new(
         contacts: Keep the contacts between links that the model has.
         name: Name of the robot. Default: the file's name.
     """
-    from gaponet.report.view.portrait import prepare
+    from gaponet.report.view.gl import prepare
 
     prepare()
     from gaponet.robot.new import RobotOptions, new_robot
@@ -232,7 +232,7 @@ def show(
         out: Picture to write, .png or .svg.
     """
     from gaponet.report.candidate import read_origin
-    from gaponet.report.figures.identified_robot import draw_uncertainty
+    from gaponet.report.figures.evaluation import draw_uncertainty
     from gaponet.robot.servo_fields import SERVO_FIELDS
     from gaponet.sysid.uncertainty import ParameterUncertainty, sentences, summarize, table_rows
 

@@ -104,7 +104,7 @@ def start(
         dry_run: Print the inspection and the commands, and write nothing.
         anyway: Continue although the doctor found errors in the logs.
     """
-    from gaponet.report.view.portrait import prepare
+    from gaponet.report.view.gl import prepare
 
     prepare()  # before MuJoCo is imported, which the report's picture would be too late for
     from gaponet.data.describe.preview import DescriptionNeededError

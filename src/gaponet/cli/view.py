@@ -10,6 +10,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Robot
 from gaponet.cli.out import Out
+from gaponet.report.methods import title
 from gaponet.report.tables import mrad
 from gaponet.share.reading import open_dataset
 
@@ -58,15 +59,15 @@ def view(
     shown = shown.only(tuple(n for n in show if n != "aligned" or model or spec.nominal is not None))
     clip = Clip.from_start(shown, start, duration, speed, fps)
     errors = {m.method: m.mpjae for m in shown.motions if m.method != "recorded"}
-    _introduce(out, entry.meta, {m.name: m.mpjae for m in shown.motions if m.method in errors}, shown.seen)
+    _introduce(out, entry.meta, {title(m.method): m.mpjae for m in shown.motions if m.method in errors}, shown.seen)
     rows = slice(round(clip.start / shown.real.dt), round(clip.stop / shown.real.dt) + 1)
     scene = Scene(shown.magnified(magnify), View(azimuth, elevation), rows, render is not None, closeup)
     if render is not None:
         _film(scene, clip, render, width, magnify, out)
     else:
-        from gaponet.report.view.player import serve
+        from gaponet.report.view.app import serve_dataset
 
-        serve(scene, clip, port, magnify, out.say)
+        serve_dataset(data, scene, clip, port, magnify, out.say)
     out.result({
         "sequence": entry.id, "virtual": entry.meta.virtual, "seen": shown.seen, "start": clip.start,
         "duration": clip.duration, "mpjae": errors, "render": None if render is None else str(render),
@@ -82,7 +83,7 @@ def _require_viewer(render: Path | None) -> None:
     from gaponet.report.view.gl import choose_gl
 
     choose_gl()
-    from gaponet.report.view.film import require_writable
+    from gaponet.report.view.picture import require_writable
 
     require_writable(render)
 
@@ -96,8 +97,7 @@ def _introduce(out: Out, meta: SequenceMeta, errors: dict[str, float], seen: boo
 
 
 def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, out: Out) -> None:
-    from gaponet.report.view.film import write
-    from gaponet.report.view.picture import Camera
+    from gaponet.report.view.picture import Camera, write
 
     with Camera(scene, clip, width, magnify) as camera, progress_bar("rendering") as update:
         pictures = write(camera, path, lambda done, total: update(done, total, "pictures"))

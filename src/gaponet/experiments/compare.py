@@ -19,8 +19,7 @@ from gaponet.experiments.outcomes import BASELINES, Outcome, Show, StudyOutcomes
 from gaponet.experiments.result import Result
 from gaponet.experiments.study import DEFAULT_MODELS, Study
 from gaponet.report.candidate import select_entries
-from gaponet.report.figures.charts import bars
-from gaponet.report.figures.style import joint_label
+from gaponet.report.figures.style import bars, joint_label
 from gaponet.report.methods import palette, title
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot

@@ -26,8 +26,7 @@ from gaponet.experiments.study import Study
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.config import Budget, Status
-from gaponet.report.candidate import select_entries, split_of_run
-from gaponet.report.provenance import describe_provenance
+from gaponet.report.candidate import describe_provenance, select_entries, split_of_run
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import load_dataset
 from gaponet.sim.metrics import runs, summary

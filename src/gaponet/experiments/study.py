@@ -17,9 +17,9 @@ from gaponet.data.store import Dataset, Entry
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.variant import Variant, parse_variant
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.report.candidate import robot_label
 from gaponet.report.evaluate import evenly_spaced
 from gaponet.report.methods import IDENTIFIED
-from gaponet.report.provenance import robot_label
 from gaponet.robot.spec import RobotSpec
 
 # Small rounds, fitted until the labels are fitted (progress.jsonl: label_rmse). With 200 gradient steps a product

@@ -189,3 +189,20 @@ def read_origin(folder: Path) -> _Origin | None:
     return read_json(
         _Origin, file, RobotError, "identify again, or remove it: all recordings then count as seen", allow_extra=True
     )
+
+
+def robot_label(entries: list[Entry]) -> str:
+    """Return the robot's name; "VIRTUAL h1_2" or "partly VIRTUAL h1_2" where recordings are virtual."""
+    virtual = sum(e.meta.virtual for e in entries)
+    kind = "" if not virtual else "VIRTUAL " if virtual == len(entries) else "partly VIRTUAL "
+    return kind + entries[0].meta.robot
+
+
+def describe_provenance(dataset: Dataset) -> str:
+    """Return a sentence that says on which robot the recordings were made."""
+    label = robot_label(dataset.entries)
+    if label == dataset.robot_name:
+        return f"Recordings of a real {label}."
+    fleets = sorted({e.meta.source for e in dataset.entries if e.meta.virtual and "fleet" in e.meta.source})
+    names = f" ({', '.join(fleets)})" if fleets else ""
+    return f"{label[0].upper()}{label[1:]}{names}: these numbers say nothing about real hardware."

@@ -83,14 +83,9 @@ class Evaluation:
 
 
 def evaluate(
-    folders: ListOf[Path],
-    dataset: Dataset,
-    robot: RobotSpec,
-    motions: tuple[str, ...] = (),
-    progress: Progress = no_progress,
-    target: RobotSpec | None = None,
-    units: tuple[str, ...] = (),
-) -> Evaluation:
+    folders: ListOf[Path], dataset: Dataset, robot: RobotSpec, motions: tuple[str, ...] = (),
+    progress: Progress = no_progress, target: RobotSpec | None = None, units: tuple[str, ...] = (),
+) -> Evaluation:  # fmt: skip
     """Roll out every method from the first recorded state under the recorded commands.
 
     Args:
@@ -140,25 +135,19 @@ def evaluate(
         done_runs["adapted"] = runs(sequences, [t.qpos for t in replays], robot)
         simulators["adapted"] = simulators[first.method]
     methods = {name: summary(part, robot) for name, part in done_runs.items()}
+    ratio = {name: m["mpjae"] / methods["nominal"]["mpjae"] for name, m in methods.items()}
+    limits = {name: m.config.delta_max for name, m in models.items()}
     result = {
-        "methods": methods,
-        "ratio_to_nominal": {name: m["mpjae"] / methods["nominal"]["mpjae"] for name, m in methods.items()},
-        "dataset": dataset.path.name,
-        "sequences": len(sequences),
+        "methods": methods, "ratio_to_nominal": ratio, "dataset": dataset.path.name, "sequences": len(sequences),
         "motions": sorted({s.meta.motion for s in sequences}),
         "moves": dict(zip(robot.operated, map(int, np.sum(moved, axis=0)), strict=True)),
-        "unseen": unseen,
-        "virtual": any(s.meta.virtual for s in sequences),
-        "robot": robot.name,
-        "simulator_hash": model_hash(nominal),
-        "simulators": simulators,
-        "delta": {
-            name: _delta_summary(parts, sequences, models[name].config.delta_max) for name, parts in deltas.items()
-        },
+        "unseen": unseen, "virtual": any(s.meta.virtual for s in sequences), "robot": robot.name,
+        "simulator_hash": model_hash(nominal), "simulators": simulators,
+        "delta": {name: _delta_summary(parts, sequences, limits[name]) for name, parts in deltas.items()},
         "adapted_units": sorted(set(adapted) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
         "command": _command(folders, dataset.address or os.path.normpath(dataset.path), motions),
-    }
+    }  # fmt: skip
     return Evaluation(result, done_runs, ctrl, deltas)
 
 
@@ -204,11 +193,9 @@ def _transferred(
 
 
 def _by_unit(
-    sequences: list[Sequence],
-    candidate: Candidate,
-    adapted: Mapping[str, Adaptation],
+    sequences: list[Sequence], candidate: Candidate, adapted: Mapping[str, Adaptation],
     progress: Callable[[int, int], None],
-) -> list[SimulatedReplay]:
+) -> list[SimulatedReplay]:  # fmt: skip
     """Roll out the model in each unit's adapted simulator, or in the common one for other units."""
     replays: dict[int, SimulatedReplay] = {}
     for unit in dict.fromkeys(s.meta.unit_id for s in sequences):

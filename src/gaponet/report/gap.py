@@ -31,10 +31,7 @@ MAX_COMPARED = 60  # recordings that are searched for equal commands
 
 
 def gap_by_step(
-    candidate: Candidate,
-    dataset: Dataset,
-    motions: tuple[str, ...] = (),
-    progress: Progress = no_progress,
+    candidate: Candidate, dataset: Dataset, motions: tuple[str, ...] = (), progress: Progress = no_progress
 ) -> dict[str, Any]:
     """Mean |error| after each step, in open-loop rollouts of motions that the candidate was not fitted to.
 

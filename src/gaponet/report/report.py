@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,17 +33,8 @@ CARD_FACTS = ("dt", "payload_seen", "units", "hours", "steps", "seconds", "seed"
               "motions", "versions", "dataset_hash")  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Evaluated:
-    """Contents of an evaluated run or robot folder.
-
-    Attributes:
-        own: Method of the folder.
-        card: Card of the run's model; None for a robot folder.
-        config: config.json of the run; empty for a robot folder.
-        curve: Validations during training; empty for a robot folder.
-        gap: gap.json, if it exists.
-    """
+class _Evaluated(NamedTuple):
+    """An evaluated run or robot folder; own is its method. Of a robot folder, card is None, config and curve empty."""
 
     robot: RobotSpec
     own: str
@@ -81,12 +71,9 @@ class _Evaluated:
 
 
 def write_report(
-    run: Path,
-    dataset: Path | None = None,
-    robot: str | None = None,
-    progress: Progress = no_progress,
+    run: Path, dataset: Path | None = None, robot: str | None = None, progress: Progress = no_progress,
     picture: Picture | None = None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Write report.html into a run or robot folder from its newest evaluation; evaluate first if there is none.
 
     Args:
@@ -106,7 +93,7 @@ def write_report(
         _evaluate(run, dataset, given, progress)
     evaluated = _Evaluated.read(run, model, spec)
     progress(0, 1, "drawing")
-    values = _values(evaluated) | _photo(evaluated, picture)
+    values = _values(evaluated, picture)
     path = run / "report.html"
     write_text(path, render("report.html.j2", report_command=f"gaponet report {shlex.quote(str(run))}", **values))
     progress(1, 1, "drawing")
@@ -129,21 +116,22 @@ def _evaluate(run: Path, dataset: Path | None, robot: RobotSpec | None, progress
     evaluate([run], data, robot, progress=progress).save(run)
 
 
-def _values(e: _Evaluated) -> dict[str, Any]:
+def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
     """Return the values of the template."""
     from gaponet.report.figures import evaluation as draw
-    from gaponet.report.figures.identified_robot import waterfall
+    from gaponet.report.figures.style import joint_label
 
     methods, name = e.metrics["methods"], title(e.own)
     bars = [
-        page_figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
+        page_figure(draw.by_group(methods, "joint", joint_label), "Mean |q_sim − q_robot| of each operated joint."),
         page_figure(draw.by_horizon(methods), "Error in the last half of the time since the common start."),
     ]
     if len(methods["nominal"]["by_payload"]) > 1:
-        bars.append(page_figure(draw.by_payload(methods), "Payload in each hand."))
+        bars.append(page_figure(draw.by_group(methods, "payload", "{} kg".format), "Payload in each hand."))
     joint_columns, joint_rows = _by_joint(e)
     shown, trajectories = e.metrics["shown"], []
-    for row, fig in draw.trajectories(e.arrays, shown, e.robot.operated, list(methods)).items():
+    drawn = draw.trajectories(e.arrays, shown, e.robot.operated, list(methods))
+    for row, fig in drawn.items():
         caption = f" (unit {shown[row]['unit_id']}, {shown[row]['payload_mass']:g} kg)"
         trajectories.append(page_figure(fig, caption, shown[row]["motion"]))
     simulators = e.metrics.get("simulators", {}).items()
@@ -156,10 +144,11 @@ def _values(e: _Evaluated) -> dict[str, Any]:
         "adapted_title": title("adapted"), "joint_columns": joint_columns, "joint_rows": joint_rows, "bars": bars,
         "trajectories": trajectories, "open_trajectories": OPEN_TRAJECTORIES,
         "by_motion": by_group(methods, "motion", mrad_and_degrees), "waterfall": None,
+        **_photo(e, next(iter(drawn), None), picture),
     }  # fmt: skip
     if e.gap is not None:
         caption = "Reduction of the mean |error| by each step (hollow: increase)."
-        values["waterfall"] = page_figure(waterfall(e.gap), caption)
+        values["waterfall"] = page_figure(draw.waterfall(e.gap), caption)
     if e.card is not None:
         caption = "Free run over whole validation motions; the circled model was selected."
         delta, artifacts = e.metrics["delta"].items(), e.metrics["artifacts"].items()
@@ -185,13 +174,11 @@ def _by_joint(e: _Evaluated) -> tuple[list[str], list[list[str]]]:
     return [*table.columns, f"{own} static", f"{own} dynamic", "moves in"], rows
 
 
-def _photo(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
-    """Draw the robot in the motion with the longest travel. Return photo, or the reason for its absence."""
+def _photo(e: _Evaluated, row: int | None, picture: Picture | None) -> dict[str, Any]:
+    """Draw the robot in a motion with stored trajectories. Return photo, or the reason for its absence."""
     metrics, arrays = e.metrics, e.arrays
-    travel = [np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in range(len(metrics["shown"]))]
-    if picture is None or not travel:
+    if picture is None or row is None:
         return {"photo": None, "photo_error": ""}
-    row = int(np.argmax(travel))
     shown = metrics["shown"][row]
     meta = SequenceMeta(
         e.robot.name, shown["unit_id"], shown["motion"], shown["payload_mass"], virtual=metrics["virtual"]

@@ -1,7 +1,7 @@
 """Charts: what is drawn is what was measured."""
 
 from gaponet.base.result_table import MeanStd
-from gaponet.report.figures.charts import bars
+from gaponet.report.figures.style import bars
 
 
 def test_bars_are_side_by_side():

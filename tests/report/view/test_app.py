@@ -7,11 +7,16 @@ import time
 import zipfile
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from arm import recordings, write_arm
 
 from gaponet.base.errors import UsageError
-from gaponet.report.view.app import App, _report, store_upload
+from gaponet.data.store import Dataset
+from gaponet.report.view import app
+from gaponet.report.view.app import TARGETS, App, _ending, _report, store_upload
 from gaponet.report.view.jobs import OUT, Jobs
+from gaponet.report.view.player import draw_curves
 
 
 def archive(**files):
@@ -170,9 +175,15 @@ def page(tmp_path):
 
 
 def test_nothing_starts_before_what_it_needs_and_the_page_says_what(page):
-    for act, hint in ((page._read, "Choose a robot"), (page._show, "Choose the robot"), (page._fit, "Check the rec")):
+    for act, hint in (
+        (page._read, "Choose a robot"),
+        (page._show, "Choose the robot"),
+        (lambda _: page._fit(), "Check the rec"),
+    ):
         page._attempt(act, None)
         assert hint in page.status.content
+    page._attempt(page._fit)
+    assert "Check the rec" in page.status.content
     assert page.fit.disabled
     assert page.jobs.all == []
 
@@ -183,7 +194,7 @@ def test_identification_is_locked_while_the_check_finds_an_error(page):
     finding = {"level": "error", "check": "sign", "message": "elbow moves against its command"}
     finish(page.jobs, "doctor", {"findings": [finding]})
     assert "Locked: the check finds an error (sign)" in page._locked()
-    page._attempt(page._fit, None)
+    page._attempt(page._fit)
     assert "Locked" in page.status.content
     finish(page.jobs, "doctor", {"findings": [finding | {"level": "warning"}]})
     assert page._locked() == ""
@@ -191,7 +202,7 @@ def test_identification_is_locked_while_the_check_finds_an_error(page):
 
 def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
     job = SimpleNamespace(command="gaponet gap data", lines=[
-        "gap: 50 %, 3 s, note", "By joint", "┏━━┳━━┓", "┃ joint ┃ MPJAE, ┃", "┃       ┃   mrad ┃", "┡━━╇━━┩",
+        "gap: 50 %, 3 s, note", "By joint", "┏━━┳━━┓", "┃ joint ┃ MPJAE, mrad ┃", "┡━━╇━━┩",
         "│ <b>x</b> │ 3.1 │", "└──┴──┘", "     ok  sign: fine", "![x](https://evil.example)",
     ])  # fmt: skip
     text = _report(job)
@@ -205,9 +216,9 @@ def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
 def test_a_name_in_the_form_is_no_option_of_the_command(page):
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
     (page.folder / "logs" / "logs.toml").write_text("mine")
-    page.unit.value = "--allow-pickle"
+    page.unit.value, page.cut.value = "--allow-pickle", 8.0
     page._attempt(page._read, None)
-    assert "--unit-id=--allow-pickle" in page.jobs.all[-1].words
+    assert {"--unit-id=--allow-pickle", "--cut=8"} < set(page.jobs.all[-1].words)
     page._attempt(page._set_aside, None)
     assert "is running" in page.status.content
     page.jobs.cancel()
@@ -222,6 +233,19 @@ def test_a_name_in_the_form_is_no_option_of_the_command(page):
     page.options["kp"].value = "--contacts"
     page._attempt(page._use_robot, None)
     assert "without a dash" in page.status.content
+
+
+def test_a_command_that_is_being_started_is_not_called_cancelled(page):
+    with page.jobs.lock:
+        page.jobs.add("robot", "robot", "list")
+        watching = threading.Thread(target=page.refresh)
+        watching.start()
+        watching.join(0.3)
+        assert "no result" not in page.status.content
+        page.jobs.started = page.jobs.all[-1].folder
+        page.jobs.process = SimpleNamespace(poll=lambda: None, terminate=lambda: None, wait=lambda: None)
+    watching.join()
+    assert "**gaponet robot**, 0 %" in page.status.content
 
 
 def test_a_guess_does_not_replace_the_logs_toml_of_the_folder(page):
@@ -239,3 +263,108 @@ def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
     page._attempt(page._propose, None)
     assert page.described.value.startswith('unit = "deg"\n')
     assert "nothing to mend" in page.described.value
+
+
+@pytest.fixture
+def clicked(monkeypatch):
+    """Buttons of the next page by label, and the commands that they start."""
+    acts, words, add = {}, [], App._button
+
+    def noted(self, label, act):
+        acts[label] = act
+        return add(self, label, act)
+
+    monkeypatch.setattr(App, "_button", noted)
+    monkeypatch.setattr(Jobs, "start", lambda self, step, *command: words.append(command))
+    return acts, words
+
+
+def test_step_use_exports_the_calibrated_robot_and_a_network_only_if_it_helps(clicked, page):
+    acts, words = clicked
+    for step in ("robot", "import", "identify", "new", "adapt"):
+        finish(page.jobs, step, {}, (step, "x", "y", "--out", step))
+        (page.folder / step).mkdir(exist_ok=True)
+        if step == "identify":
+            acts["Export"](None)
+            finish(page.jobs, "train", {"val_mpjae": {"added": 1e-4, "error": 2e-4, "start": 0.01}})
+            page.seen = ()
+            page._attempt(page.refresh)
+            assert page.target.options == TARGETS
+            finish(page.jobs, "train", {"val_mpjae": {"added": 2e-3, "error": 2e-4, "start": 0.01}})
+        if step == "new":
+            acts["Check whether the robot changed"](None)
+            acts["Calibrate with the new logs"](None)
+    page.target.value = "mjlab"
+    for label in ("Export", "Parameter sets for training", "Train a network"):
+        acts[label](None)
+    assert page._network() is not None
+    assert [" ".join(w).replace(OUT, "OUT") for w in words] == [
+        "export ./identify --to mjcf --out OUT",
+        "check ./identify ./new",
+        "adapt ./identify ./new --out OUT",
+        "export ./adapt --to mjlab --out OUT",
+        "export ./adapt --to randomization --engine mjlab --out OUT",
+        "train ./import --robot=./identify --budget=10m --out OUT",
+    ]
+
+
+def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(arm, tmp_path, monkeypatch):
+    pytest.importorskip("viser")
+    data, said, pages = Dataset.create(tmp_path / "data", arm), [], []
+    for sequence in recordings(arm, 2, rows=60):
+        data.append(sequence)
+    shown = app.side_by_side(data, data.entries[1], arm)
+
+    def once(server, tick):
+        tick(1.0)
+        pages.append(tick.__self__)
+        server.stop()
+
+    monkeypatch.setattr(app, "run_until_interrupt", once)
+    monkeypatch.setattr(app.signal, "signal", lambda *_: None)
+    app.serve_dataset(data, app.Scene(shown), app.Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append)
+    (page,) = pages
+    assert said == [f"open {page.address}?step=4 in a browser; Ctrl-C ends"]
+    assert page.recording.options == tuple(e.id for e in data.entries)
+    assert "differences drawn 2×" in page.player.title.content
+    assert not page.folder.exists()
+
+
+def test_a_large_file_is_stored_whole(tmp_path):
+    (tmp_path / "logs").mkdir()
+    store_upload("large.csv", bytes(200 << 20), tmp_path / "logs")
+    assert (tmp_path / "logs" / "large.csv").stat().st_size == 200 << 20
+
+
+def test_curves_are_saved_as_the_page_shows_them(page):
+    pytest.importorskip("matplotlib")
+    sent = {}
+    client = SimpleNamespace(send_file_download=lambda name, content: sent.update({name: content}))
+    chart = draw_curves(page.gui, np.arange(3.0), {"<b>x</b>": (np.zeros(3), "#00838f")}, "rad")
+    save = next(h for h in page.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "").startswith("Save"))
+    assert chart.title == "rad"
+    save._impl.update_cb[-1](SimpleNamespace(client=client))
+    assert sent["curves.svg"].startswith(b"<?xml")
+    assert sent["curves.png"].startswith(b"\x89PNG")
+
+
+@pytest.mark.browser  # four processes
+def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
+    write_arm(page.folder / "arm")
+    finish(page.jobs, "robot", {}, ("robot", "new", "x", "--out", "arm"))
+    page.described.value = 'time = "t"\ntime_unit = "s"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
+    page.position.value = "rad"
+    time_s = np.arange(300) * 0.02
+    for joints, scale, why in (
+        ((), 1.0, "no log of"), (("hip", "knee"), 1.0, "names joints hip, knee, which robot 'arm' does not have"),
+        (("shoulder", "elbow"), 57.3, "these look like degrees"), (("shoulder",), 1.0, "has ended"),
+    ):  # fmt: skip
+        swing = [0.8 * scale * np.sin(time_s)] * len(joints)
+        columns = ["t", *(f"{j}_des" for j in joints), *(f"{j}_pos" for j in joints)]
+        if joints:
+            rows = np.column_stack([time_s, *swing, *swing])
+            np.savetxt(page.folder / "logs" / "m.csv", rows, delimiter=",", header=",".join(columns), comments="")
+        page._attempt(page._read, None)
+        wait_for(page.jobs)
+        assert why in _ending(page.jobs.all[-1])
+    assert "elbow: not in every recording" in _report(page.jobs.all[-1])

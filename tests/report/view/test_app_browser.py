@@ -21,11 +21,11 @@ FIND = (
 class Clicker:
     """What a person does with the page."""
 
-    def __init__(self, browser, address):
+    def __init__(self, browser, address, step=""):
         from browser import wait
 
         self.browser, self.wait = browser, wait
-        browser.ask("Page.navigate", url=f"{address}?fixedDpr=0.15")  # few pixels: software draws them
+        browser.ask("Page.navigate", url=f"{address}?fixedDpr=0.15{step}")  # few pixels: software draws them
         browser.ask("DOM.enable")
         wait(lambda: "1 Robot" in self.text())
 
@@ -64,7 +64,7 @@ class Clicker:
         assert self.wait(lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)"))
 
     def write(self, label, text):
-        self.wait(lambda: self.browser.value(f"({self.field(label)}[0].focus(), true)"))
+        self.wait(lambda: self.browser.value(f"({self.field(label)}[0].select(), true)"))
         self.browser.ask("Input.insertText", text=text)
 
     def upload(self, label, file):
@@ -132,7 +132,8 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
         assert first.complaints() == []
     assert page.jobs.running.words[0] == "identify"  # the page is closed
     with Browser(1000, 700) as second:
-        at = Clicker(second, page.address)
+        at = Clicker(second, page.address, "&step=4")
+        at.sees("Measure the error")  # step Gap is open
         at.sees("gaponet gap has ended")
         at.tab("5 Identify")
         at.sees("mrad (one motion) → identified")
@@ -154,3 +155,26 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
     alone, ours = map(float, re.search(r"alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups())
     assert alone == pytest.approx(ours, rel=0.05)
     print(said)
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+def test_the_page_fits_a_desk_and_a_phone_is_readable_and_dark_where_the_system_is(page, width, scheme):
+    from browser import Browser, wait
+
+    with Browser(max(width, 500), 720) as browser:
+        metrics = {"width": width, "height": 720, "deviceScaleFactor": 1, "mobile": width < 500}
+        browser.ask("Emulation.setDeviceMetricsOverride", **metrics)
+        browser.ask("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        at = Clicker(browser, page.address, "&step=6")
+        scheme_now = "document.documentElement.dataset.mantineColorScheme"
+        wait(lambda: browser.value(scheme_now) == scheme and "Train a network" in at.text())  # a dark page loads twice
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        letters = (
+            "[...document.querySelectorAll('button, label, p, td, input, [role=tab]')].filter(e => e.offsetParent)"
+        )
+        assert browser.value(f"{letters}.every(e => parseFloat(getComputedStyle(e).fontSize) >= 12)")
+        if width > 500:  # the row of steps works from the keyboard
+            browser.value("document.querySelector('[role=tab][aria-selected=true]').focus()")
+            browser.ask("Input.dispatchKeyEvent", type="keyDown", key="ArrowLeft", code="ArrowLeft")
+            at.sees("look for a table")
+        assert browser.complaints() == []

@@ -76,7 +76,7 @@ def test_the_report_loads_nothing_else_and_fits_desk_and_phone(evaluated, width,
     from browser import Browser, wait
 
     from gaponet.report.report import write_report
-    from gaponet.report.view.portrait import portrait
+    from gaponet.report.view.picture import portrait
 
     path = write_report(evaluated, picture=portrait)
     with Browser(max(width, 500), 900) as page:

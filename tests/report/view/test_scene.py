@@ -9,8 +9,7 @@ from arm import XML, commands, record, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.report.view.film import require_writable, write
-from gaponet.report.view.picture import Camera
+from gaponet.report.view.picture import Camera, require_writable, write
 from gaponet.report.view.scene import Scene, View, visual_spec
 from gaponet.report.view.side_by_side import Clip, Copy, SideBySide
 from gaponet.robot.spec import Table, load_robot

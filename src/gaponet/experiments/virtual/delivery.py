@@ -30,8 +30,7 @@ from gaponet.experiments.virtual.statistics import (
     reduction,
     select,
 )
-from gaponet.report.figures.charts import draw_bars
-from gaponet.report.figures.style import DASHED, figure, legend, styled
+from gaponet.report.figures.style import DASHED, draw_bars, figure, legend, styled
 from gaponet.report.methods import colour, title
 from gaponet.robot.spec import RobotSpec
 from gaponet.testing.physics import Physics

@@ -17,7 +17,7 @@ from gaponet.experiments.cells import Cell
 from gaponet.experiments.result import Result, facts
 from gaponet.experiments.study import DEFAULT_MODELS, QUICK_LABEL, Options, Study
 from gaponet.experiments.virtual.play import Progress, TrainedModel
-from gaponet.report.provenance import describe_provenance
+from gaponet.report.candidate import describe_provenance
 from gaponet.robot.spec import RobotSpec
 from gaponet.testing.collect import fleet_name
 from gaponet.testing.fleet import load_fleet

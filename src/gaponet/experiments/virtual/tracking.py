@@ -33,8 +33,7 @@ from gaponet.experiments.virtual.statistics import (
 )
 from gaponet.experiments.virtual.unseen_motions import UnseenMotion, generated, require_unseen
 from gaponet.report.candidate import select_entries
-from gaponet.report.figures.charts import draw_bars
-from gaponet.report.figures.style import figure, joint_label, legend, styled
+from gaponet.report.figures.style import draw_bars, figure, joint_label, legend, styled
 from gaponet.report.methods import colour, title
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay

@@ -1,19 +1,26 @@
-"""Style, legend and files of all figures."""
+"""Style, legend and files of all figures; lines and bars, which several figures use."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as ListOf
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
+import numpy as np
+
+from gaponet.base.arrays import Array
 from gaponet.base.files import atomic_write
+from gaponet.base.result_table import MeanStd
 from gaponet.base.text import escape
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 P = ParamSpec("P")
+Bars = Mapping[str, tuple[str, ListOf[MeanStd]]]  # label → colour, value of each group
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -91,6 +98,45 @@ def legend(fig: Figure, title: str = "") -> None:
         ncols=max(1, min(len(handles), int(fig.get_figwidth() / width))), columnspacing=1.1, handlelength=1.4,
         title=title or None, alignment="left", title_fontproperties={"weight": "bold", "size": 9},
     )  # fmt: skip
+
+
+@styled
+def draw_curves(time: Array, curves: Mapping[str, tuple[Array, str]], label: str) -> Figure:
+    """Draw values over time, s; curves: name → values and colour."""
+    fig = figure(7.0, 3.2)
+    ax = fig.subplots()
+    for name, (values, colour) in curves.items():
+        ax.plot(time, values, color=colour, label=name)
+    ax.set_xlabel("time, s")
+    ax.set_ylabel(label)
+    legend(fig)
+    return fig
+
+
+@styled
+def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
+    """Draw bars with error bars, the methods of each group side by side."""
+    word = max((len(word) for group in groups for word in group.split()), default=0)
+    fig = figure(max(5.2, 0.17 * len(groups) * len(methods) + 1.7, (LETTER * word + 0.05) * len(groups) + 1.3), 3.3)
+    ax = fig.subplots()
+    draw_bars(ax, groups, methods)
+    ax.set_ylabel(axis)
+    ax.set_title(title)
+    legend(fig)
+    return fig
+
+
+def draw_bars(ax: Axes, groups: ListOf[str], methods: Bars, size: float | None = None) -> None:
+    """Draw the bars into existing axes; size is the font size of the group labels."""
+    width = 0.84 / len(methods)
+    for i, (label, (colour, values)) in enumerate(methods.items()):
+        x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
+        std = np.array([v.std if v.std == v.std else 0.0 for v in values])
+        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=std if std.any() else None, color=colour, label=label,
+               error_kw={"lw": 0.7, "capsize": 1.2, "capthick": 0.6})  # fmt: skip
+    ax.set_xticks(np.arange(len(groups)), groups, fontsize=size)
+    ax.tick_params(axis="x", length=0)
+    ax.grid(axis="x", visible=False)
 
 
 def joint_label(joint: str, wrapped: bool = True) -> str:

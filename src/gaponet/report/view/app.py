@@ -7,10 +7,13 @@ import io
 import os
 import re
 import shutil
+import signal
+import sys
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +26,11 @@ from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import look
 from gaponet.data.store import Dataset
 from gaponet.report.methods import colour
+from gaponet.report.verdict import NetworkGain
 from gaponet.report.view.jobs import OUT, PROGRESS_LINE, Job, Jobs
 from gaponet.report.view.player import Player, draw_curves
 from gaponet.report.view.scene import Scene
-from gaponet.report.view.server import open_server
+from gaponet.report.view.server import open_server, run_until_interrupt
 from gaponet.report.view.side_by_side import Clip, SideBySide, side_by_side, standing
 from gaponet.robot.finding import Finding
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
@@ -35,9 +39,10 @@ from gaponet.sim.dataset_robot import dataset_robot
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "signed_percent")
 TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
+NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
 POLL_S, MAX_UNPACKED_BYTES = 0.5, 2 << 30
 PANEL_WIDTH = 560  # pixels
-STYLE = "<style>[class*=Slider-mark], .uplot, .uplot *, input, textarea {font-size: 12px !important}</style>"
+STYLE = files("gaponet.report").joinpath("templates", "app.html")
 
 
 class App:
@@ -50,10 +55,10 @@ class App:
         self.gui = self.server.gui
         self.texts: dict[str, tuple[Any, str, Any]] = {}  # step → text, hint, pictures
         self.player: Player | None = None
-        for name in ("logs", "model"):
+        for name in ("logs", "model", "new_logs"):
             (folder / name).mkdir(exist_ok=True)
         self.gui.main_panel.set_width(PANEL_WIDTH)
-        self.gui.add_html(STYLE)
+        self.gui.add_html(STYLE.read_text(encoding="utf-8"))
         self.status, self.bar = self.gui.add_markdown(""), self.gui.add_progress_bar(0.0)
         self.cancel = self._button("Cancel", lambda _: self.jobs.cancel())
         tabs = self.gui.add_tab_group()
@@ -75,9 +80,7 @@ class App:
 
     def _robot(self) -> None:
         self.model = self.gui.add_dropdown("robot", packaged_robots())
-        self._button(
-            "Upload a model: MJCF, URDF, or a .zip with its meshes", lambda e: self._store(e, "model"), upload=True
-        )
+        self._upload("Upload a model: MJCF, URDF, or a .zip with its meshes", "model")
         hints = {"joints": "names; empty for all that the model drives", "kp": "N·m/rad", "kd": "N·m·s/rad"}
         self.options = {name: self.gui.add_text(name, "", hint=hint) for name, hint in hints.items()}
         self._button("Use this robot", self._use_robot)
@@ -93,10 +96,11 @@ class App:
             self.jobs.start("robot", "robot", "new", name, "--out", OUT, *(w for k in given for w in (k, *given[k])))
 
     def _logs(self) -> None:
-        self._button("Upload a log, or a .zip of logs", lambda e: self._store(e, "logs"), upload=True)
+        self._upload("Upload a log, or a .zip of logs", "logs")
         self.gui.add_markdown(f"Or copy them into {escape_markdown(str(self.folder / 'logs'))}.")
         self.unit, self.mass = self.gui.add_text("unit", "lab"), self.gui.add_number("payload, kg", 0.0, min=0.0)
         self.position = self.gui.add_dropdown("positions in", POSITION_UNITS)
+        self.cut = self.gui.add_number("cut into pieces, s", 0.0, min=0.0, hint="0: not cut; 3 motions are needed")
         self.described = self.gui.add_text("logs.toml", "", multiline=True, hint="empty: the logs.toml of the folder")
         self._button("Guess logs.toml from the logs", self._guess)
         self._button("Set these logs aside", self._set_aside)
@@ -108,12 +112,12 @@ class App:
         for choice in (self.recording, self.joint):
             choice.on_update(lambda _: self._draw_recording())
 
-    def _set_aside(self, _: Any) -> None:
+    def _set_aside(self, _: Any, place: str = "logs") -> None:
         self.jobs.require_idle()
-        aside = next(name for n in range(1, 1 << 20) if not (self.folder / (name := f"logs_aside{n}")).exists())
-        (self.folder / "logs").rename(self.folder / aside)
-        (self.folder / "logs").mkdir()
-        self.status.content = f"The logs are in {aside} now; logs is empty."
+        aside = next(name for n in range(1, 1 << 20) if not (self.folder / (name := f"{place}_aside{n}")).exists())
+        (self.folder / place).rename(self.folder / aside)
+        (self.folder / place).mkdir()
+        self.status.content = f"The logs are in {aside} now; {place} is empty."
 
     def _guess(self, _: Any) -> None:
         file = self.folder / "logs" / "logs.toml"
@@ -122,18 +126,18 @@ class App:
         kind, facts, recordings = look(self.folder / "logs")
         self.described.value = guess_logs(recordings, self._chosen_robot(), kind, dict(facts))
 
-    def _read(self, _: Any) -> None:
+    def _read(self, _: Any, step: str = "import", logs: str = "logs") -> None:
         robot = self._need("robot")
         self.jobs.require_idle()
         if self.described.value.strip():  # otherwise a file of the user's stays as it is
-            write_text(self.folder / "logs" / "logs.toml", self.described.value)
+            write_text(self.folder / logs / "logs.toml", self.described.value)
         words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}", "--out", OUT]
         words += [f"--position-unit={self.position.value}"] * (self.position.value in POSITION_UNITS[1:])
-        self.jobs.start("import", "import", "logs", f"--robot={_robot_argument(robot)}", *words)
+        words += [f"--cut={self.cut.value:g}"] * (self.cut.value > 0)
+        self.jobs.start(step, "import", logs, f"--robot={robot.out}", *words)
 
     def _check(self) -> None:
-        start = lambda _: self.jobs.start("doctor", "doctor", self._need("import").out, "--figures", OUT)  # noqa: E731
-        self._button("Check the recordings", start)
+        self._run("Check the recordings", "doctor", lambda: ("doctor", self._need("import").out, "--figures", OUT))
         self.proposal = self._button("Write a proposal for logs.toml into step Logs", self._propose)
         self._text("doctor", "Read the logs first. Then check them.")
 
@@ -144,7 +148,7 @@ class App:
         self.described.value = f"{own}\n{Finding.proposal(findings)}".lstrip()
 
     def _gap(self) -> None:
-        self._button("Measure the error", lambda _: self.jobs.start("gap", "gap", self._need("import").out))
+        self._run("Measure the error", "gap", lambda: ("gap", self._need("import").out))
         self._button("Show the recording of step Logs beside its simulation", self._show)
         self.stage = self.gui.add_folder(None)
         self._text("gap", "Read the logs first. Then measure how far the simulator is from the robot.")
@@ -152,20 +156,22 @@ class App:
     def _show(self, _: Any) -> None:
         data, identified = self._dataset(), self.jobs.result("identify")
         robot = dataset_robot(data) if identified is None else load_robot(self.folder / identified.out)
-        self._play(side_by_side(data, next(e for e in data.entries if e.id == self.recording.value), robot))
+        entry = next(e for e in data.entries if e.id == self.recording.value)
+        runs = [self.folder / network.out] if (network := self._network()) else []
+        self.play(side_by_side(data, entry, robot, runs))
 
     def _identify(self) -> None:
-        self.limit = self.gui.add_text("time limit", "", hint="such as 60s or 4m; empty for none")
+        self.limit = self.gui.add_text("time limit", "4m", hint="such as 60s or 4m; empty for none")
         self.table = self.gui.add_checkbox("look for a table under the robot", True)
-        self.fit = self._button("Identify", self._fit)
+        self.fit = self._run("Identify", "identify", self._fit)
         self._text("identify", "Check the recordings first. Identification is locked while the check finds an error.")
         self._text("causes", "")
 
-    def _fit(self, _: Any) -> None:
+    def _fit(self) -> list[str]:
         if reason := self._locked():
             raise UsageError(reason)
         words = [f"--budget={time}" for time in self.limit.value.split()[:1]] + ["--no-table"] * (not self.table.value)
-        self.jobs.start("identify", "identify", self._need("import").out, "--out", OUT, *words)
+        return ["identify", self._need("import").out, "--out", OUT, *words]
 
     def _locked(self) -> str:
         """Return why identification may not start; "" if it may."""
@@ -176,22 +182,46 @@ class App:
         return errors and f"Locked: the check finds an error ({errors}). Step Check says what to do."
 
     def _use(self) -> None:
-        self.target = self.gui.add_dropdown("for", TARGETS)
-        self._button("Export", lambda _: self.jobs.start(
-            "export", "export", self._need("identify").out, "--to", str(self.target.value), "--out", OUT
+        out, self.target = lambda step: self._need(step).out, self.gui.add_dropdown("for", TARGETS)
+        robot = lambda: (self.jobs.result("adapt") or self._need("identify")).out  # noqa: E731
+        engines = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}  # that apply parameter sets
+        network = lambda: str(self.target.value) in NETWORK_TARGETS  # noqa: E731
+        self._run("Export", "export", lambda: (
+            "export", out("train") if network() else robot(), "--to", str(self.target.value), "--out", OUT
         ))  # fmt: skip
         self._text("export", "Identify the robot first. Then export it for your simulator.")
+        self._run("Parameter sets for training", "randomization", lambda: (
+            "export", robot(), "--to", "randomization", "--engine", engines.get(str(self.target.value), "json"),
+            "--out", OUT,
+        ))  # fmt: skip
+        self._text("randomization", "A policy is then trained on robots that these logs cannot tell from yours.")
+        self._upload("Upload new logs, of another day or unit", "new_logs")
+        self._button("Set these new logs aside", lambda _: self._set_aside(_, "new_logs"))
+        self._button("Read the new logs", lambda _: self._read(self._need("identify"), "new", "new_logs"))
+        self._text("new", "Identify the robot first. Unit, payload, positions and logs.toml are those of step Logs.")
+        self._run("Check whether the robot changed", "check", lambda: ("check", out("identify"), out("new")))
+        self._text("check", "Read new logs first. Then check whether the identified robot still fits them.")
+        self._run("Calibrate with the new logs", "adapt", lambda: ("adapt", out("identify"), out("new"), "--out", OUT))
+        self._text("adapt", "Read new logs first. The calibrated robot is then exported.")
+        self.budget = self.gui.add_text("training time", "10m")
+        self._run("Train a network", "train", lambda: (
+            "train", out("import"), f"--robot={out('identify')}", f"--budget={self.budget.value}", "--out", OUT
+        ))  # fmt: skip
+        self._text("train", "A network can be exported if validation says that it helps.")
 
-    def _store(self, event: Any, place: str) -> None:
-        self.jobs.require_idle()
-        store_upload(event.target.value.name, event.target.value.content, self.folder / place)
-        self.status.content = f"{escape_markdown(event.target.value.name)} is stored in {place}."
+    def _network(self) -> Job | None:
+        """Return the training if its network helps on validation motions."""
+        job = self.jobs.result("train")
+        error = (job.result or {})["val_mpjae"] if job is not None else {}
+        gain = NetworkGain("", error.get("added", 0.0), error.get("error") or np.nan, error.get("start", 0.0))
+        return job if gain.helps else None
 
     # What the page shows: only what the files say.
 
     def refresh(self) -> None:
         """Show the running command; when one starts or ends, also the results and what may be done next."""
-        running, every = self.jobs.running, self.jobs.all
+        with self.jobs.lock:  # a job that is being started is neither running nor ended
+            running, every = self.jobs.running, self.jobs.all
         self.bar.visible = self.cancel.visible = running is not None
         if running is not None:
             self.bar.value, note = running.progress()
@@ -206,23 +236,27 @@ class App:
             job = self.jobs.result(step)
             hint = (step == "identify" and self._locked()) or hint
             text.content, pictures.content = _report(job) if job else hint, self._pictures(step, job)
+        self.target.options = TARGETS + NETWORK_TARGETS * (self._network() is not None)
         self.fit.disabled, self.proposal.visible = bool(self._locked()), self.jobs.result("doctor") is not None
         if self.jobs.result("import"):
             data = self._dataset()
             self.recording.options, self.joint.options = [e.id for e in data.entries], data.joint_names
             self._draw_recording()
         if running is None and (last := self.jobs.result("identify")) and last.number == every[-1].number:
-            self.jobs.start("causes", "gap", self._need("import").out, "--robot", f"./{last.out}")
+            self.jobs.start("causes", "gap", self._need("import").out, "--robot", last.out)
         elif self.player is None and self.jobs.result("robot"):
-            self._play(standing(self._chosen_robot()))
+            self.play(standing(self._chosen_robot()))
         self.seen = state  # last: after an error all is shown again
 
-    def _play(self, shown: SideBySide) -> None:
+    def play(self, shown: Scene | SideBySide, clip: Clip | None = None, magnify: float = 1.0) -> None:
+        """Show a scene, or motions, in place of what was shown before."""
+        scene = shown if isinstance(shown, Scene) else Scene(shown)
+        clip = clip or Clip.from_start(scene.shown, 0.0, 3600.0)
         before, self.player = self.player, None  # `tick` advances it in another thread
         if before is not None:
             before.remove()
         with self.stage:
-            self.player = Player(self.server, Scene(shown), Clip.from_start(shown, 0.0, 3600.0))
+            self.player = Player(self.server, scene, clip, magnify)
 
     def _draw_recording(self) -> None:
         """Draw target and measured position of the chosen joint in the chosen recording."""
@@ -250,10 +284,24 @@ class App:
         """Add the place of a step's result; `hint` stands there before."""
         self.texts[step] = self.gui.add_markdown(hint), hint, self.gui.add_html("")
 
-    def _button(self, label: str, act: Callable[[Any], None], upload: bool = False) -> Any:
-        button = (self.gui.add_upload_button if upload else self.gui.add_button)(label)
-        (button.on_upload if upload else button.on_click)(lambda event: self._attempt(act, event))
+    def _button(self, label: str, act: Callable[[Any], None]) -> Any:
+        button = self.gui.add_button(label)
+        button.on_click(lambda event: self._attempt(act, event))
         return button
+
+    def _run(self, label: str, step: str, words: Callable[[], Iterable[str]]) -> Any:
+        """Add a button that starts the command of a step."""
+        return self._button(label, lambda _: self.jobs.start(step, *words()))
+
+    def _upload(self, label: str, place: str) -> None:
+        """Add a button that stores a file in a folder of the page."""
+
+        def store(event: Any) -> None:
+            self.jobs.require_idle()
+            store_upload(event.target.value.name, event.target.value.content, self.folder / place)
+            self.status.content = f"{escape_markdown(event.target.value.name)} is stored in {place}."
+
+        self.gui.add_upload_button(label).on_upload(lambda event: self._attempt(store, event))
 
     def _attempt(self, act: Callable[..., None], *arguments: Any) -> None:
         """Call a function; an error is shown above the steps."""
@@ -266,11 +314,11 @@ class App:
     def _need(self, step: str) -> Job:
         job = self.jobs.result(step)
         if job is None:
-            raise UsageError(self.texts[step][1])
+            raise UsageError(f"{step}: there is no result yet. {self.texts[step][1]}")
         return job
 
     def _chosen_robot(self) -> RobotSpec:
-        name = _robot_argument(self._need("robot"))
+        name = self._need("robot").out
         return load_robot(name if name in packaged_robots() else self.folder / name)
 
     def _dataset(self) -> Dataset:
@@ -299,11 +347,6 @@ def store_upload(name: str, content: bytes, folder: Path) -> None:
             shutil.move(file, place)
 
 
-def _robot_argument(job: Job) -> str:
-    """Return the value of --robot for the robot of the first step."""
-    return job.words[2] if job.words[1] == "check" else f"./{job.out}"
-
-
 def _ending(job: Job) -> str:
     """Return how a command ended, in Markdown."""
     if job.result is not None:
@@ -315,17 +358,43 @@ def _ending(job: Job) -> str:
 
 def _report(job: Job) -> str:
     """Return what a command printed, in Markdown, and the command."""
-    lines, heading = list[str](), list[str]()
+    lines = list[str]()
     for line in job.lines:
-        cells = [escape_markdown(cell.strip()) for cell in line.strip("┃│").replace("┃", "│").split("│")]
-        if line.startswith("┃"):
-            heading = [f"{a} {b}".strip() for a, b in zip(heading, cells, strict=False)] if heading else cells
-        elif line.startswith("┡"):
-            lines += [f"| {' | '.join(heading)} |", f"| --- |{' ---: |' * (len(heading) - 1)}"]
-            heading = []
-        elif line.startswith("│"):
-            lines.append(f"| {' | '.join(cells)} |")
-        elif line[:1] not in ("┏", "└") and not PROGRESS_LINE.match(line) and not line.startswith("     ok "):
-            bold = "**" * line.lstrip().startswith(("error ", "warning "))
-            lines += ["", f"{bold}{' '.join(cells)}{bold}"]
+        text = re.sub("[┃│]", "|", escape_markdown(line.strip()))
+        if line.startswith("┡"):
+            lines.append(f"| --- |{' ---: |' * line.count('╇')}")
+        elif line.startswith(("┃", "│")):
+            lines.append(text)
+        elif text and not line.startswith(("┏", "└", "     ok ")) and not PROGRESS_LINE.match(line):
+            bold = "**" * text.startswith(("error ", "warning "))
+            lines += ["", f"{bold}{text}{bold}"]
     return "\n".join([*lines, "", f"To repeat it in the folder of this page: {escape_markdown(job.command)}"])
+
+
+def serve(page: App, say: Callable[[str], None], step: str = "") -> None:
+    """Serve a page until Ctrl-C; `step` is the number of the step that is shown first."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # otherwise the running command would stay
+    say(f"open {page.address}{step and '?step=' + step} in a browser; Ctrl-C ends")
+    try:
+        run_until_interrupt(page.server, page.tick)
+    finally:
+        page.jobs.cancel()
+
+
+def serve_dataset(
+    data: Dataset, scene: Scene, clip: Clip, port: int, magnify: float, say: Callable[[str], None]
+) -> None:
+    """Serve a dataset and a scene of it at step Gap. The page's folder stays if a command has written into it."""
+    folder = Path(tempfile.mkdtemp(prefix="gaponet_view_"))
+    jobs = Jobs(folder)
+    jobs.add("robot", "robot", "check", str(scene.shown.robot.folder.resolve()), result="{}")
+    jobs.add("import", "data", "card", str(data.path.resolve()), result="{}")
+    page = App(folder, port)
+    page.play(scene, clip, magnify)
+    try:
+        serve(page, say, "4")
+    finally:
+        if len(jobs.all) > 2:
+            say(f"results are in {folder}; to go on: gaponet app {folder}")
+        else:
+            shutil.rmtree(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 from ctypes.util import find_library
 
 from gaponet.base.errors import UsageError
@@ -32,3 +33,9 @@ def choose_gl() -> None:
     except Exception as error:  # each backend that is not installed fails in its own way
         chosen = os.environ.pop("MUJOCO_GL") if ours else os.environ.get("MUJOCO_GL")
         raise UsageError(f"MUJOCO_GL={chosen}: {error}. {INSTALL_HINT}") from None
+
+
+def prepare() -> None:
+    """Choose the backend before anything imports mujoco; without one, only pictures are missing later."""
+    with suppress(UsageError):
+        choose_gl()

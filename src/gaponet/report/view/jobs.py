@@ -14,27 +14,29 @@ from typing import Any
 
 from gaponet.base.child_process import module_command
 from gaponet.base.errors import UsageError
-from gaponet.base.files import write_json
+from gaponet.base.files import write_json, write_text
 from gaponet.base.progress import LINE_INTERVAL_VARIABLE
 
 # Step → the step whose result it uses. A result that is older than what it was made from is out of date.
 NEEDS = {
     "import": "robot", "doctor": "import", "gap": "import", "identify": "import", "causes": "identify",
-    "export": "identify",
+    "export": "identify", "randomization": "identify", "train": "identify", "new": "identify", "check": "new",
+    "adapt": "new",
 }  # fmt: skip
 OUT = "\0"  # word that `start` replaces by the name of a new folder
 PROGRESS_LINE = re.compile(r"^\w+: (\d+) %, \d+ s(?:, (.*))?$")
 
 
 class Job:
-    """One command and its files: step, words after `gaponet`, the folder that it writes, and what it printed."""
+    """One command and its files; `out` is the folder that it writes, or the robot or dataset that it looks at."""
 
     def __init__(self, folder: Path) -> None:
         number, _, self.step = folder.name.partition("-")
         self.folder, self.number = folder, int(number)
         self.words: list[str] = json.loads((folder / "command.json").read_text(encoding="utf-8"))
         self.command = shlex.join(["gaponet", *self.words])
-        self.out = f"{self.step}{self.number}"
+        written = self.words.index("--out") + 1 if "--out" in self.words else 0
+        self.out = f"./{self.words[written]}" if written else "".join(self.words[2:3])
 
     @cached_property
     def result(self) -> dict[str, Any] | None:
@@ -59,7 +61,7 @@ class Jobs:
     """All commands of a folder, one at a time. Their state is in files, which survive this process."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self.started = folder, folder
         self.process: subprocess.Popen[bytes] | None = None
         self.lock = threading.Lock()  # each click has a thread
 
@@ -72,7 +74,7 @@ class Jobs:
     @property
     def running(self) -> Job | None:
         """The job that runs now."""
-        return self.all[-1] if self.process is not None and self.process.poll() is None else None
+        return Job(self.started) if self.process is not None and self.process.poll() is None else None
 
     def result(self, step: str) -> Job | None:
         """Return the last successful job of a step with its folder, unless what it was made from is newer."""
@@ -83,18 +85,26 @@ class Jobs:
         before = self.result(NEEDS[step])
         return last if before is not None and before.number < last.number else None
 
+    def add(self, step: str, *words: str, result: str = "") -> Path:
+        """Write the files of a new job and return their folder; OUT becomes a new name: step and number."""
+        number = max((job.number for job in self.all), default=0) + 1
+        folder = self.folder / "jobs" / f"{number:03d}-{step}"
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "command.json", [f"{step}{number}" if word == OUT else word for word in words])
+        write_text(folder / "result.json", result)
+        write_text(folder / "log.txt", "")
+        return folder
+
     def start(self, step: str, *words: str) -> None:
-        """Start a command, or raise UsageError if one runs; OUT becomes the name of a new folder: step and number."""
+        """Start a command, or raise UsageError if one runs."""
         with self.lock:
             self.require_idle()
-            number = max((job.number for job in self.all), default=0) + 1
-            folder = self.folder / "jobs" / f"{number:03d}-{step}"
-            folder.mkdir(parents=True, exist_ok=True)
-            write_json(folder / "command.json", [f"{step}{number}" if word == OUT else word for word in words])
+            self.started = folder = self.add(step, *words)
             with (folder / "result.json").open("wb") as out, (folder / "log.txt").open("wb") as log:
                 self.process = subprocess.Popen(
                     module_command("gaponet", *Job(folder).words, "--json"), stdin=subprocess.DEVNULL, stdout=out,
-                    stderr=log, cwd=self.folder, env=os.environ | {LINE_INTERVAL_VARIABLE: "0.5"},
+                    stderr=log, cwd=self.folder,
+                    env=os.environ | {LINE_INTERVAL_VARIABLE: "0.5", "COLUMNS": "9999"},  # s; no table is divided
                 )  # fmt: skip
 
     def require_idle(self) -> None:

@@ -1,9 +1,12 @@
-"""Pictures of a scene, and of models in a row: rendered off screen by MuJoCo, labelled by Pillow."""
+"""Pictures and films of a scene, and of models in a row: MuJoCo renders, Pillow labels, imageio-ffmpeg writes MP4."""
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -11,18 +14,24 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
+from gaponet.base.files import atomic_write
+from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.report.methods import colour, title
 from gaponet.report.view.gl import INSTALL_HINT
 from gaponet.report.view.scene import Scene
-from gaponet.report.view.side_by_side import Clip
+from gaponet.report.view.side_by_side import Clip, Copy, SideBySide, largest_error_time
+from gaponet.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
-    from PIL.Image import Image as Picture
+    from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
 
 INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
 SEPARATOR = "  ·  "  # Pillow's own font has this, but no ×
 MAX_HEIGHT = 0.7  # of the width
 SIDE, HEAD = 480, 30  # pixels of one model's square and of its label
+GIF_COLOURS = 200  # shared by all frames
+SUFFIXES = (".gif", ".mp4", ".png")
 FLOOR = mujoco.mjtGeom.mjGEOM_PLANE
 
 
@@ -60,16 +69,17 @@ class Camera:
     def __exit__(self, *_: object) -> None:
         self.renderer.close()
 
-    def picture(self, time: float) -> Picture:
+    def picture(self, time: float) -> Image:
         """Return the labelled frame at a time of the recording, s: a PIL image."""
-        from PIL import Image, ImageDraw
+        from PIL.Image import fromarray, new
+        from PIL.ImageDraw import Draw
 
         self.scene.pose(time)
         self.renderer.update_scene(self.scene.data, self.lens)
-        rendered = Image.fromarray(self.renderer.render())
-        image = Image.new("RGB", (self.width, self.height), rendered.getpixel((0, 0)))
+        rendered = fromarray(self.renderer.render())
+        image = new("RGB", (self.width, self.height), rendered.getpixel((0, 0)))
         image.paste(rendered, (0, self.head))
-        self._write(ImageDraw.Draw(image), time)
+        self._write(Draw(image), time)
         return image
 
     def _lens(self) -> mujoco.MjvCamera:
@@ -90,7 +100,8 @@ class Camera:
         top, pitch, k = self.head + self.robots, self.scene.spacing * self.scale, len(self.scene.base)
         for i, m in enumerate(self.scene.shown.motions):
             x = self.width / 2 + (i - (k - 1) / 2) * pitch
-            draw.text((x, top), m.name, m.colour, large, anchor="ma", stroke_width=0.3, stroke_fill=m.colour)
+            tint = colour(m.method)
+            draw.text((x, top), title(m.method), tint, large, anchor="ma", stroke_width=0.3, stroke_fill=tint)
             if m.method != "recorded":
                 text = f"{m.error[row] * 1e3:.1f} mrad now, {m.mpjae * 1e3:.1f} mean"
                 draw.text((x, top + 1.5 * large.size), text, FAINT, small, anchor="ma")
@@ -143,41 +154,30 @@ def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
     Raises:
         UsageError: Nothing can be rendered here; the message says what to install.
     """
-    from PIL import Image, ImageDraw
+    from PIL.Image import fromarray, new
+    from PIL.ImageDraw import Draw
 
-    image = Image.new("RGB", (SIDE * len(models), SIDE + HEAD), "white")
-    draw = ImageDraw.Draw(image)
+    image = new("RGB", (SIDE * len(models), SIDE + HEAD), "white")
+    draw = Draw(image)
     camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(models[0][1], camera)
     camera.azimuth, camera.elevation = 140, -15
     for i, (label, model, qpos) in enumerate(models):
         data = mujoco.MjData(model)
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
-        if i == 0:
-            low, high = _box(model, data)
-            camera.lookat[:] = (low + high) / 2
-            camera.distance = 1.15 * float(np.linalg.norm(high - low))
         model.geom_rgba[model.geom_type == FLOOR, 3] = 0
         model.vis.map.znear = 0.01 / model.stat.extent
         model.vis.headlight.ambient[:] = 0.5
         picture = renderer(model, SIDE, SIDE)
         picture.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
         picture.update_scene(data, camera)
-        image.paste(Image.fromarray(_white(picture)), (SIDE * i, HEAD))
+        image.paste(fromarray(_white(picture)), (SIDE * i, HEAD))
         picture.close()
         draw.text((SIDE * (i + 0.5), HEAD / 2), label, INK, font(17), anchor="mm")
     file = io.BytesIO()
     image.save(file, "PNG", optimize=True)
     return file.getvalue()
-
-
-def _box(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array]:
-    """Return the corners of a box around all geoms except floors, m."""
-    shown = model.geom_type != FLOOR
-    if not shown.any():
-        return data.xpos.min(axis=0), data.xpos.max(axis=0)
-    radius, centres = np.linalg.norm(model.geom_aabb[shown, 3:], axis=1)[:, None], data.geom_xpos[shown]
-    return (centres - radius).min(axis=0, initial=np.inf), (centres + radius).max(axis=0, initial=-np.inf)
 
 
 def _white(picture: mujoco.Renderer) -> Array:
@@ -186,3 +186,97 @@ def _white(picture: mujoco.Renderer) -> Array:
     picture.enable_segmentation_rendering()
     pixels[picture.render()[:, :, 0] < 0] = 255
     return pixels
+
+
+def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str, Array]) -> bytes:
+    """Return a PNG of the copies of a robot side by side at the largest nominal error.
+
+    Args:
+        robot: Joints that are not operated are drawn at home.
+        dt: Period of the rows, s.
+        qpos: Positions by method, "recorded" among them, (T, n operated) rad.
+
+    Raises:
+        UsageError: Nothing can be rendered here; the message says what to install.
+    """
+    whole = {}
+    for method, q in qpos.items():
+        whole[method] = np.tile(robot.qpos_home, (len(q), 1))
+        whole[method][:, robot.operated_index] = q
+    base = whole["recorded"]
+    motions = tuple(Copy(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items())
+    shown = SideBySide(Sequence(meta, robot.joint_names, dt, base, base, 0 * base), robot, motions, None)
+    clip = Clip.from_start(shown, None, 8.0)
+    moment = largest_error_time(shown, clip)
+    row = min(round(moment / dt), len(base) - 2)
+    scene = Scene(shown, rows=slice(row, row + 2), flat=True, closeup=True)
+    with Camera(scene, clip, 840) as camera:
+        file = io.BytesIO()
+        camera.picture(moment).save(file, "PNG", optimize=True)
+    return file.getvalue()
+
+
+def require_writable(path: Path) -> None:
+    """Refuse an unknown file suffix, a missing folder or a missing library before any work is done."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"--render {path}: name a file that ends in {', '.join(SUFFIXES)}")
+    if not path.parent.is_dir():
+        raise UsageError(f"--render {path}: there is no folder {path.parent}; make it first")
+    if importlib.util.find_spec("PIL") is None:
+        raise UsageError("--render needs Pillow; run: pip install 'gaponet[view]'")
+    if path.suffix.lower() == ".mp4":
+        _ffmpeg()
+
+
+def write(camera: Camera, path: Path, progress: Callable[[int, int], None] = lambda i, n: None) -> int:
+    """Render to a file; a PNG shows the moment of the largest error of the first simulated copy.
+
+    Returns:
+        Number of pictures.
+    """
+    require_writable(path)
+    clip, suffix = camera.clip, path.suffix.lower()
+    hundredths = max(round(100 / clip.fps), 2)  # a GIF counts in 1/100 s, and viewers slow down below 2
+    times = clip.times(hundredths / 100 if suffix == ".gif" else 1 / clip.fps)
+
+    def pictures() -> Iterator[Image]:
+        for i, time in enumerate(times):
+            yield camera.picture(float(time))
+            progress(i + 1, len(times))
+
+    with atomic_write(path) as temporary:
+        if suffix == ".gif":
+            _write_gif(list(pictures()), temporary, 10 * hundredths)
+        elif suffix == ".mp4":
+            _write_mp4(pictures(), temporary, clip.fps, (camera.width, camera.height))
+        else:
+            camera.picture(largest_error_time(camera.scene.shown, clip)).save(temporary)
+    return 1 if suffix == ".png" else len(times)
+
+
+def _write_gif(pictures: list[Image], path: Path, milliseconds: int) -> None:
+    """Write with one palette for all frames and no dithering, which keeps the file small."""
+    from PIL.Image import Dither, Quantize, fromarray
+
+    sample = np.concatenate([np.asarray(p) for p in pictures[:: max(len(pictures) // 4, 1)]])
+    palette = fromarray(sample).quantize(GIF_COLOURS, Quantize.MAXCOVERAGE)
+    frames = [p.quantize(palette=palette, dither=Dither.NONE) for p in pictures]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True)
+
+
+def _write_mp4(pictures: Iterator[Image], path: Path, fps: float, size: tuple[int, int]) -> None:
+    writer = _ffmpeg().write_frames(str(path), size, fps=fps, quality=7, macro_block_size=2)
+    writer.send(None)
+    try:
+        for picture in pictures:
+            writer.send(picture.tobytes())
+    finally:
+        writer.close()
+
+
+def _ffmpeg() -> Any:
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise UsageError("MP4 needs imageio-ffmpeg; run: pip install 'gaponet[view]', or render a .gif") from None
+    return imageio_ffmpeg

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import mujoco
@@ -10,8 +12,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.text import escape_markdown
+from gaponet.report.methods import colour, title
 from gaponet.report.view.scene import Scene
-from gaponet.report.view.server import open_server, run_until_interrupt
 from gaponet.report.view.side_by_side import Clip, largest_error_time
 
 CURVE_ROWS = 1000  # of a chart
@@ -31,22 +33,22 @@ class Player:
         self.server, self.scene, self.clip = server, scene, clip
         self.root = server.scene.add_frame("/robots", show_axes=False)
         self.frames = self._bodies()
-        self._labels()
         self._aim()
+        self.copies = {title(m.method): m for m in scene.shown.motions if m.method != "recorded"}
         shown, worst = scene.shown, largest_error_time(scene.shown, clip)
         meta, gui = shown.real.meta, server.gui
-        self.folder = gui.add_folder(None)
+        self.folder = gui.add_folder(None, visible=len(shown.real) > 2)  # otherwise nothing moves
         with self.folder:
             heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
             heading += escape_markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
             self.title = gui.add_markdown(heading + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
-            self.playing = gui.add_checkbox("play", len(shown.real) > 2)
+            self.playing = gui.add_checkbox("play", self.folder.visible)
             self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, shown.real.dt, clip.start)
             self.worst = gui.add_button(f"Worst moment: {worst:.2f} s")
             self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
             self.table = gui.add_markdown("")
-            copies = {m.name: (1e3 * m.error, m.colour) for m in shown.motions if m.method != "recorded"}
-            draw_curves(gui, np.arange(len(shown.real)) * shown.real.dt, copies, "mean |error|, mrad")
+            curves = {name: (1e3 * m.error, colour(m.method)) for name, m in self.copies.items()}
+            draw_curves(gui, np.arange(len(shown.real)) * shown.real.dt, curves, "mean |error|, mrad")
 
         @self.worst.on_click
         def _(_: Any) -> None:
@@ -63,8 +65,7 @@ class Player:
             for body, frame in self.frames.items():
                 frame.position, frame.wxyz = scene.data.xpos[body], scene.data.xquat[body]
         row = scene.row(now)
-        errors = [(m.name, m.error[row] * 1e3, m.mpjae * 1e3) for m in scene.shown.motions if m.method != "recorded"]
-        rows = "\n".join(f"| {name} | {e:.1f} | {mean:.1f} |" for name, e, mean in errors)
+        rows = "\n".join(f"| {n} | {1e3 * m.error[row]:.1f} | {1e3 * m.mpjae:.1f} |" for n, m in self.copies.items())
         self.table.content = f"| mean error, mrad | now | whole motion |\n| --- | ---: | ---: |\n{rows}"
 
     def advance(self, elapsed: float) -> None:
@@ -90,49 +91,52 @@ class Player:
             name = "/robots/" + model.body(body).name.replace("/", "_")
             frames[body] = self.server.scene.add_frame(name, show_axes=False)
             for g in geoms:
-                vertices, faces = surface(model, int(g))
-                colour = (255 * model.geom_rgba[g, :3]).astype(int)
+                vertices, faces = _surface(model, int(g))
+                rgb = (255 * model.geom_rgba[g, :3]).astype(int)
                 self.server.scene.add_mesh_simple(
-                    f"{name}/{g}", vertices, faces, color=colour, opacity=float(model.geom_rgba[g, 3]),
+                    f"{name}/{g}", vertices, faces, color=rgb, opacity=float(model.geom_rgba[g, 3]),
                     position=model.geom_pos[g], wxyz=model.geom_quat[g],
                 )  # fmt: skip
         across = float(2.5 * self.scene.extent)
         self.server.scene.add_grid("/robots/floor", across, across, position=(0, 0, self.scene.floor))
-        return frames
-
-    def _labels(self) -> None:
         above = self.scene.view.axes[1] * 1.08 * self.scene.box[3]
         for m, base in zip(self.scene.shown.motions, self.scene.base, strict=True):
-            self.server.scene.add_label(f"/robots/label_{m.method}", m.name, position=base + above)
+            self.server.scene.add_label(f"/robots/label_{m.method}", title(m.method), position=base + above)
+        return frames
 
     def _aim(self) -> None:
-        across, up = self.scene.view.axes
+        (across, up), far = self.scene.view.axes, 2.2 + 1.2 / len(self.scene.base)  # one robot may point at the camera
         self.server.initial_camera.fov = np.radians(45)
         for camera in (self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())):
             camera.look_at = self.scene.middle
-            camera.position = self.scene.middle + 2.6 * self.scene.extent * np.cross(across, up)
+            camera.position = self.scene.middle + far * self.scene.extent * np.cross(across, up)
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:
-    """Return a new chart over time (T), s; curves: name → values (T) and colour."""
+    """Return a new chart over time (T), s, above a button that saves it; curves: name → values (T) and colour."""
     from viser.uplot import Scale, Series
 
-    rows = np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int))
-    return gui.add_uplot(
+    rows, colours = np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int)), [c for _, c in curves.values()]
+    chart = gui.add_uplot(
         (time[rows], *(values[rows] for values, _ in curves.values())),
-        (Series(label="time, s"), *(Series(label=n, stroke=colour, width=2) for n, (_, colour) in curves.items())),
+        (Series(label="time, s"), *(Series(label=n, stroke=c, width=2) for n, c in zip(curves, colours, strict=True))),
         title=title, aspect=2.2, scales={"x": Scale(time=False)},
     )  # fmt: skip
 
+    def save_chart(event: Any) -> None:
+        from gaponet.report.figures.style import draw_curves, save
 
-def serve(scene: Scene, clip: Clip, port: int, magnify: float, say: Callable[[str], None]) -> None:
-    """Serve one scene until Ctrl-C."""
-    server, address = open_server("gaponet view", port)
-    say(f"open {address} in a browser; Ctrl-C ends")
-    run_until_interrupt(server, Player(server, scene, clip, magnify).advance)
+        now, *values = chart.data
+        figure = draw_curves(now, dict(zip(curves, zip(values, colours, strict=True), strict=True)), chart.title)
+        with TemporaryDirectory() as folder:
+            for file in save(figure, Path(folder) / "curves"):
+                event.client.send_file_download(file.name, file.read_bytes())
+
+    gui.add_button("Save the curves: PNG, SVG").on_click(save_chart)
+    return chart
 
 
-def surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
+def _surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
     """Return vertices (k, 3), m in the geom's frame, and triangles (m, 3)."""
     from trimesh import creation
 

@@ -14,6 +14,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.structure import read_toml
+from gaponet.report.methods import colour as method_colour
 from gaponet.report.view.side_by_side import SideBySide
 from gaponet.robot.collision import Shapes
 from gaponet.robot.spec import RobotSpec
@@ -58,13 +59,9 @@ class Scene:
     """
 
     def __init__(
-        self,
-        shown: SideBySide,
-        view: View = View(),
-        rows: slice = slice(None),
-        flat: bool = False,
+        self, shown: SideBySide, view: View = View(), rows: slice = slice(None), flat: bool = False,
         closeup: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Build the model and fit the picture.
 
         Args:
@@ -148,7 +145,7 @@ class Scene:
         scene.compiler.degree = False
         _light(scene, self.floor, self.extent)
         for motion, place in zip(self.shown.motions, base, strict=True):
-            parts = {motion.method: (motion.colour, place)}
+            parts = {motion.method: (method_colour(motion.method), place)}
             if self.ghosts and motion.method != "recorded":
                 parts[f"{motion.method}-ghost"] = ("", place + behind)
             for prefix, (colour, pos) in parts.items():

@@ -15,7 +15,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import busiest_window
 from gaponet.data.store import Dataset, Entry
 from gaponet.report.candidate import Candidate, FittedData
-from gaponet.report.methods import colour, title
+from gaponet.report.methods import title
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import Corrector, replay
 
@@ -33,16 +33,6 @@ class Copy:
     method: str
     qpos: Array
     error: Array
-
-    @property
-    def name(self) -> str:
-        """Name of the copy for people."""
-        return title(self.method)
-
-    @property
-    def colour(self) -> str:
-        """#rrggbb."""
-        return colour(self.method)
 
     @property
     def mpjae(self) -> float:
@@ -169,11 +159,7 @@ def select_entry(
 
 
 def side_by_side(
-    dataset: Dataset,
-    entry: Entry,
-    robot: RobotSpec,
-    runs: ListOf[Path] = (),
-    progress: Progress = no_progress,
+    dataset: Dataset, entry: Entry, robot: RobotSpec, runs: ListOf[Path] = (), progress: Progress = no_progress
 ) -> SideBySide:
     """Replay a recording in the nominal simulator, in identified ones, and with each run's exported model.
 
