@@ -53,7 +53,6 @@ NOT_RUN = {
     "from gaponet_action import": "needs mjlab; make engines",
     "from actuators import": "needs mjlab, Isaac Lab and Newton; make engines",
     "mujoco_servos.Servos": "needs an exported folder; tests/export plays it",
-    "sample_robots": "needs an identified robot; test_pages",
     "gp.RemoteRobot()": "needs a run that takes live targets; tests/hw/targets",
 }
 # First words of console lines that are not gaponet's → why they are not run here.
