@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "gaponet"
 FOLDERS = sorted(p.name for p in SOURCE.iterdir() if p.is_dir() and any(p.glob("*.py")))
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-ALL_PAGES = [*PAGES, *sorted((ROOT / "docs/results").glob("*.md"))]
+ALL_PAGES = sorted((ROOT / "docs").glob("**/*.md"))
 MODEL, TRAIN, START = ModelConfig(), TrainConfig(), TRAINING.pretraining
 ONLINE = ("https://github.com/gaponet/gaponet/blob/main/", "https://raw.githubusercontent.com/gaponet/gaponet/main/")
 
@@ -35,17 +35,18 @@ def widths(layers: tuple[int, ...]) -> str:
 @pytest.mark.parametrize(
     ("page", "said"),
     [
-        ("algorithm.md", f"Branch ({widths(MODEL.branch_hidden)}, ELU) and trunk ({widths(MODEL.trunk_hidden)})"),
-        ("algorithm.md", f"(hidden layers of {widths(MODEL.sensor_hidden)})"),
-        ("algorithm.md", f"{widths(MODEL.mlp_hidden)} on the features"),
-        ("algorithm.md", f"p = {MODEL.num_basis} features"),
-        ("algorithm.md", f"m = {MODEL.num_probes} targets"),
-        ("algorithm.md", f"±{MODEL.probe_small} rad (reads gains and friction) and ±{MODEL.probe_large} rad"),
-        ("algorithm.md", f"Δ_max = {MODEL.delta_max} rad"),
-        ("algorithm.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
-        ("algorithm.md", f"Oracle answers at {TRAIN.pretraining.sensor_states} states"),
-        ("algorithm.md", f"{PRIOR_RAD} rad per unit of scale"),
-        ("benchmark.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
+        ("network.md", f"Branch ({widths(MODEL.branch_hidden)}, ELU) and trunk ({widths(MODEL.trunk_hidden)})"),
+        ("reference/paper-network.md", f"(hidden layers of {widths(MODEL.sensor_hidden)})"),
+        ("network.md", f"{widths(MODEL.mlp_hidden)} on the features"),
+        ("network.md", f"p = {MODEL.num_basis} features"),
+        ("reference/paper-network.md", f"m = {MODEL.num_probes} targets"),
+        ("reference/paper-network.md", f"Those at ±{MODEL.probe_small} rad read gains and friction"),
+        ("reference/paper-network.md", f"those at ±{MODEL.probe_large} rad read inertia"),
+        ("network.md", f"Δ_max = {MODEL.delta_max} rad"),
+        ("network.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
+        ("reference/paper-network.md", f"Oracle answers at {TRAIN.pretraining.sensor_states} states"),
+        ("identification.md", f"{PRIOR_RAD} rad per unit of scale"),
+        ("paper.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
     ],
 )  # fmt: skip
 def test_a_default_that_a_page_states_is_that_of_the_code(page, said):
@@ -54,9 +55,9 @@ def test_a_default_that_a_page_states_is_that_of_the_code(page, said):
 
 def test_words_for_fractions_are_the_code_s_too():
     assert GAINS == (3 / 4, 1 / 2, 1 / 4)
-    assert "(1, ¾, ½ or ¼)" in text("docs/algorithm.md")
+    assert "1, ¾, ½ or ¼" in text("docs/network.md")
     assert SHARED_PRIOR_RATIO == 1 / 20
-    assert "a twentieth of that" in text("docs/algorithm.md")
+    assert "a twentieth of that" in text("docs/identification.md")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

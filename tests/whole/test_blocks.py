@@ -34,20 +34,25 @@ from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name != "results.md")]
+PAGES = [
+    ROOT / "README.md",
+    *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name != "results.md"),
+    *sorted((ROOT / "docs/reference").glob("*.md")),
+]
 PATHS = {page.name: page for page in PAGES}
 WITH_PYTHON = (
     "README.md",
     "index.md",
     "api.md",
     "deploy.md",
+    "export.md",
+    "network.md",
 )  # architecture.md shows a piece of servo.py: test_newcomer.py
 # A part of a block → why it is not run here.
 NOT_RUN = {
     "from gaponet_action import": "needs mjlab; make engines",
     "from actuators import": "needs mjlab, Isaac Lab and Newton; make engines",
     "mujoco_servos.Servos": "needs an exported folder; tests/export plays it",
-    "sample_robots": "needs an identified robot; test_pages",
     "gp.RemoteRobot()": "needs a run that takes live targets; tests/hw/targets",
 }
 # First words of console lines that are not gaponet's → why they are not run here.
@@ -181,7 +186,7 @@ def in_copy(place: Path, folder: Path) -> None:
 
 def names_of_a_reader(page: str, folder: Path) -> dict[str, Any]:
     """What a page's Python blocks take from their reader: names, and run and robot folders below `folder`."""
-    if page != "deploy.md":
+    if page not in ("deploy.md", "export.md", "network.md"):
         return dict.fromkeys(("qpos", "qvel", "target"), np.zeros(5)) if page == "api.md" else {}
     robot = load_robot("h1_2")
     model = random_run(folder / "run", robot, payload_seen=(0.0, 3.0))

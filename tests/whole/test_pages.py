@@ -60,7 +60,7 @@ def play(page, heading, capsys):
 
 SECTIONS = {  # each goes on where the last ended
     "tutorial.md": "One command",
-    "deploy.md": "A policy that fails on the robot",
+    "export.md": "A policy that fails on the robot",
     "benchmark.md": "Your method on your recordings",
 }
 
@@ -77,7 +77,7 @@ def test_a_section_does_what_it_says(place, monkeypatch, capsys, page):
         assert found.delay[found.operated_index] == pytest.approx([0.04, 0.04], abs=0.008)
         here, there = map(float, re.search(r"the MJCF alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups())
         assert abs(here - there) <= 0.02 * there + 0.01
-    if page == "deploy.md":
+    if page == "export.md":
         assert "The robot would not do what the simulator did: " in said
         assert (place / "mine/arm.xml").is_file()
         assert len(np.load(place / "answer.npz")["joints"]) == 2

@@ -135,7 +135,7 @@ def pair(
     Args:
         dataset: Recordings.
         robot: Another robot than the one that the dataset keeps.
-        executor: Where they are simulated: local, ray, ray:ADDRESS (docs/scale.md), or one of concurrent.futures.
+        executor: Where they are simulated: local, ray, ray:ADDRESS (docs/install.md), or one of concurrent.futures.
 
     Raises:
         DatasetError, JointMismatchError: The folder is no dataset, or one of another robot.
@@ -173,7 +173,7 @@ def collect(
         seed: Seed of motions, noise and start states.
         nproc: Processes, or jobs at a time; 0 for one per core. More than one starts fresh interpreters: a script that
             calls this needs `if __name__ == "__main__":`.
-        executor: Where it is played: local, ray or ray:ADDRESS (docs/scale.md).
+        executor: Where it is played: local, ray or ray:ADDRESS (docs/install.md).
 
     Raises:
         UsageError: The recipe names a motion, unit or file that does not exist.

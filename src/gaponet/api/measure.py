@@ -47,7 +47,7 @@ def gap(
         run: Robot folder that `identify` wrote, or a run of `train`. The result then says how much each identified
             cause and the model reduce the error, and the floor, on motions that were not used in training; the folder
             keeps it as gap.json, gap.svg and gap.png.
-        executor: Where recordings are simulated: local, ray or ray:ADDRESS (docs/scale.md).
+        executor: Where recordings are simulated: local, ray or ray:ADDRESS (docs/install.md).
     """
     from gaponet.sim.metrics import Run, summary
     from gaponet.sim.model import model_hash

@@ -151,7 +151,7 @@ def open_pool(where: str | Executor, workers: int, threads: int) -> Iterator[Poo
             if kind != "ray":
                 raise UsageError(
                     f"--executor {where}: choose local, ray or ray:ADDRESS; "
-                    "from Python, give a concurrent.futures.Executor (docs/scale.md)"
+                    "from Python, give a concurrent.futures.Executor (docs/install.md)"
                 )
             with _child_environment(threads):
                 executor, size = _connect_ray(stack, address, workers, threads)

@@ -50,7 +50,7 @@ def check(
         out: Folder for fleet.html, adapted/ROBOT, and ROBOT.json with all its checks.
         night: Name of this check; default today's date.
         adapt: Adapt robots that drifted.
-        executor: local, ray or ray:ADDRESS (docs/scale.md); all machines must see the folders.
+        executor: local, ray or ray:ADDRESS (docs/install.md); all machines must see the folders.
         workers: Number of robots at a time; 0 for one per core.
     """
     screen = Out(json)

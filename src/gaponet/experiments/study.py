@@ -81,7 +81,7 @@ class Options:
     workers: int = 0
     """Trainings at a time, each on --threads (here 1 by default) threads; 0 for as many as there are cores."""
     executor: str = LOCAL
-    """Where they run: local, ray or ray:ADDRESS (docs/scale.md)."""
+    """Where they run: local, ray or ray:ADDRESS (docs/install.md)."""
     robot: str | None = None
     """Robot name or folder, if not the one that the dataset stores; all models correct it."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False

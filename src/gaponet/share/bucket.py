@@ -53,7 +53,7 @@ class Bucket:
         if self.scheme not in MODULES or not rest.strip("/") or "::" in rest:
             raise RemoteError(f"{self.address}: no such place; use USER/NAME, s3://, gs:// or file:// and a folder")
         if self.scheme != "file" and "@" in rest:
-            raise RemoteError(f"{self.address}: an address holds no keys; set them as docs/data-format.md says")
+            raise RemoteError(f"{self.address}: an address holds no keys; set them as docs/reference/datasets.md says")
         import_module(MODULES[self.scheme])
         import fsspec
 

@@ -26,7 +26,7 @@ def played(arm, tmp_path):
 
 
 def test_every_card_has_an_existing_robot_and_a_row_on_the_page():
-    cards, page = read_cards(CARDS), (DOCS / "recordings.md").read_text(encoding="utf-8")
+    cards, page = read_cards(CARDS), (DOCS / "reference" / "recordings.md").read_text(encoding="utf-8")
     for card in cards.set:
         robot = load_robot(ROBOTS / card.robot if card.robot not in packaged_robots() else card.robot)
         assert set(card.joints) <= set(robot.joint_names)

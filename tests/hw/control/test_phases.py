@@ -1,4 +1,4 @@
-"""The controller's state machine: every event in every phase, and the same table in docs/controller.md."""
+"""The controller's state machine: every event in every phase, and the same table in docs/reference/controller.md."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from gaponet.hw.control.phases import COMMANDING, ENDED, TRANSITION_TABLE, TRANSITIONS, Action, Phase, Trigger
 
-PAGE = Path(__file__).parents[3] / "docs" / "controller.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "controller.md"
 WAITING = (Phase.CONNECT, Phase.IDLE)
 SENDING = {Action.BLEND_IN, Action.PLAY, Action.GO_BACK, Action.RELEASE, Action.RELEASE_HERE}
 
