@@ -65,7 +65,7 @@ def test_pictures_are_listed_and_what_is_left_out(place, capsys):
 def test_export_and_import_give_the_same_recordings(place, capsys):
     run(place, capsys, "data", "export", "{}/set", "--out", "{}/lerobot")
     told = run(place, capsys, "import", "{}/lerobot", "--robot", "{}/arm", "--out", "{}/again").out
-    assert "6 sequences" in told
+    assert "6 recordings" in told
     assert "VIRTUAL robot arm, unit a, payload 0, 0.2 kg" in told
     one, other = Dataset(place / "set"), Dataset(place / "again")
     assert [e.hash for e in one.entries] == [e.hash for e in other.entries]
