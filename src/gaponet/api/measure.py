@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gaponet.api.logs import import_logs, pair, unit_recordings
-from gaponet.api.opening import (
-    Place,
-    as_dataset,
-    as_robot,
-    as_run,
-    require_commands,
-)
+from gaponet.api.opening import Place, as_dataset, as_robot, as_run, require_commands
 from gaponet.api.results import CheckResult, EvalResult, GapResult, ReplayResult
 from gaponet.base.errors import UsageError
 from gaponet.base.files import FOLDER_MARKER, write_text

@@ -135,10 +135,7 @@ class _ProgressFile:
 
 
 def run_cells(
-    cells: ListOf[Cell],
-    work: Work,
-    pool: Pool,
-    show: Callable[[Running, int], None] = lambda running, done: None,
+    cells: ListOf[Cell], work: Work, pool: Pool, show: Callable[[Running, int], None] = lambda running, done: None
 ) -> dict[str, str]:
     """Do the work of each cell in a pool. Return the failures, name → reason.
 

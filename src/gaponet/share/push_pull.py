@@ -20,17 +20,7 @@ from gaponet.base.files import FOLDER_MARKER, lock_folder, write_text
 from gaponet.data.store import Dataset
 from gaponet.share import dataset as datasets
 from gaponet.share import run as runs
-from gaponet.share.remote import (
-    FORMAT,
-    INDEX,
-    FileRecord,
-    Index,
-    Kind,
-    RemoteError,
-    download,
-    file_errors,
-    read_index,
-)
+from gaponet.share.remote import FORMAT, INDEX, FileRecord, Index, Kind, RemoteError, download, file_errors, read_index
 from gaponet.share.stream import RemoteDataset, open_remote
 
 
