@@ -119,7 +119,11 @@ def check_fleet(
             for outcome in pool.run(check_robot, jobs):
                 if outcome.error is not None and not isinstance(outcome.error, GAPONetError | OSError):
                     raise outcome.error
-                result, robot = outcome.value or _failed(name, outcome.error), outcome.job.name
+                none: Night = {
+                    "night": name, "verdict": FAILED, "advice": str(outcome.error), "moved": [], "numbers": [],
+                    "recordings": 0, "seconds": 0.0, "adapted": None, "took": 0.0,
+                }  # fmt: skip
+                result, robot = outcome.value or none, outcome.job.name
                 nights[robot] = [*(n for n in nights[robot] if n["night"] != name), result]
                 write_json(out / f"{robot}.json", nights[robot])
                 yield robot, result, len(folders)
@@ -139,11 +143,6 @@ def changed_since(nights: list[Night]) -> str:
             break
         first = night["night"]
     return first
-
-
-def _failed(name: str, error: Exception | None) -> Night:
-    return {"night": name, "verdict": FAILED, "advice": str(error), "moved": [], "numbers": [], "recordings": 0,
-            "seconds": 0.0, "adapted": None, "took": 0.0}  # fmt: skip
 
 
 def fleet_page(nights: dict[str, list[Night]], name: str) -> str:

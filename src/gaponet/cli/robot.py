@@ -202,14 +202,9 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple
         out.say(f"{spec.name} compiles and holds; see the {bad['warning']} warning(s)")
     else:
         out.say(f": {spec.name} compiles, holds its home and is stable", "ok", "bold green")
-    warnings = [f.message for f in findings if f.level in bad]
-    return _as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
-                                "findings": [vars(f) for f in findings]}  # fmt: skip
-
-
-def _as_dict(spec: RobotSpec) -> dict[str, Any]:
-    """The check as a dictionary that JSON can hold."""
     return {
+        "simulator_hash": model_hash(spec), "warnings": [f.message for f in findings if f.level in bad],
+        "findings": [vars(f) for f in findings],
         "name": spec.name, "dt": spec.dt, "timestep": spec.timestep,
         "joints": [
             {"name": name, "operated": name in spec.operated, "kp": spec.kp[i], "kd": spec.kd[i],

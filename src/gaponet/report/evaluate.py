@@ -60,14 +60,11 @@ class Evaluation:
         """Write metrics.json and trajectories.npz, which the report reads, into a run or robot folder."""
         reals = self.runs["nominal"]
         picked = evenly_spaced(list(range(len(reals))), STORED_TRAJECTORIES)
-        shown = [reals[i].meta for i in picked]
-        result = self.result | {
-            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            "shown": [
-                {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].dt}
-                for i, m in zip(picked, shown, strict=True)
-            ],
-        }
+        shown = [
+            {"motion": r.meta.motion, "unit_id": r.meta.unit_id, "payload_mass": r.meta.payload_mass, "dt": r.dt}
+            for r in (reals[i] for i in picked)
+        ]
+        result = self.result | {"date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "shown": shown}
         arrays = {}
         for row, i in enumerate(picked):
             arrays[f"{row}/recorded"] = reals[i].qpos_real

@@ -47,11 +47,7 @@ class _Evaluated(NamedTuple):
 
     @classmethod
     def read(cls, folder: Path, model: GapModel | None, robot: RobotSpec) -> _Evaluated:
-        """Read and check the folder.
-
-        Raises:
-            ModelError: A file is missing, damaged or incomplete.
-        """
+        """Read the folder; ModelError where a file is missing, damaged or incomplete."""
         own = "identified" if model is None else method(model.config.kind, robot)
         card, config = (None, {}) if model is None else (model.card, read_config(folder))
         metrics, curve = read_metrics(folder), read_progress(folder)

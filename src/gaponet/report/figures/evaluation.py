@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gaponet.base.arrays import Array
@@ -19,9 +20,6 @@ from gaponet.report.figures.style import DASHED, DOTTED, bars, figure, joint_lab
 from gaponet.report.methods import colour, shade, title
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SHOWN_S = 20.0  # of each motion, so that details are visible
 MIN_POSITION_SPAN = 0.06  # rad of a position axis, so that encoder steps of a joint at rest are not magnified
@@ -68,8 +66,7 @@ def _degrees(fig: Figure) -> Figure:
     """Add an axis in degrees on the right."""
     mrad = 1e3 * np.pi / 180
     ways: Any = (lambda y: y / mrad, lambda y: y * mrad)
-    right = fig.axes[0].secondary_yaxis("right", functions=ways)
-    right.set_ylabel("degrees")
+    fig.axes[0].secondary_yaxis("right", functions=ways).set_ylabel("degrees")
     return fig
 
 

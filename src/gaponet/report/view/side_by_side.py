@@ -79,11 +79,6 @@ class SideBySide:
         grow = lambda m: replace(m, qpos=self.real.qpos + factor * (m.qpos - self.real.qpos))  # noqa: E731
         return replace(self, motions=tuple(grow(m) for m in self.motions))
 
-    def busiest(self, seconds: float) -> float:
-        """Return the start of the part of this length with the most motion, s."""
-        rows = max(round(seconds / self.real.dt), 1)
-        return busiest_window(self.real.qpos[:, self.robot.operated_index], rows) * self.real.dt
-
 
 @dataclass(frozen=True)
 class Clip:
@@ -111,11 +106,13 @@ class Clip:
         cls, shown: SideBySide, start: float | None, duration: float, speed: float = 1.0, fps: float = 20.0
     ) -> Clip:
         """Return the part from start on, or the part with the most motion, cut at the recording's end."""
-        recorded_s = (len(shown.real) - 1) * shown.real.dt
-        begin = shown.busiest(duration) if start is None else start
-        if not 0 <= begin < recorded_s:
-            raise UsageError(f"--start is {begin:g} s; the recording lasts {recorded_s:.1f} s")
-        return cls(begin, min(duration, recorded_s - begin), speed, fps)
+        real, dt = shown.real, shown.real.dt
+        recorded_s = (len(real) - 1) * dt
+        if start is None:
+            start = dt * busiest_window(real.qpos[:, shown.robot.operated_index], max(round(duration / dt), 1))
+        if not 0 <= start < recorded_s:
+            raise UsageError(f"--start is {start:g} s; the recording lasts {recorded_s:.1f} s")
+        return cls(start, min(duration, recorded_s - start), speed, fps)
 
     @property
     def stop(self) -> float:
