@@ -15,7 +15,7 @@ NAMED = {
     "sign of command and state": ("gravity", "warning", "with its angle mirrored at elbow_flex"),
     "offset of 20 mrad": ("offset", "note", "elbow_flex rests +2"),
     "offset of 150 mrad": ("offset", "warning", "more than assembly leaves"),
-    "lag of 100 ms more": ("lag", "warning", "of that length is very long"),
+    "lag of 100 ms more": ("lag", "warning", "As a dead time this is very long"),
     "lag of one joint": ("lag", "warning", "elbow_flex lags 1"),
     "scale of 1.2": ("scale", "warning", "elbow_flex goes 1.2"),
     "spike of a state": ("jumps", "warning", "elbow_flex jumps and comes back"),
