@@ -134,14 +134,9 @@ def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Jso
 
 
 def _labels(
-    logs: Logs,
-    robot: str,
-    out: Path,
-    payloads: tuple[float, ...],
-    units: int = 1,
-    rate: float | None = None,
+    logs: Logs, robot: str, out: Path, payloads: tuple[float, ...], units: int = 1, rate: float | None = None,
     json: Json = False,
-) -> None:
+) -> None:  # fmt: skip
     """Estimate which payload each recording of one moving joint carried and which unit made it, by held torque.
 
     Args:

@@ -29,14 +29,9 @@ class MujocoAligner:
     """
 
     def __init__(
-        self,
-        model: Reference,
-        mj_model: mujoco.MjModel,
-        dt: float,
-        payload_mass: float,
-        prefix: str = "",
+        self, model: Reference, mj_model: mujoco.MjModel, dt: float, payload_mass: float, prefix: str = "",
         extrapolate: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """
         Args:
             model: The identified robot that the scene is to move like, or a trained model with its simulator.

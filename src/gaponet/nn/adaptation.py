@@ -60,13 +60,9 @@ class Adaptation:
 
     @classmethod
     def fit(
-        cls,
-        model: GapModel,
-        simulator: RobotSpec,
-        sequences: ListOf[Sequence],
-        seconds: float = 30.0,
+        cls, model: GapModel, simulator: RobotSpec, sequences: ListOf[Sequence], seconds: float = 30.0,
         progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
-    ) -> Adaptation:
+    ) -> Adaptation:  # fmt: skip
         """Fit the parameters of a unit, with the correction of a trained model.
 
         Args:

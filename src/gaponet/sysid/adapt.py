@@ -55,13 +55,9 @@ class Adapted:
 
 
 def adapt(
-    sequences: ListOf[Sequence],
-    robot: RobotSpec,
-    seconds: float = 30.0,
-    corrector: Corrector | None = None,
-    progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
-    judge: bool = False,
-) -> Adapted:
+    sequences: ListOf[Sequence], robot: RobotSpec, seconds: float = 30.0, corrector: Corrector | None = None,
+    progress: Callable[[int, int, float], None] = lambda done, total, rms: None, judge: bool = False,
+) -> Adapted:  # fmt: skip
     """Fit FIELDS of all operated joints at once.
 
     Args:

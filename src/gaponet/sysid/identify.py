@@ -42,7 +42,7 @@ from gaponet.sysid.problem import (
     fitted_fields,
     robot_fields,
     standard_errors,
-)  # fmt: skip
+)
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.servo_types import far_from_servo_type
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
@@ -107,19 +107,11 @@ class _SearchProgress:
 
 
 def identify(
-    sequences: ListOf[Sequence],
-    robot: RobotSpec,
-    validation: ListOf[Sequence] = (),
-    windows: int = WINDOWS,
-    terms: tuple[Term, ...] | None = None,
-    table: bool = True,
-    nthread: int = 0,
-    progress: Progress = lambda done, total, note: None,
-    budget: float | None = None,
-    stops: bool = False,
-    folds: int = FOLDS,
-    masses: bool = False,
-) -> Identified:
+    sequences: ListOf[Sequence], robot: RobotSpec, validation: ListOf[Sequence] = (), windows: int = WINDOWS,
+    terms: tuple[Term, ...] | None = None, table: bool = True, nthread: int = 0,
+    progress: Progress = lambda done, total, note: None, budget: float | None = None, stops: bool = False,
+    folds: int = FOLDS, masses: bool = False,
+) -> Identified:  # fmt: skip
     """Fit the parameters of all operated joints.
 
     Where fewer than three motions validate a set of joints, all recordings are fitted in the end, and cross-validation
@@ -272,13 +264,9 @@ def _with_terms(
 
 
 def _with_links(
-    wholes: ListOf[RobotFit],
-    judge: Judge,
-    start: list[Values],
-    values: list[Values],
-    gains: list[dict[str, tuple[float, float]]],
-    searches: _SearchProgress,
-) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:
+    wholes: ListOf[RobotFit], judge: Judge, start: list[Values], values: list[Values],
+    gains: list[dict[str, tuple[float, float]]], searches: _SearchProgress,
+) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:  # fmt: skip
     """Fit the links with the servos from `start`; return them and the servos' values if they are better."""
     results, fits = list[LinkResult](), [LinkFit(*one) for one in zip(wholes, start, gains, strict=True)]
     for fit in fits:

@@ -42,13 +42,9 @@ class VirtualSO101:
     """The servos on the bus; a driver opens `port`."""
 
     def __init__(
-        self,
-        robot: RobotSpec,
-        physics: Physics,
-        payload: tuple[float, str] = (0.0, "hand"),
-        link: Path | None = None,
-        frame: float | None = None,
-    ) -> None:
+        self, robot: RobotSpec, physics: Physics, payload: tuple[float, str] = (0.0, "hand"),
+        link: Path | None = None, frame: float | None = None,
+    ) -> None:  # fmt: skip
         """
         Args:
             payload: kg, and mount.

@@ -27,7 +27,7 @@ from gaponet.data.signals import (
     fast_speed,
     lowpass,
     range_before,
-)  # fmt: skip
+)
 from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec

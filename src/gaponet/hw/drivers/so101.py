@@ -82,14 +82,9 @@ class SO101Driver:
     at_stop = "lowers"
 
     def __init__(
-        self,
-        robot: RobotSpec,
-        port: str = "/dev/ttyACM0",
-        calibration: str | Path | None = None,
-        timeout: float = 0.01,
-        silent: bool = False,
-        torque_limit: list[int] | None = None,
-    ) -> None:
+        self, robot: RobotSpec, port: str = "/dev/ttyACM0", calibration: str | Path | None = None,
+        timeout: float = 0.01, silent: bool = False, torque_limit: list[int] | None = None,
+    ) -> None:  # fmt: skip
         """
         Args:
             robot: The SO-101.

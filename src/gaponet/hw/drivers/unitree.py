@@ -67,15 +67,9 @@ class UnitreeDriver:
     at_stop = "damps"
 
     def __init__(
-        self,
-        robot: RobotSpec,
-        topic: Topic = "arm_sdk",
-        joints: Joints = "arms",
-        domain: int = 0,
-        interface: str = "lo",
-        sole: bool = True,
-        silent: bool = False,
-    ) -> None:
+        self, robot: RobotSpec, topic: Topic = "arm_sdk", joints: Joints = "arms", domain: int = 0,
+        interface: str = "lo", sole: bool = True, silent: bool = False,
+    ) -> None:  # fmt: skip
         """
         Args:
             robot: The H1-2; its kp and kd before identification are sent with every command.

@@ -125,15 +125,9 @@ class LiveTargets:
     """
 
     def __init__(
-        self,
-        transport: Transport,
-        robot: RobotSpec,
-        commanded: tuple[str, ...],
-        clock: Clock,
-        dt: float,
-        speed: float,
-        config: LiveConfig = LiveConfig(),
-    ) -> None:
+        self, transport: Transport, robot: RobotSpec, commanded: tuple[str, ...], clock: Clock, dt: float,
+        speed: float, config: LiveConfig = LiveConfig(),
+    ) -> None:  # fmt: skip
         """
         Args:
             commanded: Joints that the driver commands.
