@@ -79,7 +79,7 @@ def _gap_by_cause(
     if (
         folder is not None or (candidate.folder / FOLDER_MARKER).is_file()
     ):  # a folder of the user's own is not written to
-        write_gap(table, candidate.folder, candidate.kind)
+        write_gap(table, candidate.folder)
     return GapResult(methods=table["methods"], table=table)
 
 

@@ -16,6 +16,7 @@ from gaponet.base.files import lock_folder, write_text
 from gaponet.base.result_table import MeanStd
 from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.signals import busiest_window
+from gaponet.report.candidate import is_robot
 from gaponet.report.figures.style import DASHED, DOTTED, bars, figure, joint_label, legend, save, styled
 from gaponet.report.methods import colour, shade, title
 from gaponet.robot.servo_fields import SERVO_FIELDS
@@ -159,18 +160,18 @@ def _trajectory(arrays: dict[str, Array], row: int, joints: tuple[str, ...], met
     return fig
 
 
-def _turn(command: Array, dt: float, seconds: float = 2.0) -> slice:
-    """Return the rows around the largest change of the command's speed."""
-    half = round(seconds / 2 / dt)
+def _turn(command: Array, dt: float) -> slice:
+    """Return the rows of 2 s around the largest change of the command's speed."""
+    half = round(1 / dt)
     if len(command) <= 2 * half:
         return slice(0, len(command))
     start = int(np.abs(2 * command[half:-half] - command[: -2 * half] - command[2 * half :]).argmax())
     return slice(start, start + 2 * half)
 
 
-def write_gap(gap: dict[str, Any], folder: Path, kind: str) -> None:
+def write_gap(gap: dict[str, Any], folder: Path) -> None:
     """Write the result of report.gap.gap_by_step as gap.json, gap.svg and gap.png into a robot folder or a run."""
-    with lock_folder(folder, kind):
+    with lock_folder(folder, "robot" if is_robot(folder) else "run"):
         write_text(folder / "gap.json", json.dumps(gap, indent=1) + "\n")
         save(waterfall(gap), folder / "gap")
 
