@@ -57,9 +57,12 @@ class Pool:
     threads: int = 1
 
     def run(
-        self, work: Callable[[Job], Result], jobs: Iterable[Job], on_poll: Callable[[], None] = lambda: None,
+        self,
+        work: Callable[[Job], Result],
+        jobs: Iterable[Job],
+        on_poll: Callable[[], None] = lambda: None,
         request_stop: Callable[[Job], bool] = lambda job: True,
-    ) -> Iterator[_Outcome[Job, Result]]:  # fmt: skip
+    ) -> Iterator[_Outcome[Job, Result]]:
         """Yield the outcome of each job when it ends.
 
         Args:

@@ -87,9 +87,13 @@ def validated(
 
 
 def parse_json(
-    kind: type[T], text: bytes | str, where: str | Path, error: type[GAPONetError], hint: str = "",
+    kind: type[T],
+    text: bytes | str,
+    where: str | Path,
+    error: type[GAPONetError],
+    hint: str = "",
     allow_extra: bool = False,
-) -> T:  # fmt: skip
+) -> T:
     """Convert JSON text to a value of type `kind`; arguments and error as for `validated`."""
     try:
         value = _type_adapter(cast("Any", kind)).validate_json(text, extra="allow" if allow_extra else "forbid")

@@ -77,9 +77,12 @@ def resolve_splits(dataset: Dataset, split_file: str, *rule: Any) -> Splits:
 
 
 def split_entries(
-    dataset: Dataset, holdout_units: tuple[str, ...] = (), holdout_payloads: tuple[float, ...] = (),
-    rates: tuple[float, ...] = (), train_share: float = 1.0,
-) -> Splits:  # fmt: skip
+    dataset: Dataset,
+    holdout_units: tuple[str, ...] = (),
+    holdout_payloads: tuple[float, ...] = (),
+    rates: tuple[float, ...] = (),
+    train_share: float = 1.0,
+) -> Splits:
     """Split by motion with the fixed rule, the same for all rates and shares.
 
     Where recordings hold different sets of joints, each set is split by itself. Fewer than three motions with three or

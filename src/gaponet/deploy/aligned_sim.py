@@ -30,10 +30,18 @@ class AlignedSim:
     """
 
     def __init__(
-        self, robot: RobotSpec, model: Reference | None = None, payload_mass: Array | float = 0.0,
-        payload_side: str = "both", dt: float | None = None, num_envs: int | None = None, nthread: int = 0,
-        locked: tuple[str, ...] = (), extrapolate: bool = False, simulator_payload: Array | float | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        robot: RobotSpec,
+        model: Reference | None = None,
+        payload_mass: Array | float = 0.0,
+        payload_side: str = "both",
+        dt: float | None = None,
+        num_envs: int | None = None,
+        nthread: int = 0,
+        locked: tuple[str, ...] = (),
+        extrapolate: bool = False,
+        simulator_payload: Array | float | None = None,
+    ) -> None:
         """
         Args:
             robot: The simulator. If the model was trained in another one, commands are transferred.
@@ -97,9 +105,12 @@ class AlignedSim:
         return delta[0] if self.single else delta
 
     def reset(
-        self, qpos: Array | None = None, qvel: Array | float = 0.0, ctrl: Array | None = None,
+        self,
+        qpos: Array | None = None,
+        qvel: Array | float = 0.0,
+        ctrl: Array | None = None,
         ids: Array | slice = slice(None),
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Reset simulations to a state.
 
         Args:

@@ -87,10 +87,18 @@ class Compensator:
     """
 
     def __init__(
-        self, robot: RobotSpec, model: GapModel | None = None, config: CompensatorConfig = CompensatorConfig(),
-        dt: float | None = None, num_envs: int | None = None, payload_side: str = "both", payload_step: float = 0.25,
-        nthread: int = 1, extrapolate: bool = False, adaptation: Adaptation | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        robot: RobotSpec,
+        model: GapModel | None = None,
+        config: CompensatorConfig = CompensatorConfig(),
+        dt: float | None = None,
+        num_envs: int | None = None,
+        payload_side: str = "both",
+        payload_step: float = 0.25,
+        nthread: int = 1,
+        extrapolate: bool = False,
+        adaptation: Adaptation | None = None,
+    ) -> None:
         """
         Args:
             robot: Nominal, identified or adapted parameters of the robot. With a model and aim target, the simulator of

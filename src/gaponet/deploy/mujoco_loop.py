@@ -29,9 +29,14 @@ class MujocoAligner:
     """
 
     def __init__(
-        self, model: Reference, mj_model: mujoco.MjModel, dt: float, payload_mass: float, prefix: str = "",
+        self,
+        model: Reference,
+        mj_model: mujoco.MjModel,
+        dt: float,
+        payload_mass: float,
+        prefix: str = "",
         extrapolate: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """
         Args:
             model: The identified robot that the scene is to move like, or a trained model with its simulator.

@@ -43,9 +43,14 @@ class Transfer:
     """
 
     def __init__(
-        self, reference: Reference, inverse: AnalyticInverse, conditions: list[Condition],
-        locked: tuple[str, ...] = (), nthread: int = 1, extrapolate: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        reference: Reference,
+        inverse: AnalyticInverse,
+        conditions: list[Condition],
+        locked: tuple[str, ...] = (),
+        nthread: int = 1,
+        extrapolate: bool = False,
+    ) -> None:
         """
         Args:
             reference: The model, or the simulator that the target is to move like.

@@ -203,9 +203,13 @@ def _stacked(nets: ListOf[ActuatorNet]) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _error_in_mujoco(
-    file: Path, motions: ListOf[Sequence], robot: RobotSpec, nets: dict[str, ActuatorNet], facts: dict[str, Any],
+    file: Path,
+    motions: ListOf[Sequence],
+    robot: RobotSpec,
+    nets: dict[str, ActuatorNet],
+    facts: dict[str, Any],
     gain: float,
-) -> float:  # fmt: skip
+) -> float:
     """Return the mean |error| of the networks in plain MuJoCo, rad; the scene has no servos."""
     model, op, errors = mujoco.MjModel.from_xml_path(str(file)), robot.operated_index, []
     ids = [model.joint(name).id for name in robot.joint_names]

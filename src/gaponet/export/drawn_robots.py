@@ -64,9 +64,13 @@ class DrawnRobots:
 
 
 def draw_robots(
-    robot: RobotSpec, drawn: Units, recordings: tuple[ListOf[Sequence], ListOf[Sequence]], plain: bool = False,
-    progress: Progress = no_progress, engine_terms: tuple[str, ...] = (),
-) -> DrawnRobots:  # fmt: skip
+    robot: RobotSpec,
+    drawn: Units,
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]],
+    plain: bool = False,
+    progress: Progress = no_progress,
+    engine_terms: tuple[str, ...] = (),
+) -> DrawnRobots:
     """Choose units by training motions and judge them by validation motions.
 
     The result is stored in the robot folder, and read from there if nothing changed.

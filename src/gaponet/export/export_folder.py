@@ -99,9 +99,15 @@ class ExportedFolder:
 
 
 def export_robot(
-    robot: RobotSpec, to: str, out: Path, recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None = None,
-    source: Path | None = None, prefix: str = "", payload_mass: float = 0.0, progress: Progress = no_progress,
-) -> ExportedFolder:  # fmt: skip
+    robot: RobotSpec,
+    to: str,
+    out: Path,
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None = None,
+    source: Path | None = None,
+    prefix: str = "",
+    payload_mass: float = 0.0,
+    progress: Progress = no_progress,
+) -> ExportedFolder:
     """Write a robot for an engine.
 
     Args:

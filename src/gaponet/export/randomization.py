@@ -130,9 +130,12 @@ def sample_units(
 
 
 def judge_units(
-    made: Randomization, robot: RobotSpec, recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None,
-    progress: Progress = no_progress, engine_terms: tuple[str, ...] = (),
-) -> Randomization:  # fmt: skip
+    made: Randomization,
+    robot: RobotSpec,
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None,
+    progress: Progress = no_progress,
+    engine_terms: tuple[str, ...] = (),
+) -> Randomization:
     """Choose the units that follow the robot's recordings, and state their errors (export/drawn_robots.py).
 
     Units of other days and robots are left as they are: this robot's recordings cannot judge them. The engine has the

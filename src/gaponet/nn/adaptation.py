@@ -60,9 +60,13 @@ class Adaptation:
 
     @classmethod
     def fit(
-        cls, model: GapModel, simulator: RobotSpec, sequences: ListOf[Sequence], seconds: float = 30.0,
+        cls,
+        model: GapModel,
+        simulator: RobotSpec,
+        sequences: ListOf[Sequence],
+        seconds: float = 30.0,
         progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
-    ) -> Adaptation:  # fmt: skip
+    ) -> Adaptation:
         """Fit the parameters of a unit, with the correction of a trained model.
 
         Args:

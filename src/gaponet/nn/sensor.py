@@ -20,9 +20,13 @@ class ProbeOracle:
     """Steps m copies of the simulator from each state. It is for training and rollouts, not for robots."""
 
     def __init__(
-        self, robot: RobotSpec, config: ModelConfig, conditions: list[Condition], nthread: int = 0,
+        self,
+        robot: RobotSpec,
+        config: ModelConfig,
+        conditions: list[Condition],
+        nthread: int = 0,
         locked: tuple[str, ...] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         """conditions: Payload, rate and gains of each state. States have the joints that are not in `locked`."""
         self.offsets = self.probe_offsets(config, len(robot.operated))
         self.dt, self.absolute = np.array([c[2] for c in conditions]), config.sensor_target == "absolute"

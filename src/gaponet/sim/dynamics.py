@@ -51,9 +51,12 @@ def gravity_of(robot: RobotSpec) -> Callable[[Array, float, str], Array]:
 
 
 def _gravity(
-    robot: RobotSpec, models: dict[tuple[float, str], mujoco.MjModel], qpos: Array, payload_mass: float,
+    robot: RobotSpec,
+    models: dict[tuple[float, str], mujoco.MjModel],
+    qpos: Array,
+    payload_mass: float,
     payload_side: str,
-) -> Array:  # fmt: skip
+) -> Array:
     key = (payload_mass, payload_side)
     if key not in models:
         models[key] = build_model(robot, *key)

@@ -37,9 +37,13 @@ PAYLOAD_DENSITY = 7850.0  # standard payload: a solid steel ball, kg/m³
 
 
 def build_model(
-    robot: RobotSpec, payload_mass: float = 0.0, payload_side: str = "both", dt: float | None = None,
-    locked: tuple[str, ...] = (), physics_only: bool = False,
-) -> mujoco.MjModel:  # fmt: skip
+    robot: RobotSpec,
+    payload_mass: float = 0.0,
+    payload_side: str = "both",
+    dt: float | None = None,
+    locked: tuple[str, ...] = (),
+    physics_only: bool = False,
+) -> mujoco.MjModel:
     """Return the nominal simulator of a robot with a payload.
 
     Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has. Degrees
@@ -80,9 +84,13 @@ def stiffen_friction(model: mujoco.MjModel) -> None:
 
 
 def build_spec(
-    robot: RobotSpec, payload_mass: float = 0.0, payload_side: str = "both", dt: float | None = None,
-    locked: tuple[str, ...] = (), physics_only: bool = False,
-) -> mujoco.MjSpec:  # fmt: skip
+    robot: RobotSpec,
+    payload_mass: float = 0.0,
+    payload_side: str = "both",
+    dt: float | None = None,
+    locked: tuple[str, ...] = (),
+    physics_only: bool = False,
+) -> mujoco.MjSpec:
     """Return `build_model` before compilation, for a scene of several robots (report/view/scene.py)."""
     spec = read_mjcf(robot.mjcf)
     names = sorted(j.name for j in spec.joints)

@@ -41,9 +41,14 @@ class Corrector(Protocol):
 
 
 def replay(
-    sequences: ListOf[Sequence], robot: RobotSpec, corrector: Corrector | None = None, nthread: int = 0,
-    progress: Progress = no_progress, lock_idle: bool = False, creeps: bool = False,
-) -> list[SimulatedReplay]:  # fmt: skip
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    corrector: Corrector | None = None,
+    nthread: int = 0,
+    progress: Progress = no_progress,
+    lock_idle: bool = False,
+    creeps: bool = False,
+) -> list[SimulatedReplay]:
     """Step every sequence's commands from its first recorded state (open loop).
 
     Args:
@@ -121,9 +126,12 @@ def _chunks(sequences: ListOf[Sequence], locked: list[Clamped]) -> Iterator[list
 
 
 def rollout(
-    sim: BatchSim, sequences: ListOf[Sequence], corrector: Corrector | None = None,
-    progress: Callable[[int], None] = lambda done: None, touch: Array | None = None,
-) -> Array:  # fmt: skip
+    sim: BatchSim,
+    sequences: ListOf[Sequence],
+    corrector: Corrector | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+    touch: Array | None = None,
+) -> Array:
     """Step a batch, one simulation per sequence, from the recorded start under the recorded commands.
 
     A simulation goes on from the recording after the rows of `touch`, (T, k). `progress` is called with the control
@@ -163,9 +171,13 @@ def rollout(
 
 
 def pair_dataset(
-    dataset: Dataset, robot: RobotSpec, progress: Progress = no_progress, entries: list[Entry] | None = None,
-    lock_idle: bool = False, executor: str | Executor = LOCAL,
-) -> int:  # fmt: skip
+    dataset: Dataset,
+    robot: RobotSpec,
+    progress: Progress = no_progress,
+    entries: list[Entry] | None = None,
+    lock_idle: bool = False,
+    executor: str | Executor = LOCAL,
+) -> int:
     """Replay the sequences that have no replay by this simulator yet, and store the replays; return their number.
 
     All sequences, or only some; `lock_idle` as in replay. Locally on threads of this process, else on an executor.

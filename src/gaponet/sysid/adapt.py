@@ -55,9 +55,13 @@ class Adapted:
 
 
 def adapt(
-    sequences: ListOf[Sequence], robot: RobotSpec, seconds: float = 30.0, corrector: Corrector | None = None,
-    progress: Callable[[int, int, float], None] = lambda done, total, rms: None, judge: bool = False,
-) -> Adapted:  # fmt: skip
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    seconds: float = 30.0,
+    corrector: Corrector | None = None,
+    progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
+    judge: bool = False,
+) -> Adapted:
     """Fit FIELDS of all operated joints at once.
 
     Args:

@@ -107,11 +107,19 @@ class _SearchProgress:
 
 
 def identify(
-    sequences: ListOf[Sequence], robot: RobotSpec, validation: ListOf[Sequence] = (), windows: int = WINDOWS,
-    terms: tuple[Term, ...] | None = None, table: bool = True, nthread: int = 0,
-    progress: Progress = lambda done, total, note: None, budget: float | None = None, stops: bool = False,
-    folds: int = FOLDS, masses: bool = False,
-) -> Identified:  # fmt: skip
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    validation: ListOf[Sequence] = (),
+    windows: int = WINDOWS,
+    terms: tuple[Term, ...] | None = None,
+    table: bool = True,
+    nthread: int = 0,
+    progress: Progress = lambda done, total, note: None,
+    budget: float | None = None,
+    stops: bool = False,
+    folds: int = FOLDS,
+    masses: bool = False,
+) -> Identified:
     """Fit the parameters of all operated joints.
 
     Where fewer than three motions validate a set of joints, all recordings are fitted in the end, and cross-validation
@@ -264,9 +272,13 @@ def _with_terms(
 
 
 def _with_links(
-    wholes: ListOf[RobotFit], judge: Judge, start: list[Values], values: list[Values],
-    gains: list[dict[str, tuple[float, float]]], searches: _SearchProgress,
-) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:  # fmt: skip
+    wholes: ListOf[RobotFit],
+    judge: Judge,
+    start: list[Values],
+    values: list[Values],
+    gains: list[dict[str, tuple[float, float]]],
+    searches: _SearchProgress,
+) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:
     """Fit the links with the servos from `start`; return them and the servos' values if they are better."""
     results, fits = list[LinkResult](), [LinkFit(*one) for one in zip(wholes, start, gains, strict=True)]
     for fit in fits:

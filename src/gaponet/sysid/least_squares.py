@@ -22,10 +22,15 @@ Errors = Callable[[Array], Array]  # candidates (k, n, P) → errors (k, n, m), 
 
 
 def descend(
-    x: Array, low: Array, high: Array, errors: Errors, iterations: int, progress: Progress = lambda cost: None,
+    x: Array,
+    low: Array,
+    high: Array,
+    errors: Errors,
+    iterations: int,
+    progress: Progress = lambda cost: None,
     min_decrease: float = MIN_RELATIVE_DECREASE,
     derive: Callable[[Array, Array, Errors], tuple[Array, Array]] | None = None,
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     """Minimise the soft L1 costs of n problems from S starts; return the points (S, n, P) and their costs (S, n).
 
     Problems may disturb each other a little. Where a start became worse in the sum over problems, its best earlier

@@ -68,9 +68,15 @@ class CollectResult:
 
 
 def collect(
-    robot: RobotSpec, fleet: Fleet, recipe: Recipe, out: str | Path, seed: int = 0, nproc: int = 0,
-    progress: Progress = no_progress, executor: str | Executor = LOCAL,
-) -> CollectResult:  # fmt: skip
+    robot: RobotSpec,
+    fleet: Fleet,
+    recipe: Recipe,
+    out: str | Path,
+    seed: int = 0,
+    nproc: int = 0,
+    progress: Progress = no_progress,
+    executor: str | Executor = LOCAL,
+) -> CollectResult:
     """Record every take of a recipe that the dataset at `out` lacks, with its simulated replay and the fleet's gains.
 
     Arguments and errors as of gaponet.api.collect. No folder is shared with the executor.

@@ -42,9 +42,13 @@ class VirtualSO101:
     """The servos on the bus; a driver opens `port`."""
 
     def __init__(
-        self, robot: RobotSpec, physics: Physics, payload: tuple[float, str] = (0.0, "hand"),
-        link: Path | None = None, frame: float | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        payload: tuple[float, str] = (0.0, "hand"),
+        link: Path | None = None,
+        frame: float | None = None,
+    ) -> None:
         """
         Args:
             payload: kg, and mount.

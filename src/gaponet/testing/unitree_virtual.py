@@ -39,9 +39,17 @@ class VirtualH12:
     """
 
     def __init__(
-        self, robot: RobotSpec, physics: Physics, payload: tuple[float, str] = (0.0, "both"), domain: int = 0,
-        interface: str = "lo", rate: float = 500.0, fault: FaultKind = "none", fault_at: float = 0.0, seed: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        payload: tuple[float, str] = (0.0, "both"),
+        domain: int = 0,
+        interface: str = "lo",
+        rate: float = 500.0,
+        fault: FaultKind = "none",
+        fault_at: float = 0.0,
+        seed: int = 0,
+    ) -> None:
         """
         Args:
             payload: kg per hand, and side.

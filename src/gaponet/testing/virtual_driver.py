@@ -24,9 +24,13 @@ class LiveUnit:
     """One virtual unit, stepped in equal periods without a clock; base of every virtual bus and driver."""
 
     def __init__(
-        self, robot: RobotSpec, physics: Physics, payload: tuple[float, str], seed: int = 0,
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        payload: tuple[float, str],
+        seed: int = 0,
         period: float = STATE_PERIOD_S,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """
         Args:
             payload: kg per hand, and side.
@@ -76,9 +80,15 @@ class VirtualDriver:
     qpos_range: Array | None = None
 
     def __init__(
-        self, robot: RobotSpec, physics: Physics, clock: Clock, payload: tuple[float, str] = (0.0, "both"),
-        name: str = "unit", seed: int = 0, period: float = STATE_PERIOD_S,
-    ) -> None:  # fmt: skip
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        clock: Clock,
+        payload: tuple[float, str] = (0.0, "both"),
+        name: str = "unit",
+        seed: int = 0,
+        period: float = STATE_PERIOD_S,
+    ) -> None:
         """
         Args:
             physics: Hidden parameters (testing.fleet).

@@ -38,9 +38,15 @@ class VirtualRobot:
     """N robots of one type. A row's result does not depend on the other rows, bit for bit."""
 
     def __init__(
-        self, robot: RobotSpec, units: list[Physics], payloads: list[tuple[float, str]], dt: float | None = None,
-        timestep: float | None = None, locked: tuple[str, ...] = (), nthread: int = 1,
-    ) -> None:  # fmt: skip
+        self,
+        robot: RobotSpec,
+        units: list[Physics],
+        payloads: list[tuple[float, str]],
+        dt: float | None = None,
+        timestep: float | None = None,
+        locked: tuple[str, ...] = (),
+        nthread: int = 1,
+    ) -> None:
         """
         Args:
             robot: Type of the robots; the hidden physics is added to its nominal model.
@@ -287,9 +293,13 @@ def _substeps(decimation: int, timestep: float) -> int:
 
 
 def _models(
-    robot: RobotSpec, units: list[Physics], payloads: list[tuple[float, str]], dt: float, timestep: float,
+    robot: RobotSpec,
+    units: list[Physics],
+    payloads: list[tuple[float, str]],
+    dt: float,
+    timestep: float,
     locked: tuple[str, ...],
-) -> list[mujoco.MjModel]:  # fmt: skip
+) -> list[mujoco.MjModel]:
     """Return one model per row, the same object for rows with the same unit and payload."""
     models: dict[tuple[int, float, str], mujoco.MjModel] = {}
     for unit, (mass, side) in zip(units, payloads, strict=True):

@@ -26,9 +26,13 @@ class DescriptionNeededError(LogError):
 
 
 def read_first_recording(
-    logs: Path, robot: RobotSpec, specified: Path | None = None, anyhow: bool = False, skip_bad: bool = False,
+    logs: Path,
+    robot: RobotSpec,
+    specified: Path | None = None,
+    anyhow: bool = False,
+    skip_bad: bool = False,
     **options: Any,
-) -> tuple[Log, int, str]:  # fmt: skip
+) -> tuple[Log, int, str]:
     """The first recording, how many there are, and the logs.toml that was guessed; "" where none was needed.
 
     Args:

@@ -53,9 +53,13 @@ def find(path: Path) -> list[Path]:
 
 
 def read(
-    path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None, position_unit: str | None = None,
-    joints: list[str] | None = None, ignore: list[str] | None = None,
-) -> Iterator[tuple[str, Callable[[], Log]]]:  # fmt: skip
+    path: Path,
+    robot: RobotSpec,
+    joint_map: dict[str, str] | None = None,
+    position_unit: str | None = None,
+    joints: list[str] | None = None,
+    ignore: list[str] | None = None,
+) -> Iterator[tuple[str, Callable[[], Log]]]:
     """Yield (motion name, what reads its Log) for every episode.
 
     Args:

@@ -73,9 +73,14 @@ class HoldError(Measured):
 
 
 def deliver(
-    robot: RobotSpec, unit: Physics, planner: GoalPlanner, plans: ListOf[Plan], payloads: tuple[float, ...],
-    trained: ListOf[TrainedModel], progress: Progress = lambda step, share: None,
-) -> list[HoldError]:  # fmt: skip
+    robot: RobotSpec,
+    unit: Physics,
+    planner: GoalPlanner,
+    plans: ListOf[Plan],
+    payloads: tuple[float, ...],
+    trained: ListOf[TrainedModel],
+    progress: Progress = lambda step, share: None,
+) -> list[HoldError]:
     """Execute every trajectory with every payload (kg per hand), by every method."""
     pairs, last = with_payloads(plans, payloads), round(AVERAGED_S / robot.dt)
     ctrl, mass = [p.ctrl for p, _ in pairs], [p for _, p in pairs]

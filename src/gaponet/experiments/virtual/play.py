@@ -119,9 +119,14 @@ def with_payloads(motions: ListOf[M], payloads: tuple[float, ...]) -> list[tuple
 
 
 def execute(
-    robot: RobotSpec, unit: Physics, ctrl: ListOf[Array], mass: ListOf[float], trained: ListOf[TrainedModel],
-    config: CompensatorConfig, progress: Progress = lambda step, share: None,
-) -> Iterator[tuple[str, int | None, Trajectories]]:  # fmt: skip
+    robot: RobotSpec,
+    unit: Physics,
+    ctrl: ListOf[Array],
+    mass: ListOf[float],
+    trained: ListOf[TrainedModel],
+    config: CompensatorConfig,
+    progress: Progress = lambda step, share: None,
+) -> Iterator[tuple[str, int | None, Trajectories]]:
     """Execute targets, (T, n) rad each, by every method: raw, feed-forward of robot models alone, each network.
 
     Args:
@@ -144,9 +149,13 @@ def execute(
 
 
 def _play(
-    robot: RobotSpec, unit: Physics, ctrl: ListOf[Array], mass: Array, compensator: Compensator | None,
+    robot: RobotSpec,
+    unit: Physics,
+    ctrl: ListOf[Array],
+    mass: Array,
+    compensator: Compensator | None,
     progress: Callable[[float], None],
-) -> Trajectories:  # fmt: skip
+) -> Trajectories:
     """Start at rest under the first target, then follow the targets; a motion that has ended stands still.
 
     Limbs without an operated joint stay at home: with a fixed base they share no dynamics with the others. The seed of

@@ -69,9 +69,14 @@ class Score(Measured):
 
 
 def track(
-    robot: RobotSpec, unit: Physics, unit_id: str, motions: ListOf[UnseenMotion], payloads: tuple[float, ...],
-    trained: ListOf[TrainedModel], progress: Progress = lambda step, share: None,
-) -> list[Score]:  # fmt: skip
+    robot: RobotSpec,
+    unit: Physics,
+    unit_id: str,
+    motions: ListOf[UnseenMotion],
+    payloads: tuple[float, ...],
+    trained: ListOf[TrainedModel],
+    progress: Progress = lambda step, share: None,
+) -> list[Score]:
     """Execute every motion with every payload (kg per hand), raw and compensated, and in every simulator."""
     pairs, op, rest = with_payloads(motions, payloads), robot.operated_index, round(REST_S / robot.dt)
     ctrl = [np.concatenate([np.repeat(m.ctrl[:1], rest, axis=0), m.ctrl]) for m, _ in pairs]

@@ -82,9 +82,14 @@ class SO101Driver:
     at_stop = "lowers"
 
     def __init__(
-        self, robot: RobotSpec, port: str = "/dev/ttyACM0", calibration: str | Path | None = None,
-        timeout: float = 0.01, silent: bool = False, torque_limit: list[int] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        robot: RobotSpec,
+        port: str = "/dev/ttyACM0",
+        calibration: str | Path | None = None,
+        timeout: float = 0.01,
+        silent: bool = False,
+        torque_limit: list[int] | None = None,
+    ) -> None:
         """
         Args:
             robot: The SO-101.

@@ -67,9 +67,15 @@ class UnitreeDriver:
     at_stop = "damps"
 
     def __init__(
-        self, robot: RobotSpec, topic: Topic = "arm_sdk", joints: Joints = "arms", domain: int = 0,
-        interface: str = "lo", sole: bool = True, silent: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        robot: RobotSpec,
+        topic: Topic = "arm_sdk",
+        joints: Joints = "arms",
+        domain: int = 0,
+        interface: str = "lo",
+        sole: bool = True,
+        silent: bool = False,
+    ) -> None:
         """
         Args:
             robot: The H1-2; its kp and kd before identification are sent with every command.

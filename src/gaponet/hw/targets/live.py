@@ -125,9 +125,15 @@ class LiveTargets:
     """
 
     def __init__(
-        self, transport: Transport, robot: RobotSpec, commanded: tuple[str, ...], clock: Clock, dt: float,
-        speed: float, config: LiveConfig = LiveConfig(),
-    ) -> None:  # fmt: skip
+        self,
+        transport: Transport,
+        robot: RobotSpec,
+        commanded: tuple[str, ...],
+        clock: Clock,
+        dt: float,
+        speed: float,
+        config: LiveConfig = LiveConfig(),
+    ) -> None:
         """
         Args:
             commanded: Joints that the driver commands.

@@ -112,9 +112,17 @@ class DeltaEnv:
     """
 
     def __init__(
-        self, sequences: ListOf[Sequence], robot: RobotSpec, config: ModelConfig, num_envs: int, episode_steps: int,
-        reward: RewardConfig, seed: int = 0, nthread: int = 0, device: str = "cpu",
-    ) -> None:  # fmt: skip
+        self,
+        sequences: ListOf[Sequence],
+        robot: RobotSpec,
+        config: ModelConfig,
+        num_envs: int,
+        episode_steps: int,
+        reward: RewardConfig,
+        seed: int = 0,
+        nthread: int = 0,
+        device: str = "cpu",
+    ) -> None:
         """
         Args:
             sequences: Recordings with more rows than control periods of a held correction.

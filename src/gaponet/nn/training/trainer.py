@@ -49,11 +49,19 @@ class Trainer:
     """
 
     def __init__(
-        self, dataset: Dataset, robot: RobotSpec, out: Path, config: TrainConfig, budget: Budget, *,
-        resume: bool = False, holdout_units: tuple[str, ...] = (),
-        show: Callable[[Status], None] = lambda status: None, log: tuple[str, ...] = (),
+        self,
+        dataset: Dataset,
+        robot: RobotSpec,
+        out: Path,
+        config: TrainConfig,
+        budget: Budget,
+        *,
+        resume: bool = False,
+        holdout_units: tuple[str, ...] = (),
+        show: Callable[[Status], None] = lambda status: None,
+        log: tuple[str, ...] = (),
         shared: dict[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Read the recordings and write the run's setup. All inputs are checked before training takes time.
 
         Args:
@@ -261,9 +269,14 @@ class Trainer:
         return net
 
     def _env(
-        self, num_envs: int, episode_steps: int, seed: int, *, device: str | None = None,
+        self,
+        num_envs: int,
+        episode_steps: int,
+        seed: int,
+        *,
+        device: str | None = None,
         sequences: list[Sequence] | None = None,
-    ) -> DeltaEnv:  # fmt: skip
+    ) -> DeltaEnv:
         config = self.rank_config
         return DeltaEnv(
             sequences or self.data.train, self.robot, config.model, num_envs, episode_steps, config.reward,

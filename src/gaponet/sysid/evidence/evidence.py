@@ -123,10 +123,14 @@ def evidence(
 
 
 def estimate_uncertainty(
-    robot: RobotSpec, sequences: ListOf[Sequence], judges: ListOf[Sequence],
-    covariances: Mapping[str, tuple[list[str], Array]] = {}, before: ParameterUncertainty | None = None,
-    held_out: ListOf[HeldOut] = (), nthread: int = 0,
-) -> ParameterUncertainty:  # fmt: skip
+    robot: RobotSpec,
+    sequences: ListOf[Sequence],
+    judges: ListOf[Sequence],
+    covariances: Mapping[str, tuple[list[str], Array]] = {},
+    before: ParameterUncertainty | None = None,
+    held_out: ListOf[HeldOut] = (),
+    nthread: int = 0,
+) -> ParameterUncertainty:
     """Estimate the parameter uncertainty of a robot with the values that were fitted to recordings of one robot.
 
     Args:
