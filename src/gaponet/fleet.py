@@ -31,26 +31,17 @@ MAX_NIGHTS_SHOWN = 14
 
 
 class Night(TypedDict):
-    """Result of one robot's check in one night.
-
-    Attributes:
-        verdict: Verdict of gaponet check, or FAILED.
-        advice: What to do, or why there is no verdict.
-        moved: Parameters that changed, as text; `numbers` has their joint and field.
-        seconds: Duration of the recordings, s.
-        adapted: Error before and after an adaptation, mrad.
-        took: Processor time, s.
-    """
+    """Result of one robot's check in one night."""
 
     night: str
-    verdict: str
-    advice: str
-    moved: list[str]
+    verdict: str  # verdict of gaponet check, or FAILED
+    advice: str  # what to do, or why there is no verdict
+    moved: list[str]  # parameters that changed, as text; `numbers` has their joint and field
     numbers: list[tuple[str, str]]
     recordings: int
-    seconds: float
-    adapted: tuple[float, float] | None
-    took: float
+    seconds: float  # duration of the recordings, s
+    adapted: tuple[float, float] | None  # error before and after an adaptation, mrad
+    took: float  # processor time, s
 
 
 @dataclass(frozen=True)

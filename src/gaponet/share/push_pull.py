@@ -26,19 +26,12 @@ from gaponet.share.stream import RemoteDataset, open_remote
 
 @dataclass(frozen=True)
 class TransferResult:
-    """Result of a push or a pull.
+    """Result of a push or a pull."""
 
-    Attributes:
-        kind: Dataset or run.
-        files: Number of files: all of a push, the downloaded ones of a pull.
-        size: Bytes of these files.
-        pruned: Number of deleted files of earlier pushes.
-    """
-
-    kind: Kind
-    files: int
-    size: int
-    pruned: int = 0
+    kind: Kind  # dataset or run
+    files: int  # number of files: all of a push, the downloaded ones of a pull
+    size: int  # bytes of these files
+    pruned: int = 0  # number of deleted files of earlier pushes
 
 
 def push(

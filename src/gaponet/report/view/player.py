@@ -94,7 +94,7 @@ class Player:
             for g in geoms:
                 vertices, faces = _surface(model, int(g))
                 self.server.scene.add_mesh_simple(
-                    f"{name}/{g}", vertices, faces, color=page_colour(model.geom_rgba[g, :3]),
+                    f"{name}/{g}", vertices, faces, color=_page_colour(model.geom_rgba[g, :3]),
                     opacity=float(model.geom_rgba[g, 3]), position=model.geom_pos[g], wxyz=model.geom_quat[g],
                 )  # fmt: skip
         across = float(2.5 * self.scene.extent)
@@ -112,7 +112,7 @@ class Player:
             camera.position = self.scene.middle + far * self.scene.extent * np.cross(across, up)
 
 
-def page_colour(rgb: Array) -> Array:
+def _page_colour(rgb: Array) -> Array:
     """Return a colour (3,) of 0 to 1 as one of 0 to 255 that a light and a dark page show: black becomes slate."""
     return (255 * (rgb + LIGHTER * (rgb.max() < DARK))).astype(int)
 
