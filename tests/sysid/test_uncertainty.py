@@ -18,7 +18,7 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.evidence.drift import drift
 from gaponet.sysid.evidence.evidence import estimate_uncertainty
-from gaponet.sysid.uncertainty import OLD_KEYS, ParameterUncertainty, from_axes
+from gaponet.sysid.uncertainty import OLD_KEYS, ParameterUncertainty, from_axes, sentences, table_rows
 
 TRUE = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
 
@@ -78,6 +78,18 @@ def test_uncertainty_has_sources_values_and_a_consistent_covariance(arm, folder)
         spread = np.std([from_axes(mine.fields, drawn)[f] for f in mine.fields], axis=1)
         np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.1)
         assert mine.joints[joint].residual_rms < 2e-3
+
+
+def test_a_value_that_no_log_shows_is_explained(folder):
+    mine = ParameterUncertainty.load(load_robot(folder))
+    shoulder = mine.joints["shoulder"]
+    vague = replace(
+        shoulder, covariance=(100 * np.array(shoulder.covariance) + 1e3 * np.eye(len(mine.fields))).tolist()
+    )
+    vague = replace(mine, joints=mine.joints | {"shoulder": vague})
+    for one, shown in ((mine, False), (vague, True)):
+        assert any("(not seen)" in cell for row in table_rows(one, ("kp",)) for cell in row) is shown
+        assert any(line.startswith("not seen: ") for line in sentences(one)) is shown
 
 
 def test_a_parameter_without_information_keeps_its_prior_std(arm):
