@@ -213,15 +213,11 @@ class JointSummary:
         """Return the standard error over the value, or over the field's large value."""
         return self.errors[field] / max(SERVO_FIELDS[field].large_value or abs(self.values[field]), 1e-9)
 
-    def unobserved(self, field: str) -> bool:
-        """Return true if the logs show no effect of the field."""
-        return self.relative_error(field) > UNOBSERVED_RELATIVE_ERROR[self.values[field] != 0]
-
     def cell(self, field: str) -> str:
         """Return the value with its uncertainty as text; no uncertainty where the logs say nothing."""
-        value = self.values[field] * SERVO_FIELDS[field].factor
-        if self.unobserved(field):
-            return f"{value:.3g} (not seen)" if value else "none seen"
+        value, relative = self.values[field] * SERVO_FIELDS[field].factor, self.relative_error(field)
+        if relative > UNOBSERVED_RELATIVE_ERROR[value != 0]:
+            return f"{value:.3g} (no log shows it)" if value else "none seen"
         return format_uncertainty(value, self.errors[field] * SERVO_FIELDS[field].factor)
 
 
@@ -267,14 +263,10 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
         days = ", ".join(s["days"]) or "date unknown"
         logs = f"{len(s['logs'])} log{'s' * (len(s['logs']) != 1)}"
         lines.append(f"{s['made_by']}: {logs} of {s['unit']}, {s['seconds']:.0f} s, {days}")
-    summaries = {joint: summarize(uncertainty, joint) for joint in uncertainty.joints}
-    for joint, one in summaries.items():
-        for *some, last in one.sets:
+    for joint in uncertainty.joints:
+        for *some, last in summarize(uncertainty, joint).sets:
             lines.append(f"{joint}: the logs determine only {', '.join(some)} and {last} together; change none alone")
     joints = uncertainty.joints
-    if any(one.values[f] and one.unobserved(f) for one in summaries.values() for f in one.values):
-        factor = UNOBSERVED_RELATIVE_ERROR[True]
-        lines.append(f"not seen: the standard error exceeds {factor:g} times the value; these logs show no such effect")
     worst = max(joints, key=lambda j: joints[j].residual_rms)
     judges = "were not fitted" if uncertainty.validated else "were fitted, since no others were there"
     lines.append(
