@@ -45,7 +45,7 @@ def widths(layers: tuple[int, ...]) -> str:
         ("network.md", f"Δ_max = {MODEL.delta_max} rad"),
         ("network.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
         ("reference/paper-network.md", f"Oracle answers at {TRAIN.pretraining.sensor_states} states"),
-        ("identification.md", f"{PRIOR_RAD} rad per unit of scale"),
+        ("identification.md", f"an error of {PRIOR_RAD} rad"),
         ("paper.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
     ],
 )  # fmt: skip

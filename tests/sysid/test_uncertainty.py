@@ -18,7 +18,7 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.evidence.drift import drift
 from gaponet.sysid.evidence.evidence import estimate_uncertainty
-from gaponet.sysid.uncertainty import OLD_KEYS, ParameterUncertainty, from_axes
+from gaponet.sysid.uncertainty import OLD_KEYS, JointSummary, ParameterUncertainty, from_axes
 
 TRUE = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
 
@@ -78,6 +78,15 @@ def test_uncertainty_has_sources_values_and_a_consistent_covariance(arm, folder)
         spread = np.std([from_axes(mine.fields, drawn)[f] for f in mine.fields], axis=1)
         np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.1)
         assert mine.joints[joint].residual_rms < 2e-3
+
+
+def test_a_value_is_shown_without_its_error_where_no_log_shows_it():
+    def cell(value, error):
+        return JointSummary({"kp": value}, {"kp": error}).cell("kp")
+
+    assert cell(16.0, 40.0) == "16 ± 40"
+    assert cell(16.0, 50.0) == "16 (no log shows it)"
+    assert cell(0.0, 50.0) == "none seen"
 
 
 def test_a_parameter_without_information_keeps_its_prior_std(arm):

@@ -208,7 +208,7 @@ class JointSummary:
         """Return the value with its uncertainty as text; no uncertainty where the logs say nothing."""
         value, relative = self.values[field] * SERVO_FIELDS[field].factor, self.relative_error(field)
         if relative > UNOBSERVED_RELATIVE_ERROR[value != 0]:
-            return f"{value:.3g} (not seen)" if value else "none seen"
+            return f"{value:.3g} (no log shows it)" if value else "none seen"
         return format_uncertainty(value, self.errors[field] * SERVO_FIELDS[field].factor)
 
 
