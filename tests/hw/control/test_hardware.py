@@ -95,7 +95,8 @@ def test_an_identified_stop_does_not_widen_a_range(h1_2):
     [({"offset": 0.11}, "offset of .* is 0.11 rad"), ({"offset": np.nan}, "offset"), ({"kp": 0.0}, "kp of .* is 0 N"),
      ({"kp": 24.0}, "hardware takes 25 to 400"), ({"kp": 401.0}, "kp"), ({"zero": -0.2}, "zero of .* is -0.2 rad"),
      ({"frictionloss": 21.0}, "21 N·m; hardware takes 0 to 20"), ({"damping": 101.0}, "damping"),
-     ({"armature": 9.1}, "armature"), ({"stribeck": 11.0}, "stribeck"), ({"delay": 0.2}, "delay"), ({"backlash": 0.2}, "backlash")],
+     ({"armature": 9.1}, "armature"), ({"stribeck": 11.0}, "stribeck"), ({"delay": 0.2}, "delay"),
+     ({"backlash": 0.2}, "backlash")],
 )  # fmt: skip
 def test_identified_values_beyond_what_servos_have_are_refused_on_hardware(h1_2, values, said):
     with pytest.raises(RobotError, match=said):
