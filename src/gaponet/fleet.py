@@ -31,26 +31,17 @@ MAX_NIGHTS_SHOWN = 14
 
 
 class Night(TypedDict):
-    """Result of one robot's check in one night.
-
-    Attributes:
-        verdict: Verdict of gaponet check, or FAILED.
-        advice: What to do, or why there is no verdict.
-        moved: Parameters that changed, as text; `numbers` has their joint and field.
-        seconds: Duration of the recordings, s.
-        adapted: Error before and after an adaptation, mrad.
-        took: Processor time, s.
-    """
+    """Result of one robot's check in one night."""
 
     night: str
-    verdict: str
-    advice: str
-    moved: list[str]
+    verdict: str  # verdict of gaponet check, or FAILED
+    advice: str  # what to do, or why there is no verdict
+    moved: list[str]  # parameters that changed, as text; `numbers` has their joint and field
     numbers: list[tuple[str, str]]
     recordings: int
-    seconds: float
-    adapted: tuple[float, float] | None
-    took: float
+    seconds: float  # duration of the recordings, s
+    adapted: tuple[float, float] | None  # error before and after an adaptation, mrad
+    took: float  # processor time, s
 
 
 @dataclass(frozen=True)
@@ -119,7 +110,11 @@ def check_fleet(
             for outcome in pool.run(check_robot, jobs):
                 if outcome.error is not None and not isinstance(outcome.error, GAPONetError | OSError):
                     raise outcome.error
-                result, robot = outcome.value or _failed(name, outcome.error), outcome.job.name
+                none: Night = {
+                    "night": name, "verdict": FAILED, "advice": str(outcome.error), "moved": [], "numbers": [],
+                    "recordings": 0, "seconds": 0.0, "adapted": None, "took": 0.0,
+                }  # fmt: skip
+                result, robot = outcome.value or none, outcome.job.name
                 nights[robot] = [*(n for n in nights[robot] if n["night"] != name), result]
                 write_json(out / f"{robot}.json", nights[robot])
                 yield robot, result, len(folders)
@@ -139,11 +134,6 @@ def changed_since(nights: list[Night]) -> str:
             break
         first = night["night"]
     return first
-
-
-def _failed(name: str, error: Exception | None) -> Night:
-    return {"night": name, "verdict": FAILED, "advice": str(error), "moved": [], "numbers": [], "recordings": 0,
-            "seconds": 0.0, "adapted": None, "took": 0.0}  # fmt: skip
 
 
 def fleet_page(nights: dict[str, list[Night]], name: str) -> str:

@@ -357,10 +357,7 @@ def adapt_robot(
 
     folder, spec = Path(out), as_robot(Path(robot) if isinstance(robot, str) and "/" in robot else robot)
     uncertainty = ParameterUncertainty.load(spec)
-    with (
-        lock_folder(folder, "robot"),
-        unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
-    ):
+    with lock_folder(folder, "robot"), unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences):
         fitted = adapt(sequences, spec, seconds, None, _window_rms(progress), judge=True)
         if not fitted.accepted:
             before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)

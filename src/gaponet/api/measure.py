@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gaponet.api.logs import import_logs, pair, unit_recordings
-from gaponet.api.opening import (
-    Place,
-    as_dataset,
-    as_robot,
-    as_run,
-    require_commands,
-)
+from gaponet.api.opening import Place, as_dataset, as_robot, as_run, require_commands
 from gaponet.api.results import CheckResult, EvalResult, GapResult, ReplayResult
 from gaponet.base.errors import UsageError
 from gaponet.base.files import FOLDER_MARKER, write_text
@@ -85,7 +79,7 @@ def _gap_by_cause(
     if (
         folder is not None or (candidate.folder / FOLDER_MARKER).is_file()
     ):  # a folder of the user's own is not written to
-        write_gap(table, candidate.folder, candidate.kind)
+        write_gap(table, candidate.folder)
     return GapResult(methods=table["methods"], table=table)
 
 

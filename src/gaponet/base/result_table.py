@@ -16,16 +16,11 @@ from gaponet.base.text import escape_markdown
 
 @dataclass(frozen=True)
 class MeanStd:
-    """Mean and standard deviation of repeated measurements.
-
-    Attributes:
-        std: Standard deviation of the sample (n − 1); NaN for a single value.
-        count: Number of values.
-    """
+    """Mean and standard deviation of repeated measurements."""
 
     mean: float
-    std: float
-    count: int
+    std: float  # standard deviation of the sample (n − 1); NaN for a single value
+    count: int  # number of values
 
     @classmethod
     def from_values(cls, values: Iterable[float], scale: float = 1.0) -> MeanStd:
@@ -42,21 +37,14 @@ class MeanStd:
 
 @dataclass(frozen=True)
 class ResultTable:
-    """Table of results; the first column names the row.
-
-    Attributes:
-        columns: Headings with their units, such as "MPJAE, mrad".
-        rows: Cells: text, numbers, MeanStd, or None for a blank.
-        digits: Digits behind the decimal point in text; CSV and JSON have full precision.
-        shown: False for a table that is written as CSV only.
-    """
+    """Table of results; the first column names the row."""
 
     name: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]
+    columns: tuple[str, ...]  # headings with their units, such as "MPJAE, mrad"
+    rows: tuple[tuple[Any, ...], ...]  # cells: text, numbers, MeanStd, or None for a blank
     caption: str = ""
-    digits: int = 2
-    shown: bool = True
+    digits: int = 2  # digits behind the decimal point in text; CSV and JSON have full precision
+    shown: bool = True  # False for a table that is written as CSV only
 
     def __post_init__(self) -> None:
         for row in self.rows:

@@ -27,17 +27,10 @@ Logs = Annotated[
 
 @like(api.adapt_model)
 def adapt(
-    run: Known,
-    dataset: Logs,
-    out: Path | None = None,
-    unit: Unit = "",
-    motions: tuple[str, ...] = (),
-    seconds: float = 30.0,
-    payload_mass: float | None = None,
-    robot: Robot = None,
-    mixed_gains: Flag = False,
+    run: Known, dataset: Logs, out: Path | None = None, unit: Unit = "", motions: tuple[str, ...] = (),
+    seconds: float = 30.0, payload_mass: float | None = None, robot: Robot = None, mixed_gains: Flag = False,
     json: Json = False,
-) -> None:
+) -> None:  # fmt: skip
     """Adapt an identified robot to another unit or day with short logs.
 
     For a robot folder, a new robot folder is written: gaponet adapt ./my_robot LOGS --out ./my_robot_today. For a run,

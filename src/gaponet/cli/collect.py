@@ -12,17 +12,9 @@ from gaponet.cli.out import Out
 
 @like(api.collect)
 def collect(
-    out: Path,
-    robot: str = "h1_2",
-    fleet: str = "hard",
-    recipe: str = "small",
-    payloads: tuple[float, ...] = (),
-    units: tuple[str, ...] = (),
-    seed: int = 0,
-    nproc: int = 0,
-    executor: str = "local",
-    json: Json = False,
-) -> None:
+    out: Path, robot: str = "h1_2", fleet: str = "hard", recipe: str = "small", payloads: tuple[float, ...] = (),
+    units: tuple[str, ...] = (), seed: int = 0, nproc: int = 0, executor: str = "local", json: Json = False,
+) -> None:  # fmt: skip
     """Record motions of VIRTUAL robots into a dataset.
 
     Run again after an interruption: recordings that exist stay, missing ones are recorded, and the result is the same.

@@ -61,8 +61,12 @@ def _split(
         require_distinct_samples(data, parts, update)
     path = write_split(data, parts, by, holdout)
     rows: dict[str, dict[str, Any]] = {
-        part: count_entries(entries) | _members(entries) for part, entries in parts.items()
-    }
+        part: count_entries(entries) | {
+            "units": sorted({e.meta.unit_id for e in entries}),
+            "payloads_kg": [f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries})],
+        }
+        for part, entries in parts.items()
+    }  # fmt: skip
     columns = ["part", "sequences", "hours", "frames", "motions", "units", "payloads, kg"]
     virtual = ", VIRTUAL robots" if any(e.meta.virtual for e in data.entries) else ""
     out.table(f"{data.path.name} by {by}{virtual}; parts share no recording", columns, [
@@ -130,14 +134,9 @@ def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Jso
 
 
 def _labels(
-    logs: Logs,
-    robot: str,
-    out: Path,
-    payloads: tuple[float, ...],
-    units: int = 1,
-    rate: float | None = None,
+    logs: Logs, robot: str, out: Path, payloads: tuple[float, ...], units: int = 1, rate: float | None = None,
     json: Json = False,
-) -> None:
+) -> None:  # fmt: skip
     """Estimate which payload each recording of one moving joint carried and which unit made it, by held torque.
 
     Args:
@@ -192,11 +191,3 @@ def _show_card(out: Out, made: dict[str, Any]) -> None:
     for name in ("licence", "source"):
         ask = f"; set it with gaponet data card DIR --{name} …" if made[name] == NOT_STATED else ""
         out.say(f"{name}: {made[name]}{ask}")
-
-
-def _members(entries: list[Any]) -> dict[str, list[str]]:
-    """Which units and payloads."""
-    return {
-        "units": sorted({e.meta.unit_id for e in entries}),
-        "payloads_kg": [f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries})],
-    }

@@ -25,13 +25,9 @@ QUICK = PretrainingConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200
 
 @writes("demo")
 def demo(
-    data: Path | None = None,
-    robot: str = "h1_2",
-    out: Path = Path("demo_run"),
-    budget: str = "60s",
-    network: str = "40s",
-    json: Json = False,
-) -> None:
+    data: Path | None = None, robot: str = "h1_2", out: Path = Path("demo_run"), budget: str = "60s",
+    network: str = "40s", json: Json = False,
+) -> None:  # fmt: skip
     """Run all steps in minutes, on VIRTUAL robots or on your logs.
 
     Args:

@@ -19,16 +19,10 @@ from gaponet.robot.spec import load_robot
 
 @writes("motions")
 def excite(
-    out: Path,
-    robot: str = "",
-    known: Annotated[Path | None, tyro.conf.arg(name="for")] = None,
-    minutes: float | None = None,
-    payloads: tuple[float, ...] = (0.0,),
-    rate: float = 50.0,
-    format: Literal["txt", "csv", "npz"] = "txt",
-    seed: int = 0,
-    json: Json = False,
-) -> None:
+    out: Path, robot: str = "", known: Annotated[Path | None, tyro.conf.arg(name="for")] = None,
+    minutes: float | None = None, payloads: tuple[float, ...] = (0.0,), rate: float = 50.0,
+    format: Literal["txt", "csv", "npz"] = "txt", seed: int = 0, json: Json = False,
+) -> None:  # fmt: skip
     """Write the motions to play on a robot: first, or next.
 
     Without data, give --robot NAME. For an identified robot, --for FOLDER chooses the motions that add most information

@@ -135,14 +135,10 @@ def _show_result(result: Result, out: Path, screen: Out) -> None:
 
 
 def real(
-    data: Path | None = None,
-    out: Path = Path("bench_real"),
-    sets: tuple[str, ...] = (),
-    questions: tuple[str, ...] = (),
-    method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    networks: int = 0,
-    json: Json = False,
-) -> None:
+    data: Path | None = None, out: Path = Path("bench_real"), sets: tuple[str, ...] = (),
+    questions: tuple[str, ...] = (), method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    networks: int = 0, json: Json = False,
+) -> None:  # fmt: skip
     """Compare methods on public recordings of real robots.
 
     Args:

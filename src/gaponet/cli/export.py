@@ -28,20 +28,12 @@ Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of ga
 
 @like(api.export_robot)
 def export(
-    robot: Holder,
-    to: RobotTarget | NetworkTarget | Literal["randomization", "lerobot"] = "onnx",
-    out: Path | None = None,
-    data: str | None = None,
-    into: Path | None = None,
-    prefix: str = "",
-    payload_mass: float = 0.0,
-    engine: Literal["json", "mujoco", "mjlab", "isaaclab"] = "json",
-    scope: Literal["today", "any-day", "any-robot"] = "today",
-    units: tuple[Path, ...] = (),
-    dynamics: Flag = False,
-    remove: Flag = False,
-    json: Json = False,
-) -> None:
+    robot: Holder, to: RobotTarget | NetworkTarget | Literal["randomization", "lerobot"] = "onnx",
+    out: Path | None = None, data: str | None = None, into: Path | None = None, prefix: str = "",
+    payload_mass: float = 0.0, engine: Literal["json", "mujoco", "mjlab", "isaaclab"] = "json",
+    scope: Literal["today", "any-day", "any-robot"] = "today", units: tuple[Path, ...] = (), dynamics: Flag = False,
+    remove: Flag = False, json: Json = False,
+) -> None:  # fmt: skip
     """Write an identified robot or a network for another program.
 
     Args:

@@ -28,23 +28,11 @@ UNDETERMINED = "not determined by these logs"
 @writes("robot")
 @options.like(api.identify)
 def identify(
-    dataset: Source,
-    out: Path,
-    windows: int = 40,
-    terms: tuple[Term, ...] | None = None,
-    table: bool = True,
-    threads: int = 0,
-    budget: str | None = None,
-    stops: Flag = False,
-    masses: Flag = False,
-    current: Flag = False,
-    details: Flag = False,
-    robot: Robot = None,
-    like: str | None = None,
-    units: tuple[str, ...] = (),
-    holdout_units: tuple[str, ...] = (),
-    json: Json = False,
-) -> None:
+    dataset: Source, out: Path, windows: int = 40, terms: tuple[Term, ...] | None = None, table: bool = True,
+    threads: int = 0, budget: str | None = None, stops: Flag = False, masses: Flag = False, current: Flag = False,
+    details: Flag = False, robot: Robot = None, like: str | None = None, units: tuple[str, ...] = (),
+    holdout_units: tuple[str, ...] = (), json: Json = False,
+) -> None:  # fmt: skip
     """Fit the simulator's servos to logs and write a robot folder.
 
     Gains, damping, friction, armature, zero offsets and delays are fitted to the training motions. For a robot that is

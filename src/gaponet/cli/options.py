@@ -25,8 +25,7 @@ Source = Annotated[
 ]
 Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.", metavar="RUN")]
 Known = Annotated[
-    Folder,
-    tyro.conf.arg(help="Robot folder of gaponet identify, or run folder of gaponet train.", metavar="ROBOT|RUN"),
+    Folder, tyro.conf.arg(help="Robot folder of gaponet identify, or run folder of gaponet train.", metavar="ROBOT|RUN")
 ]
 Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these motions.")]
 Robot = Annotated[

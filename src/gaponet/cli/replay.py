@@ -15,14 +15,9 @@ from gaponet.report.tables import mrad
 
 @like(api.replay)
 def replay(
-    logs: Logs,
-    robot: Path,
-    data: str | None = None,
-    described: Path | None = None,
-    payload_mass: float = 0.0,
-    out: Path | None = None,
-    json: Json = False,
-) -> None:
+    logs: Logs, robot: Path, data: str | None = None, described: Path | None = None, payload_mass: float = 0.0,
+    out: Path | None = None, json: Json = False,
+) -> None:  # fmt: skip
     """Will a policy transfer? Predict the robot in its rollout.
 
     The rollout is a log of your simulator (targets as commands, and states) in any format that gaponet import reads.

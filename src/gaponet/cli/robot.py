@@ -37,14 +37,9 @@ def list_robots(json: Json = False) -> None:
 
 
 def link(
-    robot: tyro.conf.Positional[str] = "",
-    driver: Literal["unitree", "so101"] = "unitree",
-    domain: int = 0,
-    interface: str = "lo",
-    port: str = "/dev/ttyACM0",
-    seconds: float = 5.0,
-    json: Json = False,
-) -> None:
+    robot: tyro.conf.Positional[str] = "", driver: Literal["unitree", "so101"] = "unitree", domain: int = 0,
+    interface: str = "lo", port: str = "/dev/ttyACM0", seconds: float = 5.0, json: Json = False,
+) -> None:  # fmt: skip
     """Listen to a robot without moving it: rate and age of its states, and the programs that publish commands.
 
     Args:
@@ -98,20 +93,10 @@ def check(
 
 
 def new(
-    model: Model,
-    out: Path,
-    joints: tuple[str, ...] = (),
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
-    effort_limit: tuple[str, ...] = (),
-    servo: tuple[str, ...] = (),
-    packages: tuple[str, ...] = (),
-    rate: float = 50.0,
-    keyframe: str = "",
-    contacts: Flag = False,
-    name: str = "",
-    json: Json = False,
-) -> None:
+    model: Model, out: Path, joints: tuple[str, ...] = (), kp: tuple[str, ...] = (), kd: tuple[str, ...] = (),
+    effort_limit: tuple[str, ...] = (), servo: tuple[str, ...] = (), packages: tuple[str, ...] = (),
+    rate: float = 50.0, keyframe: str = "", contacts: Flag = False, name: str = "", json: Json = False,
+) -> None:  # fmt: skip
     """Make a robot folder from a vendor's MJCF or URDF, with the source of every number, and check it.
 
     Args:
@@ -202,14 +187,9 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple
         out.say(f"{spec.name} compiles and holds; see the {bad['warning']} warning(s)")
     else:
         out.say(f": {spec.name} compiles, holds its home and is stable", "ok", "bold green")
-    warnings = [f.message for f in findings if f.level in bad]
-    return _as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
-                                "findings": [vars(f) for f in findings]}  # fmt: skip
-
-
-def _as_dict(spec: RobotSpec) -> dict[str, Any]:
-    """The check as a dictionary that JSON can hold."""
     return {
+        "simulator_hash": model_hash(spec), "warnings": [f.message for f in findings if f.level in bad],
+        "findings": [vars(f) for f in findings],
         "name": spec.name, "dt": spec.dt, "timestep": spec.timestep,
         "joints": [
             {"name": name, "operated": name in spec.operated, "kp": spec.kp[i], "kd": spec.kd[i],
@@ -271,12 +251,9 @@ def show(
 
 
 def servos(
-    name: tyro.conf.Positional[str] = "",
-    measured: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = (),
-    source: str = "",
-    licence: str = "",
-    json: Json = False,
-) -> None:
+    name: tyro.conf.Positional[str] = "", measured: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = (),
+    source: str = "", licence: str = "", json: Json = False,
+) -> None:  # fmt: skip
     """Servo types: limits, measured values (median, and 5 to 95 % of joints with their standard errors), and sources.
 
     Args:

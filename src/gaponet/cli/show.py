@@ -25,10 +25,7 @@ def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path |
 def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GROUPS) -> None:
     """The tables of gap and eval: totals by method, then by each group."""
     methods, kind = result["methods"], "VIRTUAL robot" if result["virtual"] else "real robot"
-    out.say(
-        f", {kind}, {result['sequences']} recordings, open-loop rollouts of whole motions",
-        result["robot"],
-    )
+    out.say(f", {kind}, {result['sequences']} recordings, open-loop rollouts of whole motions", result["robot"])
     whole = totals(methods)
     out.show("Error of each method", ResultTable("", whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
     for group in groups:

@@ -86,14 +86,9 @@ def train(
 
 @like(api.evaluate)
 def evaluate(
-    run: Known,
-    dataset: Source,
-    also: tuple[Path, ...] = (),
-    motions: Motions = (),
-    robot: Robot = None,
-    units: tuple[str, ...] = (),
-    json: Json = False,
-) -> None:
+    run: Known, dataset: Source, also: tuple[Path, ...] = (), motions: Motions = (), robot: Robot = None,
+    units: tuple[str, ...] = (), json: Json = False,
+) -> None:  # fmt: skip
     """Measure robots and runs on motions that they never saw."""
     out = Out(json)
     with progress_bar("evaluating") as update:

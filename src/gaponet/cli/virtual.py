@@ -22,22 +22,11 @@ if TYPE_CHECKING:
 
 
 def virtual(
-    action: tyro.conf.Positional[Literal["serve"]],
-    robot: str = "h1_2",
-    unit: str = "4",
-    payload_mass: float = 0.0,
-    payload_side: str = "both",
-    fleet: str = "hard",
-    domain: int = 0,
-    interface: str = "lo",
-    rate: float = 500.0,
-    seconds: float | None = None,
-    fault: FaultKind = "none",
-    fault_at: float = 2.0,
-    link: Path | None = None,
-    calibration: Path | None = None,
-    frame: float | None = None,
-) -> None:
+    action: tyro.conf.Positional[Literal["serve"]], robot: str = "h1_2", unit: str = "4", payload_mass: float = 0.0,
+    payload_side: str = "both", fleet: str = "hard", domain: int = 0, interface: str = "lo", rate: float = 500.0,
+    seconds: float | None = None, fault: FaultKind = "none", fault_at: float = 2.0, link: Path | None = None,
+    calibration: Path | None = None, frame: float | None = None,
+) -> None:  # fmt: skip
     """Serve a VIRTUAL robot on a real bus, for run and record.
 
     Args:

@@ -45,18 +45,13 @@ def read_record(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Cell:
-    """One model and seed: a run folder with its set-up (setup.json) and its outcome (cell.json).
-
-    Attributes:
-        dataset: Folder or address.
-        robot: The simulator that the model corrects.
-    """
+    """One model and seed: a run folder with its set-up (setup.json) and its outcome (cell.json)."""
 
     variant: Variant
     seed: int
     folder: Path
-    dataset: str
-    robot: RobotSpec
+    dataset: str  # folder or address
+    robot: RobotSpec  # the simulator that the model corrects
     budget: str
     holdout_units: tuple[str, ...]
     threads: int
@@ -135,10 +130,7 @@ class _ProgressFile:
 
 
 def run_cells(
-    cells: ListOf[Cell],
-    work: Work,
-    pool: Pool,
-    show: Callable[[Running, int], None] = lambda running, done: None,
+    cells: ListOf[Cell], work: Work, pool: Pool, show: Callable[[Running, int], None] = lambda running, done: None
 ) -> dict[str, str]:
     """Do the work of each cell in a pool. Return the failures, name → reason.
 

@@ -72,11 +72,7 @@ class Compare:
             f"over {seeds} seed{'s' if seeds > 1 else ''}."
         )
         columns = ("method", "seed", "units", "group", "key", *MEASURES)
-        tables = [
-            ResultTable("all", columns, tuple(_long_rows(runs)), shown=False),
-            _totals(runs),
-            _groups(runs),
-        ]
+        tables = [ResultTable("all", columns, tuple(_long_rows(runs)), shown=False), _totals(runs), _groups(runs)]
         return outcomes.result(
             study, "compare", "Comparison", tables, {"compare": _figure(runs, study.label)}, sentences=[heading],
             motions=sorted({e.meta.motion for e in entries}), unseen=unseen, sequences=len(entries),

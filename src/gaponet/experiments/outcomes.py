@@ -129,17 +129,11 @@ def _by_group(
 
 @dataclass(frozen=True)
 class StudyOutcomes:
-    """Outcomes of the finished cells by model word.
+    """Outcomes of the finished cells by model word."""
 
-    Attributes:
-        runs: Outcome of each finished seed, as its cell.json holds it.
-        baselines: Return the outcomes of the baselines on the test motions of a model word.
-        cells: The finished cells.
-    """
-
-    runs: Mapping[str, ListOf[Outcome]]
-    baselines: Callable[[str], Outcome]
-    cells: Mapping[str, ListOf[Cell]]
+    runs: Mapping[str, ListOf[Outcome]]  # outcome of each finished seed, as its cell.json holds it
+    baselines: Callable[[str], Outcome]  # outcomes of the baselines on the test motions of a model word
+    cells: Mapping[str, ListOf[Cell]]  # the finished cells
 
     @classmethod
     def read(cls, cells: ListOf[Cell], study: Study) -> StudyOutcomes:

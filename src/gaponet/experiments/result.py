@@ -22,23 +22,15 @@ VERSIONS = ("gaponet", "mujoco", "numpy", "torch")
 
 @dataclass(frozen=True)
 class Result:
-    """The result of one experiment.
+    """The result of one experiment."""
 
-    Attributes:
-        name: Stem of the names of its files.
-        virtual: Provenance of the recordings, a sentence (report.provenance).
-        facts: What is needed to repeat the experiment (`facts`).
-        figures: Figures by name.
-        sentences: Conclusions, made from the numbers.
-    """
-
-    name: str
+    name: str  # stem of the names of its files
     title: str
-    virtual: str
-    facts: Mapping[str, Any]
+    virtual: str  # provenance of the recordings, a sentence (report.provenance)
+    facts: Mapping[str, Any]  # what is needed to repeat the experiment (`facts`)
     tables: tuple[ResultTable, ...] = ()
-    figures: Mapping[str, Figure] = field(default_factory=dict)
-    sentences: tuple[str, ...] = ()
+    figures: Mapping[str, Figure] = field(default_factory=dict)  # figures by name
+    sentences: tuple[str, ...] = ()  # conclusions, made from the numbers
 
 
 def facts(dataset: Dataset, seeds: Iterable[int] = (), **more: Any) -> dict[str, Any]:

@@ -92,30 +92,19 @@ class Options:
 
 @dataclass(frozen=True)
 class Study:
-    """Settings that all cells of an experiment share.
-
-    Attributes:
-        robot: The simulator that models correct.
-        out: Folder of the results.
-        budget: Control steps or time of each training, as gaponet.nn.training.config reads it.
-        seeds: Number of seeds, counted from config.seed.
-        workers: Trainings at a time; 0 for as many as there are cores.
-        executor: Where they run (gaponet.base.executor).
-        identified: The identified robot, for words with identified+ in front and as a baseline.
-        quick: True for a quick run, whose numbers mean nothing.
-    """
+    """Settings that all cells of an experiment share."""
 
     data: Dataset
-    robot: RobotSpec
-    out: Path
+    robot: RobotSpec  # the simulator that models correct
+    out: Path  # folder of the results
     config: TrainConfig = TRAINING
-    budget: str = DEFAULT_BUDGET
-    seeds: int = DEFAULT_SEEDS
+    budget: str = DEFAULT_BUDGET  # control steps or time of each training, as gaponet.nn.training.config reads it
+    seeds: int = DEFAULT_SEEDS  # number of seeds, counted from config.seed
     holdout_units: tuple[str, ...] = ()
-    workers: int = 0
-    executor: str = LOCAL
-    identified: RobotSpec | None = None
-    quick: bool = False
+    workers: int = 0  # trainings at a time; 0 for as many as there are cores
+    executor: str = LOCAL  # where they run (gaponet.base.executor)
+    identified: RobotSpec | None = None  # the identified robot, for words with identified+ in front and as a baseline
+    quick: bool = False  # True for a quick run, whose numbers mean nothing
 
     def __post_init__(self) -> None:
         if self.seeds < 1 or self.workers < 0:

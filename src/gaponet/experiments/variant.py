@@ -23,16 +23,11 @@ RESERVED = ("kind", "model", "seed", "threads")  # set by the word itself or by 
 
 @dataclass(frozen=True)
 class Variant:
-    """One method of a comparison.
+    """One method of a comparison."""
 
-    Attributes:
-        name: The word as the user wrote it.
-        identified: True if it corrects the identified simulator.
-    """
-
-    name: str
+    name: str  # the word as the user wrote it
     config: TrainConfig
-    identified: bool = False
+    identified: bool = False  # True if it corrects the identified simulator
 
     @property
     def kind(self) -> str:

@@ -81,21 +81,13 @@ DELAY_NOTES = {
 
 @dataclass(frozen=True)
 class ExportedFolder:
-    """Files and errors of an export.
+    """Files and errors of an export."""
 
-    Attributes:
-        file: The MJCF or URDF; None for json.
-        errors: Form of the robot → mean |error| over the motions, rad.
-        motions: Number of validation motions.
-        virtual: True if the motions are simulated.
-        notes: Effects that the form lacks, and decisions for the user.
-    """
-
-    file: Path | None
-    errors: dict[str, float]
-    motions: int
-    virtual: bool
-    notes: tuple[str, ...] = ()
+    file: Path | None  # the MJCF or URDF; None for json
+    errors: dict[str, float]  # form of the robot → mean |error| over the motions, rad
+    motions: int  # number of validation motions
+    virtual: bool  # True if the motions are simulated
+    notes: tuple[str, ...] = ()  # effects that the form lacks, and decisions for the user
 
 
 def export_robot(

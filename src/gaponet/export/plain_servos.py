@@ -72,10 +72,7 @@ def read_recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[l
 
 
 def fit_plain_servos(
-    robot: RobotSpec,
-    recordings: ListOf[Sequence],
-    progress: Progress = no_progress,
-    engine_terms: tuple[str, ...] = (),
+    robot: RobotSpec, recordings: ListOf[Sequence], progress: Progress = no_progress, engine_terms: tuple[str, ...] = ()
 ) -> RobotSpec:
     """Fit the parameters of PD servos, without a servo model but for the terms that the engine has, to recordings.
 

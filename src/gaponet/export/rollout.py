@@ -22,23 +22,14 @@ SAMPLED_ROBOTS = 16
 
 @dataclass(frozen=True)
 class RolloutPrediction:
-    """One rollout, (T, n) rad over the operated joints.
+    """One rollout, (T, n) rad over the operated joints."""
 
-    Attributes:
-        name: Name of the rollout.
-        dt: s.
-        target: Targets of the policy.
-        rollout: Motion in the policy's simulator.
-        robot: Predicted motion of the robot.
-        half_width: Half the width of the band around the prediction.
-    """
-
-    name: str
-    dt: float
-    target: Array
-    rollout: Array
-    robot: Array
-    half_width: Array
+    name: str  # name of the rollout
+    dt: float  # s
+    target: Array  # targets of the policy
+    rollout: Array  # motion in the policy's simulator
+    robot: Array  # predicted motion of the robot
+    half_width: Array  # half the width of the band around the prediction
 
     @property
     def inside(self) -> Array:

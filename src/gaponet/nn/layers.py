@@ -96,14 +96,10 @@ class BoundedOutput(nn.Module):
     """Δa = Δ_max · tanh(gain · scale · y / Δ_max): gain · scale · y for small corrections, and never above Δ_max.
 
     A hard bound is gain · scale · y, clipped outside training. The environment clips in training.
-
-    Attributes:
-        gain: 1 in training; nn/training/validation.py lowers it if a smaller correction has a smaller error.
-        scale: RMS of the labels, rad, so that y is of order 1 for any robot.
     """
 
-    gain: Tensor
-    scale: Tensor
+    gain: Tensor  # 1 in training; nn/training/validation.py lowers it if a smaller correction has a smaller error
+    scale: Tensor  # RMS of the labels, rad, so that y is of order 1 for any robot
 
     def __init__(self, delta_max: float, hard: bool) -> None:
         super().__init__()

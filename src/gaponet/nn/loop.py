@@ -35,12 +35,7 @@ class DeltaLoop:
     """
 
     def __init__(
-        self,
-        config: ModelConfig,
-        qpos_range: Array,
-        num_envs: int,
-        network: Network | None = None,
-        like: Any = None,
+        self, config: ModelConfig, qpos_range: Array, num_envs: int, network: Network | None = None, like: Any = None
     ) -> None:
         """
         Args:

@@ -37,17 +37,11 @@ class _Origin(TypedDict):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A simulator, with or without a model that corrects it.
+    """A simulator, with or without a model that corrects it."""
 
-    Attributes:
-        folder: Robot folder, or run.
-        robot: The simulator: identified, or nominal under a model.
-        model: None for a robot folder.
-    """
-
-    folder: Path
-    robot: RobotSpec
-    model: GapModel | None
+    folder: Path  # robot folder, or run
+    robot: RobotSpec  # the simulator: identified, or nominal under a model
+    model: GapModel | None  # None for a robot folder
 
     @classmethod
     def load(cls, folder: Path, robot: RobotSpec) -> Candidate:
@@ -74,18 +68,9 @@ class Candidate:
         """Key of report.methods.METHODS."""
         return "identified" if self.model is None else method(self.model.config.kind, self.robot)
 
-    @property
-    def kind(self) -> str:
-        """Kind of the folder for gaponet.base.files.lock_folder."""
-        return "robot" if self.model is None else "run"
-
     def corrector(self) -> DeltaCorrector | None:
         """Return the corrector of targets for sim.replay."""
         return None if self.model is None else self.model.corrector(self.robot)
-
-    def adaptations(self) -> Mapping[str, Adaptation]:
-        """Return the units that the model was adapted to."""
-        return {} if self.model is None else Adaptation.load(self.folder, self.model.weights_hash())
 
 
 def is_robot(folder: Path) -> bool:
@@ -138,16 +123,11 @@ class FittedData:
 
     A recording of the test set is not among them, whatever the split: a split by unit or payload tests motions that
     were trained on.
-
-    Attributes:
-        hashes: Content hashes of the recordings.
-        motions: Names of their motions.
-        test: Content hashes of the test set.
     """
 
-    hashes: frozenset[str]
+    hashes: frozenset[str]  # of the recordings' contents
     motions: frozenset[str]
-    test: frozenset[str]
+    test: frozenset[str]  # hashes of the test set
 
     @classmethod
     def of_folder(cls, folder: Path) -> FittedData | None:

@@ -43,31 +43,24 @@ ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "adapted", "uncorrec
 class Evaluation:
     """Rollouts by method, their metrics, and the corrections applied by each learned model.
 
-    Attributes:
-        result: methods → method → metrics (mpjae rad, q_dis rad·s, …; by_joint, by_motion, … the same); unseen is
-            true if no recording was used in training.
-        runs: Method → rollouts, one per sequence.
-        ctrl: Commands, (T, n operated) rad, one array per sequence.
-        deltas: Method → corrections applied, (T, n operated) rad, one array per sequence.
+    `result` holds methods → method → metrics (mpjae rad, q_dis rad·s, …; by_joint, by_motion, … the same); unseen is
+    true if no recording was used in training. All lists have an item per sequence.
     """
 
     result: dict[str, Any]
-    runs: dict[str, list[Run]]
-    ctrl: list[Array]
-    deltas: dict[str, list[Array]]
+    runs: dict[str, list[Run]]  # method → rollouts
+    ctrl: list[Array]  # commands, (T, n operated) rad
+    deltas: dict[str, list[Array]]  # method → corrections applied, (T, n operated) rad
 
     def save(self, folder: Path) -> None:
         """Write metrics.json and trajectories.npz, which the report reads, into a run or robot folder."""
         reals = self.runs["nominal"]
         picked = evenly_spaced(list(range(len(reals))), STORED_TRAJECTORIES)
-        shown = [reals[i].meta for i in picked]
-        result = self.result | {
-            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            "shown": [
-                {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].dt}
-                for i, m in zip(picked, shown, strict=True)
-            ],
-        }
+        shown = [
+            {"motion": r.meta.motion, "unit_id": r.meta.unit_id, "payload_mass": r.meta.payload_mass, "dt": r.dt}
+            for r in (reals[i] for i in picked)
+        ]
+        result = self.result | {"date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "shown": shown}
         arrays = {}
         for row, i in enumerate(picked):
             arrays[f"{row}/recorded"] = reals[i].qpos_real
@@ -121,29 +114,26 @@ def evaluate(
     ctrl = [s.ctrl[:, op] for s in sequences]
     moved = [np.ptp(c, axis=0) > MIN_MOTION_RAD for c in ctrl]
     simulators: dict[str, str] = {}
-    for name, simulator, corrector in itertools.chain(
-        _methods(candidates, nominal), _transferred(target, first, nominal)
-    ):
+    for name, simulator, corrector in _methods(candidates, nominal, target):
         simulators[name] = model_hash(simulator)
         replays = replay(sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True)
         done_runs[name] = runs(sequences, [t.qpos for t in replays], robot)
         if name in models:
             deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, replays, strict=True)]
-    adapted = first.adaptations()
+    adapted = Adaptation.load(first.folder, first.model.weights_hash()) if first.model is not None else {}
     if any(s.meta.unit_id in adapted for s in sequences):
         replays = _by_unit(sequences, first, adapted, with_note(progress, "adapted"))
         done_runs["adapted"] = runs(sequences, [t.qpos for t in replays], robot)
         simulators["adapted"] = simulators[first.method]
     methods = {name: summary(part, robot) for name, part in done_runs.items()}
     ratio = {name: m["mpjae"] / methods["nominal"]["mpjae"] for name, m in methods.items()}
-    limits = {name: m.config.delta_max for name, m in models.items()}
     result = {
         "methods": methods, "ratio_to_nominal": ratio, "dataset": dataset.path.name, "sequences": len(sequences),
         "motions": sorted({s.meta.motion for s in sequences}),
         "moves": dict(zip(robot.operated, map(int, np.sum(moved, axis=0)), strict=True)),
         "unseen": unseen, "virtual": any(s.meta.virtual for s in sequences), "robot": robot.name,
         "simulator_hash": model_hash(nominal), "simulators": simulators,
-        "delta": {name: _delta_summary(parts, sequences, limits[name]) for name, parts in deltas.items()},
+        "delta": {k: _delta_summary(parts, sequences, models[k].config.delta_max) for k, parts in deltas.items()},
         "adapted_units": sorted(set(adapted) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
         "command": _command(folders, dataset.address or os.path.normpath(dataset.path), motions),
@@ -164,12 +154,15 @@ def evenly_spaced(items: list[T], limit: int) -> list[T]:
     return [items[round(i)] for i in np.linspace(0, len(items) - 1, limit)]
 
 
-def _methods(candidates: dict[str, Candidate], nominal: RobotSpec) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
-    """Yield name, simulator and corrector of every method, in the order of ORDER."""
+def _methods(
+    candidates: dict[str, Candidate], nominal: RobotSpec, target: RobotSpec | None
+) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
+    """Yield name, simulator and corrector of every method, in the order of ORDER; then those of the simulator `target`,
+    where gains of a log change it by as much as they change the nominal one."""
     yield "nominal", nominal, None
-    folder = next(iter(candidates.values())).folder
-    if (folder / "delay_offset.json").is_file():
-        yield "delay_offset", nominal, DelayOffset.read(folder).corrector(nominal)
+    first = next(iter(candidates.values()))
+    if (first.folder / "delay_offset.json").is_file():
+        yield "delay_offset", nominal, DelayOffset.read(first.folder).corrector(nominal)
     identified = {model_hash(c.robot): c.robot for c in candidates.values() if c.robot.nominal is not None}
     if len(identified) > 1:
         raise UsageError("these start from different identified simulators; compare those of one identification")
@@ -178,12 +171,6 @@ def _methods(candidates: dict[str, Candidate], nominal: RobotSpec) -> Iterator[t
     for name in sorted(candidates, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):
         if candidates[name].model is not None:
             yield name, candidates[name].robot, candidates[name].corrector()
-
-
-def _transferred(
-    target: RobotSpec | None, first: Candidate, nominal: RobotSpec
-) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
-    """Yield the same of another simulator; gains of a log change it by as much as they change the nominal one."""
     if target is None:
         return
     simulator = replace(target, nominal=target.nominal or nominal)

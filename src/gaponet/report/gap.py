@@ -65,35 +65,24 @@ def gap_by_step(
     floors["all"] = {k: _mean([f[k] for f in floors.values()]) for k in ("encoder", "repeatability", "both")}
     last = list(done)[-1]
     methods = {"nominal": "nominal"} | ({"delay_offset": "offset"} if "offset" in done else {})
-    methods |= ({"identified": causes[-1][0]} if causes else {}) | (
-        {candidate.method: last} if candidate.model is not None else {}
-    )
+    methods |= {"identified": causes[-1][0]} if causes else {}
+    methods |= {candidate.method: last} if candidate.model is not None else {}
     return {
         "methods": {name: errors_of(done[step], robot) for name, step in methods.items()},
-        "left": {name: metrics(part)["mpjae"] for name, part in done.items()},
-        "removed": reductions(done),
-        "unexplained": _above(metrics(done[last])["mpjae"], floors["all"]["both"]),
+        **_sources(done, floors["all"]),
         "by_joint": {
-            j: {
-                "left": {n: metrics(part, [i])["mpjae"] for n, part in done.items()},
-                "removed": reductions(done, [i]),
-                "unexplained": _above(metrics(done[last], [i])["mpjae"], floors[j]["both"]),
-                "floor": floors[j],
-            }
-            for i, j in enumerate(robot.operated) if metrics(done[last], [i])
+            j: _sources(done, floors[j], [i]) for i, j in enumerate(robot.operated) if metrics(done[last], [i])
         },
         "by_payload": {
             f"{p:g}": {n: metrics([r for r in part if r.meta.payload_mass == p])["mpjae"] for n, part in done.items()}
             for p in sorted({s.meta.payload_mass for s in sequences})
         },
-        "floor": floors["all"],
         "virtual": any(s.meta.virtual for s in sequences),
         "unseen": unseen,
         "sequences": len(sequences),
         "hours": sum(e.rows * e.dt for e in entries) / 3600,
         "simulator_hash": model_hash(nominal),
-        "simulators": {"nominal": model_hash(nominal)}
-        | ({"identified": model_hash(robot)} if causes else {}),
+        "simulators": {"nominal": model_hash(nominal)} | ({"identified": model_hash(robot)} if causes else {}),
         "dataset": dataset.path.name,
         "robot": robot.name,
     }  # fmt: skip
@@ -110,6 +99,16 @@ def _steps(candidate: Candidate, causes: list[tuple[str, RobotSpec]]) -> list[tu
     only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
     start += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
     return [*start, *middle, (candidate.method, candidate.robot, candidate.corrector())]
+
+
+def _sources(
+    done: dict[str, list[Run]], floor: dict[str, float | None], columns: list[int] | None = None
+) -> dict[str, Any]:
+    """Return the error after each step, its reductions, the floor, and the error above it, rad."""
+    left = {name: metrics(part, columns)["mpjae"] for name, part in done.items()}
+    least, last = floor["both"], list(left.values())[-1]
+    unexplained = None if least is None else max(last - least, 0.0)
+    return {"left": left, "removed": reductions(done, columns), "unexplained": unexplained, "floor": floor}
 
 
 # Fields in which an identified simulator differs from the nominal one, in the order of the steps.
@@ -178,7 +177,3 @@ def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, di
 def _mean(values: ListOf[float | None]) -> float | None:
     numbers = [v for v in values if v is not None]
     return float(np.mean(numbers)) if len(numbers) == len(values) else None
-
-
-def _above(error: float, floor: float | None) -> float | None:
-    return None if floor is None else max(error - floor, 0.0)

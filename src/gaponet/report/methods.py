@@ -6,10 +6,8 @@ A method is a key of METHODS, or a word of experiments/variant.py: [identified+]
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 METHODS = {  # title, colour
     "target": ("target", "#00838f"),

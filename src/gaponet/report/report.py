@@ -47,11 +47,7 @@ class _Evaluated(NamedTuple):
 
     @classmethod
     def read(cls, folder: Path, model: GapModel | None, robot: RobotSpec) -> _Evaluated:
-        """Read and check the folder.
-
-        Raises:
-            ModelError: A file is missing, damaged or incomplete.
-        """
+        """Read the folder; ModelError where a file is missing, damaged or incomplete."""
         own = "identified" if model is None else method(model.config.kind, robot)
         card, config = (None, {}) if model is None else (model.card, read_config(folder))
         metrics, curve = read_metrics(folder), read_progress(folder)
@@ -199,16 +195,10 @@ def warnings(card: dict[str, Any] | None, own: str, metrics: dict[str, Any]) -> 
         out.append("The recordings come from a virtual robot: these numbers say nothing about real hardware.")
     if not metrics["unseen"]:
         out.append("Some recordings were used in training or for choosing the model: not a test result.")
-    if card is not None:
-        out += _warnings_of_model(card, own, methods)
     worse = [j for j, m in methods[own]["by_joint"].items() if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]]
-    if worse:
-        out.append(f"Worse than the nominal simulator on: {', '.join(worse)}.")
-    return out
-
-
-def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) -> list[str]:
-    out = []
+    last = [f"Worse than the nominal simulator on: {', '.join(worse)}."] if worse else []
+    if card is None:
+        return out + last
     better = [n for n, m in methods.items() if n not in (own, "adapted") and m["mpjae"] <= methods[own]["mpjae"]]
     if better:
         out.append(f"The model does not beat {', '.join(map(title, better))}: do not use it.")
@@ -233,4 +223,4 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
         out.append(f"Undertrained: the budget ended after {rounds}{longer}.")
     if card.get("interrupted"):
         out.append("Training was interrupted before its budget was out.")
-    return out
+    return out + last

@@ -27,14 +27,10 @@ def _is_number(text: str) -> bool:
 
 
 class _Error(TypedDict):
-    """Error of a payload, a horizon or a motion, rad."""
-
-    mpjae: Number
+    mpjae: Number  # rad
 
 
 class _JointError(_Error):
-    """Errors of a joint, rad."""
-
     static: Number
     dynamic: Number
 
@@ -55,8 +51,6 @@ Scores = TypedDict(  # metrics of one method, in total and by group
 
 
 class _Shown(TypedDict):
-    """A sequence with stored trajectories."""
-
     motion: str
     unit_id: str
     payload_mass: Annotated[float, Interval(ge=0, le=100)]
@@ -64,15 +58,11 @@ class _Shown(TypedDict):
 
 
 class _Artifact(TypedDict):
-    """An evaluated model."""
-
     weights: str
     seed: Json
 
 
 class _Delta(TypedDict):
-    """Largest correction of a model, rad."""
-
     max: Number
 
 
@@ -87,7 +77,6 @@ class _Metrics(TypedDict):
     robot: str
     simulator_hash: str
     simulators: NotRequired[dict[Method, str]]
-    """Hash of each method's simulator."""
     delta: dict[Method, _Delta]
     artifacts: dict[Method, _Artifact]
     shown: NotRequired[Annotated[list[_Shown], Len(0, 100)]]
@@ -97,16 +86,12 @@ class _Metrics(TypedDict):
 
 
 class _PPO(TypedDict):
-    """Settings of PPO in the report."""
-
     num_envs: int
     epochs: int
     std: float
 
 
 class _Model(TypedDict):
-    """Model in a list of runs."""
-
     kind: Method
 
 
@@ -120,9 +105,7 @@ class _Config(TypedDict):
     command: NotRequired[str]
 
 
-class _Validation(TypedDict):
-    """One line of progress.jsonl."""
-
+class _Validation(TypedDict):  # one line of progress.jsonl
     stage: str
     steps: Count
     seconds: float
@@ -186,14 +169,10 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
 
 
 class _Floor(TypedDict):
-    """Error floor by encoder and repeatability, rad."""
-
     both: Number
 
 
 class _Panel(TypedDict):
-    """Error after each step, and error floor, rad."""
-
     left: dict[Method, Number]
     floor: _Floor
 

@@ -22,18 +22,11 @@ Scores = dict[str, Any]  # method → its metrics (metrics.summary)
 
 
 class NetworkGain(NamedTuple):
-    """Reduction of the error by a network, rad.
+    """Reduction of the error by a network, rad."""
 
-    Attributes:
-        base: The best method without a network.
-        reduction: Mean over recordings; negative if the network is worse.
-        standard_error: Standard error of the reduction over independent motions (paired); NaN for one motion.
-        base_error: Error of the base.
-    """
-
-    base: str
-    reduction: float
-    standard_error: float
+    base: str  # the best method without a network
+    reduction: float  # mean over recordings; negative if the network is worse
+    standard_error: float  # of the reduction over independent motions (paired); NaN for one motion
     base_error: float
 
     @property
@@ -79,12 +72,10 @@ def verdict(methods: Scores) -> list[str]:
 
 def _about_network(methods: Scores, own: str) -> str:
     gain, error = network_gain(methods, own), methods[own]["mpjae"]
-    text = (
-        f"With {title(own)} the error is {mrad(error)} mrad: the correction reduces the error of {title(gain.base)} by "
-        f"{gain.text}"
-    )
+    end = f", {100 * gain.reduction / gain.base_error:.0f} %." if gain.helps else ": leave the network out."
     return (
-        f"{text}, {100 * gain.reduction / gain.base_error:.0f} %." if gain.helps else f"{text}: leave the network out."
+        f"With {title(own)} the error is {mrad(error)} mrad: the correction reduces the error of {title(gain.base)} by "
+        f"{gain.text}{end}"
     )
 
 

@@ -53,8 +53,8 @@ class Drive:
 
 
 def drives(
-    model: mujoco.MjModel, joints: list[str], pose: np.ndarray, given: dict[str, tuple[str, ...]], file: str,
-) -> tuple[Drive, ...]:  # fmt: skip
+    model: mujoco.MjModel, joints: list[str], pose: np.ndarray, given: dict[str, tuple[str, ...]], file: str
+) -> tuple[Drive, ...]:
     """Determine the drives of hinge joints.
 
     Args:

@@ -17,21 +17,14 @@ Mend = dict[str, dict[str, Any]]  # table of logs.toml → joint → corrected v
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the doctor's report.
+    """One line of the doctor's report."""
 
-    Attributes:
-        level: One of LEVELS.
-        message: States the problem and what to do.
-        values: Numbers of the message.
-        mend: Corrections for logs.toml.
-    """
-
-    level: str
+    level: str  # one of LEVELS
     check: str
-    message: str
+    message: str  # states the problem and what to do
     joints: tuple[str, ...] = ()
-    values: dict[str, Any] = field(default_factory=dict)
-    mend: Mend = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)  # numbers of the message
+    mend: Mend = field(default_factory=dict)  # corrections for logs.toml
 
     @staticmethod
     def proposal(findings: list[Finding]) -> str:

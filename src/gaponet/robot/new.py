@@ -53,19 +53,13 @@ class RobotOptions:
 
 @dataclass(frozen=True)
 class NewRobot:
-    """Result of new_robot.
-
-    Attributes:
-        vendor: The vendor's compiled model.
-        pose: Its home pose, (nq).
-        notes: What was omitted, fixed or corrected.
-    """
+    """Result of new_robot."""
 
     robot: RobotSpec
     drives: tuple[Drive, ...]
-    vendor: mujoco.MjModel
-    pose: np.ndarray
-    notes: list[str] = field(default_factory=list)
+    vendor: mujoco.MjModel  # the vendor's compiled model
+    pose: np.ndarray  # its home pose, (nq)
+    notes: list[str] = field(default_factory=list)  # what was omitted, fixed or corrected
 
 
 def new_robot(path: Path, out: Path, options: RobotOptions) -> NewRobot:

@@ -21,16 +21,7 @@ from typing import Any
 from gaponet.base.files import FOLDER_MARKER, flush_to_disk, lock_file, write_text
 from gaponet.base.progress import progress_bar
 from gaponet.base.text import remove_credentials
-from gaponet.share.remote import (
-    INDEX,
-    MAX_INDEX_BYTES,
-    FileRecord,
-    Index,
-    Kind,
-    RemoteError,
-    lost_race,
-    network_errors,
-)
+from gaponet.share.remote import INDEX, MAX_INDEX_BYTES, FileRecord, Index, Kind, RemoteError, lost_race, network_errors
 
 MODULES = {"s3": "s3fs", "gs": "gcsfs", "file": "fsspec"}  # scheme → library
 OBJECTS = "sha256"

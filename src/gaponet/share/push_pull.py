@@ -20,35 +20,18 @@ from gaponet.base.files import FOLDER_MARKER, lock_folder, write_text
 from gaponet.data.store import Dataset
 from gaponet.share import dataset as datasets
 from gaponet.share import run as runs
-from gaponet.share.remote import (
-    FORMAT,
-    INDEX,
-    FileRecord,
-    Index,
-    Kind,
-    RemoteError,
-    download,
-    file_errors,
-    read_index,
-)
+from gaponet.share.remote import FORMAT, INDEX, FileRecord, Index, Kind, RemoteError, download, file_errors, read_index
 from gaponet.share.stream import RemoteDataset, open_remote
 
 
 @dataclass(frozen=True)
 class TransferResult:
-    """Result of a push or a pull.
+    """Result of a push or a pull."""
 
-    Attributes:
-        kind: Dataset or run.
-        files: Number of files: all of a push, the downloaded ones of a pull.
-        size: Bytes of these files.
-        pruned: Number of deleted files of earlier pushes.
-    """
-
-    kind: Kind
-    files: int
-    size: int
-    pruned: int = 0
+    kind: Kind  # dataset or run
+    files: int  # number of files: all of a push, the downloaded ones of a pull
+    size: int  # bytes of these files
+    pruned: int = 0  # number of deleted files of earlier pushes
 
 
 def push(

@@ -42,7 +42,7 @@ from gaponet.sysid.problem import (
     fitted_fields,
     robot_fields,
     standard_errors,
-)  # fmt: skip
+)
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.servo_types import far_from_servo_type
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights

@@ -68,23 +68,15 @@ class LabelledRecording:
 
 @dataclass(frozen=True)
 class LabelGroup:
-    """Recordings of one joint and command.
-
-    Attributes:
-        count: Number of recordings.
-        slope: N·m per kg.
-        band_distance: Distance of the payloads' bands in their widths.
-        units: Torque of each unit without payload, N·m.
-        determined: Whether the torque determines the payload.
-    """
+    """Recordings of one joint and command."""
 
     joint: str
     command: float
-    count: int
-    slope: float
-    band_distance: float
-    units: Array
-    determined: bool
+    count: int  # number of recordings
+    slope: float  # N·m per kg
+    band_distance: float  # distance of the payloads' bands in their widths
+    units: Array  # torque of each unit without payload, N·m
+    determined: bool  # whether the torque determines the payload
 
 
 @dataclass(frozen=True)

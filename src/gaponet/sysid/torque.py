@@ -99,19 +99,12 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
 
 
 class Gains(NamedTuple):
-    """Gains of a servo from its torque.
+    """Gains of a servo from its torque."""
 
-    Attributes:
-        kp: N·m/rad.
-        error: Standard error of kp over recordings.
-        kd: N·m·s/rad.
-        explained: Share of the torque's variance that they explain.
-    """
-
-    kp: float
-    error: float
-    kd: float
-    explained: float
+    kp: float  # N·m/rad
+    error: float  # standard error of kp over recordings
+    kd: float  # N·m·s/rad
+    explained: float  # share of the torque's variance that they explain
 
     @property
     def trusted(self) -> bool:

@@ -103,23 +103,14 @@ ArrayName = Literal["values", "covariance", "gauss_newton_step", "gauss_newton_c
 
 @dataclass(frozen=True)
 class ParameterUncertainty:
-    """Uncertainty of a robot's parameters.
+    """Uncertainty of a robot's parameters."""
 
-    Attributes:
-        fields: The P fields of the axes.
-        joints: Joint name → its uncertainty.
-        sources: Recordings, from the first to the last.
-        clusters: Number of parts of the recordings from which the overdispersion was estimated.
-        validated: Whether the residuals are of motions that were not fitted.
-        links: Of the links, if they were fitted.
-    """
-
-    fields: tuple[str, ...]
-    joints: dict[str, JointUncertainty]
-    sources: tuple[Provenance, ...]
-    clusters: int
-    validated: bool
-    links: LinkUncertainty | None = None
+    fields: tuple[str, ...]  # the P fields of the axes
+    joints: dict[str, JointUncertainty]  # joint name → its uncertainty
+    sources: tuple[Provenance, ...]  # recordings, from the first to the last
+    clusters: int  # number of parts of the recordings from which the overdispersion was estimated
+    validated: bool  # whether the residuals are of motions that were not fitted
+    links: LinkUncertainty | None = None  # of the links, if they were fitted
 
     @classmethod
     def load(cls, robot: RobotSpec) -> ParameterUncertainty | None:

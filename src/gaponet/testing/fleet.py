@@ -33,11 +33,7 @@ Spread = Annotated[float, Interval(ge=0, le=MAX_PARAMETER)]
 
 @dataclass(frozen=True)
 class Distribution:
-    """Distribution of one parameter: mean + three normal deviations, clipped to [low, high].
-
-    Attributes:
-        of_effort: The parameter is a factor of the joint's torque limit.
-    """
+    """Distribution of one parameter: mean + three normal deviations, clipped to [low, high]."""
 
     name: str
     mean: Extended
@@ -47,7 +43,7 @@ class Distribution:
     joint_spread: Spread = 0.0
     low: Extended = -np.inf
     high: Extended = np.inf
-    of_effort: bool = False
+    of_effort: bool = False  # the parameter is a factor of the joint's torque limit
 
 
 class FleetTable(TypedDict):
@@ -70,18 +66,13 @@ class RescaledFleetTable(TypedDict):
 
 @dataclass(frozen=True)
 class Fleet:
-    """Virtual units of one robot type.
-
-    Attributes:
-        units: Hidden physics by unit id.
-        gain_scale: Gain scale of the robot (RobotSpec.gain_scale); None for the robot's own.
-    """
+    """Virtual units of one robot type."""
 
     name: str
     seed: int
     distributions: tuple[Distribution, ...]
-    units: dict[str, Physics]
-    gain_scale: float | None = None
+    units: dict[str, Physics]  # hidden physics by unit id
+    gain_scale: float | None = None  # gain scale of the robot (RobotSpec.gain_scale); None for the robot's own
 
     def unit(self, unit_id: str) -> Physics:
         """Return the hidden physics of a unit."""

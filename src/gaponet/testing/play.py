@@ -24,16 +24,12 @@ from gaponet.testing.virtual_robot import VirtualRobot
 
 @dataclass(frozen=True)
 class Job:
-    """Takes to be recorded together, all at one rate. The result of a take does not depend on the others.
-
-    Attributes:
-        files: Motions of the recipe's files.
-    """
+    """Takes to be recorded together, all at one rate. The result of a take does not depend on the others."""
 
     robot: RobotSpec
     fleet: Fleet
     recipe: Recipe
-    files: tuple[Motion, ...]
+    files: tuple[Motion, ...]  # motions of the recipe's files
     seed: int
     takes: tuple[Take, ...]
 

@@ -368,3 +368,32 @@ def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
         wait_for(page.jobs)
         assert why in _ending(page.jobs.all[-1])
     assert "elbow: not in every recording" in _report(page.jobs.all[-1])
+
+
+@pytest.mark.slow
+def test_a_calibration_and_a_training_end_in_step_use_with_their_result(tmp_path, monkeypatch):
+    """Real commands on a VIRTUAL arm, by the buttons of the page; the nominal arm stands for the identified one."""
+    pytest.importorskip("viser")
+    acts, add = {}, App._button
+    monkeypatch.setattr(App, "_button", lambda self, label, act: acts.update({label: act}) or add(self, label, act))
+    robot = write_arm(tmp_path / "robot")
+    for place, kp in (("data", 0.7), ("new", 0.6)):
+        data = Dataset.create(tmp_path / place, robot)
+        for sequence in recordings(robot, 4, rows=400, kp=kp, delay=2):
+            data.append(sequence)
+    made = {"robot": "robot", "import": "data", "doctor": "data", "identify": "robot", "new": "new"}
+    for step, out in made.items():
+        finish(Jobs(tmp_path), step, {"findings": []}, (step, "x", "--out", out))
+    page = App(tmp_path, 0)
+    try:
+        page.budget.value = "20s"
+        for label, step in (("Calibrate with the new logs", "adapt"), ("Train a network", "train")):
+            page._attempt(acts[label], None)
+            wait_for(page.jobs)
+            page._attempt(page.refresh)
+            assert page.status.content == f"**gaponet {step}** has ended."
+        assert "recording(s) of unit a; robot folder adapt" in page.texts["adapt"][0].content
+        assert "best on validation" in page.texts["train"][0].content
+    finally:
+        page.jobs.cancel()
+        page.server.stop()

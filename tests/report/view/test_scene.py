@@ -9,8 +9,11 @@ from arm import XML, commands, record, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.report.evaluate import ORDER
+from gaponet.report.methods import colour
 from gaponet.report.view.picture import Camera, require_writable, write
-from gaponet.report.view.scene import Scene, View, visual_spec
+from gaponet.report.view.player import _page_colour
+from gaponet.report.view.scene import GHOST_RGBA, Scene, View, rgb, visual_spec
 from gaponet.report.view.side_by_side import Clip, Copy, SideBySide
 from gaponet.robot.spec import Table, load_robot
 from gaponet.sim.model import build_model
@@ -204,3 +207,21 @@ def test_the_browser_gets_a_mesh_for_every_body_where_it_is(four):
         assert player.worst.label == "Worst moment: 0.40 s"
     finally:
         server.stop()
+
+
+def test_every_copy_is_seen_on_a_light_and_a_dark_page():
+    """Contrast as WCAG 2 defines it; only the dark recording and its ghosts have another colour than in pictures."""
+
+    def luminance(colour):
+        linear = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+        return linear @ (0.2126, 0.7152, 0.0722)
+
+    own = {method: np.array(rgb(colour(method))[:3]) for method in ("target", *ORDER)}
+    assert all((_page_colour(x) == (255 * x).astype(int)).all() for limb in own.values() for x in (limb, 0.55 * limb))
+    recorded = np.array(rgb(colour("recorded"))[:3])
+    for x in (recorded, 0.55 * recorded, np.array(GHOST_RGBA[:3])):
+        light = luminance(_page_colour(x) / 255)
+        assert 1.05 / (light + 0.05) > 3  # on white
+        assert (light + 0.05) / (luminance(np.full(3, 0.1)) + 0.05) > 1.5
+    light = luminance(_page_colour(recorded) / 255)
+    assert (light + 0.05) / (luminance(np.full(3, 0.1)) + 0.05) > 3

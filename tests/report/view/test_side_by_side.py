@@ -7,7 +7,7 @@ from runs import untrained
 
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.data.store import Dataset
-from gaponet.report.view.side_by_side import select_entry, side_by_side
+from gaponet.report.view.side_by_side import Clip, select_entry, side_by_side
 from gaponet.sim.metrics import metrics, runs
 from gaponet.sim.replay import replay
 
@@ -75,5 +75,5 @@ def test_the_busiest_stretch_is_where_the_robot_moves(dataset, arm):
     qpos[60:80] = np.linspace(0, 1, 20)[:, None]
     qpos[80:] = 1.0
     still = type(shown.real)(shown.real.meta, arm.joint_names, 0.02, qpos, qpos, 0 * qpos)
-    start = type(shown)(still, arm, shown.motions, None).busiest(0.4)
-    assert 1.16 <= start <= 1.2  # rows 58 to 60 begin a stretch of 20 rows with all the motion
+    clip = Clip.from_start(type(shown)(still, arm, shown.motions, None), None, 0.4)
+    assert 1.16 <= clip.start <= 1.2  # rows 58 to 60 begin a stretch of 20 rows with all the motion

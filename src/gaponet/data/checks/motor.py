@@ -53,11 +53,8 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
     yield Finding(level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()})
     for name, late in dead_time.items():
-        if (
-            len(dead_time) > 2
-            and late - usual > MAX_EXTRA_LAG_S
-            and late > max(2 * expected[name][0], expected[name][1])
-        ):
+        slow, near = expected[name]
+        if len(dead_time) > 2 and late - usual > MAX_EXTRA_LAG_S and late > max(2 * slow, near):
             text = (
                 f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: its channel is read late, "
                 "filtered or from another bus, or it moves stiffly"

@@ -27,7 +27,7 @@ from gaponet.data.signals import (
     fast_speed,
     lowpass,
     range_before,
-)  # fmt: skip
+)
 from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
@@ -135,6 +135,7 @@ class Survey:
         blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
         follows, opposes = _correlations(ctrl, qpos, dt)
         delay, lead = estimate_delay(ctrl, qpos, dt, MAX_LAG_S), estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
+        apart = np.abs(qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2)  # from the line between the neighbouring rows
         return Survey(
             entry=entry,
             samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
@@ -151,7 +152,7 @@ class Survey:
             opposes=opposes,
             slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
             equals_command=(np.ptp(ctrl, axis=0) > MOVING_RAD) & (np.abs(ctrl - qpos) < EQUAL_RAD).all(axis=0),
-            jump_rows=_jump_rows(qpos, dt),
+            jump_rows=(apart > max(JUMP_RAD, JUMP_RAD_S2 / 2 * dt**2)).sum(axis=0),
             zero_rows=_zero_rows(sequence, notes, robot),
             qvel_ratio=_qvel_ratio(sequence),
             blocked_s=blocked_s,
@@ -266,11 +267,8 @@ def _standstill(ctrl: Array, qpos: Array, dt: float) -> float:
     late = round(MAX_LAG_S / dt)
     standing = np.asarray(_standing(qpos, dt).all(axis=1))
     runs = [r for r in _runs(standing) if r.stop - r.start > 2 * late]
-    runs = [
-        r for r in runs
-        if (np.ptp(ctrl[r.start : r.stop - late], axis=0) > BLOCKED_COMMAND_RAD).sum() >= commanded
-    ]  # fmt: skip
-    return max((r.stop - r.start for r in runs), default=0) * dt
+    moving = lambda r: (np.ptp(ctrl[r.start : r.stop - late], axis=0) > BLOCKED_COMMAND_RAD).sum()  # noqa: E731
+    return max((r.stop - r.start for r in runs if moving(r) >= commanded), default=0) * dt
 
 
 def _blocked(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
@@ -281,11 +279,6 @@ def _blocked(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
             longest = max(runs, key=lambda r: r.stop - r.start)
             seconds[j], places[j] = (longest.stop - longest.start) * dt, qpos[longest.start, j]
     return seconds, places
-
-
-def _jump_rows(qpos: Array, dt: float) -> Array:
-    distance = np.abs(qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2)
-    return (distance > max(JUMP_RAD, JUMP_RAD_S2 / 2 * dt**2)).sum(axis=0)
 
 
 def _zero_rows(sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> int:
@@ -403,5 +396,4 @@ def _spectrum(qpos: Array, dt: float) -> Array:
     v = np.diff(moved, axis=0)
     power = np.log(np.abs(np.fft.rfft(v * np.hanning(len(v))[:, None], axis=0)) ** 2 + 1e-30).mean(axis=1)
     smooth = np.convolve(power, np.ones(3) / 3, "same")
-    levels = np.interp(SPECTRUM_HZ, np.fft.rfftfreq(len(v), dt), smooth)
-    return np.where(0.48 / dt > SPECTRUM_HZ, levels, np.nan)
+    return np.where(0.48 / dt > SPECTRUM_HZ, np.interp(SPECTRUM_HZ, np.fft.rfftfreq(len(v), dt), smooth), np.nan)

@@ -88,10 +88,8 @@ def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     kind = kind if correlation[best] > MIN_KIND_CORRELATION else "are they torques?"
     text = f"states are {np.median(distance[judged]):.2f} times as far from their commands as from their own mean"
     follows = np.stack([np.diag(s.follows) for s in surveys])[:, robot.operated_index]
-    if (
-        max(np.nan_to_num(list(correlation.values()))) < MIN_KIND_CORRELATION
-        and np.median(follows[judged]) > MIN_FOLLOWING
-    ):
+    alike = max(np.nan_to_num(list(correlation.values()))) >= MIN_KIND_CORRELATION
+    if not alike and np.median(follows[judged]) > MIN_FOLLOWING:
         text += ", though they move with them: motors too weak for their load, or a wrong kp; check payload and kp"
         yield Finding("warning", "command", text, (), correlation)
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter, defaultdict
 from itertools import groupby
 from typing import Any
 
@@ -67,13 +68,10 @@ def _text(value: str) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _tokens(name: str) -> list[str]:
-    return [w for w in re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if w]
-
-
 def _kind(name: str) -> str | None:
     """Which channel a name speaks of; of a command's, positions only."""
-    matches = [channel for channel, words in WORDS.items() if any(w in words for w in _tokens(name))]
+    parts = re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
+    matches = [channel for channel, words in WORDS.items() if any(part in words for part in parts)]
     excluded = {"ctrl": NOT_POSITIONS, FEEDFORWARD: ("qpos", "qvel", "temperature")}.get(matches[0] if matches else "")
     if excluded and any(c in matches for c in excluded):
         return None  # a commanded velocity or torque; a feed-forward of something else
@@ -85,21 +83,15 @@ def _channels(recording: RawRecording) -> dict[str, str]:
     matches: dict[str, str] = {}
     arrays = [n for n, labels in recording.signals.items() if labels]
     for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
-        kind = _kind(name)
-        if kind:
+        if kind := _kind(name):
             matches.setdefault(kind, name)
     singles = [n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS]
-    shapes: dict[str, dict[str, int]] = {}
+    shapes = defaultdict[str, Counter[str]](Counter)
     for name in singles:
-        kind = _kind(name)
-        for pattern in _patterns(name) if kind else ():
-            counts = shapes.setdefault(str(kind), {})
-            counts[pattern] = counts.get(pattern, 0) + 1
-    for kind, counts in shapes.items():
-        best = max(counts, key=lambda p: (counts[p], len(p)))
-        if kind not in matches:
-            matches[kind] = best
-    return matches
+        if kind := _kind(name):
+            shapes[kind].update(_patterns(name))
+    best = {kind: max(counts, key=lambda p: (counts[p], len(p))) for kind, counts in shapes.items()}
+    return matches | {kind: pattern for kind, pattern in best.items() if kind not in matches}
 
 
 def _patterns(name: str) -> list[str]:

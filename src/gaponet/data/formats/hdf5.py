@@ -8,6 +8,7 @@ logs.toml must say which array is the command. Images are not read.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -36,7 +37,8 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every file, or every demonstration in it."""
     for file in files_under(path, SUFFIXES):
         arrays = _listed(file)
-        demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")}, key=_by_number)
+        demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")})
+        demos.sort(key=lambda demo: int(re.sub(r"\D", "", demo)[:9] or 0))
         for demo in demos or [""]:
             members = {n.removeprefix(demo).lstrip("/"): labels for n, labels in arrays.items() if n.startswith(demo)}
             part = demo.rpartition("/")[2]
@@ -47,11 +49,6 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
                 name, f"{file}#{part}" if part else str(file), members, partial(_load, file, demo), str(file),
                 (str(file),), default=cast("LogsFile", default),
             )  # fmt: skip
-
-
-def _by_number(demo: str) -> tuple[int, str]:
-    digits = "".join(c for c in demo if c.isdigit())
-    return int(digits[:9] or 0), demo
 
 
 @contextmanager

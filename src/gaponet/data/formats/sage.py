@@ -56,7 +56,13 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
     list_file = folder / "joint_list.txt"
     if not list_file.is_file():
         raise LogError(f"{list_file}: missing; one joint name a line, in the order of the columns")
-    raw_names = [line.strip() for line in _text(list_file).splitlines() if line.strip()]
+    try:
+        lines = read_limited(list_file, LogError).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise LogError(
+            f"{list_file}: not UTF-8 text ({error.reason} at byte {error.start}); is it this file?"
+        ) from None
+    raw_names = [line.strip() for line in lines if line.strip()]
     if not raw_names:
         raise LogError(f"{list_file}: empty; one joint name a line, in the order of the columns")
     names = tuple(resolve_all(raw_names, robot, str(list_file), joint_map))
@@ -153,12 +159,3 @@ def _seconds(file: Path, time: Array) -> float:
     if not period > 0:
         return 1e-6  # Log refuses the row where time goes back or is not a number
     raise LogError(f"{file}: the median period is {period:g}, neither microseconds nor seconds; mend the timestamps")
-
-
-def _text(file: Path) -> str:
-    try:
-        return read_limited(file, LogError).decode()
-    except UnicodeDecodeError as error:
-        raise LogError(
-            f"{file}: not UTF-8 text ({error.reason} at byte {error.start}); is it the right file?"
-        ) from None

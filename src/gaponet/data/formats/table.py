@@ -50,19 +50,19 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     if not files:
         raise LogError(f"{path}: no .csv, .txt or .parquet file in it; point at a table or a folder of tables")
     for file in files:
-        if _is_parquet(file):
+        line = 1
+        if file.suffix.lower() == ".parquet":
             names, load = _parquet_header(file), partial(_read_parquet, file)
         else:
             names, first = _csv_header(file, specified.get("header"))
-            load = partial(_read_csv, file, names, first)
+            load, line = partial(_read_csv, file, names, first), first + 1
         for name in names:
             if names.count(name) > 1:
                 raise LogError(f"{file}:1: column '{name}' stands twice; rename one")
         if joint := joint_rows.joint_column(names, specified):
             yield joint_rows.recording(file, names, joint, specified)
             continue
-        where, line = f"{file}:1", 1 if _is_parquet(file) else first + 1
-        yield RawRecording(file.stem, str(file), dict.fromkeys(names, ()), load, where, (str(file),), line)
+        yield RawRecording(file.stem, str(file), dict.fromkeys(names, ()), load, f"{file}:1", (str(file),), line)
 
 
 def _is_table(file: Path) -> bool:
@@ -71,7 +71,7 @@ def _is_table(file: Path) -> bool:
         lines = stream.read(1 << 16).decode("utf-8", "replace").splitlines()
     if file.suffix.lower() not in (".txt", ".dat"):
         return not (lines and lines[0].lstrip("\ufeff").startswith("file,"))
-    return len(lines) > 1 and _numeric(_cells(lines[1], _delimiter(lines[1])))
+    return len(lines) > 1 and _numeric(lines[1].split(_delimiter(lines[1]).strip() or None))
 
 
 def _delimiter(line: str) -> str:
@@ -79,19 +79,11 @@ def _delimiter(line: str) -> str:
     return next((d for d in (",", ";", "\t") if d in line), " ")
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
-    return line.split() if delimiter == " " else [c.strip() for c in line.split(delimiter)]
-
-
 def _numeric(cells: list[str]) -> bool:
     try:
-        return bool([float(cell) for cell in cells if cell])
+        return bool([float(cell) for cell in cells if cell.strip()])
     except ValueError:
         return False
-
-
-def _is_parquet(file: Path) -> bool:
-    return file.suffix.lower() == ".parquet"
 
 
 def _csv_header(file: Path, given: list[str] | None) -> tuple[list[str], int]:

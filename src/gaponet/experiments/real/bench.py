@@ -28,21 +28,13 @@ Row = dict[str, Any]  # errors of one method on one question (Bench.evaluate)
 
 @dataclass(eq=False)
 class Bench:
-    """A run of the benchmark. Datasets, trainings and evaluations below `work` are reused.
+    """A run of the benchmark. Datasets, trainings and evaluations below `work` are reused."""
 
-    Attributes:
-        cards: Data cards; data sets that are not present are skipped.
-        data: Folder of the public recordings.
-        work: Folder for datasets, trainings and evaluations.
-        methods: Name → title and method.
-        say: Called with a line about each step.
-    """
-
-    cards: Cards
-    data: Path
-    work: Path
-    methods: dict[str, tuple[str, Method]]
-    say: Callable[[str], None] = print
+    cards: Cards  # data cards; data sets that are not present are skipped
+    data: Path  # folder of the public recordings
+    work: Path  # folder for datasets, trainings and evaluations
+    methods: dict[str, tuple[str, Method]]  # name → title and method
+    say: Callable[[str], None] = print  # called with a line about each step
 
     def run(self, sets: tuple[str, ...] = (), names: tuple[str, ...] = ()) -> dict[str, Any]:
         """Import, split, fit and measure.

@@ -35,18 +35,12 @@ ADAPTATION_S = 30.0  # of the test's session
 
 @dataclass(frozen=True)
 class FittedSim:
-    """A fitted simulator.
-
-    Attributes:
-        corrector: Changes the targets (gaponet.sim.replay.Corrector).
-        shift: Returns an offset of a recording's simulated positions, (n,) rad.
-        note: Remark for the reader of the table.
-    """
+    """A fitted simulator."""
 
     robot: RobotSpec
-    corrector: Corrector | None = None
-    shift: Callable[[Sequence], Array] | None = None
-    note: str = ""
+    corrector: Corrector | None = None  # changes the targets (gaponet.sim.replay.Corrector)
+    shift: Callable[[Sequence], Array] | None = None  # returns an offset of a recording's simulated positions, (n,) rad
+    note: str = ""  # remark for the reader of the table
 
     def positions(self, sequences: list[Sequence]) -> list[Array]:
         """Return open-loop rollouts, (T, n) rad each."""

@@ -59,17 +59,11 @@ TABLE_1_METHODS = {"paper": 0, "gaponet": 0, "mlp": 1, "raw": 2}  # our method �
 
 @dataclass(frozen=True)
 class HoldError(Measured):
-    """Errors of one hand at one goal.
+    """Errors of one hand at one goal."""
 
-    Attributes:
-        offset: Mean |hand − goal| by axis at the end of the hold, (3,) m.
-        near: True if the hand stayed within SUCCESS_RADIUS_M at the end of the hold.
-        settle: s from the end of the move until the hand stays within SUCCESS_RADIUS_M; NaN if it does not.
-    """
-
-    offset: Array
-    near: bool
-    settle: float
+    offset: Array  # mean |hand − goal| by axis at the end of the hold, (3,) m
+    near: bool  # True if the hand stayed within SUCCESS_RADIUS_M at the end of the hold
+    settle: float  # s from the end of the move until the hand stays within SUCCESS_RADIUS_M; NaN if it does not
 
 
 def deliver(

@@ -249,10 +249,6 @@ def claim_table(scores: ListOf[Score], errors: ListOf[HoldError], joints: tracki
     )
 
 
-def _printed(row: Printed | None) -> str:
-    return f"{row.obs_dim}: {' '.join(f'{v * 1e3:.0f}' for v in row.mpjae)}" if row else ""
-
-
 def table_2(outcomes: StudyOutcomes, study: Study, *extra: Table2Row) -> ResultTable:
     """Table 2 of the paper with the rows of one network, and the paper's row behind each."""
     masses = sorted({e.meta.payload_mass for e in study.data.entries})
@@ -260,6 +256,7 @@ def table_2(outcomes: StudyOutcomes, study: Study, *extra: Table2Row) -> ResultT
     rows = []
     for row in (*table_2_rows(study), *extra):
         if runs := outcomes.of_model(row.word):
+            printed = row.printed
             nominal = summarize([outcomes.baselines(row.word)["nominal"]], "known", "mpjae", scale=1).mean
             rows.append((
                 f"{row.comparison}: {row.setting}",
@@ -267,7 +264,7 @@ def table_2(outcomes: StudyOutcomes, study: Study, *extra: Table2Row) -> ResultT
                 *(summarize(runs, "known", "by_payload", f"{m:g}", "mpjae") for m in masses),
                 summarize(runs, "known", "mpjae_no_wrist"),
                 MeanStd.from_values([run["known"]["mpjae"] / nominal for run in runs]),
-                _printed(row.printed),
+                printed and f"{printed.obs_dim}: {' '.join(f'{v * 1e3:.0f}' for v in printed.mpjae)}",
             ))  # fmt: skip
     kind = "gaponet" if study.config.model.payload_input else PAPER_MODEL
     caption = (

@@ -28,18 +28,13 @@ SAME_METHOD = ("mlp_match=on",)  # changed settings that leave the method's name
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A trained model and the run that it comes from.
+    """A trained model and the run that it comes from."""
 
-    Attributes:
-        method: Kind of model, with identified+ in front where it corrects an identified simulator.
-        robot: The simulator that it corrects.
-    """
-
-    method: str
+    method: str  # kind of model, with identified+ in front where it corrects an identified simulator
     seed: int
     run: Path
     model: GapModel
-    robot: RobotSpec
+    robot: RobotSpec  # the simulator that it corrects
 
 
 def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[TrainedModel]:

@@ -56,16 +56,11 @@ REST_S = 2.0  # under the first target before a motion begins, for the compensat
 
 @dataclass(frozen=True)
 class Score(Measured):
-    """Q_dis of one motion.
+    """Q_dis of one motion."""
 
-    Attributes:
-        part: alignment or compensation.
-        q_dis: Q_dis of each operated joint, (n,) rad·s.
-    """
-
-    part: str
+    part: str  # alignment or compensation
     motion: str
-    q_dis: Array
+    q_dis: Array  # Q_dis of each operated joint, (n,) rad·s
 
 
 def track(

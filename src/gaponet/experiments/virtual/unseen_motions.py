@@ -26,14 +26,10 @@ MIN_RMS_DIFFERENCE = 0.01  # rad between the targets of two motions that count a
 
 @dataclass(frozen=True)
 class UnseenMotion:
-    """A motion at the robot's control period.
-
-    Attributes:
-        ctrl: Targets, (T, n) rad; limbs without an operated joint stay at home.
-    """
+    """A motion at the robot's control period."""
 
     name: str
-    ctrl: Array
+    ctrl: Array  # targets, (T, n) rad; limbs without an operated joint stay at home
 
 
 def generated(robot: RobotSpec, count: int, max_payload: float) -> list[UnseenMotion]:

@@ -264,16 +264,9 @@ class Status:
     nominal_mpjae: float
 
     @property
-    def throughput(self) -> float:
-        """Control steps per second, including validation and set-up."""
-        return self.steps / max(self.seconds, 1e-9)
-
-    @property
     def note(self) -> str:
         """Stage, reward, validation error and speed as text."""
         reward = "" if self.reward != self.reward else f", reward {self.reward:.4f}"
-        ratio = f"{self.best_mpjae / self.nominal_mpjae:.2f} of nominal"
-        error = (
-            "" if self.val_mpjae != self.val_mpjae else f", validation {self.val_mpjae * 1e3:.2f} mrad (best {ratio})"
-        )
-        return f"{self.stage}{reward}{error}, {self.throughput:,.0f} steps/s"
+        best = f"(best {self.best_mpjae / self.nominal_mpjae:.2f} of nominal)"
+        error = "" if self.val_mpjae != self.val_mpjae else f", validation {self.val_mpjae * 1e3:.2f} mrad {best}"
+        return f"{self.stage}{reward}{error}, {self.steps / max(self.seconds, 1e-9):,.0f} steps/s"

@@ -63,23 +63,15 @@ class Batch:
 
 @dataclass
 class Update:
-    """Metrics of one update.
+    """Metrics of one update."""
 
-    Attributes:
-        explained_variance: Share of the variance of the returns that the critic explains.
-        kl: KL divergence of the actor's step, per joint.
-        mean_delta: Mean |Δa|, rad.
-        at_limit: Share of corrections at or beyond Δ_max.
-        reward: Mean reward of a joint and control period.
-    """
-
-    explained_variance: float = float("nan")
-    kl: float = float("nan")
+    explained_variance: float = float("nan")  # share of the variance of the returns that the critic explains
+    kl: float = float("nan")  # KL divergence of the actor's step, per joint
     learning_rate: float = float("nan")
     critic_learning_rate: float = float("nan")
-    mean_delta: float = float("nan")
-    at_limit: float = float("nan")
-    reward: float = float("nan")
+    mean_delta: float = float("nan")  # mean |Δa|, rad
+    at_limit: float = float("nan")  # share of corrections at or beyond Δ_max
+    reward: float = float("nan")  # mean reward of a joint and control period
 
 
 class PPO:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -157,7 +156,8 @@ def composition(dataset: Dataset, robot: RobotSpec) -> Figure:
     for ax, (label, key), values in zip(axes, keys.items(), names, strict=True):
         base = np.zeros(len(values))
         for level in present:
-            hours = np.array([_hours(e for e in entries if key(e) == v and e.meta.level == level) for v in values])
+            part = [e for e in entries if e.meta.level == level]
+            hours = np.array([sum(e.rows * e.dt for e in part if key(e) == v) / 3600 for v in values])
             ax.bar(range(len(values)), hours, 0.72, base, color=LEVEL_COLOURS[level], label=level.replace("_", " "))
             base = base + hours
         for x, v in enumerate(values):
@@ -174,10 +174,6 @@ def composition(dataset: Dataset, robot: RobotSpec) -> Figure:
     fig.align_xlabels(axes)
     legend(fig, f"{title}; numbers are sequences")
     return fig
-
-
-def _hours(entries: Iterable[Entry]) -> float:
-    return sum(e.rows * e.dt for e in entries) / 3600
 
 
 def torque_temperature(dataset: Dataset, robot: RobotSpec) -> Figure:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gaponet.base.arrays import Array
@@ -15,13 +16,11 @@ from gaponet.base.files import lock_folder, write_text
 from gaponet.base.result_table import MeanStd
 from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.signals import busiest_window
+from gaponet.report.candidate import is_robot
 from gaponet.report.figures.style import DASHED, DOTTED, bars, figure, joint_label, legend, save, styled
 from gaponet.report.methods import colour, shade, title
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SHOWN_S = 20.0  # of each motion, so that details are visible
 MIN_POSITION_SPAN = 0.06  # rad of a position axis, so that encoder steps of a joint at rest are not magnified
@@ -68,8 +67,7 @@ def _degrees(fig: Figure) -> Figure:
     """Add an axis in degrees on the right."""
     mrad = 1e3 * np.pi / 180
     ways: Any = (lambda y: y / mrad, lambda y: y * mrad)
-    right = fig.axes[0].secondary_yaxis("right", functions=ways)
-    right.set_ylabel("degrees")
+    fig.axes[0].secondary_yaxis("right", functions=ways).set_ylabel("degrees")
     return fig
 
 
@@ -162,18 +160,18 @@ def _trajectory(arrays: dict[str, Array], row: int, joints: tuple[str, ...], met
     return fig
 
 
-def _turn(command: Array, dt: float, seconds: float = 2.0) -> slice:
-    """Return the rows around the largest change of the command's speed."""
-    half = round(seconds / 2 / dt)
+def _turn(command: Array, dt: float) -> slice:
+    """Return the rows of 2 s around the largest change of the command's speed."""
+    half = round(1 / dt)
     if len(command) <= 2 * half:
         return slice(0, len(command))
     start = int(np.abs(2 * command[half:-half] - command[: -2 * half] - command[2 * half :]).argmax())
     return slice(start, start + 2 * half)
 
 
-def write_gap(gap: dict[str, Any], folder: Path, kind: str) -> None:
+def write_gap(gap: dict[str, Any], folder: Path) -> None:
     """Write the result of report.gap.gap_by_step as gap.json, gap.svg and gap.png into a robot folder or a run."""
-    with lock_folder(folder, kind):
+    with lock_folder(folder, "robot" if is_robot(folder) else "run"):
         write_text(folder / "gap.json", json.dumps(gap, indent=1) + "\n")
         save(waterfall(gap), folder / "gap")
 

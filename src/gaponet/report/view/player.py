@@ -17,6 +17,7 @@ from gaponet.report.view.scene import Scene
 from gaponet.report.view.side_by_side import Clip, largest_error_time
 
 CURVE_ROWS = 1000  # of a chart
+DARK, LIGHTER = 0.22, np.array([0.20, 0.26, 0.38])  # rgb; a body darker than that cannot be seen on a dark page
 
 
 class Player:
@@ -92,10 +93,9 @@ class Player:
             frames[body] = self.server.scene.add_frame(name, show_axes=False)
             for g in geoms:
                 vertices, faces = _surface(model, int(g))
-                rgb = (255 * model.geom_rgba[g, :3]).astype(int)
                 self.server.scene.add_mesh_simple(
-                    f"{name}/{g}", vertices, faces, color=rgb, opacity=float(model.geom_rgba[g, 3]),
-                    position=model.geom_pos[g], wxyz=model.geom_quat[g],
+                    f"{name}/{g}", vertices, faces, color=_page_colour(model.geom_rgba[g, :3]),
+                    opacity=float(model.geom_rgba[g, 3]), position=model.geom_pos[g], wxyz=model.geom_quat[g],
                 )  # fmt: skip
         across = float(2.5 * self.scene.extent)
         self.server.scene.add_grid("/robots/floor", across, across, position=(0, 0, self.scene.floor))
@@ -110,6 +110,11 @@ class Player:
         for camera in (self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())):
             camera.look_at = self.scene.middle
             camera.position = self.scene.middle + far * self.scene.extent * np.cross(across, up)
+
+
+def _page_colour(rgb: Array) -> Array:
+    """Return a colour (3,) of 0 to 1 as one of 0 to 255 that a light and a dark page show: black becomes slate."""
+    return (255 * (rgb + LIGHTER * (rgb.max() < DARK))).astype(int)
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:

@@ -33,10 +33,8 @@ FITTED_FRAMES = 60  # for the size of the picture
 class View:
     """Direction of the camera. Robots face +x; their row runs from left to right on the picture."""
 
-    azimuth: float = 145.0
-    """Degrees: 180 looks at the robot's front, 90 at its right side."""
-    elevation: float = -14.0
-    """Degrees, negative from above."""
+    azimuth: float = 145.0  # degrees: 180 looks at the robot's front, 90 at its right side
+    elevation: float = -14.0  # degrees, negative from above
 
     @property
     def axes(self) -> tuple[Array, Array]:
@@ -225,12 +223,8 @@ def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, ends: list[float], radius: 
 def _operated_bodies(model: mujoco.MjModel, robot: RobotSpec) -> set[int]:
     """Return the bodies that operated joints move, and the bodies that carry them."""
     moving = {int(model.jnt_bodyid[model.joint(name).id]) for name in robot.operated}
-    bodies: set[int] = set()
-    for body in range(1, model.nbody):
-        chain = carriers(model, body)
-        if moving & chain:
-            bodies |= chain
-    return bodies
+    chains = [carriers(model, body) for body in range(1, model.nbody)]
+    return set[int]().union(*(chain for chain in chains if moving & chain))
 
 
 def _cast_no_shadow(geom: mujoco.MjsGeom) -> None:

@@ -22,17 +22,11 @@ from gaponet.sim.replay import Corrector, replay
 
 @dataclass(frozen=True)
 class Copy:
-    """One copy of the robot.
+    """One copy of the robot."""
 
-    Attributes:
-        method: Key of report.methods.METHODS.
-        qpos: (T, n), rad; row t at t·dt.
-        error: Mean |q − q_real| over the operated joints, (T), rad; row 0 is the common start.
-    """
-
-    method: str
-    qpos: Array
-    error: Array
+    method: str  # key of report.methods.METHODS
+    qpos: Array  # (T, n), rad; row t at t·dt
+    error: Array  # mean |q − q_real| over the operated joints, (T), rad; row 0 is the common start
 
     @property
     def mpjae(self) -> float:
@@ -42,17 +36,12 @@ class Copy:
 
 @dataclass(frozen=True)
 class SideBySide:
-    """The motions of one recording.
-
-    Attributes:
-        motions: Target, nominal, identified, models and recording, in this order.
-        seen: True if a model was trained or validated on this recording; None without a model.
-    """
+    """The motions of one recording."""
 
     real: Sequence
     robot: RobotSpec
-    motions: tuple[Copy, ...]
-    seen: bool | None
+    motions: tuple[Copy, ...]  # target, nominal, identified, models and recording, in this order
+    seen: bool | None  # True if a model was trained or validated on this recording; None without a model
 
     def only(self, methods: tuple[str, ...]) -> SideBySide:
         """Return some motions in this order; "aligned" stands for the motions of all models.
@@ -61,13 +50,10 @@ class SideBySide:
             UsageError: No such motion, or none at all.
         """
         have = {m.method: m for m in self.motions}
-        wanted: list[str] = []
-        for name in methods:
-            models = [m for m in have if m not in ("target", "nominal", "recorded")]
-            wanted += models if name == "aligned" else [name]
-        for name in wanted:
-            if name not in have:
-                raise UsageError(f"--show {name}: here are {', '.join(have)}; models are given with --model RUN")
+        models = [m for m in have if m not in ("target", "nominal", "recorded")]
+        wanted = [m for name in methods for m in (models if name == "aligned" else [name])]
+        if unknown := [name for name in wanted if name not in have]:
+            raise UsageError(f"--show {unknown[0]}: here are {', '.join(have)}; models are given with --model RUN")
         if not wanted:
             raise UsageError("--show: nothing is selected; aligned motion needs --model RUN")
         return replace(self, motions=tuple(have[name] for name in dict.fromkeys(wanted)))
@@ -79,27 +65,15 @@ class SideBySide:
         grow = lambda m: replace(m, qpos=self.real.qpos + factor * (m.qpos - self.real.qpos))  # noqa: E731
         return replace(self, motions=tuple(grow(m) for m in self.motions))
 
-    def busiest(self, seconds: float) -> float:
-        """Return the start of the part of this length with the most motion, s."""
-        rows = max(round(seconds / self.real.dt), 1)
-        return busiest_window(self.real.qpos[:, self.robot.operated_index], rows) * self.real.dt
-
 
 @dataclass(frozen=True)
 class Clip:
-    """A part of a recording.
+    """A part of a recording."""
 
-    Attributes:
-        start: s into the recording.
-        duration: s of the recording.
-        speed: Below 1 is slow motion.
-        fps: Pictures per second of the film.
-    """
-
-    start: float
-    duration: float
-    speed: float = 1.0
-    fps: float = 20.0
+    start: float  # s into the recording
+    duration: float  # s of the recording
+    speed: float = 1.0  # below 1 is slow motion
+    fps: float = 20.0  # pictures per second of the film
 
     def __post_init__(self) -> None:
         for name, low, high in (("duration", 0, 3600), ("speed", 0, 100), ("fps", 0, 120)):
@@ -111,11 +85,13 @@ class Clip:
         cls, shown: SideBySide, start: float | None, duration: float, speed: float = 1.0, fps: float = 20.0
     ) -> Clip:
         """Return the part from start on, or the part with the most motion, cut at the recording's end."""
-        recorded_s = (len(shown.real) - 1) * shown.real.dt
-        begin = shown.busiest(duration) if start is None else start
-        if not 0 <= begin < recorded_s:
-            raise UsageError(f"--start is {begin:g} s; the recording lasts {recorded_s:.1f} s")
-        return cls(begin, min(duration, recorded_s - begin), speed, fps)
+        real, dt = shown.real, shown.real.dt
+        recorded_s = (len(real) - 1) * dt
+        if start is None:
+            start = dt * busiest_window(real.qpos[:, shown.robot.operated_index], max(round(duration / dt), 1))
+        if not 0 <= start < recorded_s:
+            raise UsageError(f"--start is {start:g} s; the recording lasts {recorded_s:.1f} s")
+        return cls(start, min(duration, recorded_s - start), speed, fps)
 
     @property
     def stop(self) -> float:

@@ -33,23 +33,14 @@ BOUND_QUANTILE = 0.9  # of all samples
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence of recordings of n joints about Q numbers: the fields of the axes, then play.
+    """Evidence of recordings of n joints about Q numbers: the fields of the axes, then play."""
 
-    Attributes:
-        gradients: Gradient of the cost in each of C clusters, (n, C, Q).
-        information: Gauss-Newton information in each cluster, (n, C, Q, Q).
-        rows: Number of rows that count, (n,).
-        recording: Recording of each cluster, (C,).
-        names: Names of the recordings.
-        window_rms: RMS error of each of W windows, (n, W) rad.
-    """
-
-    gradients: Array
-    information: Array
-    rows: Array
-    recording: Array
-    names: tuple[str, ...]
-    window_rms: Array
+    gradients: Array  # gradient of the cost in each of C clusters, (n, C, Q)
+    information: Array  # Gauss-Newton information in each cluster, (n, C, Q, Q)
+    rows: Array  # number of rows that count, (n,)
+    recording: Array  # recording of each cluster, (C,)
+    names: tuple[str, ...]  # names of the recordings
+    window_rms: Array  # RMS error of each of W windows, (n, W) rad
 
     def by_recording(self) -> Evidence:
         """Return the evidence with one cluster of each recording."""

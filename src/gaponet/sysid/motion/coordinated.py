@@ -31,19 +31,12 @@ ROLES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm.
+    """One arm."""
 
-    Attributes:
-        side: left or right.
-        sign: +1 left, −1 right: multiplies every sideways (y) quantity.
-        columns: Positions of ROLES in robot.joint_names, (5,).
-        hand: MuJoCo body at the palm.
-    """
-
-    side: str
-    sign: float
-    columns: Array
-    hand: str
+    side: str  # left or right
+    sign: float  # +1 left, −1 right: multiplies every sideways (y) quantity
+    columns: Array  # positions of ROLES in robot.joint_names, (5,)
+    hand: str  # MuJoCo body at the palm
 
 
 def arms(robot: RobotSpec) -> dict[str, Arm]:

@@ -37,19 +37,12 @@ EPSILON = 1e-9
 
 @dataclass(frozen=True)
 class ExperimentDesign:
-    """Information that R recordings would hold about n joints' P parameters, on the axes of sysid/uncertainty.py.
+    """Information that R recordings would hold about n joints' P parameters, on the axes of sysid/uncertainty.py."""
 
-    Attributes:
-        information: Gauss-Newton information of each recording, (n, R, P, P).
-        seconds: Durations, (R,).
-        covariance: Present covariance, (n, P, P).
-        overdispersion: Variance of recordings' gradients over that of independent rows, (n, P).
-    """
-
-    information: Array
-    seconds: Array
-    covariance: Array
-    overdispersion: Array
+    information: Array  # Gauss-Newton information of each recording, (n, R, P, P)
+    seconds: Array  # durations, (R,)
+    covariance: Array  # present covariance, (n, P, P)
+    overdispersion: Array  # variance of recordings' gradients over that of independent rows, (n, P)
 
     @classmethod
     def from_recordings(

@@ -26,15 +26,10 @@ ROWS_PER_STEP = 16  # postures that one step of a search checks
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Minimum-jerk moves from point to point, at rest at each.
+    """Minimum-jerk moves from point to point, at rest at each."""
 
-    Attributes:
-        points: (k, n) rad.
-        times: When each is reached, (k,) s; the first is 0.
-    """
-
-    points: Array
-    times: Array
+    points: Array  # (k, n) rad
+    times: Array  # when each is reached, (k,) s; the first is 0
 
     @classmethod
     def minimum_jerk(cls, points: Array, speed: float, acceleration: float, least: float) -> Trajectory:
