@@ -31,6 +31,13 @@ STEPS: dict[str, list[str]] = LISTED["steps"]
 README_COLUMNS = (("nominal simulator",), ("delay + offset",), ("plain script", "mujoco.sysid"), ("identification",),
                   ("identification + network",))  # fmt: skip
 TAIL = 60  # lines of an output on the page
+STEPS_HEAD = """# Steps of `make results`
+
+Commands of `benchmarks/results.toml`, and when `make results` last ran each. DATA is the folder of the public
+recordings, WORK is `results_work`. `make results STEPS="backlash hinge"` runs two steps. A step with an answer in
+WORK/answers is skipped. One that was killed starts again. Commands that store each robot or set, such as
+`gaponet experiment real` and the tournament, then continue where they were. Below the table is what steps printed.
+"""
 
 
 def measure(name: str, command: str, work: Path) -> bool:
@@ -69,7 +76,7 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
         for when, sets in made.items():
             text = "; ".join(f"{name}: {' / '.join(dict.fromkeys(methods))}" for name, methods in sets.items())
             file.write(f"| {when} | {text} |\n")
-    page = ["# Steps of `make results`\n", "Commands of `benchmarks/results.py`, and when each was last run by it.\n"]
+    page = [STEPS_HEAD]
     page.append("| step | command | seeds | measured | minutes |\n| --- | --- | --- | --- | ---: |")
     for name, (command, seeds) in STEPS.items():
         a = answers.get(name)

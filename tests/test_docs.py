@@ -44,7 +44,7 @@ def widths(layers: tuple[int, ...]) -> str:
         ("reference/paper-network.md", f"those at ±{MODEL.probe_large} rad read inertia"),
         ("network.md", f"Δ_max = {MODEL.delta_max} rad"),
         ("network.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
-        ("reference/paper-network.md", f"Oracle answers at {TRAIN.pretraining.sensor_states} states"),
+        ("reference/paper-network.md", f"own answers at {TRAIN.pretraining.sensor_states} states"),
         ("identification.md", f"an error of {PRIOR_RAD} rad"),
         ("paper.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
     ],

@@ -93,11 +93,30 @@ def test_an_identified_stop_does_not_widen_a_range(h1_2):
 @pytest.mark.parametrize(
     ("values", "said"),
     [({"offset": 0.11}, "offset of .* is 0.11 rad"), ({"offset": np.nan}, "offset"), ({"kp": 0.0}, "kp of .* is 0 N"),
-     ({"kp": 24.0}, "0.25 to 4 times the nominal 100"), ({"kp": 401.0}, "kp")],
+     ({"kp": 24.0}, "hardware takes 25 to 400"), ({"kp": 401.0}, "kp"), ({"zero": -0.2}, "zero of .* is -0.2 rad"),
+     ({"frictionloss": 21.0}, "21 N·m; hardware takes 0 to 20"), ({"damping": 101.0}, "damping"),
+     ({"armature": 9.1}, "armature"), ({"stribeck": 11.0}, "stribeck"), ({"delay": 0.2}, "delay"),
+     ({"backlash": 0.2}, "backlash")],
 )  # fmt: skip
 def test_identified_values_beyond_what_servos_have_are_refused_on_hardware(h1_2, values, said):
     with pytest.raises(RobotError, match=said):
         hardware_robot(h1_2.with_servos({JOINT: values}), h1_2)
+
+
+def test_identified_masses_beyond_what_motors_carry_are_refused_on_hardware(h1_2):
+    mounts = h1_2.payload_mounts
+    heavy, light = (
+        replace(h1_2, payload_mounts=(replace(mounts[0], mass=m), *mounts[1:]), nominal=h1_2) for m in (40, 1)
+    )
+    with pytest.raises(RobotError, match="identified masses change the torque of left_"):
+        hardware_robot(heavy, h1_2)
+    assert hardware_robot(light, h1_2).nominal is h1_2
+
+
+def test_an_identified_effort_limit_does_not_widen_that_of_the_plan(h1_2):
+    at = h1_2.index([JOINT])
+    strong = hardware_robot(h1_2.with_servos({JOINT: {"effort_limit": 1e5}}), h1_2)
+    assert strong.effort_limit[at] == h1_2.effort_limit[at]
 
 
 def test_limits_may_come_from_a_folder_that_the_user_names_but_not_beyond_the_motors(h1_2, tmp_path):

@@ -16,11 +16,14 @@ from gaponet.base.errors import RobotError, UsageError
 from gaponet.robot.collision import read_shapes
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot
-from gaponet.sim.model import model_hash
+from gaponet.sim.dynamics import static_torque
+from gaponet.sim.model import build_model, model_hash
+from gaponet.sysid.axes import MAX_ARMATURE_TIME_S
 
 ROBOT_OF_DRIVER = {"unitree": "h1_2", "so101": "so101"}
 MAX_OFFSET_RAD = 0.1  # of an identified command offset; a larger one is a wrong zero, which calibration removes
 KP_RATIO_BOUNDS = (0.25, 4.0)  # of identified kp to nominal kp
+MAX_WEIGHT_SHARE, POSTURES = 0.5, 64  # of the effort limit, for identified masses; postures in which they are compared
 RELATIVE_TOLERANCE = 1e-6  # between values of two files
 MAX_KP = 300.0  # N·m/rad of any joint; the H1-2's legs have 200
 MAX_KD = 10.0  # N·m·s/rad
@@ -56,7 +59,9 @@ def hardware_robot(robot: RobotSpec, reference: RobotSpec) -> RobotSpec:
     require_plausible(robot)
     if robot.nominal is None:
         return reference
-    return replace(reference, **{name: getattr(robot, name) for name in SERVO_FIELDS}, nominal=reference)
+    values = {name: getattr(robot, name) for name in SERVO_FIELDS}
+    values["effort_limit"] = np.minimum(robot.effort_limit, reference.effort_limit)
+    return replace(reference, **values, nominal=reference)
 
 
 def robot_hash(robot: RobotSpec) -> str:
@@ -92,21 +97,40 @@ def require_plausible(robot: RobotSpec) -> None:
     """Refuse identified values that would move commands of a real robot far from their targets.
 
     Raises:
-        RobotError: With the folder, the joint and the bound.
+        RobotError: With the folder, the joint and the bounds.
     """
     nominal = robot.before_identification
-    low, high = KP_RATIO_BOUNDS
-    for i, joint in enumerate(robot.joint_names):
-        if not abs(robot.offset[i]) <= MAX_OFFSET_RAD:
+    bounds = {"kp": np.outer(KP_RATIO_BOUNDS, nominal.kp), "armature": np.outer((0, MAX_ARMATURE_TIME_S**2), robot.kp)}
+    bounds |= dict.fromkeys(("offset", "zero"), np.outer((-MAX_OFFSET_RAD, MAX_OFFSET_RAD), np.ones(len(robot.kp))))
+    for name, field in SERVO_FIELDS.items():
+        if field.bounds and field.axis in ("value", "over kp") and name not in bounds:
+            scale = robot.kp if field.axis == "over kp" else np.ones(len(robot.kp))
+            bounds[name] = np.outer(field.bounds[:2], scale)
+    for name, (low, high) in bounds.items():
+        values, field = getattr(robot, name), SERVO_FIELDS[name]
+        beyond = ~((values >= low) & (values <= high) | np.isnan(values))  # NaN: the MJCF's; other fields have none
+        if beyond.any():
+            i = int(beyond.argmax())
             raise RobotError(
-                f"{robot.folder}: the identified offset of {joint} is {robot.offset[i]:g} rad; hardware takes at most "
-                f"{MAX_OFFSET_RAD:g}. Calibrate the joint's zero and identify again"
+                f"{robot.folder}: the identified {name} of {robot.joint_names[i]} is {values[i]:g} {field.unit}; "
+                f"hardware takes {low[i]:g} to {high[i]:g}. To do: {field.advice}; then identify again"
             )
-        if not low * nominal.kp[i] <= robot.kp[i] <= high * nominal.kp[i]:
-            raise RobotError(
-                f"{robot.folder}: the identified kp of {joint} is {robot.kp[i]:g} N·m/rad; hardware takes {low:g} to "
-                f"{high:g} times the nominal {nominal.kp[i]:g}. Check the servo's gains and identify again"
-            )
+    if robot.links or robot.payload_mounts != nominal.payload_mounts:
+        _require_light(robot, nominal)
+
+
+def _require_light(robot: RobotSpec, nominal: RobotSpec) -> None:
+    """Refuse identified masses whose weight changes a joint's torque by more than a share of its effort limit."""
+    low, high = np.clip(nominal.qpos_range.T, -np.pi, np.pi)
+    postures = np.random.default_rng(0).uniform(low, high, (POSTURES, len(robot.kp)))
+    with_mass, without = (static_torque(build_model(replace(r, table=None)), postures) for r in (robot, nominal))
+    share = np.abs(with_mass - without).max(axis=0) / nominal.effort_limit
+    if not share.max() <= MAX_WEIGHT_SHARE:
+        joint = robot.joint_names[int(share.argmax())]
+        raise RobotError(
+            f"{robot.folder}: identified masses change the torque of {joint} by {share.max():.2f} of its effort limit; "
+            f"hardware takes {MAX_WEIGHT_SHARE:g}. Check kp's unit and the payload, or identify without --masses"
+        )
 
 
 def require_motor_limits(robot: RobotSpec, packaged: str) -> None:
