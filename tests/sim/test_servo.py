@@ -29,6 +29,7 @@ def pull(robot, torque, seconds=0.3):
 
 def test_friction_at_rest_exceeds_that_in_motion(arm):
     sticky = servo_model(arm, stribeck=0.1, stribeck_speed=0.05)  # frictionloss is 0.05
+    assert abs(pull(servo_model(arm, stribeck=0.1), 0.14)) < 1e-4  # without a speed it ends at once
     assert pull(arm, 0.1) > 0.05
     assert abs(pull(sticky, 0.14)) < 1e-4
     # Once it slides fast the difference is gone: damping 0.5 alone takes what is beyond 0.05 N·m.

@@ -32,7 +32,9 @@ DEADBAND_STEPS = 0.5  # encoder steps: a motor with a least torque rests while i
 
 def present(terms: ServoTerms) -> ServoTerms:
     """Return the terms that are not zero everywhere; others are not computed. No division by these speeds fails."""
-    active = {name: x.clip(min=SLOWEST) if name == "stribeck_speed" else x for name, x in terms.items() if x.any()}
+    active = {name: x for name, x in terms.items() if x.any()}
+    if "stribeck" in active and "stribeck_speed" in terms:
+        active["stribeck_speed"] = terms["stribeck_speed"].clip(min=SLOWEST)
     if "no_load_speed" in active:
         x = active["no_load_speed"]
         active["no_load_speed"] = array_module(x).where(x > 0, x, float("inf"))
