@@ -367,7 +367,7 @@ def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
         page._attempt(page._read, None)
         wait_for(page.jobs)
         assert why in _ending(page.jobs.all[-1])
-    assert "elbow: not in every recording" in _report(page.jobs.all[-1])
+    assert "elbow: missing in some recordings" in _report(page.jobs.all[-1])
 
 
 @pytest.mark.slow

@@ -110,7 +110,7 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
         at.upload("Upload a log", archive)
         at.sees("logs.zip is stored")
         at.click("Read the logs")
-        at.sees("4 sequences")
+        at.sees("4 recordings")
         at.tab("5 Identify")
         at.sees("Check the recordings first")
         assert first.value(f"{FIND.format(repr('button'), repr('Identify'))}[0].disabled")
