@@ -53,6 +53,9 @@ def test_a_simulation_without_temperature_is_at_the_reference(tmp_path):
     assert model_hash(made[0]) != model_hash(made[1])  # stored replays of one are not the other's
     assert Condition.of(at(real, 50.0), made[1]).temperature is None
     assert (made[0].at_temperature((300.0, 300.0)).frictionloss > 0).all()
+    one_known = made[0].at_temperature((float("nan"), 50.0))
+    assert one_known.frictionloss[0] == made[0].frictionloss[0]
+    assert one_known.frictionloss[1] < made[0].frictionloss[1]
 
 
 def test_the_term_is_in_the_robot_folder(tmp_path):

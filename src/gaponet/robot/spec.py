@@ -211,10 +211,10 @@ class RobotSpec:
         return dataclasses.replace(self, kp=self.kp * kp_ratio, kd=new_kd * kd_ratio, nominal=own)
 
     def at_temperature(self, temperature: tuple[float, ...] | None) -> RobotSpec:
-        """Return the robot with friction and damping at joint temperatures, (n) °C; None: at friction_temperature."""
+        """Return the robot with friction and damping at joint temperatures, (n) °C; None or NaN: as stated."""
         if temperature is None:
             return self
-        warming = np.array(temperature) - self.friction_temperature
+        warming = np.nan_to_num(np.array(temperature) - self.friction_temperature)
         values = self.damping, self.frictionloss, self.friction_per_kelvin, self.damping_per_kelvin
         damping, friction = warmed(warming, *values)
         kd = np.maximum(self.kd + np.fmin(damping, 0.0), 0.0)

@@ -122,7 +122,7 @@ class Condition(NamedTuple):
         """Return the condition of a recording of this robot."""
         meta, gains = sequence.meta, sequence.meta.recorded_gains
         other = (None, None) if robot.with_gains(*gains) is robot else gains
-        warm = robot.friction_per_kelvin.any() and sequence.temperature is not None
+        warm = any(robot.friction_per_kelvin) or any(robot.damping_per_kelvin)
         return cls(meta.payload_mass, meta.payload_side, sequence.dt, *other, sequence.temperatures if warm else None)
 
 
