@@ -2,8 +2,8 @@
 
 results.toml lists the steps: commands with their seeds. The output, commit, date and seconds of a step go to
 WORK/answers/STEP.json. A step with an answer is skipped, and an interrupted command resumes where it can. Then
-docs/results/real.md, docs/results/steps.md and README's table are written from the answers. Of robots that were not
-measured again, the earlier rows stay.
+docs/results/real.md, docs/results/steps.md and README's table are written from the answers. What was not measured again
+stays as it was.
 
     --list    show steps and answers       --write   only write the pages       --data FOLDER   public recordings
 """
@@ -76,16 +76,21 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
         for when, sets in made.items():
             text = "; ".join(f"{name}: {' / '.join(dict.fromkeys(methods))}" for name, methods in sets.items())
             file.write(f"| {when} | {text} |\n")
+    kept = json.loads((PAGES / "steps.json").read_text(encoding="utf-8"))
+    for name, a in answers.items():
+        lines = [] if name.startswith("real_") else a["output"].replace(str(work), "WORK").splitlines()[-TAIL:]
+        kept[name] = a | {"output": lines}
+    kept = {name: kept[name] for name in STEPS if name in kept}
+    text = json.dumps(kept, indent=1, ensure_ascii=False)
+    (PAGES / "steps.json").write_text(text + "\n", encoding="utf-8")
     page = [STEPS_HEAD]
     page.append("| step | command | seeds | measured | minutes |\n| --- | --- | --- | --- | ---: |")
     for name, (command, seeds) in STEPS.items():
-        a = answers.get(name)
+        a = kept.get(name)
         done = f"{measured(a)} | {a['seconds'] / 60:.1f}" if a else "– | –"
         page.append(f"| {name} | `{filled(command, Path('WORK'), Path('DATA'))}` | {seeds} | {done} |")
-    for name, a in answers.items():
-        if not name.startswith("real_"):
-            page.append(f"\n## {name}\n\n```text\n" + "\n".join(a["output"].splitlines()[-TAIL:]) + "\n```")
-    (PAGES / "steps.md").write_text("\n".join(page).replace(str(work), "WORK") + "\n", encoding="utf-8")
+    page += [f"\n## {name}\n\n```text\n" + "\n".join(a["output"]) + "\n```" for name, a in kept.items() if a["output"]]
+    (PAGES / "steps.md").write_text("\n".join(page) + "\n", encoding="utf-8")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     table = re.compile(r"(\| real robot \|.*\n\|[- :|]+\|\n)(\|.*\n)+")
     text = "".join(readme_rows(result["rows"]))
