@@ -31,22 +31,29 @@ def arm(tmp_path: Path) -> RobotSpec:
     return write_arm(tmp_path / "robots" / "arm")
 
 
+def public(name: str) -> Path:
+    """Return a folder of the public recordings, or skip the test."""
+    if not (SHARED / name).is_dir():
+        pytest.skip(f"no {name} in {SHARED}; set GAPONET_DATA to the folder that holds it")
+    return SHARED / name
+
+
 @pytest.fixture(scope="session")
 def sage_so101() -> Path:
     """The public SO-101 logs: 40 motions of one unit, no payload."""
-    folder = SHARED / "sage_so101"
-    if not folder.is_dir():
-        pytest.skip(f"no real logs at {folder}; set GAPONET_DATA to the folder that holds sage_so101")
-    return folder
+    return public("sage_so101")
+
+
+@pytest.fixture(scope="session")
+def iit_z1() -> Path:
+    """A public recording of a Z1 arm: one chirp."""
+    return public("iit_z1")
 
 
 @pytest.fixture(scope="session")
 def paper_network() -> Path:
     """The weights that the paper's authors published, and pairs of inputs and outputs of their code."""
-    folder = SHARED / "paper_network"
-    if not folder.is_dir():
-        pytest.skip(f"no published network at {folder}; set GAPONET_DATA to the folder that holds paper_network")
-    return folder
+    return public("paper_network")
 
 
 @pytest.fixture(scope="session")

@@ -211,6 +211,7 @@ def test_the_folder_of_a_package_is_an_option(tmp_path):
         ({"kp": ("hip=1",)}, "has no position gain for roll: give those of the controller that recorded"),
         ({"kp": ("20", "hip=much")}, "--kp hip=much: give a number from 0"),
         ({"kd": ("toe=2",)}, "--kd toe=2: no such joint"),
+        ({"kp": ("80", "120")}, "--kp 80 120: give one value for all joints, and shoulder=80 for a joint"),
         ({"effort_limit": ("-3",)}, "--effort-limit -3"),
         ({"keyframe": "high"}, "vendor.xml has home, low"),
         ({"rate": 0.0}, "--rate 0.0"),

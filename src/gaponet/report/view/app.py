@@ -81,7 +81,7 @@ class App:
     def _robot(self) -> None:
         self.model = self.gui.add_dropdown("robot", packaged_robots())
         self._upload("Upload a model: MJCF, URDF, or a .zip with its meshes", "model")
-        hints = {"joints": "names; empty for all that the model drives", "kp": "N·m/rad", "kd": "N·m·s/rad"}
+        hints = {"joints": "names; empty: all that are driven", "kp": "80 joint2=120, N·m/rad", "kd": "N·m·s/rad"}
         self.options = {name: self.gui.add_text(name, "", hint=hint) for name, hint in hints.items()}
         self._button("Use this robot", self._use_robot)
         self._text("robot", "Choose a robot of the package, or upload a model of yours.")
