@@ -166,7 +166,8 @@ def test_from_a_urdf_and_one_real_chirp_of_a_z1_to_an_export_that_agrees(page, i
         at.tab("5 Identify")
         at.write("time limit", "30s")
         at.click("Identify")
-        at.sees("→ identified")
+        at.sees("gaponet identify, ")
+        at.sees("gaponet gap has ended")
         at.tab("6 Use")
         at.click("Export")
         at.sees("robot.xml alone")
@@ -235,6 +236,25 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
         assert page.jobs.result("identify").number == before
         assert second.complaints() == []
     assert export_agrees(page)
+
+
+def test_200_megabytes_of_another_robot_are_stored_and_refused_with_the_reason(page, tmp_path):
+    from browser import Browser
+
+    names = ["time", *(f"{kind}.{joint}" for kind in ("ctrl", "qpos") for joint in ("hip", "knee", "ankle"))]
+    (tmp_path / "walk.csv").write_text(",".join(names) + "\n" + "0.02,0.1,0.2,0.3,0.1,0.2,0.3\n" * 7_000_000)
+    with Browser(1000, 700) as browser:
+        at = Clicker(browser, page.address)
+        at.choose("robot", "so101")
+        at.click("Use this robot")
+        at.sees("gaponet robot has ended")
+        at.tab("2 Logs")
+        at.upload("Upload a log", tmp_path / "walk.csv")
+        at.sees("walk.csv is stored")
+        at.click("Read the logs")
+        at.sees("gaponet import gave no result")
+        at.sees("names joints hip, knee, ankle, which robot 'so101' does not have")
+        assert browser.complaints() == []
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
