@@ -76,7 +76,7 @@ results: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/results.py results_work $(STEPS)
 
 # Changed files at random into everything that reads files: a quarter of an hour; counts as JSON, exit code 1 where one
-# ends in anything but one clear error. FUZZ="--only sage --mutants 1000 --keep failed" looks at one reader.
+# ends in anything but one clear error or sane data. FUZZ="--only sage --mutants 1000 --keep failed" looks at one reader.
 FUZZ ?=
 fuzz: setup
 	OMP_NUM_THREADS=1 PYTHONPATH=src:tests $(BIN)/python -m fuzzing $(FUZZ)

@@ -34,9 +34,9 @@ TAIL = 60  # lines of an output on the page
 STEPS_HEAD = """# Steps of `make results`
 
 Commands of `benchmarks/results.toml`, and when `make results` last ran each. DATA is the folder of the public
-recordings, WORK is `results_work`. `make results STEPS="backlash hinge"` runs two steps. A step with an answer in
-WORK/answers is skipped. One that was killed starts again. Commands that store each robot or set, such as
-`gaponet experiment real` and the tournament, then continue where they were. Below the table is what steps printed.
+recordings (`GAPONET_DATA`), WORK is `results_work`. `make results STEPS="backlash hinge"` runs two steps. A step with
+an answer in WORK/answers is skipped; delete the answer to repeat it. A killed step starts again. Commands that store
+each robot or set, such as `gaponet experiment real`, then continue. Below the table is what steps printed.
 """
 
 

@@ -40,8 +40,8 @@ def virtual(
         interface: Network interface; lo reaches this machine only.
         rate: States per second (DDS).
         seconds: Stop after this time, s.
-        fault: Fault to inject, to test the controller.
-        fault_at: Time of the fault after the first command, s.
+        fault: DDS: fault to inject, to test the controller.
+        fault_at: DDS: time of the fault after the first command, s.
         link: Serial: additional name of the pseudo-terminal, such as /tmp/so101.
         calibration: Serial: file for the calibration in the servos, in the format of lerobot-calibrate.
         frame: Serial: simulated time per goal, s, instead of real time, for programs without a clock.
