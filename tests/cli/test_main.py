@@ -30,3 +30,8 @@ def test_help_imports_no_command():
 def test_a_mistyped_command_is_told_its_neighbour(capsys):
     assert main(["trian"]) == 2
     assert capsys.readouterr().err == "Usage: no command 'trian'; do you mean train? gaponet --help lists them all\n"
+
+
+def test_a_fault_that_a_virtual_robot_does_not_have_is_refused(capsys):
+    assert main(["virtual", "serve", "--robot", "so101", "--fault", "stop"]) == 2
+    assert "--fault stop: only h1_2 has faults" in capsys.readouterr().err

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.cli.out import Out
 from gaponet.hw.control.stop import STOP_SIGNALS
@@ -59,6 +60,8 @@ def virtual(
     label = f"VIRTUAL {spec.name}, fleet {fleet}, unit {name}, {payload_mass:g} kg"
     limit = float("inf") if seconds is None else seconds
     if spec.name == "so101":
+        if fault != "none":
+            raise UsageError(f"--fault {fault}: only h1_2 has faults to inject")
         side = payload_side if payload_side != "both" else "hand"
         arm = VirtualSO101(spec, physics, (payload_mass, side), link, frame)
         if calibration:
