@@ -2,8 +2,8 @@
 
 results.toml lists the steps: commands with their seeds. The output, commit, date and seconds of a step go to
 WORK/answers/STEP.json. A step with an answer is skipped, and an interrupted command resumes where it can. Then
-docs/results/real.md, docs/results/steps.md and README's table are written from the answers. What was not measured again
-stays as it was.
+docs/results/real.md, docs/results/steps.md, README's table and its picture are written from the answers. What was not
+measured again stays as it was.
 
     --list    show steps and answers       --write   only write the pages       --data FOLDER   public recordings
 """
@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -56,7 +57,7 @@ def measure(name: str, command: str, work: Path) -> bool:
 
 
 def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
-    """Write the pages of real robots and of steps, and README's table."""
+    """Write the pages of real robots and of steps, README's table and its picture."""
     result = json.loads((PAGES / "real.json").read_text(encoding="utf-8"))
     rows = {(r["set"], r["question"], r["method"]): r for r in result["rows"]}
     for answer in (a for name, a in answers.items() if name.startswith("real_")):
@@ -91,6 +92,8 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
         page.append(f"| {name} | `{filled(command, Path('WORK'), Path('DATA'))}` | {seeds} | {done} |")
     page += [f"\n## {name}\n\n```text\n" + "\n".join(a["output"]) + "\n```" for name, a in kept.items() if a["output"]]
     (PAGES / "steps.md").write_text("\n".join(page) + "\n", encoding="utf-8")
+    if (picture := work / "so101_id" / "gap.png").is_file():  # of so101_causes
+        shutil.copyfile(picture, PAGES / "so101_causes.png")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     table = re.compile(r"(\| real robot \|.*\n\|[- :|]+\|\n)(\|.*\n)+")
     text = "".join(readme_rows(result["rows"]))
