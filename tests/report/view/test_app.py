@@ -202,7 +202,7 @@ def test_identification_is_locked_while_the_check_finds_an_error(page):
 
 def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
     job = SimpleNamespace(command="gaponet gap data", lines=[
-        "gap: 50 %, 3 s, note", "By joint", "┏━━┳━━┓", "┃ joint ┃ MPJAE, mrad ┃", "┡━━╇━━┩",
+        "training auto: 50 %, 3 s, note", "By joint", "┏━━┳━━┓", "┃ joint ┃ MPJAE, mrad ┃", "┡━━╇━━┩",
         "│ <b>x</b> │ 3.1 │", "└──┴──┘", "     ok  sign: fine", "![x](https://evil.example)",
     ])  # fmt: skip
     text = _report(job)

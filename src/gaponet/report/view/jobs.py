@@ -24,7 +24,7 @@ NEEDS = {
     "adapt": "new",
 }  # fmt: skip
 OUT = "\0"  # word that `start` replaces by the name of a new folder
-PROGRESS_LINE = re.compile(r"^\w+: (\d+) %, \d+ s(?:, (.*))?$")
+PROGRESS_LINE = re.compile(r"^[^:]+: (\d+) %, \d+ s(?:, (.*))?$")
 
 
 class Job:
