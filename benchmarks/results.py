@@ -45,7 +45,8 @@ def measure(name: str, command: str, work: Path) -> bool:
     """Run a step; store its answer if it ended well, and return whether it did."""
     began, log = time.monotonic(), work / "answers" / f"{name}.txt"
     git = lambda *words: subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout  # noqa: E731
-    commit = git("rev-parse", "--short=8", "HEAD").strip() + "+" * bool(git("status", "--porcelain", "-uno"))
+    changed = git("diff", "HEAD", "--name-only", "--", "src", "benchmarks")
+    commit = git("rev-parse", "--short=8", "HEAD").strip() + "+" * bool(changed)
     paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT / "src")}
     with log.open("w") as file:
         code = subprocess.run(command, shell=True, cwd=ROOT, stdout=file, env=os.environ | paths).returncode
