@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import tracemalloc
 
 import numpy as np
@@ -105,6 +106,25 @@ def test_a_disk_that_is_full_keeps_what_was_written_and_says_so(tmp_path, monkey
     np.testing.assert_allclose(np.load(folder / "sway.cycles.npy")["qpos.elbow"], 0.001 * np.arange(kept))
     assert json.loads((folder / "sway.json").read_text())["not_whole"] == "No space left on device"
     assert path.exists()  # there was room for the table
+
+
+def test_a_full_disk_without_room_for_the_header_either_ends_the_recording_only(tmp_path, monkeypatch):
+    folder, real, writes = tmp_path / "logs", os.pwrite, []
+
+    def full(descriptor: int, data: bytes, at: int) -> int:  # a file system that copies what is overwritten
+        writes.append(at)
+        if len(writes) > 5:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(descriptor, data, at)
+
+    monkeypatch.setattr(module.os, "pwrite", full)
+    made = recording(500, folder)
+    end = threading.Thread(target=made.rows.close, daemon=True)
+    end.start()
+    end.join(10)
+    assert not end.is_alive(), "it waits for ever for a writer that has ended"
+    assert made.rows.error.strerror == "No space left on device"
+    np.testing.assert_allclose(np.load(made.rows.path)["qpos.elbow"], 0.001 * np.arange(2 * CHUNK_ROWS))
 
 
 def test_what_cannot_be_written_at_the_end_leaves_the_periods(tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ import queue
 import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -54,8 +55,7 @@ class Rows:
         self._file: IO[bytes] | None = None
         self.path: Path | None = None
         self.error: OSError | None = None
-        self._written = 0  # rows in the file
-        self._header_size = len(self._header(0))
+        self._written, self._header_size = 0, len(self._header(0))  # rows in the file; bytes
         self._pending: queue.Queue[bytes | None] = queue.Queue()
         self._writer: threading.Thread | None = None
 
@@ -105,8 +105,7 @@ class Rows:
         """Move the file to a path, or copy a temporary one."""
         self.close()
         if self.path is not None:
-            os.replace(self.path, path)
-            self.path = path
+            self.path = self.path.replace(path)
             return
         rows = self.table()
         with atomic_write(path) as temporary, temporary.open("wb") as file:
@@ -159,7 +158,8 @@ class Rows:
             except OSError as error:
                 self.error = error
             self._written += done // size
-            os.pwrite(descriptor, self._header(self._written), 0)  # overwrites: works on a full disk
+            with suppress(OSError):  # overwrites, which works on a full disk unless its file system copies
+                os.pwrite(descriptor, self._header(self._written), 0)
             self._pending.task_done()
         self._pending.task_done()
 

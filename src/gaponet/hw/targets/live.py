@@ -3,7 +3,7 @@
 A `Transport` delivers messages. `LiveTargets` checks them and is the controller's policy. A rejected target changes
 nothing: the last accepted one is held. If no target is accepted for `LiveConfig.hold`, the robot damps. An accepted
 target is approached within an acceleration limit, and then passes compensator, limits and watchdog like a motion's row.
-docs/deploy-safety.md lists the end of each fault.
+docs/reference/controller.md lists the end of each fault.
 """
 
 from __future__ import annotations
