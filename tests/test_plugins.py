@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from arm import write_arm
+from logs import arm_columns
 
 from gaponet import plugins
-from gaponet.base.errors import UsageError
+from gaponet.base.errors import LogError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.formats import FORMATS, detect, formats
+from gaponet.data.importer import import_logs
+from gaponet.data.store import Dataset
 from gaponet.experiments.real.bench import load_method
 from gaponet.hw.drivers.open import open_driver
 
@@ -96,6 +103,28 @@ def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, c
     name, method = load_method("half")
     assert (name, method(3)) == ("half", 3)
     assert caplog.records == []
+
+
+def test_the_format_of_the_architecture_page_is_listed_and_read(installed, tmp_path, capsys):
+    page = (Path(__file__).parents[1] / "docs/architecture.md").read_text(encoding="utf-8")
+    section = page.partition("## A package of your own")[2]
+    project, module = (re.findall(rf"```{kind}\n(.*?)```", section, re.DOTALL)[0] for kind in ("toml", "python"))
+    points = tomllib.loads(project)["project"]["entry-points"]
+    assert set(points) <= set(plugins.GROUPS)
+    (tmp_path / f"{points['gaponet.formats']['mylog']}.py").write_text(module)
+    installed("[gaponet.formats]\nmylog = mylog\n")
+    rows = np.column_stack(list(arm_columns().values())).astype(np.float32)
+    robot, log = write_arm(tmp_path / "arm"), tmp_path / "wave.mylog"
+    rows.tofile(log)
+    assert main(["import", "--formats"]) == 0
+    assert "Log of my arm" in capsys.readouterr().out
+    made = import_logs(log, robot, "lab", 0.0, tmp_path / "data")
+    (entry,) = made.entries
+    assert entry.meta.motion == "wave"
+    assert np.allclose(Dataset(tmp_path / "data").read(entry).ctrl, rows[:, 1:3])
+    log.write_bytes(b"1234")
+    with pytest.raises(LogError, match=r"wave.mylog: its size is no multiple of five"):
+        import_logs(log, robot, "lab", 0.0, tmp_path / "data")
 
 
 def test_run_lists_and_opens_the_drivers_of_extensions(installed, tmp_path):

@@ -1,19 +1,23 @@
 """make fuzz: mutants over all targets, their counts as JSON; exit code 1 where one failed.
 
 python -m fuzzing [--mutants 100000] [--only sage,table] [--seed 0] [--workers 2] [--keep FOLDER]
+python -m fuzzing --replay FOLDER/KIND-TARGET-NUMBER     # the files that --keep stored there, read again
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
+import tempfile
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 
 from fuzzing import readers, structures
-from fuzzing.harness import Failure, run
+from fuzzing.harness import WHY, AbsurdError, Failure, run
+from gaponet.base.errors import GAPONetError
 
 GROUPS = {"readers": readers.TARGETS, "structures": structures.TARGETS}
 
@@ -26,6 +30,24 @@ def grouped(failures: list[Failure]) -> list[tuple[str, int, Failure]]:
     return [(text, count, first[text]) for text, count in counts.most_common()]
 
 
+def replay(case: Path) -> int:
+    """Read the stored files of a mutant again; return 1 where they still fail. A traceback is raised as it is."""
+    name = case.name.partition("-")[2].rpartition("-")[0]
+    target = next(t for group in GROUPS.values() for t in group if t.name == name)
+    with tempfile.TemporaryDirectory() as place:
+        source = shutil.copytree(case, Path(place) / "in", symlinks=True, ignore=shutil.ignore_patterns(WHY))
+        try:
+            target.use(source, Path(place) / "out")
+        except GAPONetError as error:
+            print(f"refused: {error}")
+            return 0
+        except AbsurdError as error:
+            print(f"absurd: {error}")
+            return 1
+    print("taken")
+    return 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mutants", type=int, default=100_000)
@@ -33,7 +55,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--keep", type=Path, help="folder for the files of failed mutants")
+    parser.add_argument("--replay", type=Path, help="a folder in that folder: read its files again")
     args = parser.parse_args()
+    if args.replay:
+        return replay(args.replay)
     known = {t.name: (t,) for group in GROUPS.values() for t in group} | GROUPS
     chosen = [t for name in (args.only or ",".join(GROUPS)).split(",") for t in known[name]]
     shown = lambda done, failed: print(f"\r{done} done, {failed} failed", end="", file=sys.stderr)  # noqa: E731

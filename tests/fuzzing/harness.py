@@ -31,6 +31,7 @@ from gaponet.base.errors import GAPONetError
 HANG_S = 5.0
 PATIENCE = 12  # times HANG_S of waiting: a reader may start a process, on a machine that others use too
 MEMORY = 2 << 30  # bytes
+WHY = "WHY.txt"  # beside the files of a failed mutant
 RENEW = 4000  # mutants after which a worker is replaced: what it leaked is no mutant's fault
 
 
@@ -189,7 +190,7 @@ def _work(plan: list[tuple[Target, int]], seed: int, keep: Path | None, room: Pa
         if failure and keep:
             to = keep / f"{failure.kind}-{failure.target}-{number}"
             shutil.copytree(room / "in", to, dirs_exist_ok=True, symlinks=True)
-            (to / "WHY.txt").write_text(failure.text, encoding="utf-8")
+            (to / WHY).write_text(failure.text, encoding="utf-8")
         pipe.send((outcome, failure))
 
 

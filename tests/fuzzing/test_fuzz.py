@@ -7,7 +7,9 @@ import sys
 
 import pytest
 
-from fuzzing.__main__ import GROUPS
+from fuzzing.__main__ import GROUPS, replay
+from fuzzing.harness import WHY
+from fuzzing.readers import TARGETS
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -22,3 +24,15 @@ def test_changed_files_end_in_one_clear_error_or_in_sane_data(group, tmp_path):
     assert (done.returncode, found["failures"]) == (0, {}), done.stderr
     assert found["mutants"] > 0.9 * mutants
     assert found["refused"] > found["mutants"] / 3
+
+
+@pytest.mark.parametrize(("content", "printed"), [(None, "taken"), (b"time,ctrl.elbow\n0,x\n", "refused: ")])
+def test_a_stored_mutant_is_read_again_without_the_file_that_explains_it(tmp_path, capsys, content, printed):
+    table = next(t for t in TARGETS if t.name == "table")
+    case = tmp_path / "traceback-table-7"
+    case.mkdir()
+    for name, untouched in table.files().items():
+        (case / name).write_bytes(content or untouched)
+    (case / WHY).write_text("no table")
+    assert replay(case) == 0
+    assert capsys.readouterr().out.startswith(printed)

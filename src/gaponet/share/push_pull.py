@@ -132,7 +132,7 @@ def _kind(path: Path) -> Kind:
         return "dataset"
     if (path / "split.json").is_file() and (path / "config.json").is_file():
         return "run"
-    raise UsageError(f"{path}: neither a dataset (dataset.json) nor a run of gaponet train (split.json, config.json)")
+    raise UsageError(f"{path}: neither a dataset nor a run of gaponet train; send a robot folder as a .zip")
 
 
 def _require_newer(present: Index | None, kind: Kind, contents: tuple[str, ...], address: str) -> None:
