@@ -243,7 +243,7 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
     torch.testing.assert_close(term._processed_actions, own(q, v, 0.5 * a))
     other = Term(dt=0.01)
     other.folder = place / "torch"
-    with pytest.raises(ValueError, match=r"a control period is 0\.02 s, here it is 0\.01 s"):
+    with pytest.raises(ValueError, match=r"a control period of 0\.02 s, not 0\.01 s"):
         other.align(None, slice(None), ["shoulder", "elbow"])
 
 

@@ -302,6 +302,14 @@ def test_check_motions_run_in_worlds_that_restart(robot, tmp_path, capsys):
     assert capsys.readouterr().out == "recorded, 3 worlds: 0.00 mrad; in gaponet 0.00\n"
 
 
+def test_recordings_at_another_period_than_the_robots_are_checked_at_their_own(robot, tmp_path):
+    motions = own_motions(robot, count=3)
+    export_robot(replace(robot, dt=3 * robot.dt), "newton", tmp_path, (motions, motions))
+    check = Check(tmp_path)
+    assert check.facts["dt"] == pytest.approx(robot.dt)
+    assert check.step == pytest.approx(robot.timestep)
+
+
 def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path, capsys):
     alone = (
         "import sys; from gaponet.cli.main import main; sys.exit(main(sys.argv[1:]) or 9 * ('torch' in sys.modules))"

@@ -30,7 +30,7 @@ from gaponet.export.plain_servos import (
     rollout_error,
 )
 from gaponet.export.shipped import mujoco_servos
-from gaponet.export.simulator_facts import mjcf_text, simulator_facts
+from gaponet.export.simulator_facts import control_period, mjcf_text, simulator_facts
 from gaponet.export.urdf_edit import MISSING_FIELDS, edit_urdf, with_urdf_fields
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.servo_fields import SERVO_TERMS
@@ -126,7 +126,7 @@ def export_robot(
     if not validation:
         raise UsageError(f"no validation motion was made with {payload_mass:g} kg and the robot's own gains")
     plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
-    facts = simulator_facts(robot, robot.dt, payload_mass, plain)
+    facts = simulator_facts(robot, control_period(robot, (s.dt for s in validation)), payload_mass, plain)
     motions = check_motions(validation, robot)
     facts |= {"file": ROBOT, "prefix": prefix, "virtual": validation[0].meta.virtual}
     facts["error_mrad"] = {form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))}
@@ -206,8 +206,7 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
 
     model.require_payload(payload_mass)
     robot = model.simulator()
-    rates = model.card.get("dt") or [robot.dt]
-    dt = robot.dt if any(abs(rate / robot.dt - 1) < 0.02 for rate in rates) else rates[0]
+    dt = control_period(robot, model.card.get("dt") or [robot.dt])
     with lock_folder(folder, FOLDER_KIND):
         difference = export_program(model, run, folder)
         past = {"depth": (model.config.history - 1) * model.config.stride + 1, "parity_rad": difference}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from typing import Any
 
 import mujoco
@@ -32,6 +33,12 @@ MEANING = {
 
 
 Joints = dict[str, dict[str, Any]]  # joint → an identified servo and its joint, as of `servo_facts`
+
+
+def control_period(robot: RobotSpec, periods: Iterable[float]) -> float:
+    """Return the robot's control period if one of these equals it within 2 %, otherwise the first of these, s."""
+    periods = [*periods]
+    return robot.dt if any(abs(dt / robot.dt - 1) < 0.02 for dt in periods) else periods[0]
 
 
 def simulator_facts(

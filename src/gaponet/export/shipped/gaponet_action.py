@@ -138,9 +138,8 @@ class AlignedAction:
         """
         me: Any = self
         facts = read_facts(self.folder)
-        dt = me._env.step_dt
-        if abs(dt / facts["dt"] - 1) > 0.02:
-            raise ValueError(f"{self.folder}: a control period is {facts['dt']} s, here it is {dt} s")
+        if "model" in facts and abs((dt := me._env.step_dt) / facts["dt"] - 1) > 0.02:
+            raise ValueError(f"{self.folder}: its network has a control period of {facts['dt']} s, not {dt} s")
         self.aligner = Aligner(self.folder, list(names), me.num_envs, me.device, self.payload_mass)
         self.servo_offset = offset * torch.tensor([facts[form][name]["offset"] for name in names], device=me.device)
         self._aligned, self._columns = entity, ids
