@@ -15,6 +15,7 @@ Parameters, changes of the model, rollouts and the optimizer are those of mujoco
 from __future__ import annotations
 
 import sys
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,8 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
         params.add(sysid.body_inertia_param(
             spec, spec.compile(), name, sysid.InertiaType.Pseudo, param_name=name, modifier=write_inertia, **bounds
         ))  # fmt: skip
-    return sysid.optimize(params, residuals, "scipy_parallel_fd", max_iters=EVALUATIONS, diff_step=STEP, **LOSS)
+    with redirect_stdout(sys.stderr):  # it prints each iteration
+        return sysid.optimize(params, residuals, "scipy_parallel_fd", max_iters=EVALUATIONS, diff_step=STEP, **LOSS)
 
 
 def write_inertia(spec: mujoco.MjSpec, param: sysid.Parameter) -> None:

@@ -386,7 +386,7 @@ def test_a_calibration_and_a_training_end_in_step_use_with_their_result(tmp_path
         finish(Jobs(tmp_path), step, {"findings": []}, (step, "x", "--out", out))
     page = App(tmp_path, 0)
     try:
-        page.budget.value = "20s"
+        page.budget.value = "40000"
         for label, step in (("Calibrate with the new logs", "adapt"), ("Train a network", "train")):
             page._attempt(acts[label], None)
             wait_for(page.jobs)
