@@ -45,8 +45,13 @@ def record(
     if args.driver != "virtual" and not unit_id:
         raise UsageError("say which unit is recorded: --unit-id NAME")
     screen = Out(json)
+    if repetitions < 1:
+        raise UsageError(f"--repetitions {repetitions}: give 1 or more, or nothing is recorded")
     if args.driver == "virtual":
-        unit_id = args.connection.unit_name
+        virtual = args.connection.unit_name
+        if unit_id not in ("", args.connection.unit, virtual):
+            raise UsageError(f"--unit-id {unit_id}: a virtual robot is chosen by --unit, and that is {virtual}")
+        unit_id = virtual
     request = RunArgs(**vars(args), payload_mass=payload_mass)
     spec = resolve_robot(request)
     known = Dataset.open_existing(out, spec)
