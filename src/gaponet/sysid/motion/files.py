@@ -40,9 +40,8 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
         raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
     if period is None and path.suffix != ".txt":
-        raise LogError(
-            f"{path}: no {'dt' if path.suffix == '.npz' else 'column time'}, s: its pace is not known; add it"
-        )
+        name = "dt" if path.suffix == ".npz" else "column time"
+        raise LogError(f"{path}: no {name}, s: its pace is not known; add it")
     period = SAGE_DT if period is None else period
     if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
         raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}")
