@@ -52,6 +52,13 @@ def export(
         remove: For lerobot: remove the correction.
     """
     screen = Out(json)
+    for words, unused in (
+        ("--engine, --scope and --units", to != "randomization" and (engine != "json" or scope != "today" or units)),
+        ("--payload-mass", to == "randomization" and payload_mass),
+        ("--out and --data", to == "lerobot" and (out or data)),
+    ):
+        if unused:
+            raise UsageError(f"--to {to} does not use {words}: leave out what you gave")
     if to == "randomization":
         _show_ranges(screen, robot, out or robot / "randomization", engine, scope, units, data)
         return

@@ -319,6 +319,9 @@ def _time(
     if channel not in specified.get("clock", {}) and own.time is not None:
         return own.time
     if "rate" in specified:
+        periods = specified["rate"] * float(np.median(np.diff(loaded[clock].values))) if clock in loaded else 0.0
+        if periods > 0 and min(abs(periods * unit - 1) for unit in SECONDS.values()) > 0.1:  # in no unit of time
+            raise LogError(f"{where}: '{clock}' is not at rate = {specified['rate']:g} Hz; leave out one of them")
         return np.arange(len(own.values)) / specified["rate"]
     if clock not in recording.signals:
         explanation = f"'{clock or 'time'}' (the clock of {channel})"
