@@ -54,5 +54,5 @@ def test_from_a_dataset_to_an_evaluated_model(tmp_path, capsys):
 
 def test_a_payload_that_a_dataset_states_already_is_not_given_again(arm, tmp_path):
     data = write_dataset(tmp_path / "data", arm, recordings(arm, count=1))
-    with pytest.raises(UsageError, match=r"--payload-mass 3: .*data states 0 kg; leave the option out"):
+    with pytest.raises(UsageError, match=r"--payload-mass 3: .*data states 0 kg; leave it out"):
         gp.adapt_robot(arm, data.path, out=tmp_path / "out", payload_mass=3.0)

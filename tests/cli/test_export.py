@@ -59,9 +59,9 @@ def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--to", "mjcf", "--engine", "mjlab"], "--to mjcf does not use --engine, --scope and --units"),
+        (["--to", "mjcf", "--engine", "mjlab"], "--to mjcf does not use --engine, --scope, --units"),
         (["--to", "randomization", "--payload-mass", "0.1"], "--to randomization does not use --payload-mass"),
-        (["--to", "lerobot", "--into", "policy", "--out", "mine"], "--to lerobot does not use --out and --data"),
+        (["--to", "lerobot", "--into", "policy", "--out", "mine"], "--to lerobot does not use --out;"),
     ],
 )
 def test_options_of_another_form_are_refused(tmp_path, capsys, words, message):

@@ -150,7 +150,7 @@ def test_options_that_would_do_nothing_are_refused(arm, motion, tmp_path, capsys
         ([*run, "--compensation.dynamics"], "is for a compensation, and it is off; add --compensate"),
         ([*run, "--live.hold", "2"], "is for live targets, and this is a motion"),
         ([*record, "--repetitions", "0"], "--repetitions 0: give 1 or more"),
-        ([*record, "--unit-id", "2"], "--unit-id 2: a virtual robot is chosen by --unit, and that is virtual-4"),
+        ([*record, "--unit-id", "2"], "--unit-id 2: a virtual robot is chosen by --unit 4"),
     ):
         assert main(words) == 2
         assert message in " ".join(capsys.readouterr().err.split())

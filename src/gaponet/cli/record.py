@@ -48,10 +48,9 @@ def record(
     if repetitions < 1:
         raise UsageError(f"--repetitions {repetitions}: give 1 or more, or nothing is recorded")
     if args.driver == "virtual":
-        virtual = args.connection.unit_name
-        if unit_id not in ("", args.connection.unit, virtual):
-            raise UsageError(f"--unit-id {unit_id}: a virtual robot is chosen by --unit, and that is {virtual}")
-        unit_id = virtual
+        if unit_id not in ("", args.connection.unit, args.connection.unit_name):
+            raise UsageError(f"--unit-id {unit_id}: a virtual robot is chosen by --unit {args.connection.unit}")
+        unit_id = args.connection.unit_name
     request = RunArgs(**vars(args), payload_mass=payload_mass)
     spec = resolve_robot(request)
     known = Dataset.open_existing(out, spec)

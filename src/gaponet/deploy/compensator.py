@@ -72,9 +72,7 @@ class CompensatorConfig:
             and min(self.limit, self.iterations) > 0
             and all(0 <= x < np.inf for x in vars(self).values() if not isinstance(x, str))
         ):
-            raise UsageError(
-                "compensator: gain must be in (0, 1], limit and iterations positive, the rest finite and not negative"
-            )
+            raise UsageError("compensator: gain must be in (0, 1], limit and iterations > 0, the rest finite and ≥ 0")
 
 
 class Compensator:
@@ -177,8 +175,7 @@ class Compensator:
 
         Raises:
             ModelError: The payload is outside the training data, without `extrapolate`.
-            UsageError: The target or the payload is not finite.
-            LogError: The target is in degrees.
+            UsageError, LogError: The target or the payload is not finite; the target is in degrees.
         """
         self.payload_stated = payload_mass is not None or len(self.masses) == 1
         self.payload_estimate.reset(self.num_envs)
@@ -239,8 +236,7 @@ class Compensator:
             tau: Measured joint torque, N·m, for the payload estimate; default kp (u − q) − kd q̇.
 
         Raises:
-            UsageError: `reset` was not called before.
-            LogError: The first position is in degrees.
+            UsageError, LogError: `reset` was not called before; the first position is in degrees.
         """
         if self._target is None:
             raise UsageError("compensator: step before reset; call reset(target) once, then step every control period")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import Enum, StrEnum
 
@@ -111,5 +110,5 @@ class ControlConfig:
         if not 1 <= self.rate <= 1000:
             raise UsageError(f"rate is {self.rate} Hz; give 1 to 1000")
         for name in ("blend", "blend_speed", "damp", "settle"):
-            if not (0 < getattr(self, name) < math.inf or (name == "settle" and not self.settle)):
+            if not (0 < getattr(self, name) < 1e6 or (name == "settle" and not self.settle)):
                 raise UsageError(f"{name} is {getattr(self, name)}; give a positive number")

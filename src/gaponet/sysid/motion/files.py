@@ -39,12 +39,9 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
     if path.stat().st_size > LARGEST:
         raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
-    if period is None and path.suffix != ".txt":
-        name = "dt" if path.suffix == ".npz" else "column time"
-        raise LogError(f"{path}: no {name}, s: its pace is not known; add it")
-    period = SAGE_DT if period is None else period
     if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
-        raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}")
+        given = "column time of a .csv, dt of an .npz"
+        raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g} ({given})")
     joints = tuple(robot.resolve(name, str(path)) for name in names)
     columns = robot.index(joints)
     if len(set(joints)) != len(joints):
@@ -84,7 +81,7 @@ def _level_of(ctrl: Array, robot: RobotSpec) -> str:
     return "upper_body" if set(moved) <= upper and len(upper) < len(robot.joint_names) else "whole_body"
 
 
-def _text(path: Path) -> tuple[list[str], Array, float | None]:
+def _text(path: Path) -> tuple[list[str], Array, float]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
@@ -106,7 +103,7 @@ def _text(path: Path) -> tuple[list[str], Array, float | None]:
         raise LogError(f"{path}: {len(rows)} rows after the line of joint names; a motion needs two or more")
     table = np.array(rows)
     if "time" not in names:
-        return names, table, None
+        return names, table, SAGE_DT if path.suffix == ".txt" else np.nan
     at = names.index("time")
     period = np.diff(table[:, at])
     if not (period > 0).all() or np.ptp(period) > 0.01 * period.mean():
@@ -114,7 +111,7 @@ def _text(path: Path) -> tuple[list[str], Array, float | None]:
     return names[:at] + names[at + 1 :], np.delete(table, at, axis=1), float(period.mean())
 
 
-def _npz(path: Path) -> tuple[list[str], Array, float | None]:
+def _npz(path: Path) -> tuple[list[str], Array, float]:
     arrays = read_npz(path, LogError, "give a motion of at most 10 hours, as gaponet excite writes it", LARGEST)
     for name, kind, dimensions in (("joint_names", "U", 1), ("ctrl", "fiu", 2), ("dt", "fiu", 0)):
         if name not in arrays and name != "dt":
@@ -125,4 +122,4 @@ def _npz(path: Path) -> tuple[list[str], Array, float | None]:
     names, rows = arrays["joint_names"].tolist(), arrays["ctrl"].astype(float)
     if rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
         raise LogError(f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names")
-    return names, rows, float(arrays["dt"]) if "dt" in arrays else None
+    return names, rows, float(arrays.get("dt", np.nan))
