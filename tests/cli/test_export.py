@@ -60,6 +60,7 @@ def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
     ("words", "message"),
     [
         (["--to", "mjcf", "--engine", "mjlab"], "--to mjcf does not use --engine, --scope, --units"),
+        (["--to", "json", "--into", "scene.xml"], "--to json does not use --into and --prefix"),
         (["--to", "randomization", "--payload-mass", "0.1"], "--to randomization does not use --payload-mass"),
         (["--to", "lerobot", "--into", "policy", "--out", "mine"], "--to lerobot does not use --out;"),
     ],

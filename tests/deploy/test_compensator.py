@@ -234,9 +234,9 @@ def test_other_arrays_and_robots_are_refused(robot, model):
     in_degrees.reset(np.zeros(2), 0.0)
     with pytest.raises(LogError, match=r"the position of elbow is -45\.000.* look like degrees"):
         in_degrees.step(np.zeros(2), np.array([0.0, -45.0]))
-    for wrong in ({"gain": 0.0}, {"feedback_limit": -0.1}, {"feedback_time": np.nan}, {"limit": np.inf}):
+    for name, wrong in {"gain": 0.0, "feedback_limit": -0.1, "feedback_time": np.nan, "aim": "Simulator"}.items():
         with pytest.raises(UsageError, match="gain must be"):
-            CompensatorConfig(**wrong)
+            CompensatorConfig(**{name: wrong})
 
 
 def test_dynamic_feed_forward_reduces_the_error_of_a_moving_arm(robot, model):

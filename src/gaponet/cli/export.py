@@ -56,7 +56,7 @@ def export(
         ("--engine, --scope, --units", to != "randomization" and (engine != "json" or scope != "today" or units)),
         ("--payload-mass", to == "randomization" and payload_mass),
         ("--out", to == "lerobot" and out),
-        ("--into and --prefix", to in ("onnx", "torch", "actuator-net") and (into or prefix)),
+        ("--into and --prefix", to not in ("mjcf", "urdf", "lerobot") and (into or prefix)),
         ("--data", to in ("onnx", "torch", "lerobot") and data),
     ):
         if unused:

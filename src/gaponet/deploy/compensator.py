@@ -67,12 +67,11 @@ class CompensatorConfig:
     """Largest payload without a model, stated or estimated, kg. With a model, the training data give it."""
 
     def __post_init__(self) -> None:
-        if not (
-            0 < self.gain <= 1
-            and min(self.limit, self.iterations) > 0
-            and all(0 <= x < np.inf for x in vars(self).values() if not isinstance(x, str))
-        ):
-            raise UsageError("compensator: gain must be in (0, 1], limit and iterations > 0, the rest finite and ≥ 0")
+        numbers = np.array([x for x in vars(self).values() if not isinstance(x, str)], float)
+        known = self.aim in ("target", "simulator") and 0 < self.gain <= 1 and min(self.limit, self.iterations) > 0
+        if not known or not ((numbers >= 0) & (numbers < np.inf)).all():
+            text = "gain must be in (0, 1], limit and iterations > 0, the rest finite and ≥ 0"
+            raise UsageError(f"compensator: aim is target or simulator; {text}")
 
 
 class Compensator:

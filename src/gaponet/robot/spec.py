@@ -364,8 +364,7 @@ def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoT
 
 def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     joints = table.joint
-    names = [name for j in joints for name in dict.fromkeys((j.name, *j.aliases))]
-    if len(set(names)) != len(names):
+    if len(set(names := [x for j in joints for x in dict.fromkeys((j.name, *j.aliases))])) != len(names):
         raise RobotError(f"{table.name}: a joint name appears twice in {', '.join(names)} (names and aliases)")
     robot = RobotSpec(
         name=table.name,

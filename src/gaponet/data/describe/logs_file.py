@@ -25,7 +25,6 @@ HINT = "gaponet import LOGS --robot ROBOT --guess writes one to start from"
 Text = Annotated[str, Len(1, 300)]
 Gain = Annotated[float, Interval(ge=0, le=1e6)]
 Sign = Annotated[int, Interval(ge=-1, le=1)]
-_Channel = Literal["ctrl", "qpos", "qvel", "tau", "temperature", "feedforward_torque"]
 Offset = Annotated[float, Interval(ge=-10, le=10)]
 # What a name or a sheet may say of a recording: its word here → field of SequenceMeta, and what it looks like.
 FIELDS = {
@@ -73,7 +72,7 @@ class LogsFile(TypedDict, total=False):
     signs: dict[str, Sign]  # −1: the log counts the other way round
     offsets: dict[str, Offset]  # rad to add to positions, after unit and sign
     posture: dict[str, Offset]  # rad at which a joint stood that the log does not hold
-    clock: dict[_Channel, str]  # a channel's own clock: ctrl = "t_cmd"
+    clock: dict[Literal["ctrl", "qpos", "qvel", "tau", "temperature", "feedforward_torque"], str]  # ctrl = "t_cmd"
 
 
 def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile, Path | None]:
@@ -208,8 +207,7 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
     columns = ["file", *_known(rows[0])]
     ours = {name: k for k, (field, _) in FIELDS.items() if k for name in (k, field)}
     for name in (names := list(table.fieldnames or ())):
-        word = name.strip().lower()
-        near = ours.get(word, "payload" if word.startswith("payload") else "")
+        near = ours.get(word := name.strip().lower(), "payload" if word.startswith("payload") else "")
         if (near and name not in columns) or (name in columns and names.count(name) > 1):
             raise UsageError(f"{file}: column '{name}': write {near or name}, once")
     if long := [row["file"] for row in rows if any(row.get(None, ()))]:  # type: ignore[call-overload]

@@ -40,8 +40,7 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
         raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
     if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
-        given = "column time of a .csv, dt of an .npz"
-        raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g} ({given})")
+        raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g} (time, dt)")
     joints = tuple(robot.resolve(name, str(path)) for name in names)
     columns = robot.index(joints)
     if len(set(joints)) != len(joints):
@@ -56,8 +55,10 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
     """The joints that a motion names, at a control rate, Hz, as a file that read_motion reads.
 
     Raises:
-        UsageError: A .txt, which has no time column, at another rate than 50 Hz.
+        UsageError: No robot has this rate; or a .txt, which has no time column, at another than 50 Hz.
     """
+    if not 1 / MAX_PERIOD_S <= rate <= 1 / MIN_PERIOD_S:
+        raise UsageError(f"--rate {rate:g}: give the rate of the commands in Hz, 1 to {1 / MIN_PERIOD_S:g}")
     names = list(motion.named(robot))
     rows = motion.sample(1 / rate)[:, robot.index(names)]
     if path.suffix == ".npz":
