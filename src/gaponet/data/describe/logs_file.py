@@ -210,7 +210,7 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
         near = ours.get(word := name.strip().lower(), "payload" if word.startswith("payload") else "")
         if (near and name not in columns) or (name in columns and names.count(name) > 1):
             raise UsageError(f"{file}: column '{name}': write {near or name}, once")
-    if long := [row["file"] for row in rows if any(row.get(None, ()))]:  # type: ignore[call-overload]
+    if long := [row["file"] for row in rows if any(row.get(None, ()))]:
         raise UsageError(f"{file}: the row of {long[0]} has more cells than the header; is a decimal comma in it?")
     return [{c: row[c] or "" for c in columns if row.get(c) is not None} for row in rows if row.get("file")]
 
