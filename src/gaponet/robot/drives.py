@@ -131,8 +131,7 @@ def _by_joint(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str,
     """Return joint → its last word among ("100", "*wrist*=20")."""
     by, option = dict[str, str](), f"--{name.replace('_', '-')}"
     if any("=" not in word for word in words[1:]):
-        more = f"give one value for all joints first, and {joints[0]}={words[0].rpartition('=')[2]} for a joint"
-        raise UsageError(f"{option} {' '.join(words)}: {more}")
+        raise UsageError(f"{option} {' '.join(words)}: give one value for all joints first, then {joints[0]}=NUMBER")
     for word in words:
         matches = [j for j in joints if fnmatchcase(j, word.rpartition("=")[0] or "*")]
         if not matches:

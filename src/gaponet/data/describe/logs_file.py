@@ -198,8 +198,7 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
     if not file.is_file() or file.stat().st_size > 16 << 20:
         raise UsageError(f"{file}: the manifest is missing, or no table; a CSV with a column file")
     try:
-        table = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig")), skipinitialspace=True)
-        rows = list(table)
+        rows = list(table := csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig")), skipinitialspace=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{file}: not a CSV table ({error})") from None
     if not rows or not rows[0].get("file"):

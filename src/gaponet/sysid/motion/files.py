@@ -40,7 +40,7 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
         raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
     if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
-        raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g} (time, dt)")
+        raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}")
     joints = tuple(robot.resolve(name, str(path)) for name in names)
     columns = robot.index(joints)
     if len(set(joints)) != len(joints):
@@ -104,7 +104,9 @@ def _text(path: Path) -> tuple[list[str], Array, float]:
         raise LogError(f"{path}: {len(rows)} rows after the line of joint names; a motion needs two or more")
     table = np.array(rows)
     if "time" not in names:
-        return names, table, SAGE_DT if path.suffix == ".txt" else np.nan
+        if path.suffix == ".csv":
+            raise LogError(f"{path}:1: no column time, s, so its pace is not known; add one")
+        return names, table, SAGE_DT
     at = names.index("time")
     period = np.diff(table[:, at])
     if not (period > 0).all() or np.ptp(period) > 0.01 * period.mean():
@@ -115,12 +117,12 @@ def _text(path: Path) -> tuple[list[str], Array, float]:
 def _npz(path: Path) -> tuple[list[str], Array, float]:
     arrays = read_npz(path, LogError, "give a motion of at most 10 hours, as gaponet excite writes it", LARGEST)
     for name, kind, dimensions in (("joint_names", "U", 1), ("ctrl", "fiu", 2), ("dt", "fiu", 0)):
-        if name not in arrays and name != "dt":
+        if name not in arrays:
             raise LogError(f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'nothing'}")
-        if name in arrays and (arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions):
+        if arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions:
             what = "text" if kind == "U" else "numbers"
             raise LogError(f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again")
     names, rows = arrays["joint_names"].tolist(), arrays["ctrl"].astype(float)
     if rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
         raise LogError(f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names")
-    return names, rows, float(arrays.get("dt", np.nan))
+    return names, rows, float(arrays["dt"])
