@@ -5,9 +5,10 @@ import sys
 
 import numpy as np
 import pytest
-from arm import recordings, write_arm
+from arm import recordings, write_arm, write_dataset
 
 import gaponet as gp
+from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
@@ -49,3 +50,9 @@ def test_from_a_dataset_to_an_evaluated_model(tmp_path, capsys):
     assert found.mpjae["gaponet"] < 0.8 * nominal
     loop = model.loop()
     assert np.isfinite(loop.delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()
+
+
+def test_a_payload_that_a_dataset_states_already_is_not_given_again(arm, tmp_path):
+    data = write_dataset(tmp_path / "data", arm, recordings(arm, count=1))
+    with pytest.raises(UsageError, match=r"--payload-mass 3: .*data states 0 kg; leave it out"):
+        gp.adapt_robot(arm, data.path, out=tmp_path / "out", payload_mass=3.0)

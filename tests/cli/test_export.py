@@ -56,6 +56,21 @@ def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
     np.testing.assert_allclose(sim.target, there.target, atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--to", "mjcf", "--engine", "mjlab"], "--to mjcf does not use --engine, --scope, --units"),
+        (["--to", "json", "--into", "scene.xml"], "--to json does not use --into and --prefix"),
+        (["--to", "randomization", "--payload-mass", "0.1"], "--to randomization does not use --payload-mass"),
+        (["--to", "lerobot", "--into", "policy", "--out", "mine"], "--to lerobot does not use --out;"),
+    ],
+)
+def test_options_of_another_form_are_refused(tmp_path, capsys, words, message):
+    write_arm(tmp_path / "arm")
+    assert main(["export", str(tmp_path / "arm"), *words]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_without_a_checkpoint_onnx_cannot_be_written_again(run, capsys):
     (run / "checkpoint.pt").unlink()
     assert main(["export", str(run)]) == 2

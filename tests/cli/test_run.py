@@ -143,6 +143,19 @@ def test_a_motion_or_live_targets_and_not_faster_than_time(arm, motion, capsys, 
     assert "hold is -1.0 s; give a positive number" in " ".join(capsys.readouterr().err.split())
 
 
+def test_options_that_would_do_nothing_are_refused(arm, motion, tmp_path, capsys):
+    run = ["run", "--motion", motion, "--robot", str(arm.mjcf.parent), *FAST]
+    record = ["record", *run[1:], "--payload-mass", "0", "--out", str(tmp_path / "set")]
+    for words, message in (
+        ([*run, "--compensation.dynamics"], "is for a compensation, and it is off; add --compensate"),
+        ([*run, "--live.hold", "2"], "is for live targets, and this is a motion"),
+        ([*record, "--repetitions", "0"], "--repetitions 0: give 1 or more"),
+        ([*record, "--unit-id", "2"], "--unit-id 2: a virtual robot is chosen by --unit 4"),
+    ):
+        assert main(words) == 2
+        assert message in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize(("kind", "needs"), [("zmq", "zmq"), ("dds", "cyclonedds")])
 def test_live_targets_are_listened_for_where_it_says(arm, kind, needs, tmp_path):
     pytest.importorskip(needs)

@@ -8,7 +8,7 @@ import pytest
 from arm import TOML, XML, commands, write_arm
 from weak_arm import CONFIG, WEAK, Operator
 
-from gaponet.base.errors import ModelError, RobotError, UsageError
+from gaponet.base.errors import LogError, ModelError, RobotError, UsageError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.nn.adaptation import Adaptation
@@ -228,8 +228,15 @@ def test_other_arrays_and_robots_are_refused(robot, model):
         Compensator(robot, model).reset(np.zeros(3), 0.0)
     with pytest.raises(UsageError, match="target to begin at"):
         Compensator(robot, model).reset(np.array([0.0, np.nan]), 0.0)
-    with pytest.raises(UsageError, match="gain must be"):
-        CompensatorConfig(gain=0.0)
+    with pytest.raises(LogError, match=r"target to begin at of shoulder is 45\.000.* look like degrees"):
+        Compensator(robot, model).reset(np.array([45.0, 0.0]), 0.0)
+    in_degrees = Compensator(robot, model)
+    in_degrees.reset(np.zeros(2), 0.0)
+    with pytest.raises(LogError, match=r"the position of elbow is -45\.000.* look like degrees"):
+        in_degrees.step(np.zeros(2), np.array([0.0, -45.0]))
+    for name, wrong in {"gain": 0.0, "feedback_limit": -0.1, "feedback_time": np.nan, "aim": "Simulator"}.items():
+        with pytest.raises(UsageError, match="gain must be"):
+            CompensatorConfig(**{name: wrong})
 
 
 def test_dynamic_feed_forward_reduces_the_error_of_a_moving_arm(robot, model):

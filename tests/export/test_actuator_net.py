@@ -82,7 +82,7 @@ def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(run, tmp_
 
 def test_what_is_of_robots_is_refused(run, tmp_path, capsys):
     assert main(["export", str(run), "--to", "actuator-net", "--into", str(tmp_path / "scene.xml")]) == 2
-    assert "--into and --prefix are of robots" in capsys.readouterr().err
+    assert "does not use --into and --prefix" in capsys.readouterr().err
 
 
 def test_a_payload_that_nobody_recorded_is_refused(run, tmp_path):

@@ -100,6 +100,8 @@ def test_distances_agree_with_contacts_of_mujoco(so101):
 def test_the_height_of_the_plane_can_be_set(so101):
     down = so101.qpos_home.copy()
     down[so101.index(["shoulder_lift"])] = 1.0
+    with pytest.raises(RobotError, match=r"the plane is at -75 m; give its height in metres, up to 10 \(--plane\)"):
+        Collision(so101, build_model(so101), height=-75.0)
     lower = Collision(so101, build_model(so101), height=-0.2)
     (free,) = lower.distances(down[None])
     assert lower.distance(down[None])[0] > 0 > Collision(so101, build_model(so101)).distance(down[None])[0]

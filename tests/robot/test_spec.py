@@ -80,6 +80,12 @@ def test_an_unknown_robot_error_lists_the_packaged_ones():
         ("dt = 0.02", "dt = nan", "dt: should be a finite number"),
         ("timestep = 0.005", "timestep = 0", "timestep: should be greater than"),
         ('name = "elbow"', 'name = "shoulder"', "a joint name appears twice in shoulder, shoulder"),
+        (
+            'name = "elbow"',
+            'name = "elbow"\naliases = ["shoulder"]',
+            r"appears twice in shoulder, elbow, shoulder \(names",
+        ),
+        ("pos = [0.2,", "pos = [20.0,", r"payload_mount\[0\]\.pos\[0\]: should be less than or equal to 10, not 20.0"),
         ("timestep = 0.005", "timestep = 0.003", "dt / timestep = 0.02 / 0.003 = 6.667 is not a whole number"),
         ("kp = 20.0", 'kp = 20.0\nlog_unit = "grad"', r"joint\[0\]\.log_unit: should be 'rad', 'deg' or"),
         ("kp = 20.0", "kp = 20.0\noperated = false", "no joint has operated = true"),

@@ -97,6 +97,7 @@ def test_a_timestep_that_does_not_divide_the_control_period_is_refused(tmp_path)
         ({"payload_mass": -1.0}, r"payload_mass is -1\.0; give the mass in kg, 0 for an empty hand"),
         ({"payload_mass": float("nan")}, "payload_mass is nan"),
         ({"payload_side": "foot"}, "payload side 'foot' is unknown to arm; use both or one of hand"),
+        ({"dt": 50.0}, "dt is 50.0; the control period in seconds must be positive and at most 1"),
         ({"dt": 0.0}, "the control period in seconds must be positive"),
     ],
 )

@@ -79,6 +79,8 @@ def test_postures_of_the_logs_in_which_links_meet_are_counted(tmp_path):
     ("xml", "check", "words"),
     [
         (XML.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-2 2"', 1), "limits", "stops the motor at 2 N·m"),
+        (XML.replace('range="-1.5 1.5"', 'range="-86 86"', 1), "range", "shoulder: its range is -86 to 86 rad: are"),
+        (XML.replace('angle="radian"', 'angle="degree"'), "range", "elbow: its range is -0.0262 to 0.0262 rad"),
         (LIGHT, "damping", "no damping, kd or friction at shoulder, elbow"),
         (LIGHT, "inertia", "no armature at shoulder, elbow"),
         (XML.replace('axis="0 1 0"', 'axis="0 1 0" stiffness="3"', 1), "couplings", "springs at shoulder"),

@@ -94,6 +94,8 @@ def test_commands_that_need_positions_name_identify(robot, tmp_path, capsys):
         assert main(words) == 2, words
         assert "gaponet identify" in capsys.readouterr().err
     assert main(["doctor", data]) == 0
+    assert main(["identify", data, "--out", str(tmp_path / "found"), "--terms", "load"]) == 2
+    assert "leave out --like, --units, --holdout-units, --terms" in capsys.readouterr().err
     # Parts of a single recording fit and validate in turn.
     assert main(["identify", data, "--out", str(tmp_path / "found")]) == 0
 

@@ -52,6 +52,15 @@ def export(
         remove: For lerobot: remove the correction.
     """
     screen = Out(json)
+    for words, unused in (
+        ("--engine, --scope, --units", to != "randomization" and (engine != "json" or scope != "today" or units)),
+        ("--payload-mass", to == "randomization" and payload_mass),
+        ("--out", to == "lerobot" and out),
+        ("--into and --prefix", to not in ("mjcf", "urdf", "lerobot") and (into or prefix)),
+        ("--data", to in ("onnx", "torch", "lerobot") and data),
+    ):
+        if unused:
+            raise UsageError(f"--to {to} does not use {words}; leave out what you gave")
     if to == "randomization":
         _show_ranges(screen, robot, out or robot / "randomization", engine, scope, units, data)
         return
@@ -64,8 +73,6 @@ def export(
         if (robot / "robot.toml").is_file():
             engines = "mjcf, mjlab, isaaclab, newton, drake or json"
             raise UsageError(f"{robot}: is a robot, which has no network; --to {engines}")
-        if into or prefix or (data and to != "actuator-net"):
-            raise UsageError(f"--data, --into and --prefix are of robots; --to {to} writes a run's network")
         made = api.export_network(robot, to=to, out=out, data=data, payload_mass=payload_mass)
     else:
         with progress_bar("exporting") as update:

@@ -50,8 +50,9 @@ def identify(
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
     if driven_by_torque(data):
-        if like is not None:
-            raise UsageError(f"--like {like}: {dataset} holds a robot that is driven by torque; leave --like out")
+        if like or units or holdout_units or terms or stops or masses:
+            what = "--like, --units, --holdout-units, --terms, --stops and --masses"
+            raise UsageError(f"{dataset} holds a robot that is driven by torque; leave out {what}")
         with progress_bar("identifying"):
             driven = api.identify_torque(data, out=out, current=current, robot=spec)
         _show_torque(screen, driven, current)

@@ -26,6 +26,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, RobotError, UsageError
+from gaponet.data.describe.plausibility import require_radians
 from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.payload import PayloadEstimate
 from gaponet.nn.adaptation import Adaptation
@@ -66,14 +67,11 @@ class CompensatorConfig:
     """Largest payload without a model, stated or estimated, kg. With a model, the training data give it."""
 
     def __post_init__(self) -> None:
-        if not (
-            0 < self.gain <= 1
-            and min(self.limit, self.iterations) > 0
-            and min(self.feedback, self.feedback_time, self.blend, self.acceleration_time, self.payload_max) >= 0
-        ):
-            raise UsageError(
-                "compensator: gain must be in (0, 1], limit and iterations positive, the rest not negative"
-            )
+        numbers = np.array([x for x in vars(self).values() if not isinstance(x, str)], float)
+        known = self.aim in ("target", "simulator") and 0 < self.gain <= 1 and min(self.limit, self.iterations) > 0
+        if not known or not ((numbers >= 0) & (numbers < np.inf)).all():
+            text = "gain must be in (0, 1], limit and iterations > 0, the rest finite and ≥ 0"
+            raise UsageError(f"compensator: aim is target or simulator; {text}")
 
 
 class Compensator:
@@ -176,7 +174,7 @@ class Compensator:
 
         Raises:
             ModelError: The payload is outside the training data, without `extrapolate`.
-            UsageError: The target or the payload is not finite.
+            UsageError, LogError: The target or the payload is not finite; the target is in degrees.
         """
         self.payload_stated = payload_mass is not None or len(self.masses) == 1
         self.payload_estimate.reset(self.num_envs)
@@ -187,6 +185,7 @@ class Compensator:
         a = self._as_rows(target)
         if not np.isfinite(a).all():
             raise UsageError("compensator: the target to begin at is not a number")
+        require_radians(a, self.robot.joint_names, self.robot, lambda row: "compensator: the target to begin at")
         self._target, self.command, self.periods = a, a[:, self.op], 0
         if self.loop is not None:
             self.loop.reset()
@@ -236,7 +235,7 @@ class Compensator:
             tau: Measured joint torque, N·m, for the payload estimate; default kp (u − q) − kd q̇.
 
         Raises:
-            UsageError: `reset` was not called before.
+            UsageError, LogError: `reset` was not called before; the first position is in degrees.
         """
         if self._target is None:
             raise UsageError("compensator: step before reset; call reset(target) once, then step every control period")
@@ -244,6 +243,9 @@ class Compensator:
         self._target = targets = np.where(np.isfinite(given), given, self._target)
         a = targets[:, self.op]
         if qpos is not None:
+            if self.periods == 0:
+                measured = self._as_rows(qpos)
+                require_radians(measured, self.robot.joint_names, self.robot, lambda row: "compensator: the position")
             v, torque = (None if x is None else self._as_rows(x)[:, self.op] for x in (qvel, tau))
             self._process_state(self._as_rows(qpos)[:, self.op], v, torque)
         self.feedforward.update(a)

@@ -20,8 +20,8 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError
 from gaponet.base.structure import read_toml
 from gaponet.robot.spec import RobotSpec
+from gaponet.robot.toml_file import Metres
 
-Metres = Annotated[float, Interval(ge=-100, le=100)]
 Point = tuple[Metres, Metres, Metres]
 CLEARANCE_M = 0.03  # between capsules: a loaded arm sags by centimetres below its command
 POSTURE_STEP_RAD = 0.03  # between checked postures: a hand at 0.7 m moves by less than the clearance
@@ -94,6 +94,8 @@ class Collision:
         ).reshape(-1, 2)
         plane = shapes.plane
         self.height = plane.height if height is None and plane else height
+        if not abs(self.height or 0.0) <= 10:
+            raise RobotError(f"the plane is at {self.height:g} m; give its height in metres, up to 10 (--plane)")
         stands = tuple(plane.stands.split()) if plane else ()
         above = [i for i, n in enumerate(self.names) if self.height is not None and not n.startswith(stands)]
         self.above = np.array(above, int)

@@ -130,9 +130,8 @@ def _limits(model: mujoco.MjModel, j: int, actuators: list[int], file: str) -> I
 def _by_joint(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, str]:
     """Return joint → its last word among ("100", "*wrist*=20")."""
     by, option = dict[str, str](), f"--{name.replace('_', '-')}"
-    if sum("=" not in word for word in words) > 1:
-        more = f"give one value for all joints, and {joints[0]}={words[0]} for a joint"
-        raise UsageError(f"{option} {' '.join(words)}: {more}")
+    if any("=" not in word for word in words[1:]):
+        raise UsageError(f"{option} {' '.join(words)}: give one value for all joints first, then {joints[0]}=NUMBER")
     for word in words:
         matches = [j for j in joints if fnmatchcase(j, word.rpartition("=")[0] or "*")]
         if not matches:

@@ -139,8 +139,6 @@ class RobotSpec:
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         object.__setattr__(self, "servos", self.servos or (None,) * n)
-        if len(set(self.joint_names)) != n:
-            raise RobotError(f"{self.name}: a joint name appears twice in {', '.join(self.joint_names)}")
         if not self.operated:
             raise RobotError(f"{self.name}: no joint has operated = true; the operator needs at least one")
         ratio = self.dt / self.timestep
@@ -366,6 +364,8 @@ def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoT
 
 def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     joints = table.joint
+    if len(set(names := [x for j in joints for x in dict.fromkeys((j.name, *j.aliases))])) != len(names):
+        raise RobotError(f"{table.name}: a joint name appears twice in {', '.join(names)} (names and aliases)")
     robot = RobotSpec(
         name=table.name,
         description=table.description or table.name,

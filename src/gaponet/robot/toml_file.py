@@ -12,7 +12,7 @@ from gaponet.base.structure import Angle, Count, Name
 from gaponet.robot.servo_fields import PASSIVE_FIELDS, SERVO_FIELDS
 
 Gain = Annotated[float, Interval(ge=0, le=1e6)]
-Metres = Annotated[float, Interval(ge=-100, le=100)]
+Metres = Annotated[float, Interval(ge=-10, le=10)]  # more are millimetres
 
 
 @dataclass(frozen=True)

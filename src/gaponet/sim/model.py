@@ -59,7 +59,7 @@ def build_model(
 
     Raises:
         RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
-        UsageError: Negative payload, unknown side, or a dt that is not positive.
+        UsageError: Negative payload, unknown side, or a dt that is not positive, or above 1 s.
     """
     spec = build_spec(robot, payload_mass, payload_side, dt, locked, physics_only)
     model = compile_spec(spec, robot.mjcf)
@@ -98,8 +98,8 @@ def build_spec(
         raise RobotError(f"{robot.mjcf}: robot.toml names joint '{missing[0]}', the MJCF has: {', '.join(names)}")
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
     period = robot.dt if dt is None else dt
-    if not period > 0:
-        raise UsageError(f"dt is {dt}; the control period in seconds must be positive")
+    if not 0 < period <= 1:
+        raise UsageError(f"dt is {dt}; the control period in seconds must be positive and at most 1")
     spec.option.timestep = period / robot.steps_per(period)
     spec.option.tolerance = TOLERANCE
     for joint in spec.joints:

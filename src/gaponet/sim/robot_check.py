@@ -76,6 +76,9 @@ def _joints(robot: RobotSpec) -> Iterator[Finding]:
         if not np.isfinite(low):
             text = f"{name}: has no range in the MJCF; commands are not clipped and doctor cannot judge positions"
             yield Finding("warning", "range", f"{text}: write range in robot.xml", (name,))
+        elif not 0.1 <= high - low <= 40.0:  # 6°, 6 turns
+            text = f"{name}: its range is {low:.3g} to {high:.3g} rad: are these degrees? Correct it in robot.xml"
+            yield Finding("warning", "range", text, (name,))
 
 
 def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Finding]:

@@ -50,6 +50,33 @@ def test_the_name_of_a_file_says_motion_payload_repetition_and_gain(tmp_path, ar
         list(read_logs(tmp_path / "logs", arm))
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,motion,payload_mass\nrun_7,lift,0.2\n", "column 'payload_mass': write payload, once"),
+        ("file,motion,Payload\nrun_7,lift,0.2\n", "column 'Payload': write payload, once"),
+        ("file,motion,payload (kg)\nrun_7,lift,0.2\n", r"column 'payload \(kg\)': write payload, once"),
+        ("file,kp.elbow,kp.elbow\nrun_7,9,8\n", r"column 'kp\.elbow': write kp\.elbow, once"),
+        ("file,motion,payload,unit\nrun_7,lift,0,2,b\n", "row of run_7 has more cells .* decimal comma"),
+    ],
+)
+def test_a_sheet_that_would_be_read_in_part_is_refused(tmp_path, arm, text, message):
+    folder = write(tmp_path / "logs", NAMES + 'manifest = "sheet.csv"\n', "run_7.csv")
+    (folder / "sheet.csv").write_text(text)
+    with pytest.raises(UsageError, match=message):
+        list(read_logs(folder, arm))
+    (folder / "sheet.csv").write_text("file, motion, payload, , \nrun_7, lift, 0.2, , ,\n")
+    ((name, log),) = read_logs(folder, arm)
+    assert (name, log.meta["stated"]) == ("lift", {"payload_mass": 0.2})
+
+
+def test_a_rate_that_the_clock_contradicts_is_refused(tmp_path, arm):
+    with pytest.raises(LogError, match="'t' is not at rate = 100 Hz; leave out one of them"):
+        list(read_logs(write(tmp_path / "logs", "rate = 100.0\n" + NAMES), arm))
+    ((_, log),) = read_logs(write(tmp_path / "logs", "rate = 50.0\n" + NAMES), arm)
+    assert log.meta["dt"] == 0.02
+
+
 def test_a_sheet_says_what_names_do_not_and_every_recording_stands_in_it_once(tmp_path, arm):
     folder = write(tmp_path / "logs", NAMES + 'manifest = "sheet.csv"\n', "run_7.csv")
     sheet = folder / "sheet.csv"
@@ -178,6 +205,7 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
         ('motion = "{motion}_{speed}"', "use each of {motion}, {unit}, {side}, {payload}"),
         ('motion = "{motion}_{motion}"', "at most once"),
         ('motion = "{}_{}_{}_{motion}"', "at most 3 words may be of any text; use a manifest"),
+        ('[clock]\ncmd = "t"', r"clock\.cmd.*should be 'ctrl', 'qpos'"),
         ('manifest = "../sheet.csv"', "it lies beside logs.toml; give its name"),
         ('manifest = "no.csv"', "the manifest is missing, or no table"),
         ("[signs]\nelbow = 0", "a sign is 1 or -1"),

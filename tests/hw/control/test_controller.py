@@ -179,7 +179,18 @@ def test_a_stop_is_latched(arm):
         controller.run(motion_policy(MOTION, DT))
 
 
-@pytest.mark.parametrize(("field", "value"), [("rate", 0.5), ("rate", 1001.0), ("rate", np.nan), ("damp", 0.0)])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("rate", 0.5),
+        ("rate", 1001.0),
+        ("rate", np.nan),
+        ("damp", 0.0),
+        ("settle", -1.0),
+        ("settle", np.nan),
+        ("blend", np.inf),
+    ],
+)
 def test_times_that_no_run_can_have_are_refused(field, value):
     with pytest.raises(UsageError, match=f"{field} is {value:g}"):
         ControlConfig(**{field: value})

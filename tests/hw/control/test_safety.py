@@ -149,8 +149,12 @@ def test_damping_never_asks_for_more_than_the_effort_limit():
 
 
 def test_limits_that_leave_nothing_or_more_than_there_is_are_refused(arm):
-    with pytest.raises(UsageError, match=r"torque_share is 1\.5; give at most 1"):
+    with pytest.raises(UsageError, match=r"torque_share is 1\.5; give a positive number to 1"):
         SafetyConfig(torque_share=1.5)
+    with pytest.raises(UsageError, match=r"tilt is 40; give a positive number up to π rad"):
+        SafetyConfig(tilt=40)
+    with pytest.raises(UsageError, match=r"tracking_time is 250; give a positive number up to 60 s"):
+        SafetyConfig(tracking_time=250)
     with pytest.raises(UsageError, match="leaves nothing of the range of shoulder"):
         Limits.from_robot(arm, arm.joint_names, SafetyConfig(margin=2.0))
 

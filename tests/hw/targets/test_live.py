@@ -303,6 +303,9 @@ def test_times_and_acceleration_must_be_positive():
     for name in ("hold", "late", "wait", "acceleration"):
         with pytest.raises(UsageError, match=f"live: {name} is -1"):
             LiveConfig(**{name: -1})
+    for name in ("hold", "late"):
+        with pytest.raises(UsageError, match=f"live: {name} is 500 s; .* up to 60"):
+            LiveConfig(**{name: 500})
 
 
 def test_nothing_is_taken_apart_for_the_first_time_while_the_robot_moves(arm):

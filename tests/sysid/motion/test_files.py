@@ -40,6 +40,7 @@ def test_a_public_sage_motion_is_read_and_can_be_fitted():
         ("bad.txt", "shoulder,elbow\n0,0\n0\n", r"bad\.txt:3: 1 values for 2 names"),
         ("bad.txt", "shoulder,elbow\n0,0\n", r"1 rows after the line of joint names"),
         ("bad.txt", "shoulder,shoulder\n0,0\n0,0\n", r"two columns are the same joint of arm"),
+        ("bad.csv", "shoulder\n0\n0\n", r"bad\.csv:1: no column time, s, so its pace is not known"),
         ("bad.csv", "time,shoulder\n0,0\n0.02,0\n0.05,0\n", r"time must rise evenly; it steps by 0\.02 to 0\.03 s"),
         ("bad.txt", "shoulder,elbow\n0,0\n45,0\n", r"bad\.txt: command 2 of shoulder is 45\.000, outside its range"),
         ("bad.txt", "knee\n0\n1\n", r"names joint 'knee', which robot 'arm' does not have; nearest: "),
@@ -59,13 +60,16 @@ def test_a_bad_file_is_an_error_that_says_what_is_wrong(arm, tmp_path, name, tex
         ({"ctrl": np.array([["x"], ["y"]])}, "array 'ctrl' must hold numbers in 2 dimensions"),
         ({"ctrl": np.full((3, 1), np.nan)}, r"ctrl has shape \(3, 1\) or holds NaN"),
         ({"ctrl": np.full((3, 1), 1e9)}, "command 1 of shoulder is .* must be in radians"),
+        ({"dt": None}, "array 'dt' is missing"),
         ({"dt": [1, 2]}, "array 'dt' must hold numbers in 0 dimensions"),
+        ({"dt": 0.0}, r"its period is 0 s"),
         ({"dt": 1e-30}, r"its period is 1e-30 s; expected 0\.0001 to 1"),
         ({"dt": np.nan}, "its period is nan s"),
     ],
 )
 def test_arrays_that_are_no_motion_are_refused(arm, tmp_path, arrays, message):
-    np.savez(tmp_path / "bad.npz", **({"joint_names": np.array(["shoulder"]), "ctrl": np.zeros((3, 1))} | arrays))
+    good = {"joint_names": np.array(["shoulder"]), "ctrl": np.zeros((3, 1)), "dt": 0.02}
+    np.savez(tmp_path / "bad.npz", **{name: x for name, x in (good | arrays).items() if x is not None})
     with pytest.raises(LogError, match=rf"bad\.npz: {message}"):
         read_motion(tmp_path / "bad.npz", arm)
 

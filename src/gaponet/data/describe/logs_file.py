@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -72,7 +72,7 @@ class LogsFile(TypedDict, total=False):
     signs: dict[str, Sign]  # −1: the log counts the other way round
     offsets: dict[str, Offset]  # rad to add to positions, after unit and sign
     posture: dict[str, Offset]  # rad at which a joint stood that the log does not hold
-    clock: dict[str, str]  # a channel's own clock: ctrl = "t_cmd"
+    clock: dict[Literal["ctrl", "qpos", "qvel", "tau", "temperature", "feedforward_torque"], str]  # ctrl = "t_cmd"
 
 
 def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile, Path | None]:
@@ -198,12 +198,19 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
     if not file.is_file() or file.stat().st_size > 16 << 20:
         raise UsageError(f"{file}: the manifest is missing, or no table; a CSV with a column file")
     try:
-        rows = list(csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig"))))
+        rows = list(table := csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig")), skipinitialspace=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{file}: not a CSV table ({error})") from None
     if not rows or not rows[0].get("file"):
         raise UsageError(f"{file}: a manifest has a column file, and a row for each recording")
     columns = ["file", *_known(rows[0])]
+    ours = {name: k for k, (field, _) in FIELDS.items() if k for name in (k, field)}
+    for name in (names := list(table.fieldnames or ())):
+        near = ours.get(word := name.strip().lower(), "payload" if word.startswith("payload") else "")
+        if (near and name not in columns) or (name in columns and names.count(name) > 1):
+            raise UsageError(f"{file}: column '{name}': write {near or name}, once")
+    if long := [row["file"] for row in rows if any(row.get(None, ()))]:
+        raise UsageError(f"{file}: the row of {long[0]} has more cells than the header; is a decimal comma in it?")
     return [{c: row[c] or "" for c in columns if row.get(c) is not None} for row in rows if row.get("file")]
 
 

@@ -116,7 +116,7 @@ class RawRecording:
         if FEEDFORWARD in given and FEEDFORWARD not in chosen:
             raise LogError(f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: {self.shown()}")
         units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
-        clocks = {channel: specified.get("clock", {}).get(channel) or specified.get("time") for channel in chosen}
+        clocks = {c: dict[Any, str](specified.get("clock", {})).get(c) or specified.get("time") for c in chosen}
         gains = {name: _gain_columns(self, specified, name, chosen["ctrl"]) for name in ("kp", "kd")}
         names = {signal for joints in (*chosen.values(), *gains.values()) for signal, _ in joints.values()}
         loaded = self.load([*names, *{c for c in clocks.values() if c in self.signals and c not in names}])
@@ -319,6 +319,9 @@ def _time(
     if channel not in specified.get("clock", {}) and own.time is not None:
         return own.time
     if "rate" in specified:
+        periods = specified["rate"] * float(np.median(np.diff(loaded[clock].values))) if clock in loaded else 0.0
+        if periods > 0 and min(abs(periods * unit - 1) for unit in SECONDS.values()) > 0.1:  # in no unit of time
+            raise LogError(f"{where}: '{clock}' is not at rate = {specified['rate']:g} Hz; leave out one of them")
         return np.arange(len(own.values)) / specified["rate"]
     if clock not in recording.signals:
         explanation = f"'{clock or 'time'}' (the clock of {channel})"

@@ -109,6 +109,6 @@ class ControlConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.rate <= 1000:
             raise UsageError(f"rate is {self.rate} Hz; give 1 to 1000")
-        for name in ("blend", "blend_speed", "damp"):
-            if not getattr(self, name) > 0:
+        for name in ("blend", "blend_speed", "damp", "settle"):
+            if not (0 < getattr(self, name) < 1e6 or (name == "settle" and not self.settle)):
                 raise UsageError(f"{name} is {getattr(self, name)}; give a positive number")

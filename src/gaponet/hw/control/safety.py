@@ -29,6 +29,9 @@ from gaponet.robot.spec import RobotSpec
 RELATIVE_ROUNDING = 1e-9  # of a bound: kept free, so that rounding does not exceed a limit that is computed back
 MIN_STILL_STATES = 4  # new states in which one joint must read the same; at a turn two may by chance
 CHECKSUM_WINDOW_S = 1.0  # in which wrong checksums are counted
+# More is degrees, milliseconds or Fahrenheit, and would switch the check off.
+MAX_OPTIONS = dict.fromkeys(("delta", "frozen_travel", "frozen_joint", "tilt", "tracking"), (np.pi, "up to π rad"))
+MAX_OPTIONS |= {"tracking_time": (60, "up to 60 s"), "temperature": (150, "up to 150 °C"), "torque_share": (1, "to 1")}
 MIN_SPEED_RAD_S = 1e-6  # below it a joint counts as standing still for damping
 
 
@@ -79,10 +82,9 @@ class SafetyConfig:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             may_be_zero = name in ("margin", "jump", "frozen", "following")
-            if not np.isfinite(value) or value < 0 or (value == 0 and not may_be_zero):
-                raise UsageError(f"safety: {name} is {value}; give a positive number")
-        if self.torque_share > 1:
-            raise UsageError(f"safety: torque_share is {self.torque_share}; give at most 1, the effort limit itself")
+            most, text = MAX_OPTIONS.get(name, (np.finfo(float).max, "below infinity"))
+            if not 0 <= value <= most or (value == 0 and not may_be_zero):
+                raise UsageError(f"safety: {name} is {value}; give a positive number {text}")
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from gaponet.robot.spec import RobotSpec
 MAX_MESSAGE_BYTES = 1 << 14  # a message of 27 joints with long names has 1,500
 MAX_BEYOND_RANGE_RAD = 0.2  # beyond a joint's range: up to this a target is clipped to the range, else rejected
 MAX_CATCH_UP_PERIODS = 5  # control periods for which the speed limit bounds the distance to the last target
+MAX_OPTIONS = {"hold": (60.0, "s"), "late": (60.0, "s"), "wait": (1e6, "s"), "acceleration": (1e6, "rad/s²")}
 MAX_CLOCK_DRIFT = 2e-4  # of the sender's clock, relative to ours
 
 
@@ -43,9 +44,9 @@ class LiveConfig:
     """Fastest acceleration with which targets are followed, rad/s²."""
 
     def __post_init__(self) -> None:
-        for name, unit in {"hold": "s", "late": "s", "wait": "s", "acceleration": "rad/s²"}.items():
-            if not 0 < getattr(self, name) < np.inf:
-                raise UsageError(f"live: {name} is {getattr(self, name)} {unit}; give a positive number")
+        for name, (most, unit) in MAX_OPTIONS.items():
+            if not 0 < getattr(self, name) <= most:
+                raise UsageError(f"live: {name} is {getattr(self, name)} {unit}; give a positive number up to {most:g}")
 
 
 @dataclass(frozen=True)

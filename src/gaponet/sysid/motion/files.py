@@ -39,7 +39,6 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
     if path.stat().st_size > LARGEST:
         raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
-    period = period or SAGE_DT
     if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
         raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}")
     joints = tuple(robot.resolve(name, str(path)) for name in names)
@@ -56,8 +55,10 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
     """The joints that a motion names, at a control rate, Hz, as a file that read_motion reads.
 
     Raises:
-        UsageError: A .txt, which has no time column, at another rate than 50 Hz.
+        UsageError: No robot has this rate; or a .txt, which has no time column, at another than 50 Hz.
     """
+    if not 1 / MAX_PERIOD_S <= rate <= 1 / MIN_PERIOD_S:
+        raise UsageError(f"--rate {rate:g}: give the rate of the commands in Hz, 1 to {1 / MIN_PERIOD_S:g}")
     names = list(motion.named(robot))
     rows = motion.sample(1 / rate)[:, robot.index(names)]
     if path.suffix == ".npz":
@@ -81,7 +82,7 @@ def _level_of(ctrl: Array, robot: RobotSpec) -> str:
     return "upper_body" if set(moved) <= upper and len(upper) < len(robot.joint_names) else "whole_body"
 
 
-def _text(path: Path) -> tuple[list[str], Array, float | None]:
+def _text(path: Path) -> tuple[list[str], Array, float]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
@@ -103,7 +104,9 @@ def _text(path: Path) -> tuple[list[str], Array, float | None]:
         raise LogError(f"{path}: {len(rows)} rows after the line of joint names; a motion needs two or more")
     table = np.array(rows)
     if "time" not in names:
-        return names, table, None
+        if path.suffix == ".csv":
+            raise LogError(f"{path}:1: no column time, s, so its pace is not known; add one")
+        return names, table, SAGE_DT
     at = names.index("time")
     period = np.diff(table[:, at])
     if not (period > 0).all() or np.ptp(period) > 0.01 * period.mean():
@@ -111,15 +114,15 @@ def _text(path: Path) -> tuple[list[str], Array, float | None]:
     return names[:at] + names[at + 1 :], np.delete(table, at, axis=1), float(period.mean())
 
 
-def _npz(path: Path) -> tuple[list[str], Array, float | None]:
+def _npz(path: Path) -> tuple[list[str], Array, float]:
     arrays = read_npz(path, LogError, "give a motion of at most 10 hours, as gaponet excite writes it", LARGEST)
     for name, kind, dimensions in (("joint_names", "U", 1), ("ctrl", "fiu", 2), ("dt", "fiu", 0)):
-        if name not in arrays and name != "dt":
+        if name not in arrays:
             raise LogError(f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'nothing'}")
-        if name in arrays and (arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions):
+        if arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions:
             what = "text" if kind == "U" else "numbers"
             raise LogError(f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again")
     names, rows = arrays["joint_names"].tolist(), arrays["ctrl"].astype(float)
     if rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
         raise LogError(f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names")
-    return names, rows, float(arrays["dt"]) if "dt" in arrays else None
+    return names, rows, float(arrays["dt"])
