@@ -147,8 +147,8 @@ def test_options_that_would_do_nothing_are_refused(arm, motion, tmp_path, capsys
     run = ["run", "--motion", motion, "--robot", str(arm.mjcf.parent), *FAST]
     record = ["record", *run[1:], "--payload-mass", "0", "--out", str(tmp_path / "set")]
     for words, message in (
-        ([*run, "--compensation.dynamics"], "is for a compensation, and it is off; add --compensate"),
-        ([*run, "--live.hold", "2"], "is for live targets, and this is a motion"),
+        ([*run, "--compensation.dynamics"], "settings of the compensation are given, and it is off; add --compensate"),
+        ([*run, "--live.hold", "2"], "settings of live targets are given, and this is a motion"),
         ([*record, "--repetitions", "0"], "--repetitions 0: give 1 or more"),
         ([*record, "--unit-id", "2"], "--unit-id 2: a virtual robot is chosen by --unit 4"),
     ):

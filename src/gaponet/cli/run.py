@@ -182,9 +182,9 @@ def perform(
     if (motion_name is None) == (args.targets is None):
         raise UsageError("give either --motion, what to play, or --targets, where targets come from while it moves")
     if args.compensation != CompensatorConfig() and not (args.compensate or args.model):
-        raise UsageError("--compensation.… is for a compensation, and it is off; add --compensate or --model")
+        raise UsageError("settings of the compensation are given, and it is off; add --compensate or --model")
     if args.live != Live() and args.targets is None:
-        raise UsageError("--live.… is for live targets, and this is a motion; leave it out")
+        raise UsageError("settings of live targets are given, and this is a motion; leave them out")
     spec = identified = resolve_robot(args)
     if args.driver != "virtual":
         spec = hardware_robot(identified, reference_robot(args.driver, args.limits_from))
