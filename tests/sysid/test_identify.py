@@ -56,6 +56,13 @@ def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
     assert any("not determined" in w for w in identify(still, robot, windows=2).warnings)
 
 
+def test_no_term_is_tried_after_the_time_limit(tmp_path):
+    robot = write_arm(tmp_path)
+    fit = identify(recordings(robot, 3, rows=100), robot, windows=2, terms=("stribeck", "load"), budget=1e-6)
+    assert fit.comparisons == ()
+    assert any("the time was over before stribeck, load" in w for w in fit.warnings)
+
+
 def test_windows_cover_all_recordings(tmp_path):
     robot = write_arm(tmp_path)
     sequences = recordings(robot, 5, rows=900)

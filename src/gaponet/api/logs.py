@@ -306,6 +306,7 @@ def unit_recordings(
             data, _ = as_dataset(source, robot)
         data.require_robot(robot)
         unit, entries = entries_of_unit(data, unit, motions)
-        if other := {e.meta.payload_mass for e in entries} - {payload_mass} if payload_mass is not None else ():
-            raise UsageError(f"--payload-mass {payload_mass:g}: {source} states {max(other):g} kg; leave it out")
+        stated = max((e.meta.payload_mass for e in entries if e.meta.payload_mass != payload_mass), default=None)
+        if payload_mass is not None and stated is not None:
+            raise UsageError(f"--payload-mass {payload_mass:g}: {source} states {stated:g} kg; leave it out")
         yield unit, data.sequences(entries)

@@ -34,7 +34,7 @@ def demo(
         data: Folder of real logs; default: logs collected from virtual H1-2 robots here and now.
         robot: Robot name or folder.
         out: Folder for dataset, robot, run and report; an interrupted demo continues there.
-        budget: Time of identification.
+        budget: Time of the searches of identification.
         network: Training time of a network on top of the identified robot.
     """
     if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")):

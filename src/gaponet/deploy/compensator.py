@@ -68,8 +68,8 @@ class CompensatorConfig:
 
     def __post_init__(self) -> None:
         numbers = np.array([x for x in vars(self).values() if not isinstance(x, str)], float)
-        known = self.aim in ("target", "simulator") and 0 < self.gain <= 1 and min(self.limit, self.iterations) > 0
-        if not known or not ((numbers >= 0) & (numbers < np.inf)).all():
+        valid = self.aim in ("target", "simulator") and 0 < self.gain <= 1 and min(self.limit, self.iterations) > 0
+        if not valid or not ((numbers >= 0) & (numbers < np.inf)).all():
             text = "gain must be in (0, 1], limit and iterations > 0, the rest finite and ≥ 0"
             raise UsageError(f"compensator: aim is target or simulator; {text}")
 

@@ -73,6 +73,7 @@ class _SearchProgress:
         # Of the time that is left when a search begins: as much as of one more term stays.
         self._shares = [share / (sum(shares[i:]) + fits * term) for i, share in enumerate(shares)]
         self._total, self._done, self._end, self._search = self._last_of[-1], 0, np.inf, 0
+        self.untried: tuple[Term, ...] = ()  # terms for which no time was left
         self.tell(0, "inertias along the recordings")
 
     def tell(self, done: float, what: str) -> None:
@@ -90,6 +91,10 @@ class _SearchProgress:
     def expired(self) -> bool:
         """Return whether the time of the present search is over."""
         return time.monotonic() - self._began > self._end
+
+    def over(self) -> bool:
+        """Return whether the time of all searches is over."""
+        return self._seconds is not None and time.monotonic() - self._began > self._seconds
 
     def report(self, what: str, joints: tuple[str, ...], rows: Array) -> Callable[[Array], bool]:
         """Return a function of the costs (n,) of problems of so many rows (n,), which says whether to end the search.
@@ -133,7 +138,8 @@ def identify(
         terms: Terms of the servo model, from TERMS, in the order in which they are fitted;
             default: motion_limits.default_terms.
         table: Fit a table under the robot's tips.
-        budget: Time of the searches, s, without the table's; results are the same on every machine only without it.
+        budget: Time of the searches, s, without the table's. A search that has begun ends, and no further term is
+            tried. Results are the same on every machine only without it.
         stops: Give joints that stayed behind several commands a stop there.
         folds: Folds of the cross-validation, at most; 1 for none.
         masses: Fit masses, centres of mass and inertias of the links too.
@@ -201,8 +207,10 @@ def _fit_robot(
         ]
     one_payload = bool(links and robot.payload_mounts and not gains[-1])
     one_payload = one_payload and len({s.meta.payload_mass for s in sequences}) == 1
+    untried = f"the time was over before {', '.join(searches.untried)}: give more, or no limit, to try more terms"
     warnings = (
-        *[ONE_PAYLOAD] * one_payload, *joints.bounds.warnings(values[-1], fitted_fields(values[-1])),
+        *[untried] * bool(searches.untried), *[ONE_PAYLOAD] * one_payload,
+        *joints.bounds.warnings(values[-1], fitted_fields(values[-1])),
         *stop_questions(given, robot), *far_from_servo_type(fitted), *errors.sentences,
     )  # fmt: skip
     pairs = (first, ()), (values, links)
@@ -234,7 +242,9 @@ def _classic_candidates(
     searches.begin()
     report = searches.report("whole robot", names, whole.rollouts.rows)
     together = whole.descend(CLASSIC, bounds.start, (alone, bounds.start), ROBOT_ITERATIONS, report=report)
-    chains = whole.descend_chains(together, lambda names, rows: searches.report("kinematic chains", names, rows))
+    chains = together
+    if not searches.expired():
+        chains = whole.descend_chains(together, lambda names, rows: searches.report("kinematic chains", names, rows))
     return whole, {
         "given": given, "limbs": chains, "joints": alone, "whole": together, "delay and offset": late,
     }  # fmt: skip
@@ -250,8 +260,11 @@ def _with_terms(
     (n,).
     """
     comparisons, gaps = list[Comparison](), None
-    for term in terms:
+    for i, term in enumerate(terms):
         first = TERMS[term][0]
+        if searches.over():
+            searches.untried = terms[i:]
+            break
         if term == "backlash" and ("backlash" in base[-1] or not backlash.worth_a_search(fits[-1], base[-1])):
             continue
         each = [_fit_term(term, *one, searches) for one in zip(fits, wholes, base, strict=True)]

@@ -70,6 +70,13 @@ class Clicker:
         self.browser.ask("Input.insertText", text=text)
         time.sleep(1.0)  # the page sends it after a moment
 
+    def use(self, robot):
+        """Go through step Robot and open step Logs."""
+        self.choose("robot", robot)
+        self.click("Use this robot")
+        self.sees("gaponet robot has ended")
+        self.tab("2 Logs")
+
     def upload(self, label, file):
         button = f"{FIND.format(repr('button'), json.dumps(label))}[0]"
         name = self.wait(lambda: self.browser.value(f"{button}.parentElement.querySelector('input[type=file]').id"))
@@ -143,13 +150,10 @@ def test_from_a_urdf_and_one_real_chirp_of_a_z1_to_an_export_that_agrees(page, i
         at = Clicker(browser, page.address)
         at.upload("Upload a model", tmp_path / "z1.urdf")
         at.sees("z1.urdf is stored")
-        at.choose("robot", "model/z1.urdf")
         at.write("joints", " ".join(f"joint{n}" for n in range(1, 7)))
         at.write("kp", "80 joint2=120 joint3=120")
         at.write("kd", "2.5")
-        at.click("Use this robot")
-        at.sees("gaponet robot has ended")
-        at.tab("2 Logs")
+        at.use("model/z1.urdf")
         at.upload("Upload a log", iit_z1 / "traj_0.pt")
         at.sees("traj_0.pt is stored")
         at.click("Guess logs.toml")
@@ -188,10 +192,7 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
     archive = shutil.make_archive(str(tmp_path / "logs"), "zip", logs)
     with Browser(1000, 700) as first:
         at = Clicker(first, page.address)
-        at.choose("robot", "so101")
-        at.click("Use this robot")
-        at.sees("gaponet robot has ended")
-        at.tab("2 Logs")
+        at.use("so101")
         at.click("Read the logs")
         at.sees("gaponet import gave no result")  # there are none
         at.upload("Upload a log", archive)
@@ -245,10 +246,7 @@ def test_200_megabytes_of_another_robot_are_stored_and_refused_with_the_reason(p
     (tmp_path / "walk.csv").write_text(",".join(names) + "\n" + "0.02,0.1,0.2,0.3,0.1,0.2,0.3\n" * 7_000_000)
     with Browser(1000, 700) as browser:
         at = Clicker(browser, page.address)
-        at.choose("robot", "so101")
-        at.click("Use this robot")
-        at.sees("gaponet robot has ended")
-        at.tab("2 Logs")
+        at.use("so101")
         at.upload("Upload a log", tmp_path / "walk.csv")
         at.sees("walk.csv is stored")
         at.click("Read the logs")

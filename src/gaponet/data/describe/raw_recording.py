@@ -116,7 +116,8 @@ class RawRecording:
         if FEEDFORWARD in given and FEEDFORWARD not in chosen:
             raise LogError(f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: {self.shown()}")
         units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
-        clocks = {c: dict[Any, str](specified.get("clock", {})).get(c) or specified.get("time") for c in chosen}
+        own: dict[Any, str] = specified.get("clock", {})
+        clocks = {channel: own.get(channel) or specified.get("time") for channel in chosen}
         gains = {name: _gain_columns(self, specified, name, chosen["ctrl"]) for name in ("kp", "kd")}
         names = {signal for joints in (*chosen.values(), *gains.values()) for signal, _ in joints.values()}
         loaded = self.load([*names, *{c for c in clocks.values() if c in self.signals and c not in names}])
