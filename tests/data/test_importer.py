@@ -216,6 +216,8 @@ def test_gains_are_the_robots_unless_said_by_joint_or_for_all(logs, so101, tmp_p
 def test_gains_that_make_no_sense_are_refused(logs, so101, tmp_path, words):
     with pytest.raises(UsageError, match=r"--kp .*: give one number"):
         import_logs(logs, so101, "lab", 0.0, tmp_path / "data", kp=words)
+    with pytest.raises(UsageError, match=r"--kp elbow_flex=9 elbow_flex=5: a joint stands there twice"):
+        import_logs(logs, so101, "lab", 0.0, tmp_path / "data", kp=("elbow_flex=9", "elbow_flex=5"))
 
 
 def test_a_journal_from_before_gains_were_kept_still_opens(logs, so101, tmp_path):

@@ -85,6 +85,8 @@ def test_a_robot_s_own_servo_type_comes_before_the_table_s(tmp_path):
 def test_an_undefined_servo_type_is_refused(tmp_path):
     with pytest.raises(RobotError, match="joint 'shoulder': servo 'S1' is no"):
         write_arm(tmp_path, TWO.replace(SERVO, ""))
+    with pytest.raises(RobotError, match=r"two \[\[servo\]\] have the name 'S1'"):
+        write_arm(tmp_path, TWO + SERVO)
 
 
 @pytest.mark.parametrize(

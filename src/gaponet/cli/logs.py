@@ -153,7 +153,10 @@ def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
     for pair in pairs:
         if pair.count("=") != 1 or not all(part.strip() for part in pair.split("=")):
             raise UsageError(f"--map {pair}: write NAME_IN_LOG=NAME_OF_ROBOT")
-    return {a.strip(): b.strip() for a, b in (pair.split("=") for pair in pairs)} or None
+    names = {a.strip(): b.strip() for a, b in (pair.split("=") for pair in pairs)}
+    if len(names) < len(pairs):
+        raise UsageError(f"--map {' '.join(pairs)}: a name of the log stands there twice")
+    return names or None
 
 
 def _show_import(out: Out, made: ImportResult) -> None:

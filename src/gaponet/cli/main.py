@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ast
 import io
+import math
 import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from difflib import get_close_matches
 from functools import wraps
 from importlib.util import find_spec
@@ -89,6 +91,7 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
 
         @wraps(command)
         def run(*args: Any, **kwargs: Any) -> Any:
+            _require_counts(kwargs)
             begin()
             return command(*args, **kwargs)
 
@@ -102,6 +105,18 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         args=argv,
         sort_subcommands=False,
     )
+
+
+def _require_counts(options: dict[str, Any]) -> None:
+    """Refuse an option that is nan, and a whole number below 0: no option has a meaning for them."""
+    for name, value in options.items():
+        for number in value if isinstance(value, tuple) else (value,):
+            if is_dataclass(number):
+                _require_counts(vars(number))
+            elif isinstance(number, float) and math.isnan(number):
+                raise UsageError(f"--{name.replace('_', '-')} nan: give a number")
+            elif isinstance(number, int) and number < 0:
+                raise UsageError(f"--{name.replace('_', '-')} {number}: give at least 0")
 
 
 def _overview() -> str:

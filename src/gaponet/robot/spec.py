@@ -356,6 +356,8 @@ def servo_table() -> ServoTable:
 def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoType:
     """Return the servo type of that name among a robot.toml's own and the package's; `where` begins the error."""
     types = {servo.name: servo for servo in (*servo_table().servo, *own)}
+    if sum(servo.name == name for servo in own) > 1:
+        raise RobotError(f"{where}: two [[servo]] have the name '{name}'")
     if name not in types:
         near = " or ".join(difflib.get_close_matches(name, types, n=MAX_SUGGESTIONS, cutoff=0.0))
         raise RobotError(f"{where}: servo '{name}' is no [[servo]], nor in gaponet robot servos; nearest: {near}")

@@ -27,6 +27,8 @@ MAX_ERROR_RAD = np.pi  # of a simulation that diverged
 
 def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
     """Return `count` evenly picked windows of WINDOW_S, shorter where a recording is."""
+    if count < 1:
+        raise UsageError(f"--windows {count}: give at least 1")
     parts = []
     for s in sequences:
         rows = min(round(WINDOW_S / s.dt), len(s))
