@@ -140,7 +140,10 @@ def main() -> int:
     files = {name: work / "answers" / f"{name}.json" for name in STEPS}
     for i, (name, (text, _)) in enumerate(STEPS.items()):
         command = filled(text, work, args.data.resolve())
+        program = LISTED["needs"].get(name)
         state = "done before" if files[name].is_file() else "to do" if args.list or args.write else "runs"
+        if state == "runs" and program and not shutil.which(program):
+            state = f"skipped, no {program} here"
         if not args.steps or name in args.steps:
             print(f"[{i + 1}/{len(STEPS)}] {name}: {state}: {command}", flush=True)
             if state == "runs" and not measure(name, command, work):
