@@ -185,7 +185,8 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
             "moved": [(m.joint, m.field, m.by, m.sigmas) for m in found.moved],
             "aside": [a.recording for a in found.against], "took": time.monotonic() - began,
         })  # fmt: skip
-        print(lines[-1], flush=True)
+        moved = "; ".join(f"{m.joint}: {m.field} {m.by:+.3g} ({m.sigmas:+.1f} standard errors)" for m in found.moved)
+        print(f"{name}: {found.verdict}{'; ' * bool(moved)}{moved}", flush=True)
     facts = {"inside": inside, "alone": alone, "drift": lines,
              "joints": {j: (k.parameter_rms, k.residual_rms, k.residual_p90) for j, k in mine.joints.items()},
              }  # fmt: skip

@@ -75,6 +75,8 @@ SLOW = wave(ROWS, 2, 0.02, amplitude=0.4, hertz=0.05)
 FAULTS = {
     "mirrored": (lambda u, q: {"qpos": q * ELBOW}, "sign", "error", "elbow moves against its command"),
     "degrees": (lambda u, q: {"qpos": q * DEGREES}, "unit", "error", "elbow moves 57.3 times as far as commanded"),
+    "a command in rad, read as degrees": (lambda u, q: {"ctrl": u / DEGREES}, "unit", "error",
+                                          "elbow moves 57.3 times as far as commanded"),
     "velocity in degrees": (lambda u, q: {"qvel": np.gradient(q, 0.02, axis=0) * DEGREES}, "unit", "warning",
                             "recorded velocity of elbow is 57.3 times the derivative of its position"),
     "another scale": (lambda u, q: {"qpos": q * [1, 1.3]}, "unit", "warning",

@@ -42,7 +42,6 @@ PAGES = [
 PATHS = {page.name: page for page in PAGES}
 WITH_PYTHON = (
     "README.md",
-    "index.md",
     "api.md",
     "deploy.md",
     "export.md",

@@ -75,7 +75,8 @@ ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 DELAY_NOTES = {
     "newton": "Newton has no delays: check.py has a buffer of five lines",
     "drake": "Drake has no delays: check.py has a buffer of five lines; robot_cfg.py has the friction",
-    "mjcf": "delays need MuJoCo 3.5; MJX and Newton ignore them without a message: check_mjx.py has a buffer",
+    "mjcf": "delays need MuJoCo 3.5, and after each reset fill_delays of mujoco_servos.py; MJX and Newton ignore them "
+    "without a message: check_mjx.py has a buffer",
 }
 
 

@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from logs import repeated_motions
 
@@ -13,6 +14,7 @@ from gaponet.experiments.real import methods as module
 from gaponet.experiments.real.bench import Bench, load_method
 from gaponet.experiments.real.cards import CARDS, ROBOTS, read_cards
 from gaponet.experiments.real.methods import LEFT_OUT, METHODS
+from gaponet.experiments.real.page import result_table
 from gaponet.experiments.real.questions import questions, repeatability
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot, packaged_robots
@@ -59,6 +61,17 @@ def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(ar
     )
     again = stopped.evaluate(card, "new motions", [question])
     assert [r["mrad"] for r in again] == [r["mrad"] for r in rows]
+
+
+def test_the_table_has_paired_differences_to_identification_over_motions():
+    common = {"set": "a", "question": "b", "standard_error": 0.5, "of_nominal": 0.5, "less_than_nominal": 0.0,
+              "floor_mrad": None, "motions": 3}  # fmt: skip
+    by_motion = {"identification": [1.0, 2.0, 9.0], "rival": [2.0, 3.0, 10.0], "another": [1.0, 2.0, 12.0]}
+    rows = [
+        common | {"method": name, "mrad": np.mean(mrad), "by_motion_mrad": dict(zip("xyz", mrad, strict=True))}
+        for name, mrad in by_motion.items()
+    ]
+    assert [row[6] for row in result_table(rows).rows] == ["", "1.00 ± 0.00", "1.00 ± 1.00"]
 
 
 def test_networks_are_trained_once_and_rejected_without_a_gain_over_identification(arm, played, tmp_path, monkeypatch):

@@ -28,13 +28,19 @@ def _moved(surveys: list[Survey], joint: int) -> list[Survey]:
     return [s for s in surveys if s.ctrl_range[joint] > MIN_COMMAND_RAD]
 
 
+def _in_degrees(survey: Survey) -> Array:
+    """Return which joints follow a small command far, as if command and state had different units, (n)."""
+    follow = np.diag(survey.follows) > MIN_FOLLOWING
+    return follow & (survey.qpos_range > np.maximum(MIN_COMMAND_RAD, RATIO_BOUNDS[1] * survey.ctrl_range))
+
+
 def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does each command move its own joint?"""
     candidates: dict[tuple[int, int], list[float]] = defaultdict(list)
     motions = np.zeros(len(robot.joint_names), int)
     for s in surveys:
         moved = s.ctrl_range > MIN_COMMAND_RAD
-        motions += moved
+        motions += moved | _in_degrees(s)
         for i in np.flatnonzero(moved & (np.diag(s.follows) < 0.3) & (np.diag(s.opposes) < 0.6)):
             others = np.flatnonzero((s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6).any()))
             if others.size:
@@ -54,6 +60,7 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if idle:
         level = "warning" if set(idle) & set(robot.operated) else "note"
         text = f"no motion commands {abbreviate(list(idle))} over more than {MIN_COMMAND_RAD:g} rad"
+        text += ", read as degrees; were they logged in rad?" if set(idle) & set(_read_as_degrees(surveys)) else ""
         yield Finding(level, "order", f"{text}: nothing can be learned there", idle)
     if not swapped:
         yield Finding("ok", "order", "each command moves the joint of its name")
@@ -156,7 +163,8 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     median = lambda values: float(np.median(values)) if values else 1.0  # noqa: E731
     wrong = []
     for i, name in enumerate(robot.joint_names):
-        ratio = median([s.qpos_range[i] / s.ctrl_range[i] for s in _moved(surveys, i)])
+        commanded = _moved(surveys, i) or [s for s in surveys if _in_degrees(s)[i]]
+        ratio = median([s.qpos_range[i] / s.ctrl_range[i] for s in commanded])
         if ratio > RATIO_BOUNDS[1] or 0 < ratio < RATIO_BOUNDS[0]:
             text = (
                 f"{name} moves {ratio:.3g} times as far as commanded (57.3 and 0.0175 are degrees beside radians): "
@@ -183,7 +191,7 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if widest < MIN_WIDEST_COMMAND_RAD:
         text = f"no command spans more than {widest:.3f} rad: were radians read as degrees?"
         wrong.append(Finding("warning", "unit", text))
-    elif small and any("deg" in s.entry.meta.notes.get("converted_from", {}).values() for s in surveys):
+    elif small and _read_as_degrees(surveys):
         text = (
             f"no command of {abbreviate(small)} is further than {np.degrees(MAX_READ_AS_DEGREES_RAD):.1f}° from zero: "
             "radians that were read as degrees, beside logs in degrees? Import them by themselves, with their unit"
@@ -193,14 +201,19 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from wrong or [Finding("ok", "unit", "commands, positions and velocities agree in unit")]
 
 
+def _units(surveys: list[Survey]) -> dict[str, str]:
+    """Return joint → unit from which its positions were converted."""
+    return {name: unit for s in surveys for name, unit in s.entry.meta.notes.get("converted_from", {}).items()}
+
+
+def _read_as_degrees(surveys: list[Survey]) -> tuple[str, ...]:
+    return tuple(name for name, unit in _units(surveys).items() if unit == "deg")
+
+
 def _converted(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    unit_of: dict[str, str] = {}
-    for s in surveys:
-        unit_of |= s.entry.meta.notes.get("converted_from", {})
-    degrees = tuple(name for name, unit in unit_of.items() if unit == "deg")
-    if degrees:
+    if degrees := _read_as_degrees(surveys):
         yield Finding("note", "unit", f"logged in degrees, converted: {', '.join(degrees)}", degrees)
-    for name in (name for name, unit in unit_of.items() if unit == "fraction"):
+    for name in (name for name, unit in _units(surveys).items() if unit == "fraction"):
         low, high = robot.qpos_range[robot.joint_names.index(name)]
         text = f"{name} is logged as 0..1, not in rad: mapped to its range [{low:.2f}, {high:.2f}], velocity computed"
         yield Finding("note", "unit", text, (name,))

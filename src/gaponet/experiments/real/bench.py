@@ -86,9 +86,10 @@ class Bench:
         """Evaluate every method on every fold of a question; methods without the data that they need are skipped.
 
         Returns:
-            A row per method for JSON: mrad, standard errors over motions, of differences paired; floor_mrad, the mean
-            difference of repetitions; splits, a hash per fold; and by_joint_mrad, joint → payload, kg → (mean error
-            over motions; number of recordings), of data sets in which joints were recorded one at a time.
+            A row per method for JSON: mrad, standard errors over motions, of differences paired; by_motion_mrad, each
+            independent motion; floor_mrad, the mean difference of repetitions; splits, a hash per fold; and
+            by_joint_mrad, joint → payload, kg → (mean error over motions; number of recordings), of data sets in
+            which joints were recorded one at a time.
         """
         rows: list[Row] = []
         floors = [f for q in folds if (f := repeatability(q)) == f]
@@ -103,7 +104,8 @@ class Bench:
                 kind = "" if isinstance(error, GAPONetError) else f"{type(error).__name__}: "
                 self.say(f"{card.name}, {name}, {title}: {kind}{error}")
                 continue
-            errors, by_joint = _averages(folds, [e["errors"] for e in evaluated])
+            by_motion, by_joint = _averages(folds, [e["errors"] for e in evaluated])
+            errors = np.array([*by_motion.values()])
             nominal = nominal if rows else errors
             less = 1e3 * (nominal - errors)
             rows.append(json_compatible({
@@ -112,6 +114,7 @@ class Bench:
                 "less_than_nominal": less.mean(), "less_standard_error": standard_error(less), "motions": len(errors),
                 "recordings": sum(len(e["errors"]) for e in evaluated),
                 "floor_mrad": 1e3 * float(np.mean(floors or [np.nan])), "splits": [q.split_hash for q in folds],
+                "by_motion_mrad": {motion: 1e3 * error for motion, error in by_motion.items()},
                 "by_joint_mrad": by_joint, "seconds": round(sum(e["seconds"] for e in evaluated), 1),
                 "notes": [e["note"] for e in evaluated if e["note"]],
             }))  # fmt: skip
@@ -153,7 +156,7 @@ class Bench:
 
 def _averages(
     folds: list[Question], errors: list[list[float]]
-) -> tuple[np.ndarray, dict[str, dict[str, tuple[float, int]]]]:
+) -> tuple[dict[str, float], dict[str, dict[str, tuple[float, int]]]]:
     """Return the mean error of each independent motion, rad, and by_joint_mrad (Bench.evaluate)."""
     by_motion: dict[str, list[float]] = {}
     by_cell: dict[tuple[str, str], dict[str, list[float]]] = {}
@@ -167,7 +170,7 @@ def _averages(
     for (joint, kg), motions in sorted(by_cell.items()):
         mean = float(np.mean([np.mean(v) for v in motions.values()]))
         by_joint.setdefault(joint, {})[kg] = mean, sum(map(len, motions.values()))
-    return np.array([np.mean(v) for v in by_motion.values()]), by_joint
+    return {motion: float(np.mean(v)) for motion, v in by_motion.items()}, by_joint
 
 
 def _lacks_data(method: str, question: Question) -> bool:

@@ -10,9 +10,10 @@ import numpy as np
 
 from gaponet.base.files import write_text
 from gaponet.base.result_table import ResultTable
-from gaponet.experiments.real.methods import LEFT_OUT
+from gaponet.experiments.real.methods import LEFT_OUT, METHODS
 from gaponet.report.figures.style import figure, legend, save, styled
 from gaponet.report.methods import colour, shade
+from gaponet.sim.metrics import standard_error
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,26 +29,36 @@ LOOKS = {  # method's title → colour, marker
     "identification + GAPONet": (colour("identified+gaponet"), "v"),
 }
 MAX_OF_NOMINAL = 1.6  # end of the figure's axis; larger values are drawn at it
-COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal, mrad", "floor", "motions",
-           "recordings")  # fmt: skip
+COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal, mrad",
+           "more than identification, mrad", "floor", "motions")  # fmt: skip
 STEM = "real"
 HEADING = """# Real robots
 
 `gaponet experiment real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in open-loop
 rollouts from the recorded start. Errors are in mrad. ± is the standard error over independent motions, of differences
-to the nominal simulator paired. "Floor" is the difference of two recordings of one command. "Identified elsewhere"
+paired. "Floor" is the difference of two recordings of one command. "Identified elsewhere"
 means: on another session or unit."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:
     """One row per data set, question and method, from Bench.evaluate."""
+    fitted = {(r["set"], r["question"]): r for r in rows if r["method"] == METHODS["identified"][0]}
     return ResultTable(STEM, COLUMNS, tuple(
         (r["set"], r["question"], r["method"] + _left_out(r.get("notes", ())),
          _plus_minus(r["mrad"], r["standard_error"]), f"{r['of_nominal']:.2f}",
          "" if i == 0 or not r["less_than_nominal"] else _plus_minus(r["less_than_nominal"], r["less_standard_error"]),
-         "–" if r["floor_mrad"] is None else f"{r['floor_mrad']:.1f}", r["motions"], r["recordings"])
+         _more_than(fitted.get((r["set"], r["question"])), r),
+         "–" if r["floor_mrad"] is None else f"{r['floor_mrad']:.1f}", r["motions"])
         for i, r in enumerate(rows)
     ))  # fmt: skip
+
+
+def _more_than(fitted: dict[str, Any] | None, row: dict[str, Any]) -> str:
+    """Return how much larger a row's error is than that of identification, ± over motions; "" if it is no rival."""
+    if fitted in (None, row) or not (fitted.keys() & row.keys() >= {"by_motion_mrad"}):
+        return ""
+    more = np.array([row["by_motion_mrad"][motion] - mrad for motion, mrad in fitted["by_motion_mrad"].items()])
+    return _plus_minus(more.mean(), standard_error(more) if len(more) > 1 else None)
 
 
 def _left_out(notes: tuple[str, ...]) -> str:

@@ -1,6 +1,7 @@
 """Identified servos in plain MuJoCo. This file is copied into exports; it needs MuJoCo and numpy, not gaponet.
 
 servos = Servos(model, read("facts.json"))     # once; prefix="left/" where the robot was attached to a scene
+data.ctrl[...] = …; fill_delays(model, data)   # after each reset
 data.ctrl[...] = …; servos.before(data); mujoco.mj_step(model, data)     # mj_forward after a change of state
 """
 
@@ -91,6 +92,15 @@ def addresses(model: Any, joints: list[str], prefix: str = "") -> tuple[Any, Any
     return model.jnt_dofadr[ids], model.jnt_qposadr[ids], servos
 
 
+def fill_delays(model: Any, data: Any) -> None:
+    """Let each delayed actuator act as if data.ctrl had always been in force; MuJoCo's reset lets it begin at 0."""
+    import mujoco
+
+    for i, samples in enumerate(model.actuator_history[:, 0] if model.nhistory else ()):
+        if samples:
+            mujoco.mj_initCtrlHistory(model, data, i, None, np.full(samples, data.ctrl[i]))
+
+
 def play(model: Any, facts: dict[str, Any], motion: Motion, prefix: str = "", form: str = "joints") -> Any:
     """Play a motion in plain MuJoCo from its first state, as if its first command had always been in force.
 
@@ -110,9 +120,7 @@ def play(model: Any, facts: dict[str, Any], motion: Motion, prefix: str = "", fo
     servos, data = Servos(model, facts, prefix) if form == "joints" else None, mujoco.MjData(model)
     dof, at, servo = addresses(model, names, prefix)
     data.qpos[at], data.qvel[dof], data.ctrl[servo] = qpos[0], motion["qvel"][0], ctrl[0]
-    for i, value in zip(servo, ctrl[0], strict=True):
-        if model.nhistory and model.actuator_history[i, 0]:
-            mujoco.mj_initCtrlHistory(model, data, i, None, np.full(model.actuator_history[i, 0], float(value)))
+    fill_delays(model, data)
     mujoco.mj_forward(model, data)
     for t in range(len(ctrl) - 1):
         data.ctrl[servo] = ctrl[t]
