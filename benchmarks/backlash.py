@@ -1,7 +1,7 @@
 """Backlash on VIRTUAL robots: right verdicts, widths and errors, with and without a play hinge.
 
-    python benchmarks/backlash.py OUT.json --robots 12 --first 0
-    python benchmarks/backlash.py OUT.json --robots 12 --hinge
+    python benchmarks/backlash.py OUT.jsonl --robots 12 --first 0     # resumes
+    python benchmarks/backlash.py OUT.jsonl --robots 12 --hinge
 
 The robots are plain MuJoCo models. Backlash is a hinge of its own with a range of ± b/2 between the motor (armature,
 damping, friction) and the link, or a spring stands there. The encoder is on the link. One or two joints hang under
@@ -14,13 +14,13 @@ and with a play hinge. Its servo reads the motor (also with the best offset), or
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from by_seed import Row, measure_seeds, plus_minus, print_table
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -218,28 +218,37 @@ def play_hinge(robot: PlayRobot, h: float, motion: Sequence, own: mujoco.MjModel
     return path
 
 
+def verdicts(seed: int) -> Row:
+    """Identify a robot with a gap, with and without the term, and the same robot without a gap."""
+    gap, none = (PlayRobot.draw(seed, has) for has in (True, False))
+    return {"with": result(gap), "left out": result(gap, ("stribeck", "load")), "no gap": result(none)}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--robots", type=int, default=12)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--hinge", action="store_true")
-    args, results = parser.parse_args(), []
+    args = parser.parse_args()
+    rows = measure_seeds(
+        args.out, range(args.first, args.first + args.robots), hinge_result if args.hinge else verdicts
+    )
+    lines: list[tuple[object, ...]] = []
     if args.hinge:
-        made = [hinge_result(seed) for seed in range(args.first, args.first + args.robots)]
-        args.out.write_text(json.dumps(made, indent=1))
-        for name in made[0]:
-            errors = 1e3 * np.array([one[name] for one in made])
-            worse = sum(one[name] > one["left out"] for one in made)
-            error = errors.std(ddof=1) / np.sqrt(len(made))
-            print(f"{name}: {errors.mean():.2f} ± {error:.2f} mrad, worse than left out: {worse} of {len(made)}")
+        for name in (n for n in rows[0] if n != "seed"):
+            worse = sum(r[name] > r["left out"] for r in rows)
+            lines.append((name, plus_minus(1e3 * r[name] for r in rows), f"{worse} of {len(rows)}"))
+        print_table(("form in plain MuJoCo", "difference, mrad", "worse than left out"), lines)
         return
-    for seed in range(args.first, args.first + args.robots):
-        gap, none = (PlayRobot.draw(seed, has) for has in (True, False))
-        made = {"with": result(gap), "left out": result(gap, ("stribeck", "load")), "no gap": result(none)}
-        results.append(made)
-        args.out.write_text(json.dumps(results, indent=1))
-        print(seed, {name: (r["rad"], 1e3 * np.mean(r["test_rad"])) for name, r in made.items()}, flush=True)
+    for name in ("with", "left out", "no gap"):
+        some = [r[name] for r in rows]
+        joints, gaps = sum(len(r["rad"]) for r in some), sum(bool(w) for r in some for w in r["rad"])
+        inside = [abs(w - true) < 1.645 * std for r in some
+                  for w, true, std in zip(r["rad"], r["true_rad"], r["std_rad"], strict=True) if w]  # fmt: skip
+        error = plus_minus(1e3 * np.mean(r["test_rad"]) for r in some)
+        lines.append((name, len(some), joints, gaps, f"{sum(inside)} of {len(inside)}", error))
+    print_table(("VIRTUAL robots", "robots", "joints", "gaps accepted", "inside 90 %", "error, mrad"), lines)
 
 
 if __name__ == "__main__":

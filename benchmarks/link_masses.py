@@ -1,7 +1,6 @@
 """Link masses on VIRTUAL arms whose file is right or wrong: identify --masses beside a plain rival.
 
-    python benchmarks/link_masses.py OUT.jsonl --robots 20 --first 100     # one line a robot; resumes
-    python benchmarks/link_masses.py OUT.jsonl --robots 0                  # the table
+    python benchmarks/link_masses.py OUT.jsonl --robots 20 --first 100     # resumes
 
 Arms have two joints. In a wrong file one link has 1 / 1.3 to 1 / 2 of the true mass, or its centre of mass 2 to 5 cm
 away. Half of the arms are recorded with two payloads, half with none. Seven motions of 8 s are fitted and validated;
@@ -16,7 +15,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.util
-import json
 import tempfile
 import time
 from dataclasses import replace
@@ -25,11 +23,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from by_seed import Row, measure_seeds, plus_minus, print_table
 from plain_fit import Problem, fit
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import Link, RobotSpec, load_robot
-from gaponet.sim.metrics import standard_error
 from gaponet.sim.model import build_model, stiffen_friction
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
@@ -249,47 +247,34 @@ def play(seed: int, torque: bool) -> dict[str, Any]:
     return row
 
 
-def table(rows: list[dict[str, Any]]) -> None:
-    """Print errors by kind of file and payloads."""
-    names = list(rows[0]["test"])
-    print(
-        "| arms | accepted |", *(f"{key}: {n} |" for key in ("test", "new payload") for n in names), "90 % intervals |"
-    )
-    for wrong in (False, True):
-        for payloads in (1, 2):
-            some = [r for r in rows if r["wrong"] == wrong and r["payloads"] == payloads]
-            if not some:
-                continue
-            cells = []
-            count = JOINTS * len(some)
-            held = [
-                f"{sum(r.get(k, 0) for r in some)} of {count}" for k in ("masses inside", "mujoco.sysid masses inside")
-            ]
-            print("masses within their 90 % interval, identify where accepted, mujoco.sysid:", *held)
-            for key in ("test", "new payload"):
-                errors = np.array([[r[key][n] for n in names] for r in some])
-                cells += [f"{e.mean():.2f} ± {standard_error(e):.2f}" for e in errors.T]
-            inside, known = (sum(r.get(k, 0) for r in some) for k in ("inside", "known"))
-            kind = f"{len(some)}, {'wrong' if wrong else 'right'} file, {payloads} payload(s)"
-            print(f"| {kind} | {sum(r['accepted'] for r in some)} |", " | ".join(cells), f"| {inside} of {known} |")
-    print("processor seconds:", {n: round(float(np.mean([r["s"][n] for r in rows])), 1) for n in names})
+def table(rows: list[Row]) -> None:
+    """Print errors of both payloads, verdicts and intervals, by kind of file and payloads."""
+    kinds = [(wrong, payloads) for wrong in (False, True) for payloads in (1, 2)]
+    groups = [[r for r in rows if (r["wrong"], r["payloads"]) == kind] for kind in kinds]
+    titles = [f"{'wrong' if wrong else 'right'} file, {payloads} payload(s)" for wrong, payloads in kinds]
+    for key in ("test", "new payload"):
+        lines = [(n, *(plus_minus(r[key][n] for r in some) for some in groups)) for n in rows[0][key]]
+        print_table((f"mrad, {key}", *titles), lines)
+    lines = [("arms", *map(len, groups)), ("--masses accepted", *(sum(r["accepted"] for r in some) for some in groups))]
+    fitted = {"masses inside": [[r for r in g if r["accepted"]] for g in groups], "mujoco.sysid masses inside": groups}
+    for name, some in fitted.items():
+        lines.append((f"{name} 90 %", *(f"{sum(r.get(name, 0) for r in g)} of {JOINTS * len(g)}" for g in some)))
+    sums = [[sum(r.get(k, 0) for r in some) for k in ("inside", "known")] for some in groups]
+    print_table(("number", *titles), [*lines, ("all values inside 90 %", *(f"{a} of {b}" for a, b in sums))])
+    seconds = {n: float(np.mean([r["s"][n] for r in rows])) for n in rows[0]["s"]}
+    print("processor, s:", ", ".join(f"{n} {s:.1f}" for n, s in seconds.items()))
 
 
 def main() -> None:
-    """Play robots that are not in the file yet, then print the table."""
+    """Play robots that are not in the file yet, then print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--torque", action="store_true", help="record torque too")
     args = parser.parse_args()
-    rows = [json.loads(line) for line in args.out.read_text().splitlines()] if args.out.exists() else []
-    for seed in sorted(set(range(args.first, args.first + args.robots)) - {r["seed"] for r in rows}):
-        rows.append(play(seed, args.torque))
-        with args.out.open("a") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
-        print(rows[-1], flush=True)
-    table(rows)
+    seeds = range(args.first, args.first + args.robots)
+    table(measure_seeds(args.out, seeds, lambda seed: play(seed, args.torque)))
 
 
 if __name__ == "__main__":

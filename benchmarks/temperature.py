@@ -1,7 +1,6 @@
 """Friction by temperature on VIRTUAL robots: verdicts, intervals, errors: docs/results/know.md.
 
-    python benchmarks/temperature.py OUT.jsonl [--first 0] [--robots 40]
-    python benchmarks/temperature.py OUT.jsonl --table
+    python benchmarks/temperature.py OUT.jsonl [--first 0] [--robots 40]     # resumes
 
 Arms with one or two joints, drawn by seed. The friction of every second robot falls by 0.3 to 2 % per K of its housing;
 half of these lose viscous damping as well. Of the others every second one loses gain with the temperature, by
@@ -12,13 +11,13 @@ thermometer is in the winding. Six motions of 4 s are fitted, four validate, six
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from by_seed import Row, measure_seeds, plus_minus, print_table
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -127,22 +126,25 @@ def result(seed: int) -> dict[str, object]:
     }  # fmt: skip
 
 
-def table(file: Path) -> None:
+def table(rows: list[Row]) -> None:
     """Print verdicts, coverage and errors of each kind of robots."""
-    results = [json.loads(line) for line in file.read_text().splitlines()]
-    kinds = {0: "friction and damping thin", 1: "nothing but lost gain", 2: "friction thins", 3: "nothing"}
-    for kind, name in kinds.items():
-        some = [r for r in results if r["seed"] % 4 == {0: 0, 1: 1, 2: 2, 3: 3}[kind]]
-        if not some:
-            continue
+    kinds = (
+        "friction and damping fall",
+        "the gain falls, friction does not",
+        "friction alone falls",
+        "nothing depends",
+    )
+    lines = []
+    for i, kind in enumerate(kinds):
+        some = [r for r in rows if r["seed"] % 4 == i]
         inside = [abs(c - true) <= NORMAL_90 * std for r in some if r["accepted"]
                   for c, true, std in zip(r["per_kelvin"], r["true_per_kelvin"], r["std"], strict=True)]  # fmt: skip
-        errors = 1e3 * np.array([[np.mean(r[k]) for k in ("test_without_rad", "test_rad")] for r in some])
-        change = errors[:, 1] - errors[:, 0]
-        print(f"{name}: {len(some)} robots, tried {sum(r['tried'] for r in some)}, "
-              f"accepted {sum(r['accepted'] for r in some)}, inside 90 %: {sum(inside)} of {len(inside)}, error "
-              f"{errors[:, 0].mean():.3f} → {errors[:, 1].mean():.3f} mrad, change {change.mean():+.3f} ± "
-              f"{change.std(ddof=1) / np.sqrt(len(change)):.3f}, worst {change.max():+.3f}")  # fmt: skip
+        before, after = (1e3 * np.array([np.mean(r[k]) for r in some]) for k in ("test_without_rad", "test_rad"))
+        accepted = sum(r["accepted"] for r in some)
+        lines.append((kind, len(some), accepted, plus_minus(before), plus_minus(after), plus_minus(after - before),
+                      f"{sum(inside)} of {len(inside)}"))  # fmt: skip
+    columns = ("VIRTUAL robots", "robots", "accepted", "without it, mrad", "with it, mrad", "change", "inside 90 %")
+    print_table(columns, lines)
 
 
 def main() -> None:
@@ -150,16 +152,8 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--robots", type=int, default=40)
-    parser.add_argument("--table", action="store_true")
     args = parser.parse_args()
-    if args.table:
-        return table(args.out)
-    for seed in range(args.first, args.first + args.robots):
-        made = result(seed)
-        with args.out.open("a") as file:
-            file.write(json.dumps(made, default=float) + "\n")
-        shown = {k: made[k] for k in ("seed", "true_per_kelvin", "per_kelvin", "std", "accepted", "seconds")}
-        print(shown, 1e3 * np.mean(made["test_without_rad"]), 1e3 * np.mean(made["test_rad"]), flush=True)
+    table(measure_seeds(args.out, range(args.first, args.first + args.robots), result))
 
 
 if __name__ == "__main__":

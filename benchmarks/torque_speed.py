@@ -1,8 +1,6 @@
 """Torque-speed line on VIRTUAL robots: verdicts, intervals of the no-load speed, errors: docs/results/know.md.
 
-    python benchmarks/torque_speed.py WORK [--first 0] [--robots 40] [--timestep 0.005]
-                                                 a JSON line each in WORK/torque_speed.jsonl
-    python benchmarks/torque_speed.py WORK --table
+    python benchmarks/torque_speed.py WORK [--first 0] [--robots 40] [--timestep 0.005]     # resumes
 
 Arms with one or two joints, drawn by seed. Every second robot has a line; two of four come from the package's virtual
 robots, two from MuJoCo's <dcmotor> behind a current controller. The file's kp differs from the true one, and in about
@@ -14,13 +12,13 @@ six others are the test set.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from by_seed import Row, measure_seeds, plus_minus, print_table
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -213,45 +211,35 @@ def measure(seed: int, work: Path, timestep: float) -> dict[str, object]:
     return row | {"std": [rich.std[joint].get("no_load_speed", 0.0) for joint in robot.operated]}
 
 
-def table(work: Path) -> None:
-    """Print verdicts, coverage and errors of the robots in WORK."""
-    rows = [json.loads(text) for text in (work / "torque_speed.jsonl").read_text().splitlines()]
-    print("| VIRTUAL robots | robots | tried | accepted | without, mrad | with, mrad | better by, mrad | v0 in 90 % |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
-    for line in (True, False):
-        for simulator in ("package", "dcmotor"):
-            some = [r for r in rows if (r["line"], r["simulator"]) == (line, simulator)]
-            if not some:
-                continue
-            both = np.array([[np.mean(r["without"]), np.mean(r["with"])] for r in some if r["tried"]])
-            gain = both[:, 0] - both[:, 1]
-            inside = [
-                abs(v - e) < NORMAL_90 * s
-                for r in some if line and not r["corner"] and r["kd_right"]
-                for v, e, s in zip(r["no_load"], r["estimate"], r["std"], strict=True) if e
-            ]  # fmt: skip
-            accepted = sum(any(r["estimate"]) for r in some)
-            print(f"| {'line' if line else 'no line'}, {simulator} | {len(some)} | {sum(r['tried'] for r in some)} | "
-                  f"{accepted} | {both[:, 0].mean():.2f} | {both[:, 1].mean():.2f} | {gain.mean():.2f} ± "
-                  f"{gain.std(ddof=1) / np.sqrt(len(gain)):.2f} | {sum(inside)} of {len(inside)} |")  # fmt: skip
+def table(rows: list[Row]) -> None:
+    """Print verdicts, coverage and errors of each kind of robots."""
+    lines = []
+    for line, simulator in ((True, "package"), (True, "dcmotor"), (False, "package"), (False, "dcmotor")):
+        some = [r for r in rows if (r["line"], r["simulator"]) == (line, simulator)]
+        tried = [r for r in some if r["tried"]]
+        without, rich = (np.array([np.mean(r[k]) for r in tried]) for k in ("without", "with"))
+        inside = [
+            abs(v - e) < NORMAL_90 * s
+            for r in some if line and not r["corner"] and r["kd_right"]
+            for v, e, s in zip(r["no_load"], r["estimate"], r["std"], strict=True) if e
+        ]  # fmt: skip
+        kind = f"{'line' if line else 'no line'}, {simulator}"
+        lines.append((kind, len(some), len(tried), sum(any(r["estimate"]) for r in some), plus_minus(without),
+                      plus_minus(rich), plus_minus(without - rich), f"{sum(inside)} of {len(inside)}"))  # fmt: skip
+    columns = ("VIRTUAL robots", "robots", "tried", "accepted", "without, mrad", "with, mrad", "better by, mrad")
+    print_table((*columns, "no-load speed inside 90 %"), lines)
 
 
 def main() -> None:
-    """Run the benchmark, or print its table."""
+    """Measure robots that are not in the file yet, then print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--robots", type=int, default=40)
     parser.add_argument("--timestep", type=float, default=0.005, help="physics step of the fitted robot, s")
-    parser.add_argument("--table", action="store_true")
     args = parser.parse_args()
-    if not args.table:
-        args.work.mkdir(parents=True, exist_ok=True)
-        for seed in range(args.first, args.first + args.robots):
-            row = measure(seed, args.work, args.timestep)
-            with (args.work / "torque_speed.jsonl").open("a") as file:
-                file.write(json.dumps(row) + "\n")
-    table(args.work)
+    file, seeds = args.work / "torque_speed.jsonl", range(args.first, args.first + args.robots)
+    table(measure_seeds(file, seeds, lambda seed: measure(seed, args.work, args.timestep)))
 
 
 if __name__ == "__main__":
