@@ -223,7 +223,7 @@ def perform(
             _show(screen, plan, spec, robot, limits.max_payload)
         if needs_consent:
             how = f"as {args.targets} says" if motion is None else "as planned"
-            require_consent(f"{robot.address} will move {len(robot.commanded)} joints {how}.")
+            require_consent(f"{robot.address} will move {how}; {len(robot.commanded)} joints are commanded.")
 
     controller = Controller(
         driver, spec, config=args.control, safety=args.safety, compensator=compensator, clock=clock,
