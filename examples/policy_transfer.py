@@ -5,7 +5,7 @@
 
 A VIRTUAL robot plays excitation, and `gaponet identify` writes a robot folder from the recordings. PPO trains a small
 network to follow motions in three simulators: the nominal one, the identified one, and sixteen samples of the
-identified one within its uncertainty (gaponet.export.rollout.drawn_robots). All policies are tested on the VIRTUAL
+identified one within its uncertainty (gaponet.export.rollout.sample_robots). All policies are tested on the VIRTUAL
 robot with other motions. Finally, `gaponet replay` predicts the robot's motion under the targets of the nominal
 policy's own rollout.
 """
@@ -26,7 +26,7 @@ from tensordict import TensorDict
 
 from gaponet.cli.main import main as gaponet
 from gaponet.deploy.aligned_sim import AlignedSim
-from gaponet.export.rollout import drawn_robots
+from gaponet.export.rollout import sample_robots
 from gaponet.robot.spec import RobotSpec, load_robot
 
 Array = np.ndarray
@@ -165,7 +165,7 @@ def main(
     task, unseen = (Task(spec, motions(spec, 0.0, seed, names), 1.0) for seed in (LEARN_SEED, TRY_SEED))
     tried = np.zeros(len(unseen.first))
     robots = {
-        "nominal": [spec], "identified": [found], "identified + ranges": drawn_robots(found, DRAWS),
+        "nominal": [spec], "identified": [found], "identified + ranges": sample_robots(found, DRAWS),
     }  # fmt: skip
     errors: dict[str, list[Array]] = {}
     for seed in seeds:

@@ -139,3 +139,27 @@ def test_what_may_run_on_a_robot_never_imports_training():
         part = name.split(".")[1:]
         if part and part[0] not in ("experiments", "api", "cli") and part[:2] != ["nn", "training"]:
             assert "gaponet.nn.training" not in file.read_text(encoding="utf-8"), file
+
+
+def names(file: Path) -> set[str]:
+    """Names that a module binds at any depth, and its submodules."""
+    bound = {inner.stem for inner in file.parent.iterdir()} if file.name == "__init__.py" else set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            bound.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            bound.add(node.id)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            bound |= {(alias.asname or alias.name) for alias in node.names}
+    return bound
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "examples", "plugins"])
+def test_scripts_import_names_that_exist(folder):
+    absent = []
+    for file in (PACKAGE.parents[1] / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gaponet."):
+                there = names(MODULES[node.module]) if node.module in MODULES else set()
+                absent += [f"{file.name}: {node.module}.{a.name}" for a in node.names if a.name not in there]
+    assert absent == []
