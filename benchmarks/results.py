@@ -107,16 +107,13 @@ def measured(answer: dict[str, Any]) -> str:
 
 def readme_rows(rows: list[dict[str, Any]]) -> list[str]:
     """Return the lines of README's table: errors of each column's method, of two rivals the better one."""
-    errors = {
-        (f"{r['set']}, {r['question']}", r["method"]): (r["mrad"], f" (from {x})" if (x := r.get("from_mrad")) else "")
-        for r in rows
-    }
+    errors = {(f"{r['set']}, {r['question']}", r["method"]): r["mrad"] for r in rows}
     lines = []
     for key, label in LISTED["readme"].items():
         cells = [
             min((errors[key, m] for m in methods if (key, m) in errors), default=None) for methods in README_COLUMNS
         ]
-        lines.append(f"| {label} | {' | '.join(f'{c[0]:.2f}{c[1]}' if c else '–' for c in cells)} |\n")
+        lines.append(f"| {label} | {' | '.join(f'{c:.2f}' if c else '–' for c in cells)} |\n")
     return lines
 
 
