@@ -125,5 +125,6 @@ def require_radians(values: Array, joint_names: tuple[str, ...], robot: RobotSpe
         if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
             raise LogError(
                 f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
-                "must be in radians: these look like degrees (--position-unit deg)"
+                "must be in radians: these look like degrees; logs state them with --position-unit deg, or for one "
+                "joint with [joint_units]"
             )
