@@ -56,6 +56,15 @@ def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
     assert any("not determined" in w for w in identify(still, robot, windows=2).warnings)
 
 
+def test_terms_of_the_robot_are_part_of_the_start(tmp_path):
+    robot = write_arm(tmp_path)
+    logs = recordings(robot, 3, rows=100)
+    begun = robot.with_servos({j: {"stribeck": 0.05, "stribeck_speed": 0.1} for j in robot.operated})
+    warm = robot.with_servos({j: {"friction_per_kelvin": -0.01} for j in robot.operated})
+    for start in (begun, warm):
+        assert identify(logs, start, windows=2, terms=(), budget=1e-6).robot.joint_names == robot.joint_names
+
+
 def test_no_term_is_tried_after_the_time_limit(tmp_path):
     robot = write_arm(tmp_path)
     fit = identify(recordings(robot, 3, rows=100), robot, windows=2, terms=("stribeck", "load"), budget=1e-6)

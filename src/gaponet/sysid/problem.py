@@ -154,7 +154,7 @@ class JointFit(FitProblem):
         x = np.repeat(axes.normalize(start)[None], STARTS, axis=0)
         x[1:] += START_STD * rng.standard_normal(x[1:].shape)
         for i, one in enumerate(others):
-            x[2 + i] = axes.normalize(one)
+            x[2 + i] = axes.normalize(start | one)
         x = np.clip(x, axes.low, axes.high)
         windows = (self.rollouts.shortened(SHORT_WINDOW_S), self.rollouts, self.rollouts)
         for rollouts, iterations in zip(windows, SEARCH_ITERATIONS, strict=True):
