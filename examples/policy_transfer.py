@@ -1,11 +1,11 @@
-"""Transfer of a policy trained in the nominal simulator, the identified one, and the identified one with ranges.
+"""Transfer of a policy trained in the nominal simulator, the identified one, and the identified one with drawn units.
 
     pip install "rsl-rl-lib>=5.4.2,<6"
     python examples/policy_transfer.py WORK        # a VIRTUAL SO-101; minutes on two cores
 
 A VIRTUAL robot plays excitation, and `gaponet identify` writes a robot folder from the recordings. PPO trains a small
-network to follow motions in three simulators: the nominal one, the identified one, and sixteen samples of the
-identified one within its uncertainty (gaponet.export.rollout.sample_robots). All policies are tested on the VIRTUAL
+network to follow motions in three simulators: the nominal one, the identified one, and sixteen of the units that
+`gaponet export --to randomization` draws from its uncertainty and chooses. All policies are tested on the VIRTUAL
 robot with other motions. Finally, `gaponet replay` predicts the robot's motion under the targets of the nominal
 policy's own rollout.
 """
@@ -26,7 +26,7 @@ from tensordict import TensorDict
 
 from gaponet.cli.main import main as gaponet
 from gaponet.deploy.aligned_sim import AlignedSim
-from gaponet.export.rollout import sample_robots
+from gaponet.export.drawn_robots import robots_of
 from gaponet.robot.spec import RobotSpec, load_robot
 
 Array = np.ndarray
@@ -84,6 +84,14 @@ def identified(work: Path, robot: str, fleet: str, unit: str, quick: bool) -> Pa
     if not (known / "robot.toml").is_file() and gaponet(["identify", str(data), "--out", str(known), *budget]):
         raise SystemExit(2)
     return known
+
+
+def drawn(known: Path, work: Path) -> list[RobotSpec]:
+    """Return DRAWS of the units that gaponet exports for randomisation."""
+    if gaponet(["export", str(known), "--to", "randomization", "--out", str(work / "randomization")]):
+        raise SystemExit(2)
+    units = json.loads((work / "randomization" / "randomization.json").read_text(encoding="utf-8"))["units"]
+    return robots_of(load_robot(known), {field: np.array(rows)[:DRAWS] for field, rows in units.items()})
 
 
 def rollout(task: Task, robot: RobotSpec, policy: Any, file: Path) -> Array:
@@ -165,7 +173,7 @@ def main(
     task, unseen = (Task(spec, motions(spec, 0.0, seed, names), 1.0) for seed in (LEARN_SEED, TRY_SEED))
     tried = np.zeros(len(unseen.first))
     robots = {
-        "nominal": [spec], "identified": [found], "identified + ranges": sample_robots(found, DRAWS),
+        "nominal": [spec], "identified": [found], "identified + units": drawn(known, work),
     }  # fmt: skip
     errors: dict[str, list[Array]] = {}
     for seed in seeds:
