@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,8 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
     logs(robot, tmp_path / "logs" / "a", 40, 4, kp=0.8, delay=1)
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```(console|python)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert [kind for kind, _ in blocks] == ["console", "console", "python", "console", "console", "console"]
+    assert [kind for kind, _ in blocks] == ["console", "python", "console", "console", "console"]
+    assert main(["identify", "data", "--out", "my_arm"]) == 0
     codes = {}
     for kind, text in blocks:
         if kind == "python":
@@ -42,11 +44,12 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
             if line.startswith("gaponet check --fleet"):
                 shutil.copytree("my_arm", "robots/a")
             try:
-                codes[line] = main(line.removeprefix("gaponet ").split())
+                codes[line] = main(shlex.split(line, comments=True)[1:])
             except SystemExit as end:
                 codes[line] = end.code
-    assert {line: code for line, code in codes.items() if code} == {"gaponet check my_arm new_logs": 1}  # it is softer
+    assert {line.partition("  #")[0]: code for line, code in codes.items() if code} == {
+        "gaponet check my_arm new_logs": 1  # it is softer
+    }
     made = json.loads((tmp_path / "my_arm_today/randomization/randomization.json").read_text())
     kp = made["ranges"]["elbow"]["kp"]
     assert kp["low"] < 14 < 16 < kp["high"]  # both days' are inside
-    assert (tmp_path / "known.png").stat().st_size > 10_000
