@@ -28,8 +28,8 @@ def _moved(surveys: list[Survey], joint: int) -> list[Survey]:
     return [s for s in surveys if s.ctrl_range[joint] > MIN_COMMAND_RAD]
 
 
-def _in_degrees(survey: Survey) -> Array:
-    """Return which joints follow a small command far, as if command and state had different units, (n)."""
+def _follow_small_commands(survey: Survey) -> Array:
+    """Return which joints move far with a small command, as where state and command have different units, (n)."""
     follow = np.diag(survey.follows) > MIN_FOLLOWING
     return follow & (survey.qpos_range > np.maximum(MIN_COMMAND_RAD, RATIO_BOUNDS[1] * survey.ctrl_range))
 
@@ -40,7 +40,7 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     motions = np.zeros(len(robot.joint_names), int)
     for s in surveys:
         moved = s.ctrl_range > MIN_COMMAND_RAD
-        motions += moved | _in_degrees(s)
+        motions += moved | _follow_small_commands(s)
         for i in np.flatnonzero(moved & (np.diag(s.follows) < 0.3) & (np.diag(s.opposes) < 0.6)):
             others = np.flatnonzero((s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6).any()))
             if others.size:
@@ -163,7 +163,7 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     median = lambda values: float(np.median(values)) if values else 1.0  # noqa: E731
     wrong = []
     for i, name in enumerate(robot.joint_names):
-        commanded = _moved(surveys, i) or [s for s in surveys if _in_degrees(s)[i]]
+        commanded = _moved(surveys, i) or [s for s in surveys if _follow_small_commands(s)[i]]
         ratio = median([s.qpos_range[i] / s.ctrl_range[i] for s in commanded])
         if ratio > RATIO_BOUNDS[1] or 0 < ratio < RATIO_BOUNDS[0]:
             text = (

@@ -86,8 +86,8 @@ class Bench:
         """Evaluate every method on every fold of a question; methods without the data that they need are skipped.
 
         Returns:
-            A row per method for JSON: mrad, standard errors over motions, of differences paired; by_motion_mrad, each
-            independent motion; floor_mrad, the mean difference of repetitions; splits, a hash per fold; and
+            A row per method for JSON: mrad, standard errors over motions, of differences paired; by_motion_mrad,
+            independent motion → error; floor_mrad, the mean difference of repetitions; splits, a hash per fold; and
             by_joint_mrad, joint → payload, kg → (mean error over motions; number of recordings), of data sets in
             which joints were recorded one at a time.
         """
