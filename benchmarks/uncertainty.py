@@ -1,13 +1,14 @@
 """Coverage of the standard errors and prediction bands, and verdicts of gaponet check: docs/results/know.md.
 
-    python benchmarks/uncertainty.py virtual WORK --robots 100 --form right|wrong   VIRTUAL two-joint arms, a line each
-    python benchmarks/uncertainty.py real ROBOT DAY OTHER_DAY WORK                  datasets of two days
-    python benchmarks/uncertainty.py table WORK                                     tables of the virtual arms
+    python benchmarks/uncertainty.py virtual WORK --robots 100 --form FORM     VIRTUAL two-joint arms, a line each
+    python benchmarks/uncertainty.py real ROBOT DAY OTHER_DAY WORK             datasets of two days
+    python benchmarks/uncertainty.py table WORK                                tables of the virtual arms
 
-A virtual arm is drawn from the fleet `hard`. With the right form, only its gain, damping, dry friction, delay and
-encoder noise are hidden. Each joint is identified on its own from eight motions of 15 s; three more are the validation
-set. Then the arm plays eight other motions per day: on some days nothing changed, on the others one parameter did.
-ROBOT was identified from the training motions of DAY.
+A virtual arm is drawn from the fleet `hard`. With the form "right", only its gain, damping, dry friction, delay and
+encoder noise are hidden; it has the physics step of its file, and delays of whole steps. With "step", its own steps are
+1 ms long, those of the file 5 ms. With "wrong", all effects of the fleet are hidden. `gaponet identify` fits eight
+motions of 15 s; three more are the validation set. Then the arm plays eight other motions per day: on some days nothing
+changed, on the others one parameter did. ROBOT was identified from the training motions of DAY.
 """
 
 from __future__ import annotations
@@ -28,12 +29,9 @@ from gaponet.data.store import Dataset
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import replay
-from gaponet.sysid.axes import CLASSIC, Bounds, with_values
 from gaponet.sysid.evidence.drift import drift
 from gaponet.sysid.evidence.evidence import estimate_uncertainty
-from gaponet.sysid.joint_rollouts import JointRollouts
-from gaponet.sysid.problem import JointFit, standard_errors
-from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.identify import identify
 from gaponet.sysid.uncertainty import ParameterUncertainty
 from gaponet.testing.fleet import load_fleet, sample_unit
 from gaponet.testing.physics import Physics
@@ -42,11 +40,12 @@ from gaponet.testing.virtual_robot import VirtualRobot
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from arm import write_arm
 
-MOTIONS, ROWS, GROUP = 8, 750, 50
+MOTIONS, ROWS, GROUP, WINDOWS = 8, 750, 50, 12
 RIGHT = ("gain", "damping", "friction", "delay", "encoder")
 DAYS = ("train", "val", "same", "friction +20 %", "zero +5 mrad", "delay +5 ms", "backlash 8 mrad", "30 K warmer")
 ANOTHER = "another robot"
 NORMAL_90 = 1.645
+FORMS = ("right", "step", "wrong")
 
 
 def commands(seed: int, dt: float) -> np.ndarray:
@@ -74,13 +73,14 @@ def changed(p: Physics, what: str) -> Physics:
     return replace(p, warmth=p.warmth + 30.0) if what == "30 K warmer" else p
 
 
-def play(robot: RobotSpec, units: list[Physics], first: int, day: int) -> list[list[Sequence]]:
-    """Simulate the motions of one day for every unit."""
+def play(robot: RobotSpec, units: list[Physics], first: int, day: int, timestep: float | None) -> list[list[Sequence]]:
+    """Simulate the motions of one day for every unit, at a physics step in s or at the virtual robots' own."""
     n = len(units)
     ctrl = np.stack(
         [commands(100_000 * day + 100 * (first + k) + m, robot.dt) for k in range(n) for m in range(MOTIONS)], 1
     )
-    sim = VirtualRobot(robot, [u for u in units for _ in range(MOTIONS)], [(0.0, "both")] * ctrl.shape[1], robot.dt)
+    rows, empty = [u for u in units for _ in range(MOTIONS)], [(0.0, "both")] * ctrl.shape[1]
+    sim = VirtualRobot(robot, rows, empty, robot.dt, timestep)
     rng = np.random.default_rng([first, day])
     warm = [
         max(0.0, float(u.warmth[0] + u.warmth_spread[0] * rng.standard_normal())) for u in units for _ in range(MOTIONS)
@@ -112,9 +112,13 @@ def virtual(work: Path, robots: int, form: str) -> None:
     for first in range(done, robots, GROUP):
         last = min(first + GROUP, robots)
         units = [sample_unit(robot, fleet.distributions, fleet.seed, 1 + k) for k in range(first, last)]
-        if form == "right":
+        if form != "wrong":
             units = [replace(u.only(RIGHT), friction_asymmetry=0 * u.friction) for u in units]
-        days = [play(robot, [changed(u, what) for u in units], first, d) for d, what in enumerate(DAYS)]
+        step = None
+        if form == "right":
+            step = robot.timestep
+            units = [replace(u, delay=np.ceil(u.delay / step - 1e-9) * step) for u in units]
+        days = [play(robot, [changed(u, what) for u in units], first, d, step) for d, what in enumerate(DAYS)]
         for k, unit in enumerate(units):
             line = _evaluated(robot, unit, [day[k] for day in days], days[2][(k + 1) % len(units)])
             with file.open("a") as out:
@@ -127,15 +131,14 @@ def _evaluated(
 ) -> dict[str, object]:
     """Identify one arm and check it on every day."""
     train, val, began = days[0], days[1][:3], time.monotonic()
-    bounds = Bounds(robot, train)
-    fit = JointFit(JointRollouts(cut(train, 12), robot, nthread=1), robot, bounds)
-    values = fit.search(CLASSIC, bounds.start)
-    right = with_values(robot, values)
-    mine = estimate_uncertainty(right, train, val, standard_errors(fit, values).covariance, nthread=1)
+    fit = identify(train, robot, val, windows=WINDOWS, table=False, nthread=1)
+    right = fit.robot
+    mine = estimate_uncertainty(right, train, val, fit.covariance, nthread=1)
     op = robot.operated_index
     truth = {
         "kp": robot.kp[op] * unit.kp_scale * unit.kt_scale, "damping": 0.5 + unit.damping,
         "frictionloss": 0.05 + unit.friction, "delay": unit.delay + 0 * op, "armature": 0.02 + 0.0 * op,
+        "offset": 0.0 * op,
     }  # fmt: skip
     z = {f: [] for f in truth}
     for i, joint in enumerate(robot.operated):
@@ -195,7 +198,7 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
 
 def table(work: Path) -> None:
     """Print the tables of the virtual arms in Markdown."""
-    for form in ("right", "wrong"):
+    for form in FORMS:
         file = work / f"{form}.jsonl"
         if not file.is_file():
             continue
@@ -227,7 +230,7 @@ def main() -> None:
     parser.add_argument("what", choices=("virtual", "real", "table"))
     parser.add_argument("paths", nargs="+", type=Path)
     parser.add_argument("--robots", type=int, default=100)
-    parser.add_argument("--form", choices=("right", "wrong"), default="wrong")
+    parser.add_argument("--form", choices=FORMS, default="wrong")
     args = parser.parse_args()
     args.paths[-1].mkdir(parents=True, exist_ok=True)
     if args.what == "virtual":
