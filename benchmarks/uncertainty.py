@@ -22,6 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from by_seed import print_table
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
@@ -46,6 +47,10 @@ DAYS = ("train", "val", "same", "friction +20 %", "zero +5 mrad", "delay +5 ms",
 ANOTHER = "another robot"
 NORMAL_90 = 1.645
 FORMS = ("right", "step", "wrong")
+KINDS = (
+    "printed",
+    "stored",
+)  # standard errors: of the table of identify, which knows the physics step; in uncertainty.json
 
 
 def commands(seed: int, dt: float) -> np.ndarray:
@@ -140,11 +145,13 @@ def _evaluated(
         "frictionloss": 0.05 + unit.friction, "delay": unit.delay + 0 * op, "armature": 0.02 + 0.0 * op,
         "offset": 0.0 * op,
     }  # fmt: skip
-    z = {f: [] for f in truth}
+    z = {kind: {f: [] for f in truth} for kind in KINDS}
     for i, joint in enumerate(robot.operated):
         at, cov = mine.si(joint)
         for f, v in truth.items():
-            z[f].append((at[f] - float(v[i])) / float(np.sqrt(cov[mine.fields.index(f), mine.fields.index(f)])))
+            stored = float(np.sqrt(cov[mine.fields.index(f), mine.fields.index(f)]))
+            for kind, std in zip(KINDS, (fit.std[joint][f], stored), strict=True):
+                z[kind][f].append((at[f] - float(v[i])) / std)
     fresh = days[1][3:]
     error = np.concatenate([np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(fresh, replay(fresh, right), strict=True)])
     inside = [float((error[:, i] <= k.residual_p90).mean()) for i, k in enumerate(mine.joints.values())]
@@ -203,10 +210,15 @@ def table(work: Path) -> None:
         if not file.is_file():
             continue
         lines = [json.loads(line) for line in file.read_text().splitlines()]
-        print(f"\n{len(lines)} VIRTUAL arms, form {form}\n\n| number | in 90 % | median \\|z\\| |\n|---|---:|---:|")
-        for f in lines[0]["z"]:
-            z = np.abs([v for line in lines for v in line["z"][f]])
-            print(f"| {f} | {100 * np.mean(z < NORMAL_90):.0f} % | {np.median(z):.2f} |")
+        print(f"\n{len(lines)} VIRTUAL arms, form {form}")
+        cells = []
+        for f in lines[0]["z"]["printed"]:
+            z = [np.abs([v for line in lines for v in line["z"][kind][f]]) for kind in KINDS]
+            cells.append(
+                (f, *(f"{100 * np.mean(x < NORMAL_90):.0f} %" for x in z), *(f"{np.median(x):.2f}" for x in z))
+            )
+        inside = [f"in 90 %, {kind}" for kind in KINDS]
+        print_table(("number", *inside, *(f"median |z|, {kind}" for kind in KINDS)), cells)
         for name in ("inside", "alone"):
             print(f"\nsamples {name}: {100 * np.mean([line[name] for line in lines]):.1f} %")
         print(
