@@ -80,8 +80,8 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
             file.write(f"| {when} | {text} |\n")
     kept = json.loads((PAGES / "steps.json").read_text(encoding="utf-8"))
     for name, a in answers.items():
-        lines = [] if name.startswith("real_") else a["output"].replace(str(work), "WORK").splitlines()[-TAIL:]
-        kept[name] = a | {"output": lines}
+        text = re.sub(r"/tmp/\S+", "TEMPORARY", a["output"].replace(str(work), "WORK"))
+        kept[name] = a | {"output": [] if name.startswith("real_") else text.splitlines()[-TAIL:]}
     kept = {name: kept[name] for name in STEPS if name in kept}
     text = json.dumps(kept, indent=1, ensure_ascii=False)
     (PAGES / "steps.json").write_text(text + "\n", encoding="utf-8")

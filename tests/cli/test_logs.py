@@ -78,7 +78,7 @@ def test_a_map_that_is_none_says_how_to_write_it(logs, tmp_path, capsys):
     assert capsys.readouterr().err.strip().endswith("Usage: --map Elbow: write NAME_IN_LOG=NAME_OF_ROBOT")
     twice = ["--map", "j1=shoulder_pan", "--map", "j1=elbow_flex"]
     assert import_so101(logs, tmp_path / "data", *twice) == 2
-    assert "--map j1=shoulder_pan j1=elbow_flex: a name of the log stands there twice" in capsys.readouterr().err
+    assert "--map j1=shoulder_pan j1=elbow_flex: names one joint of the log twice" in capsys.readouterr().err
 
 
 def sage_with(old: str, new: str, name: str) -> Callable[[Path], Path]:

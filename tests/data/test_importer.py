@@ -216,7 +216,7 @@ def test_gains_are_the_robots_unless_said_by_joint_or_for_all(logs, so101, tmp_p
 def test_gains_that_make_no_sense_are_refused(logs, so101, tmp_path, words):
     with pytest.raises(UsageError, match=r"--kp .*: give one number"):
         import_logs(logs, so101, "lab", 0.0, tmp_path / "data", kp=words)
-    with pytest.raises(UsageError, match=r"--kp elbow_flex=9 elbow_flex=5: a joint stands there twice"):
+    with pytest.raises(UsageError, match=r"--kp elbow_flex=9 elbow_flex=5: names a joint twice"):
         import_logs(logs, so101, "lab", 0.0, tmp_path / "data", kp=("elbow_flex=9", "elbow_flex=5"))
 
 

@@ -155,7 +155,7 @@ def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
             raise UsageError(f"--map {pair}: write NAME_IN_LOG=NAME_OF_ROBOT")
     names = {a.strip(): b.strip() for a, b in (pair.split("=") for pair in pairs)}
     if len(names) < len(pairs):
-        raise UsageError(f"--map {' '.join(pairs)}: a name of the log stands there twice")
+        raise UsageError(f"--map {' '.join(pairs)}: names one joint of the log twice")
     return names or None
 
 

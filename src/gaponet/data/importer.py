@@ -262,7 +262,7 @@ def _parse_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[f
             raise UsageError(f"--{name} {word}: give one number ≥ 0 for all joints, or JOINT=NUMBER for some")
         gains[robot.index([joint]) if equals else slice(None)] = value
     if len({word.rpartition("=")[0] for word in words}) < len(words):
-        raise UsageError(f"--{name} {' '.join(words)}: a joint stands there twice")
+        raise UsageError(f"--{name} {' '.join(words)}: names a joint twice")
     return tuple(gains.tolist())
 
 
