@@ -1,4 +1,4 @@
-# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint, types, sizes and prose. make site: docs/ as a site.
+# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint and types. make site: docs/ as a site.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
@@ -104,8 +104,6 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python .ci/size.py
-	$(BIN)/python .ci/prose.py
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-issue-forms .github/ISSUE_TEMPLATE/*.yml
 	$(BIN)/zizmor --offline --quiet .github/workflows

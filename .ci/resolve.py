@@ -17,7 +17,12 @@ from itertools import product
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-BESIDE = {"alone": "", "LeRobot": "lerobot>=0.6,<0.7", "mjlab": "mjlab>=1.6,<1.7", "Isaac Lab": "isaaclab>=3,<4"}
+BESIDE = {
+    "alone": "",
+    "LeRobot": "lerobot>=0.6,<0.7",
+    "mjlab": "mjlab>=1.6,<1.7",
+    "Isaac Lab": "isaaclab>=3,<4",
+}
 PLATFORMS = {
     "Linux x86_64": "x86_64-manylinux_2_35",
     "Linux aarch64": "aarch64-manylinux_2_35",
@@ -31,27 +36,47 @@ UNTIL = {"mjlab": "3.13"}  # an upper bound of Requires-Python, at which uv does
 
 def extras() -> list[str]:
     """Those for users."""
-    known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "optional-dependencies"
+    ]
     return sorted(set(known) - {"dev", "docs"})
 
 
 def missing(name: str, where: str, python: str) -> list[str]:
     """Extras that are known not to go: cyclonedds has no wheel (docs/install.md), mujoco-warp is MuJoCo 4's."""
-    return ["dds"] * (where == "Linux aarch64" or python == "3.14") + ["warp"] * (name in ("mjlab", "Isaac Lab"))
+    return ["dds"] * (where == "Linux aarch64" or python == "3.14") + ["warp"] * (
+        name in ("mjlab", "Isaac Lab")
+    )
 
 
 def resolve(wanted: list[str], beside: str, where: str, python: str) -> dict[str, str] | None:
     """Package → version; None where there is no solution. Nothing wanted: the other tool by itself; nothing beside it:
     every package must have a wheel."""
-    lines = [beside] * bool(beside) + ([f"gaponet[{','.join(wanted)}] @ {ROOT.as_uri()}"] if wanted else [])
-    words = ["uv", "pip", "compile", "-", "--quiet", "--no-header", "--no-annotate", "--python-version", python]
+    lines = [beside] * bool(beside) + (
+        [f"gaponet[{','.join(wanted)}] @ {ROOT.as_uri()}"] if wanted else []
+    )
+    words = [
+        "uv",
+        "pip",
+        "compile",
+        "-",
+        "--quiet",
+        "--no-header",
+        "--no-annotate",
+        "--python-version",
+        python,
+    ]
     words += ["--python-platform", PLATFORMS[where]]
     words += [] if beside else ["--only-binary", ":all:", "--no-binary", "gaponet"]
     system = os.environ | {"MACOSX_DEPLOYMENT_TARGET": "14.0"}
     done = subprocess.run(words, input="\n".join(lines), capture_output=True, text=True, env=system)
     if done.returncode and "No solution found" not in done.stderr:
         raise SystemExit(f"{' '.join(words)}\n{done.stderr}")
-    return None if done.returncode else dict(re.findall(r"^([a-z0-9-]+)==(\S+)", done.stdout, re.MULTILINE))
+    return (
+        None
+        if done.returncode
+        else dict(re.findall(r"^([a-z0-9-]+)==(\S+)", done.stdout, re.MULTILINE))
+    )
 
 
 def cell(name: str, where: str, python: str) -> tuple[str, list[str]]:
@@ -59,11 +84,19 @@ def cell(name: str, where: str, python: str) -> tuple[str, list[str]]:
     beside = BESIDE[name]
     known = missing(name, where, python)
     found = resolve([extra for extra in extras() if extra not in known], beside, where, python)
-    if python > UNTIL.get(name, python) or (found is None and beside and resolve([], beside, where, python) is None):
+    if python > UNTIL.get(name, python) or (
+        found is None and beside and resolve([], beside, where, python) is None
+    ):
         return "not offered", []
     if found is None:
-        alone = [extra or "base" for extra in ["", *extras()] if resolve([extra], beside, where, python) is None]
-        return "no", [f"{name}, {where}, Python {python}: {', '.join(alone) or 'each extra, but not all together'}"]
+        alone = [
+            extra or "base"
+            for extra in ["", *extras()]
+            if resolve([extra], beside, where, python) is None
+        ]
+        return "no", [
+            f"{name}, {where}, Python {python}: {', '.join(alone) or 'each extra, but not all together'}"
+        ]
     text = ", ".join(f"{package} {found[package]}" for package in SHOWN)
     return text + "".join(f", without {extra}" for extra in known), []
 
@@ -76,7 +109,10 @@ def main() -> int:
     print("| beside | platform |" + "".join(f" Python {p} |" for p in PYTHONS))
     print("| --- | --- |" + " --- |" * len(PYTHONS))
     for place in places:
-        print(f"| {' | '.join(place)} |" + "".join(f" {cells[*place, p].result()[0]} |" for p in PYTHONS))
+        print(
+            f"| {' | '.join(place)} |"
+            + "".join(f" {cells[*place, p].result()[0]} |" for p in PYTHONS)
+        )
     wrong = [line for found in cells.values() for line in found.result()[1]]
     print("\n".join(wrong), file=sys.stderr)
     return bool(wrong)

@@ -67,7 +67,11 @@ def main(wanted: list[str]) -> None:
             what = f"gaponet[{extra}] @ {wheel.as_uri()}"
             run("uv", "pip", "install", "--quiet", "--python", place, what, folder=folder)
             for command in commands:
-                words = [bin / "python", "-c", command] if command is GYM else [bin / "gaponet", *command.split()]
+                words = (
+                    [bin / "python", "-c", command]
+                    if command is GYM
+                    else [bin / "gaponet", *command.split()]
+                )
                 run(*words, folder=folder)
             shutil.rmtree(place)
     print(f"{wheel.name}: {len(TRIES)} clean environments")

@@ -61,7 +61,10 @@ class PlayRobot:
         mass, length = rng.uniform(0.05, 0.3, n), rng.uniform(0.1, 0.25, n)
         own = mass * length**2 / 3
         inertia = np.array(
-            [(mass[i:] * length[i:] ** 2).sum() / 3 + 0.5 * mass[i + 1 :].sum() * length[i] ** 2 for i in range(n)]
+            [
+                (mass[i:] * length[i:] ** 2).sum() / 3 + 0.5 * mass[i + 1 :].sum() * length[i] ** 2
+                for i in range(n)
+            ]
         )
         armature = own * np.exp(rng.uniform(np.log(0.2), np.log(3.0), n))
         pace = rng.uniform(12, 35, n)
@@ -114,7 +117,9 @@ class PlayRobot:
             f'[[joint]]\nname = "j{i}"\nkp = {0.8 * self.kp[i]}\neffort_limit = {100 * self.kp[i]}\n'
             for i in range(len(self.kp))
         )
-        (folder / "robot.toml").write_text(f'name = "play{self.seed}"\ndt = {DT}\ntimestep = {DT / 5}\n{joints}')
+        (folder / "robot.toml").write_text(
+            f'name = "play{self.seed}"\ndt = {DT}\ntimestep = {DT / 5}\n{joints}'
+        )
         return load_robot(folder)
 
     def commands(self, number: int, seconds: float = SECONDS) -> np.ndarray:
@@ -130,7 +135,9 @@ class PlayRobot:
         at = np.clip(t / seconds * 6, 0, 5.999)
         i, s = at.astype(int)[:, 0], at % 1
         s = np.clip(s / (0.6 if kind == 1 else 0.02), 0, 1)
-        return knots[i] + (knots[i + 1] - knots[i]) * (10 * s**3 - 15 * s**4 + 6 * s**5) * (1.0 if kind == 1 else 0.4)
+        return knots[i] + (knots[i + 1] - knots[i]) * (10 * s**3 - 15 * s**4 + 6 * s**5) * (
+            1.0 if kind == 1 else 0.4
+        )
 
     def record(self, ctrl: np.ndarray, names: list[str]) -> list[Sequence]:
         """Simulate motions (m, T, n) rad and log them."""
@@ -153,10 +160,15 @@ class PlayRobot:
                     link[:, t] = q
                 target = ctrl[:, min(max((t * each + part - late) // each, 0), rows - 1)]
                 if self.stribeck.any():
-                    friction[:, motor] = self.friction + self.stribeck / (1 + (qvel[:, motor] / 0.05) ** 2)
+                    friction[:, motor] = self.friction + self.stribeck / (
+                        1 + (qvel[:, motor] / 0.05) ** 2
+                    )
                 applied[:, motor] = self.kp * (target - q)
                 batch.step()
-        return [self.log(c, q, name, i) for i, (c, q, name) in enumerate(zip(ctrl, link, names, strict=True))]
+        return [
+            self.log(c, q, name, i)
+            for i, (c, q, name) in enumerate(zip(ctrl, link, names, strict=True))
+        ]
 
     def log(self, ctrl: np.ndarray, qpos: np.ndarray, motion: str, number: int) -> Sequence:
         """Return the log of a motion, (T, n) rad each, with an encoder's noise and steps."""
@@ -184,20 +196,30 @@ def hinge_result(seed: int) -> dict[str, float]:
     """Return the error of each form of one joint with a gap, rad, from gaponet's simulation of it."""
     robot = replace(PlayRobot.draw(seed, True, joints=1), delay=0.0, stribeck=np.zeros(1))
     fields = ("kp", "damping", "armature", "backlash")
-    servo = {f: float(getattr(robot, f)[0]) for f in fields} | {"frictionloss": float(robot.friction[0])}
+    servo = {f: float(getattr(robot, f)[0]) for f in fields} | {
+        "frictionloss": float(robot.friction[0])
+    }
     spec, none = robot.spec().with_servos({"j0": servo}), np.zeros(1)
     commands = [robot.commands(k) for k in range(MOTIONS - VALIDATED)]
-    motions = [replace(robot.log(c, c, f"m{k}", k), qpos=0 * c + c[0], qvel=0 * c) for k, c in enumerate(commands)]
+    motions = [
+        replace(robot.log(c, c, f"m{k}", k), qpos=0 * c + c[0], qvel=0 * c)
+        for k, c in enumerate(commands)
+    ]
     ours = np.array([one.qpos for one in replay(motions, spec)])
     plain = np.array([one.qpos for one in replay(motions, replace(spec, backlash=none))])
     model = build_model(spec)
-    hinges = [np.array([play_hinge(robot, spec.timestep, m, model, link) for m in motions]) for link in (False, True)]
+    hinges = [
+        np.array([play_hinge(robot, spec.timestep, m, model, link) for m in motions])
+        for link in (False, True)
+    ]
     forms = {"left out": plain, "motor read": hinges[0], "link read": hinges[1]}
     forms["motor read, best offset"] = hinges[0] - np.median(hinges[0] - ours)
     return {name: float(np.abs(path - ours)[:, 1:].mean()) for name, path in forms.items()}
 
 
-def play_hinge(robot: PlayRobot, h: float, motion: Sequence, own: mujoco.MjModel, link: bool) -> np.ndarray:
+def play_hinge(
+    robot: PlayRobot, h: float, motion: Sequence, own: mujoco.MjModel, link: bool
+) -> np.ndarray:
     """Play a motion with a play hinge in plain MuJoCo at a physics step of h s; return the link's path, (T, 1) rad."""
     model = mujoco.MjModel.from_xml_string(robot.xml(True))
     model.opt.timestep, model.opt.tolerance = h, own.opt.tolerance
@@ -212,7 +234,9 @@ def play_hinge(robot: PlayRobot, h: float, motion: Sequence, own: mujoco.MjModel
     path = np.array(motion.qpos, float)
     for t in range(len(path) - 1):
         for _ in range(round(DT / h)):
-            data.qfrc_applied[0] = robot.kp[0] * (motion.ctrl[t, 0] - data.qpos[0] - link * data.qpos[1])
+            data.qfrc_applied[0] = robot.kp[0] * (
+                motion.ctrl[t, 0] - data.qpos[0] - link * data.qpos[1]
+            )
             mujoco.mj_step(model, data)
         path[t + 1] = data.qpos.sum()
     return path
@@ -221,18 +245,26 @@ def play_hinge(robot: PlayRobot, h: float, motion: Sequence, own: mujoco.MjModel
 def verdicts(seed: int) -> Row:
     """Identify a robot with a gap, with and without the term, and the same robot without a gap."""
     gap, none = (PlayRobot.draw(seed, has) for has in (True, False))
-    return {"with": result(gap), "left out": result(gap, ("stribeck", "load")), "no gap": result(none)}
+    return {
+        "with": result(gap),
+        "left out": result(gap, ("stribeck", "load")),
+        "no gap": result(none),
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--robots", type=int, default=12)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--hinge", action="store_true")
     args = parser.parse_args()
     rows = measure_seeds(
-        args.out, range(args.first, args.first + args.robots), hinge_result if args.hinge else verdicts
+        args.out,
+        range(args.first, args.first + args.robots),
+        hinge_result if args.hinge else verdicts,
     )
     lines: list[tuple[object, ...]] = []
     if args.hinge:
@@ -243,12 +275,17 @@ def main() -> None:
         return
     for name in ("with", "left out", "no gap"):
         some = [r[name] for r in rows]
-        joints, gaps = sum(len(r["rad"]) for r in some), sum(bool(w) for r in some for w in r["rad"])
+        joints, gaps = (
+            sum(len(r["rad"]) for r in some),
+            sum(bool(w) for r in some for w in r["rad"]),
+        )
         inside = [abs(w - true) < 1.645 * std for r in some
                   for w, true, std in zip(r["rad"], r["true_rad"], r["std_rad"], strict=True) if w]  # fmt: skip
         error = plus_minus(1e3 * np.mean(r["test_rad"]) for r in some)
         lines.append((name, len(some), joints, gaps, f"{sum(inside)} of {len(inside)}", error))
-    print_table(("VIRTUAL robots", "robots", "joints", "gaps accepted", "inside 90 %", "error, mrad"), lines)
+    print_table(
+        ("VIRTUAL robots", "robots", "joints", "gaps accepted", "inside 90 %", "error, mrad"), lines
+    )
 
 
 if __name__ == "__main__":

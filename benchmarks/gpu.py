@@ -23,7 +23,12 @@ import torch
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 
-SERVO_TERMS = {"stribeck": 0.02, "stribeck_speed": 0.05, "friction_motor": 0.1, "friction_external": 0.1}
+SERVO_TERMS = {
+    "stribeck": 0.02,
+    "stribeck_speed": 0.05,
+    "friction_motor": 0.1,
+    "friction_external": 0.1,
+}
 
 
 def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
@@ -67,7 +72,10 @@ def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dic
 
 def reached(runs: list[Path]) -> None:
     """Print when each run reached the best validation error of the first; the time includes labels and sensors."""
-    lines = [[json.loads(x) for x in (run / "progress.jsonl").read_text("utf-8").splitlines()] for run in runs]
+    lines = [
+        [json.loads(x) for x in (run / "progress.jsonl").read_text("utf-8").splitlines()]
+        for run in runs
+    ]
     best = min(line["val_mpjae"] for line in lines[0])
     for run, rows in zip(runs, lines, strict=True):
         there = next((r for r in rows if r["val_mpjae"] <= best), None)
@@ -79,7 +87,9 @@ def reached(runs: list[Path]) -> None:
 
 def main() -> None:
     """Measure and print one JSON line per size and servo."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("sizes", type=int, nargs="*")
     parser.add_argument("--reached", type=Path, nargs=2, metavar=("RUN", "OTHER"))
     parser.add_argument("--device", default="cuda", choices=("cuda", "warp-cpu"))
@@ -94,9 +104,14 @@ def main() -> None:
             ("stated", stated),
             ("law", stated.with_servos(dict.fromkeys(stated.operated, SERVO_TERMS))),
         ):
-            found = {k: round(v) for k, v in measure(robot, size, args.device, args.seconds).items()}
+            found = {
+                k: round(v) for k, v in measure(robot, size, args.device, args.seconds).items()
+            }
             memory = torch.cuda.max_memory_reserved() >> 20 if args.device == "cuda" else 0
-            print(json.dumps({"num_envs": size, "servo": servo, "torch_mb": memory} | found), flush=True)
+            print(
+                json.dumps({"num_envs": size, "servo": servo, "torch_mb": memory} | found),
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -68,7 +68,9 @@ def entries(out: Path) -> Any:
 
 def names(out: Path) -> list[str]:
     """Return the files of a folder without markers, which depend on the order of writing."""
-    return sorted(str(f.relative_to(out)) for f in out.rglob("*") if f.is_file() and f.name != FOLDER_MARKER)
+    return sorted(
+        str(f.relative_to(out)) for f in out.rglob("*") if f.is_file() and f.name != FOLDER_MARKER
+    )
 
 
 def digests(out: Path) -> dict[str, str]:
@@ -93,7 +95,10 @@ def result(out: Path) -> Any:
     """Return the rows of an experiment, without times, and its files."""
     record = json.loads((out / "compare.json").read_text())
     table = record["tables"][0]
-    rows = [[cell for cell, name in zip(row, table["columns"], strict=True) if name != "min"] for row in table["rows"]]
+    rows = [
+        [cell for cell, name in zip(row, table["columns"], strict=True) if name != "min"]
+        for row in table["rows"]
+    ]
     return [rows, sorted(p.name for p in (out / "cells").iterdir()), names(out)]
 
 
@@ -114,7 +119,9 @@ def cases(given: Path) -> dict[str, Case]:
     return {
         "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),
         "collect": Case(lambda out: ["collect", *robot, *recipe, "--out", str(out)], entries),
-        "gap": Case(lambda out: ["gap", str(out)], entries, given / "bare", unwritable=0),  # replays go elsewhere
+        "gap": Case(
+            lambda out: ["gap", str(out)], entries, given / "bare", unwritable=0
+        ),  # replays go elsewhere
         "train": Case(train, trained),
         "export": Case(lambda out: ["data", "export", data, "--out", str(out)], digests, done=2),
         "artifact": Case(lambda out: ["export", run, "--out", str(out)], names),
@@ -130,7 +137,15 @@ def prepare(given: Path) -> None:
     for name, payloads, variants in (("few", "0.0", 3), ("more", "0.0, 0.2", 6)):
         (given / f"{name}.toml").write_text(recipe.format(payloads, variants))
     for argv in (
-        ["collect", "--robot", "so101", "--recipe", str(given / "few.toml"), "--out", str(given / "data")],
+        [
+            "collect",
+            "--robot",
+            "so101",
+            "--recipe",
+            str(given / "few.toml"),
+            "--out",
+            str(given / "data"),
+        ],
         ["data", "export", str(given / "data"), "--out", str(given / "logs")],
         ["train", str(given / "data"), "--out", str(given / "run"), "--budget", "2000", *TRAIN],
     ):
@@ -259,7 +274,9 @@ class Trial:
             out = self.fresh(place / "out")
             subprocess.run(["mount", "-o", "remount,ro", str(place)], check=True)
             before = digests(place)
-            self.expect("read-only", wait(start(self.case.argv(out), self.log)), self.case.unwritable)
+            self.expect(
+                "read-only", wait(start(self.case.argv(out), self.log)), self.case.unwritable
+            )
             if digests(place) != before:
                 self.wrong.append("read-only: changed")
         finally:
@@ -310,7 +327,9 @@ def mixed(given: Path, work: Path, turns: int = 6) -> dict[str, Any]:
         later = wait(start(both[first == "import"].argv(out), log))
         if sorted(map(str, codes)) != ["0", "2"] or later != (2 if first == "import" else 0):
             wrong.append(f"mixed: exit codes {codes}, then {later}; see {log}")
-        if entries(out)[0] != entries(work / first)[0] or "Traceback" in log.read_text(errors="replace"):
+        if entries(out)[0] != entries(work / first)[0] or "Traceback" in log.read_text(
+            errors="replace"
+        ):
             wrong.append(f"mixed: {out} is not what {first} leaves; see {log}")
     return {**count, "wrong": wrong}
 
@@ -324,12 +343,16 @@ def mounted(place: Path, size: float) -> Path:
     """Mount a tmpfs of this size, bytes."""
     place.mkdir()
     pages = max(int(size) // 4096, 4)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={pages * 4096}", "tmpfs", str(place)], check=True)
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={pages * 4096}", "tmpfs", str(place)], check=True
+    )
     return place
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("work", type=Path)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--only", default="", help="some of the commands, separated by commas")

@@ -28,8 +28,17 @@ import tyro
 from gaponet.robot.spec import load_robot
 
 GAPONET = [sys.executable, "-m", "gaponet"]
-WAYS: dict[str, dict[str, bool] | None] = {"uncorrected": None, "corrected": {}, "dynamics": {"dynamics": True}}
-MOTIONS = ("tour-all-20", "tour-all-21", "limber-all-20", "limber-all-21")  # of the test; excitation has other ones
+WAYS: dict[str, dict[str, bool] | None] = {
+    "uncorrected": None,
+    "corrected": {},
+    "dynamics": {"dynamics": True},
+}
+MOTIONS = (
+    "tour-all-20",
+    "tour-all-21",
+    "limber-all-20",
+    "limber-all-21",
+)  # of the test; excitation has other ones
 MINUTES, FPS, UNIT = 8, 25, "1"  # excitation, LeRobot's rate, unit of the fleet `hard`
 LEAD = 5.0  # s of a test motion that are not judged: the way to its start, and the correction's blending in
 
@@ -45,15 +54,32 @@ def main(work: tyro.conf.Positional[Path]) -> None:
     wait_longer()
     count_frames()
     tell_where_it_is()
-    excitation, data, arm, run, out = (work / x for x in ("excitation", "data", "identified", "run", "exported"))
+    excitation, data, arm, run, out = (
+        work / x for x in ("excitation", "data", "identified", "run", "exported")
+    )
     if not excitation.is_dir():
         call("excite", "--robot", "so101", "--minutes", MINUTES, "--out", excitation)
     with served(work):
         sets = work / "lerobot" / "me"
         record(sets / "excitation", work, str(excitation), 2 * MINUTES, 30.0)
         if not (data / "dataset.json").is_file():
-            words = ["--position-unit", "deg", "--unit-id", f"virtual-{UNIT}", "--payload-mass", "0"]
-            call("import", sets / "excitation", "--robot", softer(work / "so101_p16"), *words, "--out", data)
+            words = [
+                "--position-unit",
+                "deg",
+                "--unit-id",
+                f"virtual-{UNIT}",
+                "--payload-mass",
+                "0",
+            ]
+            call(
+                "import",
+                sets / "excitation",
+                "--robot",
+                softer(work / "so101_p16"),
+                *words,
+                "--out",
+                data,
+            )
         if not (arm / "robot.toml").is_file():
             call("identify", data, "--out", arm, "--windows", 12, "--no-table", "--terms")
         if not (run / "model" / "card.json").is_file():
@@ -66,7 +92,10 @@ def main(work: tyro.conf.Positional[Path]) -> None:
                 step = {"model": str(run), **given} if given is not None else None
                 record(sets / f"{motion}-{how}", work, motion, 1, LEAD + 8.0, step)
                 errors[f"{motion} {how}"] = error(sets / f"{motion}-{how}")
-    ratios = {how: [errors[f"{motion} {how}"] / errors[f"{motion} uncorrected"] for motion in MOTIONS] for how in WAYS}
+    ratios = {
+        how: [errors[f"{motion} {how}"] / errors[f"{motion} uncorrected"] for motion in MOTIONS]
+        for how in WAYS
+    }
     nominal = json.loads(call("gap", data, "--json"))["methods"]["nominal"]["mpjae"]
     print(json.dumps({
         "virtual": True, "unit": UNIT, "fps": FPS, "gap_rad": nominal, "opened_by_lerobot": opened(out),
@@ -127,15 +156,28 @@ def count_frames() -> None:
 
 def call(*words: object) -> str:
     """Run a command of gaponet; what it printed."""
-    return subprocess.run([*GAPONET, *map(str, words)], check=True, stdout=subprocess.PIPE, text=True).stdout
+    return subprocess.run(
+        [*GAPONET, *map(str, words)], check=True, stdout=subprocess.PIPE, text=True
+    ).stdout
 
 
 @contextmanager
 def served(work: Path) -> Iterator[None]:
     """A VIRTUAL arm on the pseudo-terminal WORK/so101, its calibration in WORK/virtual.json."""
-    words = ["--robot", "so101", "--unit", UNIT, "--link", work / "so101", "--calibration", work / "virtual.json"]
+    words = [
+        "--robot",
+        "so101",
+        "--unit",
+        UNIT,
+        "--link",
+        work / "so101",
+        "--calibration",
+        work / "virtual.json",
+    ]
     (work / "virtual.json").unlink(missing_ok=True)
-    process = subprocess.Popen([*GAPONET, "virtual", "serve", *map(str, words), "--frame", str(1 / FPS)])
+    process = subprocess.Popen(
+        [*GAPONET, "virtual", "serve", *map(str, words), "--frame", str(1 / FPS)]
+    )
     try:
         while not (work / "virtual.json").exists():
             if process.poll() is not None:
@@ -148,14 +190,22 @@ def served(work: Path) -> Iterator[None]:
 
 
 def record(
-    out: Path, work: Path, motions: str, episodes: int, seconds: float, step: dict[str, object] | None = None
+    out: Path,
+    work: Path,
+    motions: str,
+    episodes: int,
+    seconds: float,
+    step: dict[str, object] | None = None,
 ) -> None:
     """LeRobot's record() with its own SO-101 and our motions, through the processor step where it is configured."""
     if (out / "meta" / "stats.json").is_file():
         return
     from lerobot.configs.dataset import DatasetRecordConfig
     from lerobot.processor import ProcessorStepRegistry, RobotProcessorPipeline
-    from lerobot.processor.converters import robot_action_observation_to_transition, transition_to_robot_action
+    from lerobot.processor.converters import (
+        robot_action_observation_to_transition,
+        transition_to_robot_action,
+    )
     from lerobot.robots.so_follower import SO101FollowerConfig
     from lerobot.scripts.lerobot_record import RecordConfig
     from lerobot.scripts.lerobot_record import record as play
@@ -163,7 +213,9 @@ def record(
 
     steps = [ProcessorStepRegistry.get("gaponet_correct")(**step)] if step else []
     processor = RobotProcessorPipeline(
-        steps=steps, to_transition=robot_action_observation_to_transition, to_output=transition_to_robot_action
+        steps=steps,
+        to_transition=robot_action_observation_to_transition,
+        to_output=transition_to_robot_action,
     )
     teleop = TeleoperatorConfig.get_choice_class("gaponet_motion")(motions=motions, fps=FPS)
     robot = SO101FollowerConfig(port=str(work / "so101"), id="virtual", calibration_dir=work)
@@ -185,7 +237,9 @@ def opened(folder: Path) -> list[int]:
 def error(recorded: Path) -> float:
     """Mean |observation − action of the frame before| over the joints that move, rad."""
     table = pq.read_table(recorded / "data", columns=["action", "observation.state"])
-    asked, seen = (np.array(table[name].to_pylist())[round(LEAD * FPS) :, :5] for name in table.column_names)
+    asked, seen = (
+        np.array(table[name].to_pylist())[round(LEAD * FPS) :, :5] for name in table.column_names
+    )
     moves = np.ptp(asked, axis=0) > 1.0  # degrees
     return float(np.deg2rad(np.abs(seen[1:] - asked[:-1])[:, moves]).mean())
 

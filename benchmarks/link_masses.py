@@ -73,7 +73,9 @@ def draw_arm(rng: np.random.Generator, folder: Path) -> tuple[RobotSpec, np.ndar
     return load_robot(folder), np.maximum(hold, 0.3 * hold.max())
 
 
-def draw_physics(rng: np.random.Generator, robot: RobotSpec, hold: np.ndarray, wrong: bool) -> Physics:
+def draw_physics(
+    rng: np.random.Generator, robot: RobotSpec, hold: np.ndarray, wrong: bool
+) -> Physics:
     """Draw servos that differ from the file, and one link that does, if the file is to be wrong."""
     n, one = JOINTS, np.ones(JOINTS)
     physics = replace(
@@ -107,9 +109,12 @@ def record(
     ctrl = np.zeros((count, rows, JOINTS))
     for one in ctrl:
         waves = (
-            np.sin(2 * np.pi * rng.uniform(0.05, f, JOINTS) * t + rng.uniform(0, 6, JOINTS)) for f in (0.2, 0.5, 0.9)
+            np.sin(2 * np.pi * rng.uniform(0.05, f, JOINTS) * t + rng.uniform(0, 6, JOINTS))
+            for f in (0.2, 0.5, 0.9)
         )
-        one[:] = rng.uniform(-1, 1, JOINTS) + sum(rng.uniform(0.1, 0.5, JOINTS) * wave for wave in waves)
+        one[:] = rng.uniform(-1, 1, JOINTS) + sum(
+            rng.uniform(0.1, 0.5, JOINTS) * wave for wave in waves
+        )
     ctrl = ctrl.clip(-2, 2)
     units = VirtualRobot(robot, [physics] * count, [(mass, "both") for mass in payloads])
     units.reset(ctrl[:, 0], rng.integers(0, 1 << 30, count).tolist())
@@ -137,7 +142,10 @@ class MassProblem(Problem):
         self.bodies = [f"link{i}" for i in range(JOINTS)]
         size = 4 * len(self.bodies)
         self.start = np.r_[self.start, np.zeros(size)]
-        self.low, self.high = np.r_[self.low, np.full(size, -3.0)], np.r_[self.high, np.full(size, 3.0)]
+        self.low, self.high = (
+            np.r_[self.low, np.full(size, -3.0)],
+            np.r_[self.high, np.full(size, 3.0)],
+        )
 
     def servos(self, x: np.ndarray, window: int) -> dict[str, np.ndarray]:
         """Return the servos' values in a window."""
@@ -168,7 +176,9 @@ def links_of(model: mujoco.MjModel, names: list[str]) -> dict[str, Link]:
         mujoco.mju_quat2Mat(turn, body.iquat)
         full = turn.reshape(3, 3) @ np.diag(body.inertia) @ turn.reshape(3, 3).T
         numbers = (*np.diag(full), *full[[0, 0, 1], [1, 2, 2]])
-        links[name] = Link(float(body.mass[0]), tuple(body.ipos.tolist()), tuple(map(float, numbers)))
+        links[name] = Link(
+            float(body.mass[0]), tuple(body.ipos.tolist()), tuple(map(float, numbers))
+        )
     return links
 
 
@@ -186,7 +196,9 @@ def mujoco_sysid(sequences: list[Sequence], robot: RobotSpec) -> tuple[RobotSpec
         params[name].apply_modifier(spec)
         log_mass, by = params[name].value[0], half[6 * JOINTS + 10 * i]
         masses.append(np.exp(2 * np.array([log_mass - by, log_mass + by])))
-    fitted = replace(problem.robot_with(params.as_vector()[: 6 * JOINTS]), links=links_of(spec.compile(), names))
+    fitted = replace(
+        problem.robot_with(params.as_vector()[: 6 * JOINTS]), links=links_of(spec.compile(), names)
+    )
     return fitted, np.array(masses)
 
 
@@ -201,7 +213,11 @@ def play(seed: int, torque: bool) -> dict[str, Any]:
         )
         heavy = round(0.1 * float(hold[-1]), 2)
         loads = [0.0, heavy] if loaded else [0.0]
-        scale = np.exp(0.05 * np.random.default_rng([seed, 4]).standard_normal(JOINTS)) if torque else None
+        scale = (
+            np.exp(0.05 * np.random.default_rng([seed, 4]).standard_normal(JOINTS))
+            if torque
+            else None
+        )
         train, validation, test = (
             record(rng, robot, physics, name, [loads[i % len(loads)] for i in range(count)], scale)
             for name, count in (("train", TRAIN), ("validation", VALIDATION), ("test", TEST))
@@ -227,15 +243,25 @@ def play(seed: int, torque: bool) -> dict[str, Any]:
             made = identify(train, robot, validation, table=False, masses=masses)
             judge(name, made.robot, time.process_time() - began)
         began = time.process_time()
-        judge("plain, masses", fit(MassProblem([*train, *validation], robot), 1), time.process_time() - began)
+        judge(
+            "plain, masses",
+            fit(MassProblem([*train, *validation], robot), 1),
+            time.process_time() - began,
+        )
         nominal = build_model(robot)
-        mass = np.array([nominal.body(f"link{i}").mass[0] * physics.mass_scale[i] for i in range(JOINTS)])
+        mass = np.array(
+            [nominal.body(f"link{i}").mass[0] * physics.mass_scale[i] for i in range(JOINTS)]
+        )
         if importlib.util.find_spec("colorama"):  # of mujoco[sysid]
             began = time.process_time()
             fitted, low_high = mujoco_sysid([*train, *validation], robot)
             judge("mujoco.sysid", fitted, time.process_time() - began)
-            row["mujoco.sysid masses inside"] = int(((low_high[:, 0] < mass) & (mass < low_high[:, 1])).sum())
-            row["mujoco.sysid mass error"] = [fitted.links[f"link{i}"].mass / mass[i] - 1 for i in range(JOINTS)]
+            row["mujoco.sysid masses inside"] = int(
+                ((low_high[:, 0] < mass) & (mass < low_high[:, 1])).sum()
+            )
+            row["mujoco.sysid mass error"] = [
+                fitted.links[f"link{i}"].mass / mass[i] - 1 for i in range(JOINTS)
+            ]
         row["accepted"] = made.links is not None
         if made.links is not None:
             _, now, std, prior = (x[:, :4] for x in made.links.moments())
@@ -243,7 +269,10 @@ def play(seed: int, torque: bool) -> dict[str, Any]:
             row["masses inside"] = int((np.abs(now[:, 0] - mass) < 1.645 * std[:, 0]).sum())
             true = np.stack([mass, physics.com_x, physics.com_y, physics.com_z], axis=1)
             known = std < KNOWN * prior
-            row["inside"], row["known"] = int((np.abs(now - true) < 1.645 * std)[known].sum()), int(known.sum())
+            row["inside"], row["known"] = (
+                int((np.abs(now - true) < 1.645 * std)[known].sum()),
+                int(known.sum()),
+            )
     return row
 
 
@@ -251,23 +280,42 @@ def table(rows: list[Row]) -> None:
     """Print errors of both payloads, verdicts and intervals, by kind of file and payloads."""
     kinds = [(wrong, payloads) for wrong in (False, True) for payloads in (1, 2)]
     groups = [[r for r in rows if (r["wrong"], r["payloads"]) == kind] for kind in kinds]
-    titles = [f"{'wrong' if wrong else 'right'} file, {payloads} payload(s)" for wrong, payloads in kinds]
+    titles = [
+        f"{'wrong' if wrong else 'right'} file, {payloads} payload(s)" for wrong, payloads in kinds
+    ]
     for key in ("test", "new payload"):
-        lines = [(n, *(plus_minus(r[key][n] for r in some) for some in groups)) for n in rows[0][key]]
+        lines = [
+            (n, *(plus_minus(r[key][n] for r in some) for some in groups)) for n in rows[0][key]
+        ]
         print_table((f"mrad, {key}", *titles), lines)
-    lines = [("arms", *map(len, groups)), ("--masses accepted", *(sum(r["accepted"] for r in some) for some in groups))]
-    fitted = {"masses inside": [[r for r in g if r["accepted"]] for g in groups], "mujoco.sysid masses inside": groups}
+    lines = [
+        ("arms", *map(len, groups)),
+        ("--masses accepted", *(sum(r["accepted"] for r in some) for some in groups)),
+    ]
+    fitted = {
+        "masses inside": [[r for r in g if r["accepted"]] for g in groups],
+        "mujoco.sysid masses inside": groups,
+    }
     for name, some in fitted.items():
-        lines.append((f"{name} 90 %", *(f"{sum(r.get(name, 0) for r in g)} of {JOINTS * len(g)}" for g in some)))
+        lines.append(
+            (
+                f"{name} 90 %",
+                *(f"{sum(r.get(name, 0) for r in g)} of {JOINTS * len(g)}" for g in some),
+            )
+        )
     sums = [[sum(r.get(k, 0) for r in some) for k in ("inside", "known")] for some in groups]
-    print_table(("number", *titles), [*lines, ("all values inside 90 %", *(f"{a} of {b}" for a, b in sums))])
+    print_table(
+        ("number", *titles), [*lines, ("all values inside 90 %", *(f"{a} of {b}" for a, b in sums))]
+    )
     seconds = {n: float(np.mean([r["s"][n] for r in rows])) for n in rows[0]["s"]}
     print("processor, s:", ", ".join(f"{n} {s:.1f}" for n, s in seconds.items()))
 
 
 def main() -> None:
     """Play robots that are not in the file yet, then print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--first", type=int, default=100)

@@ -43,7 +43,15 @@ def main(
         no_stop: Count late periods and old states instead of stopping.
     """
     robot = load_robot("h1_2")
-    command = [sys.executable, "-m", "gaponet", "virtual", "serve", "--payload-mass", str(payload_mass)]
+    command = [
+        sys.executable,
+        "-m",
+        "gaponet",
+        "virtual",
+        "serve",
+        "--payload-mass",
+        str(payload_mass),
+    ]
     command += ["--domain", str(domain), "--rate", str(state_rate)]
     served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:

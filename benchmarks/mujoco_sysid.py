@@ -46,8 +46,12 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
     for w, (spec, state) in enumerate(zip(problem.specs, problem.states, strict=True)):
         commands = problem.controls(np.zeros(len(problem.op)), w)
         times = np.arange(len(commands) + 1) * spec.option.timestep
-        control = sysid.TimeSeries(times, np.append(commands, commands[-1:], axis=0))  # the last one is not applied
-        recorded = sysid.TimeSeries(times, np.zeros((len(times), 0)))  # positions are in the problem
+        control = sysid.TimeSeries(
+            times, np.append(commands, commands[-1:], axis=0)
+        )  # the last one is not applied
+        recorded = sysid.TimeSeries(
+            times, np.zeros((len(times), 0))
+        )  # positions are in the problem
         window_of |= {id(spec): w, id(control): w, id(recorded): w}
         windows.append(sysid.ModelSequences(str(w), spec, str(w), state, control, recorded, True))
 
@@ -70,13 +74,21 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
 
     def rollout(control_signal: list[Any], param_dicts: list[Any], **rest: Any) -> Any:
         late = []
-        for control, params in zip(control_signal, param_dicts, strict=True):  # one window, many candidates
+        for control, params in zip(
+            control_signal, param_dicts, strict=True
+        ):  # one window, many candidates
             w = window_of[id(control)]
             delay = problem.servos(vector(params), w)["delay"]
-            late.append(replace(control, data=np.append(problem.controls(delay, w), control.data[-1:], axis=0)))
+            late.append(
+                replace(
+                    control, data=np.append(problem.controls(delay, w), control.data[-1:], axis=0)
+                )
+            )
         return sysid.sysid_rollout(control_signal=late, **rest)
 
-    def residual(params: Any, simulated: Any, recorded: Any, model: Any, every: bool, state: np.ndarray) -> Any:
+    def residual(
+        params: Any, simulated: Any, recorded: Any, model: Any, every: bool, state: np.ndarray
+    ) -> Any:
         return problem.errors(state, window_of[id(recorded)]), recorded, recorded
 
     residuals = sysid.build_residual_fn(
@@ -84,7 +96,9 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
         resample_true=False,
     )  # fmt: skip
     params, bounds = sysid.ParameterDict(), (problem.start, problem.low, problem.high)
-    for field, start, low, high in zip(FIELDS, *(np.split(x, len(FIELDS)) for x in bounds), strict=True):
+    for field, start, low, high in zip(
+        FIELDS, *(np.split(x, len(FIELDS)) for x in bounds), strict=True
+    ):
         params.add(sysid.Parameter(field, start, low, high))
     for name in links:
         spec = problem.specs[0].copy()  # the parameter changes it
@@ -93,7 +107,9 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
             spec, spec.compile(), name, sysid.InertiaType.Pseudo, param_name=name, modifier=write_inertia, **bounds
         ))  # fmt: skip
     with redirect_stdout(sys.stderr):  # it prints each iteration
-        return sysid.optimize(params, residuals, "scipy_parallel_fd", max_iters=EVALUATIONS, diff_step=STEP, **LOSS)
+        return sysid.optimize(
+            params, residuals, "scipy_parallel_fd", max_iters=EVALUATIONS, diff_step=STEP, **LOSS
+        )
 
 
 def write_inertia(spec: mujoco.MjSpec, param: sysid.Parameter) -> None:

@@ -49,33 +49,60 @@ class Problem:
     """
 
     def __init__(
-        self, sequences: list[Sequence], robot: RobotSpec, window: float = 8.0, count: int = 40, friction: float = 200.0
+        self,
+        sequences: list[Sequence],
+        robot: RobotSpec,
+        window: float = 8.0,
+        count: int = 40,
+        friction: float = 200.0,
     ) -> None:
         """Take `count` windows of so many seconds; `friction` bounds dry friction in thousandths of kp."""
         lengths = [round(window / s.dt) for s in sequences]
-        cuts = [s.rows(slice(a, a + k)) for s, k in zip(sequences, lengths, strict=True) for a in range(0, len(s), k)]
+        cuts = [
+            s.rows(slice(a, a + k))
+            for s, k in zip(sequences, lengths, strict=True)
+            for a in range(0, len(s), k)
+        ]
         cuts = [c for c in cuts if c.duration > 0.9 * window] or list(sequences)
-        self.cuts = cuts = [cuts[i * len(cuts) // min(count, len(cuts))] for i in range(min(count, len(cuts)))]
+        self.cuts = cuts = [
+            cuts[i * len(cuts) // min(count, len(cuts))] for i in range(min(count, len(cuts)))
+        ]
         self.robot, self.steps = robot, [robot.steps_per(c.dt) for c in cuts]
         locked = idle_limbs(cuts, robot)
         free = [j for j in robot.joint_names if j not in locked]
         self.free, self.op = robot.index(free), np.array([free.index(j) for j in robot.operated])
         self.specs = [
-            build_spec(robot, c.meta.payload_mass, c.meta.payload_side, c.dt, locked, physics_only=True) for c in cuts
+            build_spec(
+                robot, c.meta.payload_mass, c.meta.payload_side, c.dt, locked, physics_only=True
+            )
+            for c in cuts
         ]
         of = robot.operated_index
-        self.gains = np.array([[r.kp[of], r.kd[of]] for r in (robot.with_gains(*c.meta.recorded_gains) for c in cuts)])
-        self.states = np.array([[0.0, *c.qpos[0, self.free], *c.qvel[0, self.free]] for c in cuts], float)
+        self.gains = np.array(
+            [[r.kp[of], r.kd[of]] for r in (robot.with_gains(*c.meta.recorded_gains) for c in cuts)]
+        )
+        self.states = np.array(
+            [[0.0, *c.qpos[0, self.free], *c.qvel[0, self.free]] for c in cuts], float
+        )
         self.ticks = np.arange(max((len(c) - 1) * k for c, k in zip(cuts, self.steps, strict=True)))
         own, n = self.specs[0].compile(), len(of)
-        self.kp, self.kd, damping = robot.kp[of], robot.kd[of], own.dof_damping[self.op] + robot.kd[of]
+        self.kp, self.kd, damping = (
+            robot.kp[of],
+            robot.kd[of],
+            own.dof_damping[self.op] + robot.kd[of],
+        )
         # Stiff joints are unstable with less armature at this step.
         armature, late = np.maximum(own.dof_armature[self.op], 2.5e-5 * self.kp), np.full(n, 0.02)
         slow = np.maximum(damping, 0.05 * self.kp)
         self.scale = np.stack([self.kp, slow, 1e-3 * self.kp, armature, late, late / 2])
         self.low, self.high = np.repeat(LOW, n), np.repeat((*HIGH[:2], friction, *HIGH[3:]), n)
-        start = np.stack([self.kp, damping, own.dof_frictionloss[self.op], armature, late, 0 * late]) / self.scale
-        self.start = np.clip(start.ravel(), self.low + 0.2, self.high - 0.2)  # the trust region is slow at bounds
+        start = (
+            np.stack([self.kp, damping, own.dof_frictionloss[self.op], armature, late, 0 * late])
+            / self.scale
+        )
+        self.start = np.clip(
+            start.ravel(), self.low + 0.2, self.high - 0.2
+        )  # the trust region is slow at bounds
 
     def servos(self, x: np.ndarray, window: int) -> dict[str, np.ndarray]:
         """Return kp, kd, damping, frictionloss, armature, delay and offset, (n,) each, in a window with its gains."""
@@ -88,7 +115,9 @@ class Problem:
     def controls(self, delay: np.ndarray, window: int) -> np.ndarray:
         """Return late commands by physics step; linear between commands, so that a delay has a gradient."""
         cut, times = self.cuts[window], self.ticks * self.specs[window].option.timestep
-        ctrl = cut.ctrl[np.minimum(self.ticks // self.steps[window], len(cut) - 1)][:, self.free].astype(float)
+        ctrl = cut.ctrl[np.minimum(self.ticks // self.steps[window], len(cut) - 1)][
+            :, self.free
+        ].astype(float)
         for late, j in zip(delay, self.op, strict=True):
             ctrl[:, j] = np.interp(times - late, times, ctrl[:, j])
         return ctrl
@@ -116,13 +145,18 @@ class Problem:
         servo = {"kp": kp, "damping": total - self.kd, "frictionloss": friction, "armature": armature, "delay": delay,
                  "offset": offset}  # fmt: skip
         names = self.robot.operated
-        return self.robot.with_servos({j: {f: float(v[i]) for f, v in servo.items()} for i, j in enumerate(names)})
+        return self.robot.with_servos(
+            {j: {f: float(v[i]) for f, v in servo.items()} for i, j in enumerate(names)}
+        )
 
 
 def equal_problem(question: Question) -> Problem:
     """Return 40 windows of 8 s and friction up to kp / 5, as gaponet identify has them."""
     gains = {s.meta.recorded_gains for s in question.fitted}
-    return Problem(question.fitted, question.robot.with_gains(*gains.pop()) if len(gains) == 1 else question.robot)
+    return Problem(
+        question.fitted,
+        question.robot.with_gains(*gains.pop()) if len(gains) == 1 else question.robot,
+    )
 
 
 def equal_windows(question: Question) -> FittedSim:
@@ -151,15 +185,21 @@ def fit(problem: Problem, threads: int = 2) -> RobotSpec:
 
     def slopes(x: np.ndarray) -> np.ndarray:
         here, by = errors(x), np.where(x + STEP > problem.high, -STEP, STEP)
-        return np.stack([(errors(x + row) - here) / by[i] for i, row in enumerate(np.diag(by))], axis=1)
+        return np.stack(
+            [(errors(x + row) - here) / by[i] for i, row in enumerate(np.diag(by))], axis=1
+        )
 
     box = problem.low, problem.high
-    return problem.robot_with(least_squares(errors, problem.start, slopes, box, max_nfev=EVALUATIONS, **LOSS).x)
+    return problem.robot_with(
+        least_squares(errors, problem.start, slopes, box, max_nfev=EVALUATIONS, **LOSS).x
+    )
 
 
 def main() -> None:
     """Fit on training motions, measure on whole validation motions."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("dataset")
     parser.add_argument("--robot")
     parser.add_argument("--out", type=Path)
@@ -171,7 +211,12 @@ def main() -> None:
     seconds, op = time.monotonic() - began, robot.operated_index
     for name, spec in (("as it is", robot), ("plain fit", found)):
         replays = replay(parts["val"], spec)
-        error = np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(parts["val"], replays, strict=True)])
+        error = np.mean(
+            [
+                np.abs(t.qpos - s.qpos)[1:, op].mean()
+                for s, t in zip(parts["val"], replays, strict=True)
+            ]
+        )
         print(f"{name}: {1e3 * error:.3f} mrad over {len(replays)} validation motions")
     print(f"{seconds:.0f} s")
     if args.out:

@@ -25,8 +25,15 @@ from gaponet.sim.replay import replay
 FIELDS = "kp", "damping", "armature", "frictionloss"
 PAN, LIFT, ELBOW, EVERY = "shoulder_pan", "shoulder_lift", "elbow_flex", ""
 SETS = {
-    "NVIDIA so101-typing-task": {PAN: (48.9, 2.31, 0.058, 0.215), ELBOW: (18.6, 0.53, 0.055, 0.402)},
-    "AnchorBench": {PAN: (48.4, 3.34, 0.068, 0.347), LIFT: (47.78, 2.563, 0.0276, 0.345), ELBOW: (14.7, nan, nan, nan)},
+    "NVIDIA so101-typing-task": {
+        PAN: (48.9, 2.31, 0.058, 0.215),
+        ELBOW: (18.6, 0.53, 0.055, 0.402),
+    },
+    "AnchorBench": {
+        PAN: (48.4, 3.34, 0.068, 0.347),
+        LIFT: (47.78, 2.563, 0.0276, 0.345),
+        ELBOW: (14.7, nan, nan, nan),
+    },
     "MuJoCo Playground": {PAN: (nan, nan, 0.109, 0.0001), ELBOW: (nan, nan, 0.122, 0.0)},
     "community MJCF": {EVERY: (17.8, 0.60, 0.028, 0.052)},
     "hand-tuned before AnchorBench": {EVERY: (33.0, 1.6, 0.02, 0.0)},
@@ -71,7 +78,10 @@ def main() -> None:
     data, robot = open_dataset(sys.argv[1], None, None)
     test, op = data.sequences(split_entries(data)["test"]), robot.operated_index
     for name, spec in {"nominal": robot, **{name: published(robot, name) for name in SETS}}.items():
-        errors = [np.abs(t.qpos - s.qpos)[1:, op].mean(axis=0) for s, t in zip(test, replay(test, spec), strict=True)]
+        errors = [
+            np.abs(t.qpos - s.qpos)[1:, op].mean(axis=0)
+            for s, t in zip(test, replay(test, spec), strict=True)
+        ]
         cells = [f"{1e3 * e:.2f}" for e in np.mean(errors, axis=0)]
         print(f"| {name} | {' | '.join(cells)} |")
 

@@ -121,13 +121,24 @@ class RandomRobot:
         spec.option.timestep = period / np.ceil(period / 1e-3)
         if payload:
             hand = spec.body(self.bodies[-1])
-            hand.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], mass=payload, contype=0, conaffinity=0)
+            hand.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[0.02, 0, 0],
+                mass=payload,
+                contype=0,
+                conaffinity=0,
+            )
         for j, name in enumerate(self.joints):
             joint = spec.joint(name)
-            joint.damping, joint.armature = _like(joint.damping, servo.damping[j]), servo.armature[j]
+            joint.damping, joint.armature = (
+                _like(joint.damping, servo.damping[j]),
+                servo.armature[j],
+            )
             joint.frictionloss = servo.friction[j]
             joint.solref_friction = [2.5 * spec.option.timestep, 1.0]
-            if not servo.creeps:  # MuJoCo's own joints creep by milliradians a second where real ones stick
+            if (
+                not servo.creeps
+            ):  # MuJoCo's own joints creep by milliradians a second where real ones stick
                 joint.solimp_friction = [0.9999, 0.9999, 0.001, 0.5, 2.0]
             _servo(spec, name, servo.kp[j], servo.kd[j], servo.limit[j])
         return spec.compile()
@@ -137,7 +148,10 @@ class RandomRobot:
         spec = self.spec.copy()
         for j, name in enumerate(self.joints):
             joint = spec.joint(name)
-            joint.damping, joint.armature = _like(joint.damping, self.said["damping"][j]), self.said["armature"][j]
+            joint.damping, joint.armature = (
+                _like(joint.damping, self.said["damping"][j]),
+                self.said["armature"][j],
+            )
             _servo(spec, name, self.said["kp"][j], self.said["kd"][j], self.servo.limit[j])
         spec.compile()
         return spec.to_xml()
@@ -159,22 +173,31 @@ class RandomRobot:
             together = kind != "mixed" and number % 8 < 6  # all joints rest at the same time
             times = rng.integers(1 << 30, size=n)
             for j in range(n):
-                way = self._visits(rng, np.random.default_rng(times[0 if together else j]), t, kind == "steps")
+                way = self._visits(
+                    rng, np.random.default_rng(times[0 if together else j]), t, kind == "steps"
+                )
                 found[:, j] += (0.5 if kind == "ways" else 0.2) * room[j] * way
         return np.clip(found, self.low, self.high)
 
-    def _visits(self, rng: np.random.Generator, clock: np.random.Generator, t: Array, jump: bool) -> Array:
+    def _visits(
+        self, rng: np.random.Generator, clock: np.random.Generator, t: Array, jump: bool
+    ) -> Array:
         """Draw moves between rests in −1 … 1; `rng` draws positions, `clock` times."""
         found, at, now = np.zeros(len(t)), 0.0, 0.0
         while now < t[-1]:
-            rest, way = clock.uniform(0.6, 2.5), 0.0 if jump else clock.uniform(0.6, 2.0) * 2 / self.pace
+            rest, way = (
+                clock.uniform(0.6, 2.5),
+                0.0 if jump else clock.uniform(0.6, 2.0) * 2 / self.pace,
+            )
             to = rng.uniform(-1, 1)
             s = np.clip((t - now - rest) / max(way, 1e-9), 0, 1)
             found = np.where(t >= now, at + (to - at) * (10 * s**3 - 15 * s**4 + 6 * s**5), found)
             at, now = to, now + rest + way
         return found
 
-    def recordings(self, motions: int = MOTIONS, seconds: float | None = None) -> Iterator[Recording]:
+    def recordings(
+        self, motions: int = MOTIONS, seconds: float | None = None
+    ) -> Iterator[Recording]:
         """Yield the logs of all motions; every second one carries the payload, if there is one."""
         rng = np.random.default_rng([self.seed, 2])
         channels = 2 + self.log_noise.velocity + self.log_noise.torque
@@ -186,7 +209,12 @@ class RandomRobot:
 
     def play(self, motion: str, ctrl: Array, payload: float, number: int) -> Recording:
         """Simulate a motion and log it."""
-        model, servo, log_noise, n = self.model(payload), self.servo, self.log_noise, len(self.joints)
+        model, servo, log_noise, n = (
+            self.model(payload),
+            self.servo,
+            self.log_noise,
+            len(self.joints),
+        )
         data, h = mujoco.MjData(model), model.opt.timestep
         each = round(1 / self.rate / h)
         target = self._targets(ctrl, h, each)
@@ -201,9 +229,9 @@ class RandomRobot:
                 e = u - q
                 u = q + np.sign(e) * np.maximum(np.abs(e) - servo.dead_band, 0)
             if loses:
-                more = servo.stribeck * np.exp(-np.abs(v) / servo.stribeck_speed) + servo.load * np.abs(
-                    data.actuator_force
-                )
+                more = servo.stribeck * np.exp(
+                    -np.abs(v) / servo.stribeck_speed
+                ) + servo.load * np.abs(data.actuator_force)
                 model.dof_frictionloss[dof] = servo.friction + more
             states[k] = q, v, data.actuator_force
             data.ctrl[:] = u
@@ -211,7 +239,9 @@ class RandomRobot:
         rng = np.random.default_rng([self.seed, number, 3])
         rows = np.arange(len(ctrl))
         jitter = (
-            np.clip(rng.normal(0, log_noise.jitter / 2, len(rows)), -log_noise.jitter, log_noise.jitter)
+            np.clip(
+                rng.normal(0, log_noise.jitter / 2, len(rows)), -log_noise.jitter, log_noise.jitter
+            )
             if log_noise.jitter
             else 0.0
         )
@@ -223,7 +253,13 @@ class RandomRobot:
         v = v + 20 * log_noise.noise * rng.standard_normal(q.shape)
         f = f + 0.01 * np.abs(f).max(axis=0) * rng.standard_normal(q.shape)
         log = Recording(
-            motion, payload, sampled * h, ctrl, q, v if log_noise.velocity else None, f if log_noise.torque else None
+            motion,
+            payload,
+            sampled * h,
+            ctrl,
+            q,
+            v if log_noise.velocity else None,
+            f if log_noise.torque else None,
         )
         keep = rng.random(len(rows)) >= log_noise.dropped
         keep[0] = True
@@ -283,7 +319,9 @@ def with_file_error(robot: RandomRobot, how: str) -> RandomRobot:
     return replace(robot, said={f: x * factor.get(f, 1.0) for f, x in robot.said.items()})
 
 
-def draw_robot(seed: int, public: bool | None = None, small: bool = False, named: str = "") -> RandomRobot:
+def draw_robot(
+    seed: int, public: bool | None = None, small: bool = False, named: str = ""
+) -> RandomRobot:
     """Draw the robot of a seed.
 
     Args:
@@ -292,7 +330,11 @@ def draw_robot(seed: int, public: bool | None = None, small: bool = False, named
         named: Part of the path of a public model, or a robot of gaponet.
     """
     if small:
-        next(i for i in range(100) if len((found := draw_robot(seed + 10**6 * i, False)).joints) <= SMALL)
+        next(
+            i
+            for i in range(100)
+            if len((found := draw_robot(seed + 10**6 * i, False)).joints) <= SMALL
+        )
         return replace(found, rate=min(found.rate, SLOW))
     rng = np.random.default_rng([seed, 0])
     chance, place = rng.random() < 0.4, rng.integers(len(PUBLIC))
@@ -300,7 +342,9 @@ def draw_robot(seed: int, public: bool | None = None, small: bool = False, named
     if named and (PACKAGED / named / "robot.xml").is_file():
         body = f"{named}/robot.xml"
         spec = _public(PACKAGED / body, ())
-    elif (bool(named) or (chance if public is None else public)) and (folder := _folder()) is not None:
+    elif (bool(named) or (chance if public is None else public)) and (
+        folder := _folder()
+    ) is not None:
         spec = _public(folder / body, PUBLIC[body])
     if spec is None:
         body = ("arm", "legs", "hand")[rng.integers(3)]
@@ -328,7 +372,10 @@ def _public(path: Path, welded: tuple[str, ...]) -> mujoco.MjSpec:
     for joint in [j for j in spec.joints if j.type != hinge or any(w in j.name for w in welded)]:
         spec.delete(joint)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.compiler.boundmass, spec.compiler.boundinertia = 0.01, 1e-6  # of bodies whose mass was their mesh's
+    spec.compiler.boundmass, spec.compiler.boundinertia = (
+        0.01,
+        1e-6,
+    )  # of bodies whose mass was their mesh's
     return mujoco.MjSpec.from_string(_plain(spec))
 
 
@@ -337,7 +384,15 @@ def _plain(spec: mujoco.MjSpec) -> str:
     return spec.to_xml()
 
 
-def _link(rng: np.random.Generator, name: str, axis: str, length: float, mass: float, inside: str, limit: float) -> str:
+def _link(
+    rng: np.random.Generator,
+    name: str,
+    axis: str,
+    length: float,
+    mass: float,
+    inside: str,
+    limit: float,
+) -> str:
     """Return a body with a hinge, a rod, and a child at its end."""
     to = np.roll([length, 0, 0], rng.integers(3)) * rng.choice([-1, 1])
     to = to if abs(to[1]) < 1e-9 else np.array([0, 0, -length])
@@ -346,11 +401,14 @@ def _link(rng: np.random.Generator, name: str, axis: str, length: float, mass: f
     return (
         f'<joint name="{name}" axis="{axis}" range="{low:.4g} {limit * rng.uniform(0.6, 1):.4g}"/>'
         f'<geom type="capsule" size="{0.12 * length + 0.004:.4g}" fromto="0 0 0 {end}" mass="{mass:.5g}" '
-        f'contype="0" conaffinity="0"/>' + (f'<body name="{name}_next" pos="{end}">{inside}</body>' if inside else "")
+        f'contype="0" conaffinity="0"/>'
+        + (f'<body name="{name}_next" pos="{end}">{inside}</body>' if inside else "")
     )
 
 
-def _chain(rng: np.random.Generator, prefix: str, n: int, length: float, mass: float, limit: float) -> str:
+def _chain(
+    rng: np.random.Generator, prefix: str, n: int, length: float, mass: float, limit: float
+) -> str:
     """Return n links, each shorter and lighter than its parent."""
     text = ""
     for i in reversed(range(n)):
@@ -362,7 +420,9 @@ def _chain(rng: np.random.Generator, prefix: str, n: int, length: float, mass: f
 
 def _arm(rng: np.random.Generator) -> str:
     n, length = int(rng.integers(3, 8)), np.exp(rng.uniform(np.log(0.06), np.log(0.45)))
-    inside = _chain(rng, "arm_joint", n, length, 60 * length**2 * rng.uniform(0.3, 1.5), rng.uniform(1.2, 2.9))
+    inside = _chain(
+        rng, "arm_joint", n, length, 60 * length**2 * rng.uniform(0.3, 1.5), rng.uniform(1.2, 2.9)
+    )
     return ARM.format(f'<body name="arm" pos="0 0 1">{inside}</body>')
 
 
@@ -370,7 +430,9 @@ def _legs(rng: np.random.Generator) -> str:
     count, length = int(rng.choice([1, 2, 4])), np.exp(rng.uniform(np.log(0.1), np.log(0.4)))
     mass = 50 * length**2 * rng.uniform(0.3, 1.5)
     one = lambda leg: _chain(rng, f"leg{leg}_joint", 3, length, mass, 1.2)  # noqa: E731
-    bodies = (f'<body name="leg{leg}" pos="{leg * length} 0 1">{one(leg)}</body>' for leg in range(count))
+    bodies = (
+        f'<body name="leg{leg}" pos="{leg * length} 0 1">{one(leg)}</body>' for leg in range(count)
+    )
     return ARM.format("".join(bodies))
 
 
@@ -378,7 +440,9 @@ def _hand(rng: np.random.Generator) -> str:
     fingers, n, length = int(rng.integers(2, 5)), int(rng.integers(2, 5)), rng.uniform(0.025, 0.06)
     mass = 15 * length**2 * rng.uniform(0.5, 1.5)
     one = lambda f: _chain(rng, f"finger{f}_joint", n, length, mass, 1.4)  # noqa: E731
-    bodies = (f'<body name="finger{f}" pos="{0.03 * f} 0 1">{one(f)}</body>' for f in range(fingers))
+    bodies = (
+        f'<body name="finger{f}" pos="{0.03 * f} 0 1">{one(f)}</body>' for f in range(fingers)
+    )
     return ARM.format("".join(bodies))
 
 
@@ -390,14 +454,19 @@ def _complete(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: st
     joints = tuple(model.joint(j).name for j in range(model.njnt))
     n, data = len(joints), mujoco.MjData(model)
     limited = model.jnt_limited.astype(bool)
-    low, high = np.where(limited, model.jnt_range[:, 0], -1.5), np.where(limited, model.jnt_range[:, 1], 1.5)
+    low, high = (
+        np.where(limited, model.jnt_range[:, 0], -1.5),
+        np.where(limited, model.jnt_range[:, 1], 1.5),
+    )
     low, high = np.maximum(low, -2.5), np.minimum(high, 2.5)
     low, high = low + 0.05 * (high - low), high - 0.05 * (high - low)
     inertia, weight, full = np.zeros(n), np.zeros(n), np.zeros((n, n))
     for _ in range(40):
         data.qpos[:] = rng.uniform(low, high)
         mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, full, data.qM) if hasattr(data, "qM") else mujoco.mj_fullM(model, data, full)
+        mujoco.mj_fullM(model, full, data.qM) if hasattr(data, "qM") else mujoco.mj_fullM(
+            model, data, full
+        )
         inertia = np.maximum(inertia, np.diag(full) / 2)
         weight = np.maximum(weight, np.abs(data.qfrc_bias))
     inertia = np.maximum(inertia, 0.02 * inertia.max())
@@ -405,11 +474,17 @@ def _complete(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: st
     pace, motor = spread(1.5, 7.0), spread(0.1, 1.5)
     armature = inertia * motor * spread(0.7, 1.4, n)
     moved = inertia + armature
-    kp = np.maximum(moved * (2 * np.pi * pace) ** 2 * spread(0.8, 1.25, n), weight / rng.uniform(0.03, 0.15))
+    kp = np.maximum(
+        moved * (2 * np.pi * pace) ** 2 * spread(0.8, 1.25, n), weight / rng.uniform(0.03, 0.15)
+    )
     total = 2 * rng.uniform(0.4, 1.2, n) * np.sqrt(kp * moved)
     share = rng.uniform(0.2, 1.0)
     none = np.zeros(n)
-    effects = () if rng.random() < 0.5 else tuple(map(str, rng.choice(EFFECTS, rng.integers(1, 4), replace=False)))
+    effects = (
+        ()
+        if rng.random() < 0.5
+        else tuple(map(str, rng.choice(EFFECTS, rng.integers(1, 4), replace=False)))
+    )
     each = lambda name, least, most: spread(least, most, n) if name in effects else none  # noqa: E731
     limit = 3 * weight + 0.6 * kp
     servo = Servo(
@@ -421,7 +496,10 @@ def _complete(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: st
         backlash=each("backlash", 1e-3, 1e-2), dead_band=each("dead_band", 1e-3, 1e-2),
         speed=each("speed", 0.4, 2.0), filter=each("filter", 0.01, 0.06), creeps="creep" in effects,
     )  # fmt: skip
-    said = {name: getattr(servo, name) * _wrong(rng, n, name != "kp") for name in ("kp", "kd", "damping", "armature")}
+    said = {
+        name: getattr(servo, name) * _wrong(rng, n, name != "kp")
+        for name in ("kp", "kd", "damping", "armature")
+    }
     log_noise = LogNoise(
         noise=float(rng.choice([0.0, spread(1e-5, 1e-3)])),
         step=float(rng.choice([0.0, 2 * np.pi / 4096, 2 * np.pi / 16384, 2 * np.pi / 131072])),
@@ -429,7 +507,11 @@ def _complete(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: st
         jitter=float(rng.choice([0.0, rng.uniform(0, 0.3)])),
         velocity=bool(rng.random() < 0.6), torque=bool(rng.random() < 0.4),
     )  # fmt: skip
-    heavy = float(model.body_mass.sum()) * rng.uniform(0.05, 0.3) if body == "arm" and rng.random() < 0.5 else 0.0
+    heavy = (
+        float(model.body_mass.sum()) * rng.uniform(0.05, 0.3)
+        if body == "arm" and rng.random() < 0.5
+        else 0.0
+    )
     bodies = tuple(model.body(b).name for b in range(1, model.nbody))
     return RandomRobot(seed, body, spec, joints, np.clip(none, low, high), low, high, servo, said, effects,
                     float(rng.choice(RATES)), log_noise, round(heavy, 3), float(pace), bodies)  # fmt: skip

@@ -22,7 +22,15 @@ from typing import Any
 import numpy as np
 from kills import TRAIN, prepare, trained
 
-TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m"]
+TORCHRUN = [
+    sys.executable,
+    "-m",
+    "torch.distributed.run",
+    "--standalone",
+    "--nproc-per-node",
+    "2",
+    "-m",
+]
 MINUTE = 60.0
 LIMITS = {"rank frozen": 160.0}  # s; before its first sign of life it is waited for two minutes
 KINDS = ("rank killed", "rank frozen", "rank killed", "torchrun killed")
@@ -30,7 +38,17 @@ KINDS = ("rank killed", "rank frozen", "rank killed", "torchrun killed")
 
 def command(data: Path, out: Path, steps: int, options: list[str], ranks: int) -> list[str]:
     resume = ["--resume"] if (out / "checkpoint.pt").is_file() else []
-    words = ["gaponet", "train", str(data), "--out", str(out), "--budget", str(steps), *resume, *options]
+    words = [
+        "gaponet",
+        "train",
+        str(data),
+        "--out",
+        str(out),
+        "--budget",
+        str(steps),
+        *resume,
+        *options,
+    ]
     return [*(TORCHRUN if ranks > 1 else [sys.executable, "-m"]), *words]
 
 
@@ -43,7 +61,11 @@ def ranks_of(mark: str) -> list[int]:
             state = (process / "stat").read_text().rpartition(")")[2].split()[0]
         except OSError:  # it has ended meanwhile
             continue
-        if f"TRIAL={mark}".encode() in said and any(x.startswith(b"RANK=") for x in said) and state != "Z":
+        if (
+            f"TRIAL={mark}".encode() in said
+            and any(x.startswith(b"RANK=") for x in said)
+            and state != "Z"
+        ):
             found.append(int(process.name))
     return sorted(found)
 
@@ -56,7 +78,9 @@ def adversity(data: Path, work: Path, wanted: int, rng: np.random.Generator) -> 
 
     def start(out: Path, mark: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {"TRIAL": mark}
-        return subprocess.Popen(command(data, out, 4000, TRAIN, 2), stdout=log, stderr=log, env=environment)
+        return subprocess.Popen(
+            command(data, out, 4000, TRAIN, 2), stdout=log, stderr=log, env=environment
+        )
 
     began, whole = time.monotonic(), work / "whole"
     if start(whole, f"{work}-whole").wait():
@@ -76,7 +100,9 @@ def adversity(data: Path, work: Path, wanted: int, rng: np.random.Generator) -> 
         kind, begun = KINDS[done % len(KINDS)], time.monotonic()
         victim = process.pid if kind == "torchrun killed" else int(rng.choice(there))
         os.kill(victim, signal.SIGSTOP if kind == "rank frozen" else signal.SIGKILL)
-        while ((left := ranks_of(mark)) or process.poll() is None) and time.monotonic() - begun < 3 * MINUTE:
+        while (
+            (left := ranks_of(mark)) or process.poll() is None
+        ) and time.monotonic() - begun < 3 * MINUTE:
             time.sleep(0.1)
         lasted.setdefault(kind, []).append(round(time.monotonic() - begun, 1))
         if lasted[kind][-1] > LIMITS.get(kind, MINUTE):
@@ -96,7 +122,9 @@ def adversity(data: Path, work: Path, wanted: int, rng: np.random.Generator) -> 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("work", type=Path)
     parser.add_argument("--kills", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
@@ -104,7 +132,9 @@ def main() -> int:
     work = args.work.resolve()
     if not (work / "input").is_dir():
         prepare(work / "input")
-    found = adversity(work / "input" / "data", work / "kills", args.kills, np.random.default_rng(args.seed))
+    found = adversity(
+        work / "input" / "data", work / "kills", args.kills, np.random.default_rng(args.seed)
+    )
     print(json.dumps(found))
     return int(bool(found["wrong"]))
 

@@ -34,7 +34,11 @@ def released_network(weights: dict[str, Array]) -> PaperNet:
     """
     net = PaperNet(ModelConfig(kind="paper", payload_input=False, delta_max=10.0), 10).eval()
     state = net.state_dict()
-    published = {"predictor.net": "sensor_model", "trunk": "trunk_net.net", "branch": "branch_net.branches.0"}
+    published = {
+        "predictor.net": "sensor_model",
+        "trunk": "trunk_net.net",
+        "branch": "branch_net.branches.0",
+    }
     for own, name in published.items():
         for layer in (0, 2, 4, 6):
             fusion = own == "branch" and layer == 6
@@ -43,7 +47,9 @@ def released_network(weights: dict[str, Array]) -> PaperNet:
                 if f"{source}.{part}" in weights:
                     state[f"{own}.{layer}.{part}"] = torch.from_numpy(weights[f"{source}.{part}"])
     first, n = state["predictor.net.0.weight"], net.n
-    state["predictor.net.0.weight"] = torch.cat([first[:, :n], torch.zeros(len(first), n), first[:, n:]], dim=1)
+    state["predictor.net.0.weight"] = torch.cat(
+        [first[:, :n], torch.zeros(len(first), n), first[:, n:]], dim=1
+    )
     for part in ("weight", "bias"):
         mean = state[f"predictor.net.4.{part}"]
         state[f"predictor.net.4.{part}"] = torch.cat([mean, torch.zeros_like(mean)])
@@ -61,7 +67,10 @@ def released_inputs(observation: Array, action: Array) -> Tensor:
 
 def difference(folder: Path) -> float:
     """Largest |module − published output| over the pairs, rad."""
-    net, pairs = released_network(dict(np.load(folder / "weights.npz"))), np.load(folder / "pairs.npz")
+    net, pairs = (
+        released_network(dict(np.load(folder / "weights.npz"))),
+        np.load(folder / "pairs.npz"),
+    )
     with torch.inference_mode():
         delta = net(released_inputs(pairs["model_obs"], pairs["action"])).numpy()
     return float(np.abs(delta - pairs["delta"]).max())

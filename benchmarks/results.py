@@ -44,16 +44,29 @@ each robot or set, such as `gaponet experiment real`, then continue. Below the t
 def measure(name: str, command: str, work: Path) -> bool:
     """Run a step; store its answer if it ended well, and return whether it did."""
     began, log = time.monotonic(), work / "answers" / f"{name}.txt"
-    git = lambda *words: subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout  # noqa: E731
+    git = lambda *words: (  # noqa: E731
+        subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout
+    )
     changed = git("diff", "HEAD", "--name-only", "--", "src", "benchmarks")
     commit = git("rev-parse", "--short=8", "HEAD").strip() + "+" * bool(changed)
-    paths = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT / "src")}
+    paths = {
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT / "src"),
+    }
     with log.open("w") as file:
-        code = subprocess.run(command, shell=True, cwd=ROOT, stdout=file, env=os.environ | paths).returncode
-    answer = {"commit": commit, "date": date.today().isoformat(), "seconds": round(time.monotonic() - began)}
+        code = subprocess.run(
+            command, shell=True, cwd=ROOT, stdout=file, env=os.environ | paths
+        ).returncode
+    answer = {
+        "commit": commit,
+        "date": date.today().isoformat(),
+        "seconds": round(time.monotonic() - began),
+    }
     if code == 0:
         answer["output"] = log.read_text(encoding="utf-8")
-        log.with_suffix(".json").write_text(json.dumps(answer, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        log.with_suffix(".json").write_text(
+            json.dumps(answer, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
     return code == 0
 
 
@@ -64,7 +77,10 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     for answer in (a for name, a in answers.items() if name.startswith("real_")):
         new = json.loads(answer["output"])
         for r in new["rows"]:
-            r |= {"method": LISTED["titles"].get(r["method"], r["method"]), "measured": measured(answer)}
+            r |= {
+                "method": LISTED["titles"].get(r["method"], r["method"]),
+                "measured": measured(answer),
+            }
             rows[r["set"], r["question"], r["method"]] = r
         result |= {key: result[key] | new[key] for key in ("labels", "seconds")}
     order = [*result["cards"]]
@@ -76,7 +92,9 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     with (PAGES / "real.md").open("a", encoding="utf-8") as file:
         file.write("\n| measured | set: rows |\n| --- | --- |\n")
         for when, sets in made.items():
-            text = "; ".join(f"{name}: {' / '.join(dict.fromkeys(methods))}" for name, methods in sets.items())
+            text = "; ".join(
+                f"{name}: {' / '.join(dict.fromkeys(methods))}" for name, methods in sets.items()
+            )
             file.write(f"| {when} | {text} |\n")
     kept = json.loads((PAGES / "steps.json").read_text(encoding="utf-8"))
     for name, a in answers.items():
@@ -90,8 +108,14 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     for name, (command, seeds) in STEPS.items():
         a = kept.get(name)
         done = f"{measured(a)} | {a['seconds'] / 60:.1f}" if a else "– | –"
-        page.append(f"| {name} | `{filled(command, Path('WORK'), Path('DATA'))}` | {seeds} | {done} |")
-    page += [f"\n## {name}\n\n```text\n" + "\n".join(a["output"]) + "\n```" for name, a in kept.items() if a["output"]]
+        page.append(
+            f"| {name} | `{filled(command, Path('WORK'), Path('DATA'))}` | {seeds} | {done} |"
+        )
+    page += [
+        f"\n## {name}\n\n```text\n" + "\n".join(a["output"]) + "\n```"
+        for name, a in kept.items()
+        if a["output"]
+    ]
     (PAGES / "steps.md").write_text("\n".join(page) + "\n", encoding="utf-8")
     if (picture := work / "so101_id" / "gap.png").is_file():  # of so101_causes
         shutil.copyfile(picture, PAGES / "so101_causes.png")
@@ -111,7 +135,8 @@ def readme_rows(rows: list[dict[str, Any]]) -> list[str]:
     lines = []
     for key, label in LISTED["readme"].items():
         cells = [
-            min((errors[key, m] for m in methods if (key, m) in errors), default=None) for methods in README_COLUMNS
+            min((errors[key, m] for m in methods if (key, m) in errors), default=None)
+            for methods in README_COLUMNS
         ]
         lines.append(f"| {label} | {' | '.join(f'{c:.2f}' if c else '–' for c in cells)} |\n")
     return lines
@@ -119,14 +144,22 @@ def readme_rows(rows: list[dict[str, Any]]) -> list[str]:
 
 def filled(command: str, work: Path, data: Path) -> str:
     """Return a step's command with words and folders in place."""
-    return command.format(**LISTED["words"], work="{work}", data="{data}").format(work=work, data=data)
+    return command.format(**LISTED["words"], work="{work}", data="{data}").format(
+        work=work, data=data
+    )
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("work", type=Path)
     parser.add_argument("steps", nargs="*", metavar="STEP")
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("GAPONET_DATA", ROOT.parent / "shared/data")))
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=Path(os.environ.get("GAPONET_DATA", ROOT.parent / "shared/data")),
+    )
     parser.add_argument("--list", action="store_true")
     parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
@@ -138,7 +171,13 @@ def main() -> int:
     for i, (name, (text, _)) in enumerate(STEPS.items()):
         command = filled(text, work, args.data.resolve())
         program = LISTED["needs"].get(name)
-        state = "done before" if files[name].is_file() else "to do" if args.list or args.write else "runs"
+        state = (
+            "done before"
+            if files[name].is_file()
+            else "to do"
+            if args.list or args.write
+            else "runs"
+        )
         if state == "runs" and program and not shutil.which(program):
             state = f"skipped, no {program} here"
         if not args.steps or name in args.steps:
@@ -146,8 +185,17 @@ def main() -> int:
             if state == "runs" and not measure(name, command, work):
                 failed.append(name)
     if not args.list:
-        write({name: json.loads(f.read_text(encoding="utf-8")) for name, f in files.items() if f.is_file()}, work)
-    print(f"failed: {', '.join(failed)}; the same command tries again" if failed else "no step failed")
+        write(
+            {
+                name: json.loads(f.read_text(encoding="utf-8"))
+                for name, f in files.items()
+                if f.is_file()
+            },
+            work,
+        )
+    print(
+        f"failed: {', '.join(failed)}; the same command tries again" if failed else "no step failed"
+    )
     return bool(failed)
 
 

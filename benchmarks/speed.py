@@ -55,7 +55,11 @@ def bench_latency(run: Path) -> dict[str, Any]:
         for name, turn in turns.items():
             micro[name].append(_durations(turn, CALLS // 10))
     quantiles = {
-        name: {"p50": float(np.median(t)), "p99": float(np.quantile(t, 0.99)), "max": float(t.max())}
+        name: {
+            "p50": float(np.median(t)),
+            "p99": float(np.quantile(t, 0.99)),
+            "max": float(t.max()),
+        }
         for name, t in ((name, np.concatenate(times)) for name, times in micro.items())
     }
     batch = _durations(partial(GapModel.load(run, 1).infer, x), 3).min() * 1e-6
@@ -71,7 +75,9 @@ def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, 
     nominal = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * num_envs, 0, locked)
     aligned = AlignedSim(robot, model, 0.0, num_envs=num_envs, locked=locked)
     phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (num_envs, nominal.n))
-    targets = [aligned.qpos_home + 0.3 * np.sin(phase + np.pi * robot.dt * t) for t in range(TURN_STEPS)]
+    targets = [
+        aligned.qpos_home + 0.3 * np.sin(phase + np.pi * robot.dt * t) for t in range(TURN_STEPS)
+    ]
 
     def run_nominal() -> None:
         nominal.reset(slice(None), targets[0], 0.0, past=targets[0][:, None])  # type: ignore[arg-type]
@@ -89,8 +95,12 @@ def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, 
             start = time.perf_counter()
             turn()
             seconds[name].append(time.perf_counter() - start)
-    speed = {name: num_envs * TURN_STEPS / min(s[1:]) for name, s in seconds.items()}  # the first warms up
-    return {name: {"control_steps_per_s": v, "ratio": v / speed["nominal"]} for name, v in speed.items()}
+    speed = {
+        name: num_envs * TURN_STEPS / min(s[1:]) for name, s in seconds.items()
+    }  # the first warms up
+    return {
+        name: {"control_steps_per_s": v, "ratio": v / speed["nominal"]} for name, v in speed.items()
+    }
 
 
 def _correction(model: GapModel, states: Array) -> Turn:
@@ -119,13 +129,19 @@ def _durations(turn: Turn, calls: int) -> Array:
 
 def main() -> None:
     """Measure and print JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("latency", "aligned"))
     parser.add_argument("--run", type=Path, default=Path("."), help="run folder of gaponet train")
     parser.add_argument("--num-envs", type=int, default=512)
     parser.add_argument("--rounds", type=int, default=15)
     args = parser.parse_args()
-    result = bench_latency(args.run) if args.what == "latency" else bench_aligned(args.run, args.num_envs, args.rounds)
+    result = (
+        bench_latency(args.run)
+        if args.what == "latency"
+        else bench_aligned(args.run, args.num_envs, args.rounds)
+    )
     print(json.dumps(result, indent=1))
 
 

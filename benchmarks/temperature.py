@@ -40,7 +40,9 @@ def draw(seed: int) -> tuple[RobotSpec, Physics, np.ndarray]:
     lengths, masses = rng.uniform(0.1, 0.3, n), rng.uniform(0.1, 0.4, n)
     load = np.array([sum(masses[j:]) * sum(lengths[j:]) ** 2 / 2 for j in range(n)])
     armature = load * rng.uniform(0.3, 1.5, n)
-    kp = np.maximum((load + armature) * (2 * np.pi * rng.uniform(2.0, 4.0)) ** 2, 40 * masses * lengths)
+    kp = np.maximum(
+        (load + armature) * (2 * np.pi * rng.uniform(2.0, 4.0)) ** 2, 40 * masses * lengths
+    )
     total = 2 * rng.uniform(0.5, 1.0, n) * np.sqrt(kp * (load + armature))
     friction = kp * np.exp(rng.uniform(np.log(3e-3), np.log(2e-2), n))
     body = ""
@@ -56,7 +58,9 @@ def draw(seed: int) -> tuple[RobotSpec, Physics, np.ndarray]:
         f'[[joint]]\nname = "j{j}"\nkp = {0.8 * kp[j]}\nkd = {0.4 * total[j]}\neffort_limit = {limit[j]}\n'
         for j in range(n)
     )
-    (folder / "robot.toml").write_text(f'name = "warm{seed}"\ndt = {DT}\ntimestep = {DT / 4}\n{joints}')
+    (folder / "robot.toml").write_text(
+        f'name = "warm{seed}"\ndt = {DT}\ntimestep = {DT / 4}\n{joints}'
+    )
     robot, has, half = load_robot(folder), seed % 2 == 0, seed // 2 % 2 == 0
     thinning = has * np.exp(rng.uniform(np.log(3e-3), np.log(2e-2), n))
     passive = rng.uniform(0.3, 0.6) * half * has
@@ -76,7 +80,11 @@ def commands(n: int, seed: int, number: int) -> np.ndarray:
     """Draw sines, slow ways with rests, jumps or fast sines, (ROWS, n) rad."""
     rng, t = np.random.default_rng([seed, number, 22]), DT * np.arange(ROWS)[:, None]
     paces = rng.uniform(0.2, 0.8, n) * (4 if number % 4 == 3 else 1)
-    waves = rng.uniform(0.3, 0.8, n) * np.sin(2 * np.pi * paces * t + rng.uniform(0, 6, n)) * np.minimum(1, t)
+    waves = (
+        rng.uniform(0.3, 0.8, n)
+        * np.sin(2 * np.pi * paces * t + rng.uniform(0, 6, n))
+        * np.minimum(1, t)
+    )
     knots = rng.uniform(-0.7, 0.7, (8, n))
     ways = np.stack([np.interp(t[:, 0], np.repeat(np.arange(8), 2) * 0.6 + [0, 0.3] * 8, np.repeat(x, 2))
                      for x in knots.T], axis=1)  # fmt: skip
@@ -97,7 +105,9 @@ def record(robot: RobotSpec, unit: Physics, seed: int) -> list[Sequence]:
         virtual.step(ctrl[:, t])
     metas = [SequenceMeta(robot.name, "a", f"m{k:02}", 0.0, virtual=True) for k in range(MOTIONS)]
     return [
-        Sequence(meta, robot.joint_names, DT, ctrl[k], logs[0, k], logs[1, k], temperature=logs[2, k])
+        Sequence(
+            meta, robot.joint_names, DT, ctrl[k], logs[0, k], logs[1, k], temperature=logs[2, k]
+        )
         for k, meta in enumerate(metas)
     ]
 
@@ -111,7 +121,13 @@ def result(seed: int) -> dict[str, object]:
     term, without = next((c for c in fit.comparisons if c.name == "temperature"), None), fit
     if term and term.accepted:  # else the term changes nothing
         without = identify(
-            logs[:FITTED], robot, logs[FITTED:VALIDATED], terms=OTHER_TERMS, table=False, folds=1, nthread=1
+            logs[:FITTED],
+            robot,
+            logs[FITTED:VALIDATED],
+            terms=OTHER_TERMS,
+            table=False,
+            folds=1,
+            nthread=1,
         )
     return {
         "seed": seed, "true_per_kelvin": (-thinning).tolist(), "per_kelvin": fit.robot.friction_per_kelvin.tolist(),
@@ -139,16 +155,28 @@ def table(rows: list[Row]) -> None:
         some = [r for r in rows if r["seed"] % 4 == i]
         inside = [abs(c - true) <= NORMAL_90 * std for r in some if r["accepted"]
                   for c, true, std in zip(r["per_kelvin"], r["true_per_kelvin"], r["std"], strict=True)]  # fmt: skip
-        before, after = (1e3 * np.array([np.mean(r[k]) for r in some]) for k in ("test_without_rad", "test_rad"))
+        before, after = (
+            1e3 * np.array([np.mean(r[k]) for r in some]) for k in ("test_without_rad", "test_rad")
+        )
         accepted = sum(r["accepted"] for r in some)
         lines.append((kind, len(some), accepted, plus_minus(before), plus_minus(after), plus_minus(after - before),
                       f"{sum(inside)} of {len(inside)}"))  # fmt: skip
-    columns = ("VIRTUAL robots", "robots", "accepted", "without it, mrad", "with it, mrad", "change", "inside 90 %")
+    columns = (
+        "VIRTUAL robots",
+        "robots",
+        "accepted",
+        "without it, mrad",
+        "with it, mrad",
+        "change",
+        "inside 90 %",
+    )
     print_table(columns, lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--robots", type=int, default=40)

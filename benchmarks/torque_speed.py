@@ -103,10 +103,18 @@ def draw(seed: int) -> tuple[Arm, str, bool]:
 
 def commands(arm: Arm, seed: int, number: int) -> np.ndarray:
     """Draw jumps, sines and ramps, (ROWS, n) rad."""
-    rng, t, n = np.random.default_rng([seed, number, 12]), DT * np.arange(ROWS)[:, None], len(arm.kp)
+    rng, t, n = (
+        np.random.default_rng([seed, number, 12]),
+        DT * np.arange(ROWS)[:, None],
+        len(arm.kp),
+    )
     jumps = np.repeat(rng.uniform(-0.8, 0.8, (10, n)), ROWS // 10, axis=0)
     pace = arm.pace * rng.uniform(0.1, 0.5, n)
-    sines = rng.uniform(0.2, 0.7, n) * np.sin(2 * np.pi * pace * t + rng.uniform(0, 6, n)) * np.minimum(1, t)
+    sines = (
+        rng.uniform(0.2, 0.7, n)
+        * np.sin(2 * np.pi * pace * t + rng.uniform(0, 6, n))
+        * np.minimum(1, t)
+    )
     return (jumps, sines, 0.6 * jumps + 0.5 * sines, sines * rng.uniform(0.1, 0.5))[number % 4]
 
 
@@ -136,14 +144,19 @@ def play_dcmotor(arm: Arm, robot: RobotSpec, ctrl: np.ndarray, seed: int) -> np.
     spec = mujoco.MjSpec.from_string(arm.xml())
     spec.option.timestep = h
     for joint in spec.joints:
-        joint.solref_friction, joint.solimp_friction = [2.5 * h, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
+        joint.solref_friction, joint.solimp_friction = (
+            [2.5 * h, 1.0],
+            [0.9999, 0.9999, 0.001, 0.5, 2.0],
+        )
     no_load = np.where(np.isfinite(arm.no_load), arm.no_load, 100 * arm.speed)
     constant = VOLTS / no_load
     resistance = constant * VOLTS / arm.limit
     for j in range(n):
         motor = spec.add_actuator(name=f"j{j}", target=f"j{j}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_dcmotor(
-            motorconst=[constant[j], 0.0], resistance=resistance[j], ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE)
+            motorconst=[constant[j], 0.0],
+            resistance=resistance[j],
+            ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE),
         )
         motor.forcelimited, motor.forcerange = True, [-arm.limit[j], arm.limit[j]]
     model = spec.compile()
@@ -160,10 +173,18 @@ def play_dcmotor(arm: Arm, robot: RobotSpec, ctrl: np.ndarray, seed: int) -> np.
             error = np.sign(error) * np.maximum(np.abs(error) - arm.backlash / 2, 0.0)
             asked = arm.kp * error - arm.kd * data.qvel
             torque = torque + (asked - torque) * min(1.0, h / max(arm.current_time, h))
-            data.ctrl[:] = np.clip(torque * resistance / constant + constant * data.qvel, -VOLTS, VOLTS)
-            model.dof_frictionloss[:] = arm.friction * (1 + arm.stribeck * np.exp(-np.abs(data.qvel) / 0.1))
+            data.ctrl[:] = np.clip(
+                torque * resistance / constant + constant * data.qvel, -VOLTS, VOLTS
+            )
+            model.dof_frictionloss[:] = arm.friction * (
+                1 + arm.stribeck * np.exp(-np.abs(data.qvel) / 0.1)
+            )
             mujoco.mj_step(model, data)
-    return out + rng.standard_normal(out.shape) * np.array([arm.noise, 20 * arm.noise])[:, None, None, None]
+    return (
+        out
+        + rng.standard_normal(out.shape)
+        * np.array([arm.noise, 20 * arm.noise])[:, None, None, None]
+    )
 
 
 def measure(seed: int, work: Path, timestep: float) -> dict[str, object]:
@@ -176,13 +197,17 @@ def measure(seed: int, work: Path, timestep: float) -> dict[str, object]:
         f'[[joint]]\nname = "j{j}"\nkp = {arm.kp[j] * arm.stated_kp[j]:.6g}\nkd = {arm.kd[j] * arm.stated_kd[j]:.6g}\n'
         f"effort_limit = {arm.limit[j] * arm.stated_limit:.6g}\n" for j in range(n)
     )  # fmt: skip
-    (folder / "robot.toml").write_text(f'name = "arm{seed}"\ndt = {DT}\ntimestep = {timestep}\n{joints}')
+    (folder / "robot.toml").write_text(
+        f'name = "arm{seed}"\ndt = {DT}\ntimestep = {timestep}\n{joints}'
+    )
     robot = load_robot(folder)
     ctrl = np.stack([commands(arm, seed, i) for i in range(FITTED + TEST)])
     play = play_package if simulator == "package" else play_dcmotor
     qpos, qvel = play(arm, robot, ctrl, seed)
     motions = [
-        Sequence(SequenceMeta(robot.name, "a", f"m{i}", 0.0, virtual=True), robot.joint_names, DT, *x)
+        Sequence(
+            SequenceMeta(robot.name, "a", f"m{i}", 0.0, virtual=True), robot.joint_names, DT, *x
+        )
         for i, x in enumerate(zip(ctrl, qpos, qvel, strict=True))
     ]
     train, validation, test = motions[VALIDATION:FITTED], motions[:VALIDATION], motions[FITTED:]
@@ -194,10 +219,18 @@ def measure(seed: int, work: Path, timestep: float) -> dict[str, object]:
         "kd_right": bool((arm.kd * (arm.stated_kd - 1) == 0).all()), "stated": arm.stated_limit,
     }  # fmt: skip
     if not row["tried"]:  # the term costs nothing and changes nothing
-        return row | {"without": [0.0], "with": [0.0], "estimate": [0.0] * n, "no_load": [0.0] * n, "std": [0.0] * n}
+        return row | {
+            "without": [0.0],
+            "with": [0.0],
+            "estimate": [0.0] * n,
+            "no_load": [0.0] * n,
+            "std": [0.0] * n,
+        }
     options = {"windows": 8, "table": False, "nthread": 1}
     limits = tuple(t for t in base if t == "limit")
-    rich = plain = identify(train, robot, validation, terms=(*limits, "speed", *base[len(limits) :]), **options)
+    rich = plain = identify(
+        train, robot, validation, terms=(*limits, "speed", *base[len(limits) :]), **options
+    )
     row["seconds"] = time.perf_counter() - began
     if rich.robot.no_load_speed.any():  # else nothing of the term is left in the robot
         plain = identify(train, robot, validation, terms=base, **options)
@@ -214,7 +247,12 @@ def measure(seed: int, work: Path, timestep: float) -> dict[str, object]:
 def table(rows: list[Row]) -> None:
     """Print verdicts, coverage and errors of each kind of robots."""
     lines = []
-    for line, simulator in ((True, "package"), (True, "dcmotor"), (False, "package"), (False, "dcmotor")):
+    for line, simulator in (
+        (True, "package"),
+        (True, "dcmotor"),
+        (False, "package"),
+        (False, "dcmotor"),
+    ):
         some = [r for r in rows if (r["line"], r["simulator"]) == (line, simulator)]
         tried = [r for r in some if r["tried"]]
         without, rich = (np.array([np.mean(r[k]) for r in tried]) for k in ("without", "with"))
@@ -226,17 +264,29 @@ def table(rows: list[Row]) -> None:
         kind = f"{'line' if line else 'no line'}, {simulator}"
         lines.append((kind, len(some), len(tried), sum(any(r["estimate"]) for r in some), plus_minus(without),
                       plus_minus(rich), plus_minus(without - rich), f"{sum(inside)} of {len(inside)}"))  # fmt: skip
-    columns = ("VIRTUAL robots", "robots", "tried", "accepted", "without, mrad", "with, mrad", "better by, mrad")
+    columns = (
+        "VIRTUAL robots",
+        "robots",
+        "tried",
+        "accepted",
+        "without, mrad",
+        "with, mrad",
+        "better by, mrad",
+    )
     print_table((*columns, "no-load speed inside 90 %"), lines)
 
 
 def main() -> None:
     """Measure robots that are not in the file yet, then print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("work", type=Path)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--robots", type=int, default=40)
-    parser.add_argument("--timestep", type=float, default=0.005, help="physics step of the fitted robot, s")
+    parser.add_argument(
+        "--timestep", type=float, default=0.005, help="physics step of the fitted robot, s"
+    )
     args = parser.parse_args()
     file, seeds = args.work / "torque_speed.jsonl", range(args.first, args.first + args.robots)
     table(measure_seeds(file, seeds, lambda seed: measure(seed, args.work, args.timestep)))

@@ -126,7 +126,9 @@ def play(
             call("import", place, "--robot", mine, "--out", out, "--unit-id", "a", "--payload-mass",
                  place.name, "--position-unit", "rad", "--time-unit", "s")  # fmt: skip
     told = json.loads(call("doctor", data, "--json"))
-    row["doctor"] = [f"{f['level']} {f['check']}" for f in told["findings"] if f["level"] in ("warning", "error")]
+    row["doctor"] = [
+        f"{f['level']} {f['check']}" for f in told["findings"] if f["level"] in ("warning", "error")
+    ]
     try:
         took = Taken()
         fit = json.loads(call("identify", data, "--out", found, "--json"))
@@ -141,7 +143,10 @@ def play(
     row["identified"] = measured.get("identified", measured["nominal"])["mpjae"]
     judged = open_dataset(str(fresh), None, None)[0]
     whole = judged.sequences(judged.select())
-    row["motions"] = {"nominal": errors_of(whole, load_robot(mine)), "identified": errors_of(whole, load_robot(best))}
+    row["motions"] = {
+        "nominal": errors_of(whole, load_robot(mine)),
+        "identified": errors_of(whole, load_robot(best)),
+    }
     if not rival:
         return row
     took, (dataset, spec) = Taken(), open_dataset(str(data), None, None)
@@ -158,7 +163,10 @@ def errors_of(whole: list[Sequence], robot: RobotSpec) -> list[float]:
 
 
 def inside(
-    robot: RandomRobot, folder: Path, std: dict[str, dict[str, float]], undetermined: dict[str, list[str]]
+    robot: RandomRobot,
+    folder: Path,
+    std: dict[str, dict[str, float]],
+    undetermined: dict[str, list[str]],
 ) -> Row:
     """Compare parameters with the truth: deviation in standard errors and relative, by field; counts of those that
     identify reports as not determined."""
@@ -170,7 +178,10 @@ def inside(
         for j, joint in enumerate(robot.joints):
             i = spec.joint_names.index(joint.replace("/", "_"))
             value = getattr(spec, field)[i] + (spec.kd[i] if field == "damping" else 0.0)
-            far, error = abs(float(value - truth[field][j])), std.get(joint.replace("/", "_"), {}).get(field)
+            far, error = (
+                abs(float(value - truth[field][j])),
+                std.get(joint.replace("/", "_"), {}).get(field),
+            )
             if field in undetermined.get(joint.replace("/", "_"), ()):
                 row["undetermined"][field] = row["undetermined"].get(field, 0) + 1
             elif error and np.isfinite(far):
@@ -229,20 +240,36 @@ def tables(rows: list[Row]) -> list[str]:
             far = np.concatenate([[], *(r["relative"].get(field, []) for r in parts)])
             size = f"{np.median(far):.1%}" if len(far) else "–"
             unknown = sum(r["undetermined"].get(field, 0) for r in parts)
-            said.append(f"| {field} | {np.mean(sigmas <= 2):.0%} of {len(sigmas)} | {size} | {unknown} |")
-    false = [f"{r['seed']} ({e.removeprefix('error ')})" for r in rows for e in r["doctor"] if e.startswith("error")]
-    twice = [f"{r['seed']} {1e3 * r['first']:.3g} → {1e3 * r['identified']:.3g}" for r in rows if "first" in r]
+            said.append(
+                f"| {field} | {np.mean(sigmas <= 2):.0%} of {len(sigmas)} | {size} | {unknown} |"
+            )
+    false = [
+        f"{r['seed']} ({e.removeprefix('error ')})"
+        for r in rows
+        for e in r["doctor"]
+        if e.startswith("error")
+    ]
+    twice = [
+        f"{r['seed']} {1e3 * r['first']:.3g} → {1e3 * r['identified']:.3g}"
+        for r in rows
+        if "first" in r
+    ]
     said += ["", f"Played again after a mend, mrad: {', '.join(twice)}."] * bool(twice)
     return [*said, "", f"Errors that doctor sees in these good logs: {', '.join(false) or 'none'}."]
 
 
 def losers(rows: list[Row]) -> list[str]:
     """List robots that are worse than their file or the plain script, and refused ones."""
-    said = ["| seed | body | joints | Hz | effects | nominal, mrad | identified | plain | what |", "|---" * 9 + "|"]
+    said = [
+        "| seed | body | joints | Hz | effects | nominal, mrad | identified | plain | what |",
+        "|---" * 9 + "|",
+    ]
     for r in rows:
         worse = r["identified"] > WORSE * r["nominal"] or ("plain" in r and not level(r))
         if worse or "refused" in r or "plain_refused" in r:
-            mrad = [f"{1e3 * r[k]:.2f}" if k in r else "–" for k in ("nominal", "identified", "plain")]
+            mrad = [
+                f"{1e3 * r[k]:.2f}" if k in r else "–" for k in ("nominal", "identified", "plain")
+            ]
             why = r.get("refused", r.get("plain_refused", ""))[:160].replace("|", "/")
             effects = ", ".join(r["effects"]) or "of the form"
             robot = f"{r['seed']} | {r['body']} | {r['joints']} | {r['rate']:g}"
@@ -264,19 +291,30 @@ def known(journal: Path) -> dict[int, Row]:
 
 def main() -> None:
     """Run the missing robots one at a time, then print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("work", type=Path)
     parser.add_argument("--robots", type=int, default=10)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--motions", type=int, default=12)
-    parser.add_argument("--seconds", type=float, help="recorded of each robot; default two to five minutes")
+    parser.add_argument(
+        "--seconds", type=float, help="recorded of each robot; default two to five minutes"
+    )
     parser.add_argument("--small", action="store_true", help="small robots, a minute of logs")
     parser.add_argument("--alone", action="store_true", help="without the plain script")
-    parser.add_argument("--named", default="", help="part of a public model's path: every robot is this one")
     parser.add_argument(
-        "--file-error", default=FILE_ERRORS[0], choices=FILE_ERRORS, help="what its file has wrong beyond that"
+        "--named", default="", help="part of a public model's path: every robot is this one"
     )
-    parser.add_argument("--seeds", type=int, nargs="*", help="these, instead of a range; measured again")
+    parser.add_argument(
+        "--file-error",
+        default=FILE_ERRORS[0],
+        choices=FILE_ERRORS,
+        help="what its file has wrong beyond that",
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="*", help="these, instead of a range; measured again"
+    )
     parser.add_argument("--keep", action="store_true", help="keep each robot's folder")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
@@ -285,7 +323,9 @@ def main() -> None:
         write_text(journal, journal.read_text().rpartition("\n")[0] + "\n")
     seconds = args.seconds or (SMALL if args.small else None)
     for seed in args.seeds or range(args.first, args.first + args.robots):
-        if seed in known(journal) and not args.seeds:  # by another process on the same folder, perhaps
+        if (
+            seed in known(journal) and not args.seeds
+        ):  # by another process on the same folder, perhaps
             continue
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)
@@ -306,7 +346,10 @@ def main() -> None:
     text = "\n".join([*tables(rows), "", *losers(rows)]) + "\n"
     print(text)
     if (ratios(rows) > WORSE).any() or (ratios(rows, "plain") > WORSE_THAN_PLAIN).any():
-        parser.exit(1, "a robot is worse than its file by more than 1 %, or than the plain script by more than 10 %\n")
+        parser.exit(
+            1,
+            "a robot is worse than its file by more than 1 %, or than the plain script by more than 10 %\n",
+        )
 
 
 if __name__ == "__main__":

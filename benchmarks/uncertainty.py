@@ -43,7 +43,16 @@ from arm import write_arm
 
 MOTIONS, ROWS, GROUP, WINDOWS = 8, 750, 50, 12
 RIGHT = ("gain", "damping", "friction", "delay", "encoder")
-DAYS = ("train", "val", "same", "friction +20 %", "zero +5 mrad", "delay +5 ms", "backlash 8 mrad", "30 K warmer")
+DAYS = (
+    "train",
+    "val",
+    "same",
+    "friction +20 %",
+    "zero +5 mrad",
+    "delay +5 ms",
+    "backlash 8 mrad",
+    "30 K warmer",
+)
 ANOTHER = "another robot"
 NORMAL_90 = 1.645
 FORMS = ("right", "step", "wrong")
@@ -58,12 +67,15 @@ def commands(seed: int, dt: float) -> np.ndarray:
     rng, t = np.random.default_rng([seed, 77]), np.arange(ROWS)[:, None] * dt
     pace = np.exp(rng.uniform(np.log(0.1), np.log(1.5), (3, 2)))
     waves = sum(
-        rng.uniform(0.05, 0.25, 2) / (1 + 2 * p) * np.sin(2 * np.pi * p * t + rng.uniform(0, 6, 2)) for p in pace
+        rng.uniform(0.05, 0.25, 2) / (1 + 2 * p) * np.sin(2 * np.pi * p * t + rng.uniform(0, 6, 2))
+        for p in pace
     )
     stops = np.cumsum(rng.uniform(0.8, 2.5, 12))
     places = rng.uniform(-0.5, 0.5, (13, 2))
     when = np.r_[0, np.repeat(stops, 2) + np.tile([0, 0.5], 12)]
-    ways = np.stack([np.interp(t[:, 0], when, np.r_[p[0], np.repeat(p, 2)[1:25]]) for p in places.T], axis=1)
+    ways = np.stack(
+        [np.interp(t[:, 0], when, np.r_[p[0], np.repeat(p, 2)[1:25]]) for p in places.T], axis=1
+    )
     return ways + waves
 
 
@@ -78,17 +90,26 @@ def changed(p: Physics, what: str) -> Physics:
     return replace(p, warmth=p.warmth + 30.0) if what == "30 K warmer" else p
 
 
-def play(robot: RobotSpec, units: list[Physics], first: int, day: int, timestep: float | None) -> list[list[Sequence]]:
+def play(
+    robot: RobotSpec, units: list[Physics], first: int, day: int, timestep: float | None
+) -> list[list[Sequence]]:
     """Simulate the motions of one day for every unit, at a physics step in s or at the virtual robots' own."""
     n = len(units)
     ctrl = np.stack(
-        [commands(100_000 * day + 100 * (first + k) + m, robot.dt) for k in range(n) for m in range(MOTIONS)], 1
+        [
+            commands(100_000 * day + 100 * (first + k) + m, robot.dt)
+            for k in range(n)
+            for m in range(MOTIONS)
+        ],
+        1,
     )
     rows, empty = [u for u in units for _ in range(MOTIONS)], [(0.0, "both")] * ctrl.shape[1]
     sim = VirtualRobot(robot, rows, empty, robot.dt, timestep)
     rng = np.random.default_rng([first, day])
     warm = [
-        max(0.0, float(u.warmth[0] + u.warmth_spread[0] * rng.standard_normal())) for u in units for _ in range(MOTIONS)
+        max(0.0, float(u.warmth[0] + u.warmth_spread[0] * rng.standard_normal()))
+        for u in units
+        for _ in range(MOTIONS)
     ]
     sim.reset(ctrl[0], [1000 * day + i for i in range(ctrl.shape[1])], np.array(warm))
     seen = np.empty((2, *ctrl.shape), np.float32)
@@ -116,14 +137,19 @@ def virtual(work: Path, robots: int, form: str) -> None:
     done = len(file.read_text().splitlines()) if file.is_file() else 0
     for first in range(done, robots, GROUP):
         last = min(first + GROUP, robots)
-        units = [sample_unit(robot, fleet.distributions, fleet.seed, 1 + k) for k in range(first, last)]
+        units = [
+            sample_unit(robot, fleet.distributions, fleet.seed, 1 + k) for k in range(first, last)
+        ]
         if form != "wrong":
             units = [replace(u.only(RIGHT), friction_asymmetry=0 * u.friction) for u in units]
         step = None
         if form == "right":
             step = robot.timestep
             units = [replace(u, delay=np.ceil(u.delay / step - 1e-9) * step) for u in units]
-        days = [play(robot, [changed(u, what) for u in units], first, d, step) for d, what in enumerate(DAYS)]
+        days = [
+            play(robot, [changed(u, what) for u in units], first, d, step)
+            for d, what in enumerate(DAYS)
+        ]
         for k, unit in enumerate(units):
             line = _evaluated(robot, unit, [day[k] for day in days], days[2][(k + 1) % len(units)])
             with file.open("a") as out:
@@ -153,14 +179,30 @@ def _evaluated(
             for kind, std in zip(KINDS, (fit.std[joint][f], stored), strict=True):
                 z[kind][f].append((at[f] - float(v[i])) / std)
     fresh = days[1][3:]
-    error = np.concatenate([np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(fresh, replay(fresh, right), strict=True)])
-    inside = [float((error[:, i] <= k.residual_p90).mean()) for i, k in enumerate(mine.joints.values())]
-    alone = [float((error[:, i] <= NORMAL_90 * k.parameter_rms).mean()) for i, k in enumerate(mine.joints.values())]
+    error = np.concatenate(
+        [np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(fresh, replay(fresh, right), strict=True)]
+    )
+    inside = [
+        float((error[:, i] <= k.residual_p90).mean()) for i, k in enumerate(mine.joints.values())
+    ]
+    alone = [
+        float((error[:, i] <= NORMAL_90 * k.parameter_rms).mean())
+        for i, k in enumerate(mine.joints.values())
+    ]
     said = {}
     for what, logs in [*zip(DAYS[2:], days[2:], strict=True), (ANOTHER, another)]:
         found = drift(right, mine, logs, 1)
-        said[what] = {"verdict": found.verdict, "moved": [(m.joint, m.field, m.by, m.sigmas) for m in found.moved]}
-    return {"z": z, "inside": inside, "alone": alone, "said": said, "seconds": time.monotonic() - began}
+        said[what] = {
+            "verdict": found.verdict,
+            "moved": [(m.joint, m.field, m.by, m.sigmas) for m in found.moved],
+        }
+    return {
+        "z": z,
+        "inside": inside,
+        "alone": alone,
+        "said": said,
+        "seconds": time.monotonic() - began,
+    }
 
 
 def real(folder: Path, day: Path, other: Path, work: Path) -> None:
@@ -175,8 +217,13 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
         mine = estimate_uncertainty(robot, train, val)
         mine.save(work / "robot")
     op, lines = robot.operated_index, []
-    error = np.concatenate([np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(test, replay(test, robot), strict=True)])
-    inside = {j: float((error[:, i] <= k.residual_p90).mean()) for i, (j, k) in enumerate(mine.joints.items())}
+    error = np.concatenate(
+        [np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(test, replay(test, robot), strict=True)]
+    )
+    inside = {
+        j: float((error[:, i] <= k.residual_p90).mean())
+        for i, (j, k) in enumerate(mine.joints.items())
+    }
     inside["every joint"] = float((error <= [k.residual_p90 for k in mine.joints.values()]).mean())
     shares = ", ".join(f"{j} {100 * share:.0f} %" for j, share in inside.items())
     print(f"test samples inside the 90 % bands: {shares}", flush=True)
@@ -195,7 +242,10 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
             "moved": [(m.joint, m.field, m.by, m.sigmas) for m in found.moved],
             "aside": [a.recording for a in found.against], "took": time.monotonic() - began,
         })  # fmt: skip
-        moved = "; ".join(f"{m.joint}: {m.field} {m.by:+.3g} ({m.sigmas:+.1f} standard errors)" for m in found.moved)
+        moved = "; ".join(
+            f"{m.joint}: {m.field} {m.by:+.3g} ({m.sigmas:+.1f} standard errors)"
+            for m in found.moved
+        )
         print(f"{name}: {found.verdict}{'; ' * bool(moved)}{moved}", flush=True)
     facts = {"inside": inside, "alone": alone, "drift": lines,
              "joints": {j: (k.parameter_rms, k.residual_rms, k.residual_p90) for j, k in mine.joints.items()},
@@ -215,7 +265,11 @@ def table(work: Path) -> None:
         for f in lines[0]["z"]["printed"]:
             z = [np.abs([v for line in lines for v in line["z"][kind][f]]) for kind in KINDS]
             cells.append(
-                (f, *(f"{100 * np.mean(x < NORMAL_90):.0f} %" for x in z), *(f"{np.median(x):.2f}" for x in z))
+                (
+                    f,
+                    *(f"{100 * np.mean(x < NORMAL_90):.0f} %" for x in z),
+                    *(f"{np.median(x):.2f}" for x in z),
+                )
             )
         inside = [f"in 90 %, {kind}" for kind in KINDS]
         print_table(("number", *inside, *(f"median |z|, {kind}" for kind in KINDS)), cells)
@@ -238,7 +292,9 @@ def table(work: Path) -> None:
 
 def main() -> None:
     """Run one part."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("virtual", "real", "table"))
     parser.add_argument("paths", nargs="+", type=Path)
     parser.add_argument("--robots", type=int, default=100)

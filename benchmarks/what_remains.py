@@ -45,9 +45,12 @@ def main(dataset: str, folder: str) -> None:
     print(f"{'rows':<16}{'share':>7}{'all':>7}  " + "  ".join(robot.operated))
     for kind, total, count in zip(kinds, sums, counts, strict=True):
         joints = "  ".join(
-            f"{x:{len(j)}.2f}" for x, j in zip(total / np.maximum(count, 1), robot.operated, strict=True)
+            f"{x:{len(j)}.2f}"
+            for x, j in zip(total / np.maximum(count, 1), robot.operated, strict=True)
         )
-        print(f"{kind:<16}{count.sum() / counts.sum():7.2f}{total.sum() / max(count.sum(), 1):7.2f}  {joints}")
+        print(
+            f"{kind:<16}{count.sum() / counts.sum():7.2f}{total.sum() / max(count.sum(), 1):7.2f}  {joints}"
+        )
     whole, free = np.mean(means, axis=0)
     print(f"mean over {len(test)} motions: {whole:.2f} mrad, without rows at the table {free:.2f}")
 

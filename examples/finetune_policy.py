@@ -40,7 +40,9 @@ from gaponet.testing.virtual_robot import VirtualRobot
 Array = np.ndarray
 
 KINDS = ("reach", "pick_and_place", "lift", "wave", "stir", "mirror", "carry", "wander")
-LEARN = [f"{kind}-{variant}" for kind in KINDS for variant in ("both-0", "both-1", "left-0", "right-0")]
+LEARN = [
+    f"{kind}-{variant}" for kind in KINDS for variant in ("both-0", "both-1", "left-0", "right-0")
+]
 TRY = [f"{kind}-both-0" for kind in KINDS]
 LEARN_SEED, TRY_SEED = 101, 202  # different motions; the package's recipes use seed 0
 AHEAD = (2, 3, 5, 8, 11)  # observed rows of the reference, beside the next one
@@ -88,13 +90,20 @@ class Task:
         loads = []
         for mass in (0.0, heaviest):
             model = build_model(robot, mass)
-            moves = [[c, v := np.gradient(c, robot.dt, axis=0), np.gradient(v, robot.dt, axis=0)] for c in ctrls]
+            moves = [
+                [c, v := np.gradient(c, robot.dt, axis=0), np.gradient(v, robot.dt, axis=0)]
+                for c in ctrls
+            ]
             torque = np.concatenate([inverse_dynamics(model, *move) for move in moves])
-            damped = robot.kd * np.concatenate([move[1] for move in moves])  # the servo damps its own motion
+            damped = robot.kd * np.concatenate(
+                [move[1] for move in moves]
+            )  # the servo damps its own motion
             loads.append(((torque + damped) / robot.kp)[:, operated])
         self.load = np.array(loads)
 
-    def observe(self, q: Array, v: Array, row: Array, last: Array, mass: Array, action: Array) -> Array:
+    def observe(
+        self, q: Array, v: Array, row: Array, last: Array, mass: Array, action: Array
+    ) -> Array:
         """Return the observation, (N, 5 n + n len(AHEAD) + 1) float32.
 
         Args:
@@ -108,7 +117,15 @@ class Task:
         ahead = [self.reference[np.minimum(row + k, last)][:, self.op] - then for k in AHEAD]
         share = (mass / self.heaviest)[:, None]
         load = (1 - share) * self.load[0, at] + share * self.load[1, at]
-        parts = [then, (q - then) / REACH, 0.3 * v, load / REACH, action, share, *[a / REACH for a in ahead]]
+        parts = [
+            then,
+            (q - then) / REACH,
+            0.3 * v,
+            load / REACH,
+            action,
+            share,
+            *[a / REACH for a in ahead],
+        ]
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def target(self, row: Array, last: Array, action: Array) -> Array:
@@ -150,7 +167,9 @@ class TrackingEnv(VecEnv):
         seen = self.task.observe(q, v, self.row, self.last, self.sim.payload_mass, self.action)
         return TensorDict({"policy": torch.from_numpy(seen)}, batch_size=[self.num_envs])
 
-    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    def step(
+        self, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Step; the reward is minus the mean error in units of 20 mrad, minus a penalty for changes of the action."""
         action = actions.numpy().astype(float)
         self.sim.step(self.task.target(self.row, self.last, action))
@@ -171,11 +190,19 @@ class TrackingEnv(VecEnv):
 class Unit:
     """Copies of a virtual unit, one per payload and motion, with the methods of AlignedSim and sensor readings only."""
 
-    def __init__(self, robot: RobotSpec, task: Task, name: str, payload_mass: Array, fleet: str = "easy") -> None:
+    def __init__(
+        self, robot: RobotSpec, task: Task, name: str, payload_mass: Array, fleet: str = "easy"
+    ) -> None:
         physics = load_fleet(fleet, robot).unit(name)
         payloads = [(float(mass), "both") for mass in payload_mass]
-        self.robots = VirtualRobot(robot, [physics] * len(payloads), payloads, robot.dt, locked=task.locked, nthread=0)
-        self.payload_mass, self.free, self.home = payload_mass, robot.index(task.joints), robot.qpos_home
+        self.robots = VirtualRobot(
+            robot, [physics] * len(payloads), payloads, robot.dt, locked=task.locked, nthread=0
+        )
+        self.payload_mass, self.free, self.home = (
+            payload_mass,
+            robot.index(task.joints),
+            robot.qpos_home,
+        )
 
     def reset(self, qpos: Array) -> None:
         self.robots.reset(self._full(qpos), list(range(len(qpos))), WARMTH)
@@ -216,7 +243,8 @@ def train(name: str, runner: OnPolicyRunner, env: TrackingEnv, updates: int) -> 
         if k % max(updates // 4, 1) == 0:
             error, env.error = 1e3 * float(np.mean(env.error)), []
             print(
-                f"{name}: {k} of {updates} updates, {time.perf_counter() - start:.0f} s, {error:.1f} mrad", flush=True
+                f"{name}: {k} of {updates} updates, {time.perf_counter() - start:.0f} s, {error:.1f} mrad",
+                flush=True,
             )
     return runner
 
@@ -234,7 +262,9 @@ def follow(task: Task, plant: AlignedSim | Unit, policy: OnPolicyRunner | None) 
             q, v = plant.qpos[:, task.op], plant.qvel[:, task.op]
             seen = torch.from_numpy(task.observe(q, v, row, last, plant.payload_mass, action))
             with torch.inference_mode():
-                action = actor(TensorDict({"policy": seen}, batch_size=[count])).numpy().astype(float)
+                action = (
+                    actor(TensorDict({"policy": seen}, batch_size=[count])).numpy().astype(float)
+                )
         plant.step(task.target(row, last, action))
         going = row < last
         row = np.minimum(row + 1, last)
@@ -272,36 +302,57 @@ def main(
     """
     begin = time.perf_counter()
     torch.set_num_threads(1)  # the simulators take the other cores
-    first, more, num_envs, names = (2, 1, 16, LEARN[:2]) if quick else (first, more, num_envs, LEARN)
+    first, more, num_envs, names = (
+        (2, 1, 16, LEARN[:2]) if quick else (first, more, num_envs, LEARN)
+    )
     model = GapModel.load(run, threads=0)
-    corrected = load_robot(run / "robot")  # the simulator that the model corrects: nominal, or identified
+    corrected = load_robot(
+        run / "robot"
+    )  # the simulator that the model corrects: nominal, or identified
     robot = corrected.nominal or corrected
     heaviest = float(max(model.card["payload_seen"])) or model.config.payload_max
     task = Task(robot, motions(robot, heaviest, LEARN_SEED, names), heaviest)
     unseen = Task(robot, motions(robot, heaviest, TRY_SEED, TRY[: len(names)]), heaviest)
-    mass, tried = np.resize(np.linspace(0, heaviest, 4), num_envs), np.repeat([0.0, heaviest], len(unseen.first))
+    mass, tried = (
+        np.resize(np.linspace(0, heaviest, 4), num_envs),
+        np.repeat([0.0, heaviest], len(unseen.first)),
+    )
     plants: dict[str, AlignedSim | Unit] = {
-        "nominal simulator": AlignedSim(robot, None, tried, num_envs=len(tried), locked=task.locked),
-        "aligned simulator": AlignedSim(corrected, model, tried, num_envs=len(tried), locked=task.locked),
+        "nominal simulator": AlignedSim(
+            robot, None, tried, num_envs=len(tried), locked=task.locked
+        ),
+        "aligned simulator": AlignedSim(
+            corrected, model, tried, num_envs=len(tried), locked=task.locked
+        ),
         unit: Unit(robot, unseen, unit, tried),
     }
     results: dict[str, list[Array]] = {}
 
     def evaluate(name: str, policy: OnPolicyRunner | None) -> None:
-        errors = [follow(unseen, plant, policy).reshape(2, -1).mean(axis=1) for plant in plants.values()]
+        errors = [
+            follow(unseen, plant, policy).reshape(2, -1).mean(axis=1) for plant in plants.values()
+        ]
         results.setdefault(name, []).append(1e3 * np.array(errors))
 
-    print(f"{len(task.first)} motions to learn from, {len(unseen.first)} to try; {time.perf_counter() - begin:.0f} s")
+    print(
+        f"{len(task.first)} motions to learn from, {len(unseen.first)} to try; {time.perf_counter() - begin:.0f} s"
+    )
     evaluate("reference as target", None)
     for seed in seeds:
         torch.manual_seed(seed)
-        env = TrackingEnv(task, AlignedSim(robot, None, mass, num_envs=num_envs, locked=task.locked), seed)
+        env = TrackingEnv(
+            task, AlignedSim(robot, None, mass, num_envs=num_envs, locked=task.locked), seed
+        )
         policy = train("nominal", make_runner(env), env, first)
         evaluate("policy, nominal", policy)
         env.error = []
         longer = make_runner(env, policy)
-        aligned = TrackingEnv(task, AlignedSim(corrected, model, mass, num_envs=num_envs, locked=task.locked), seed)
-        evaluate("policy, fine-tuned", train("fine-tuning", make_runner(aligned, policy), aligned, more))
+        aligned = TrackingEnv(
+            task, AlignedSim(corrected, model, mass, num_envs=num_envs, locked=task.locked), seed
+        )
+        evaluate(
+            "policy, fine-tuned", train("fine-tuning", make_runner(aligned, policy), aligned, more)
+        )
         evaluate("policy, nominal as long", train("nominal, on", longer, env, more))
     print(table(results, list(plants), heaviest))
     print(f"{time.perf_counter() - begin:.0f} s in all")
@@ -314,7 +365,10 @@ def table(results: dict[str, list[Array]], plants: list[str], heaviest: float) -
     lines.append("| --- |" + " ---: |" * len(columns))
     for name, errors in results.items():
         mean, std = np.mean(errors, axis=0).ravel(), np.std(errors, axis=0).ravel()
-        cells = [f"{m:.1f} ± {s:.1f}" if len(errors) > 1 else f"{m:.1f}" for m, s in zip(mean, std, strict=True)]
+        cells = [
+            f"{m:.1f} ± {s:.1f}" if len(errors) > 1 else f"{m:.1f}"
+            for m, s in zip(mean, std, strict=True)
+        ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -75,35 +75,70 @@ def identified(work: Path, robot: str, fleet: str, unit: str, quick: bool) -> Pa
     recipe, data, known = work / "recipe.toml", work / "data", work / "identified"
     work.mkdir(parents=True, exist_ok=True)
     names = ["tour-all-0", "tour-all-1", "limber-all-0", "limber-all-1"] if quick else ["*"]
-    kept = {"motions": names, "payloads": [0.0], "units": [unit], "rates": [50], "repetitions": 1, "variants": 3}
+    kept = {
+        "motions": names,
+        "payloads": [0.0],
+        "units": [unit],
+        "rates": [50],
+        "repetitions": 1,
+        "variants": 3,
+    }
     recipe.write_text("".join(f"{name} = {json.dumps(value)}\n" for name, value in kept.items()))
-    said = ["--robot", robot, "--fleet", fleet, "--recipe", str(recipe), "--seed", str(RECORDED_SEED), "--nproc", "1"]
+    said = [
+        "--robot",
+        robot,
+        "--fleet",
+        fleet,
+        "--recipe",
+        str(recipe),
+        "--seed",
+        str(RECORDED_SEED),
+        "--nproc",
+        "1",
+    ]
     if gaponet(["collect", "--out", str(data), *said]):
         raise SystemExit(2)
     budget = ["--budget", "2s", "--terms", "--windows", "6"] if quick else ["--budget", "5m"]
-    if not (known / "robot.toml").is_file() and gaponet(["identify", str(data), "--out", str(known), *budget]):
+    if not (known / "robot.toml").is_file() and gaponet(
+        ["identify", str(data), "--out", str(known), *budget]
+    ):
         raise SystemExit(2)
     return known
 
 
 def drawn(known: Path, work: Path) -> list[RobotSpec]:
     """Return DRAWS of the units that gaponet exports for randomisation."""
-    if gaponet(["export", str(known), "--to", "randomization", "--out", str(work / "randomization")]):
+    if gaponet(
+        ["export", str(known), "--to", "randomization", "--out", str(work / "randomization")]
+    ):
         raise SystemExit(2)
-    units = json.loads((work / "randomization" / "randomization.json").read_text(encoding="utf-8"))["units"]
-    return robots_of(load_robot(known), {field: np.array(rows)[:DRAWS] for field, rows in units.items()})
+    units = json.loads((work / "randomization" / "randomization.json").read_text(encoding="utf-8"))[
+        "units"
+    ]
+    return robots_of(
+        load_robot(known), {field: np.array(rows)[:DRAWS] for field, rows in units.items()}
+    )
 
 
 def rollout(task: Task, robot: RobotSpec, policy: Any, file: Path) -> Array:
     """Simulate the first motion with the policy and write it as a log; returns its targets, (T, free) rad."""
-    sim, actor = AlignedSim(robot, None, np.zeros(1), num_envs=1, locked=task.locked), policy.get_inference_policy()
+    sim, actor = (
+        AlignedSim(robot, None, np.zeros(1), num_envs=1, locked=task.locked),
+        policy.get_inference_policy(),
+    )
     row, last, action = task.first[:1].copy(), task.last[:1], np.zeros((1, task.n))
     sim.reset(task.reference[row])
     states, targets = [], []
     while row[0] < last[0]:
-        seen = task.observe(sim.qpos[:, task.op], sim.qvel[:, task.op], row, last, np.zeros(1), action)
+        seen = task.observe(
+            sim.qpos[:, task.op], sim.qvel[:, task.op], row, last, np.zeros(1), action
+        )
         with torch.inference_mode():
-            action = actor(TensorDict({"policy": torch.from_numpy(seen)}, batch_size=[1])).numpy().astype(float)
+            action = (
+                actor(TensorDict({"policy": torch.from_numpy(seen)}, batch_size=[1]))
+                .numpy()
+                .astype(float)
+            )
         targets.append(task.target(row, last, action)[0])
         states.append(sim.qpos[0].copy())
         sim.step(targets[-1][None])
@@ -170,7 +205,9 @@ def main(
     spec, found = load_robot(robot), load_robot(known)
     kinds = ("tour", "limber")
     names = [f"{kind}-all-{v}" for kind in kinds for v in range(1 if quick else 8)]
-    task, unseen = (Task(spec, motions(spec, 0.0, seed, names), 1.0) for seed in (LEARN_SEED, TRY_SEED))
+    task, unseen = (
+        Task(spec, motions(spec, 0.0, seed, names), 1.0) for seed in (LEARN_SEED, TRY_SEED)
+    )
     tried = np.zeros(len(unseen.first))
     robots = {
         "nominal": [spec], "identified": [found], "identified + units": drawn(known, work),
@@ -183,7 +220,9 @@ def main(
             policy = train(name, make_runner(env), env, updates)
             own = Several(mine if len(mine) == 1 else [found], len(tried), unseen.locked)
             plants = [own, Unit(spec, unseen, unit, tried, fleet)]
-            errors.setdefault(name, []).append(1e3 * np.array([follow(unseen, p, policy) for p in plants]))
+            errors.setdefault(name, []).append(
+                1e3 * np.array([follow(unseen, p, policy) for p in plants])
+            )
             if name == "nominal" and seed == seeds[0]:
                 (work / "rollout").mkdir(exist_ok=True)
                 targets = rollout(unseen, spec, policy, work / "rollout" / "policy.npz")
@@ -200,7 +239,8 @@ def table(errors: dict[str, list[Array]]) -> str:
     for name, runs in errors.items():
         each = np.array(runs)  # (seeds, 2, motions)
         cells = [
-            f"{m:.1f} ± {s:.1f}" for m, s in zip(each.mean(axis=(0, 2)), each.mean(axis=2).std(axis=0), strict=True)
+            f"{m:.1f} ± {s:.1f}"
+            for m, s in zip(each.mean(axis=(0, 2)), each.mean(axis=2).std(axis=0), strict=True)
         ]
         apart = each[:, 1].mean(axis=0) - np.array(errors["nominal"])[:, 1].mean(axis=0)
         error = apart.std(ddof=1) / np.sqrt(len(apart)) if len(apart) > 1 else np.nan

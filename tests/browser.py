@@ -78,7 +78,9 @@ class Browser:
         """The answer to a command of the DevTools protocol; what happens meanwhile is kept in events."""
         self.count += 1
         message = {"id": self.count, "method": method, "params": parameters}
-        self.socket.send(json.dumps(message | ({"sessionId": self.session} if self.session else {})))
+        self.socket.send(
+            json.dumps(message | ({"sessionId": self.session} if self.session else {}))
+        )
         while (answer := json.loads(self.socket.recv(PATIENCE))).get("id") != self.count:
             self.events.append(answer)
         assert "error" not in answer, answer
@@ -86,7 +88,9 @@ class Browser:
 
     def value(self, script: str) -> Any:
         """What a JavaScript expression says in the page."""
-        return self.ask("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+        return self.ask("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
+            "value"
+        )
 
     def look(self, selector: str = "") -> np.ndarray:
         """What is seen of the page, or of one element: (height, width, 3) int."""
@@ -100,11 +104,19 @@ class Browser:
 
     def complaints(self) -> list[str]:
         """Exceptions of the page's scripts."""
-        return [json.dumps(e["params"]) for e in self.events if e.get("method") == "Runtime.exceptionThrown"]
+        return [
+            json.dumps(e["params"])
+            for e in self.events
+            if e.get("method") == "Runtime.exceptionThrown"
+        ]
 
     def requested(self) -> list[str]:
         """Everything that the page asked for, over whatever protocol."""
-        sent = [e["params"]["request"]["url"] for e in self.events if e.get("method") == "Network.requestWillBeSent"]
+        sent = [
+            e["params"]["request"]["url"]
+            for e in self.events
+            if e.get("method") == "Network.requestWillBeSent"
+        ]
         return [url for url in sent if not url.startswith("data:")]
 
 

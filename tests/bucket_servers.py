@@ -34,7 +34,10 @@ def free_ports(count: int, apart: int = 0) -> list[int]:
     while len(found) < count:
         with socket.create_server(("127.0.0.1", 0)) as one:
             port = one.getsockname()[1]
-            with suppress(OSError, OverflowError), socket.create_server(("127.0.0.1", port + apart if apart else 0)):
+            with (
+                suppress(OSError, OverflowError),
+                socket.create_server(("127.0.0.1", port + apart if apart else 0)),
+            ):
                 found.append(port)
     return found
 
@@ -43,7 +46,9 @@ def free_ports(count: int, apart: int = 0) -> list[int]:
 def running(command: list[str], url: str, folder: Path, env: dict[str, str]) -> Iterator[None]:
     """A server, until the block ends; skips the test where it does not answer in two minutes."""
     with (folder / "log").open("wb") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, env=os.environ | env)
+        process = subprocess.Popen(
+            command, stdout=log, stderr=log, cwd=folder, env=os.environ | env
+        )
     try:
         deadline = time.monotonic() + STARTS
         while time.monotonic() < deadline and process.poll() is None:
@@ -97,7 +102,11 @@ class Wire:
                 threading.Thread(target=self._pass, args=(client,), daemon=True).start()
 
     def _pass(self, client: socket.socket) -> None:
-        with client, suppress(OSError), socket.create_connection(("127.0.0.1", self.server)) as server:
+        with (
+            client,
+            suppress(OSError),
+            socket.create_connection(("127.0.0.1", self.server)) as server,
+        ):
             while not self.closed:
                 for one in select.select([client, server], [], [], 0.5)[0]:
                     block = one.recv(1 << 16)
@@ -129,7 +138,10 @@ def seaweed(folder: Path) -> Iterator[Wire]:
     wire = Wire(s3)
     with running(command, f"http://127.0.0.1:{s3}", folder, keys):
         deadline = time.monotonic() + STARTS
-        while "ready to use" not in (folder / "log").read_text(errors="replace") and time.monotonic() < deadline:
+        while (
+            "ready to use" not in (folder / "log").read_text(errors="replace")
+            and time.monotonic() < deadline
+        ):
             time.sleep(0.2)
         yield wire
         wire.close()
@@ -139,7 +151,12 @@ def seaweed(folder: Path) -> Iterator[Wire]:
 def google(folder: Path) -> Iterator[Wire]:
     """The stand-in of GCS with one bucket, behind a wire."""
     python = Path(environment("buckets", PYTHON, SERVERS))
-    server = next(python.parents[1].glob("lib/*/site-packages/fake_gcs_server*/vendor/*/bin/fake-gcs-server-*"), None)
+    server = next(
+        python.parents[1].glob(
+            "lib/*/site-packages/fake_gcs_server*/vendor/*/bin/fake-gcs-server-*"
+        ),
+        None,
+    )
     if server is None:
         pytest.skip("fake-gcs-server has no program for this machine")
     (port,) = free_ports(1)
@@ -149,7 +166,9 @@ def google(folder: Path) -> Iterator[Wire]:
                f"-external-url=http://127.0.0.1:{wire.port}", "-log-level=error"]  # fmt: skip
     with running(command, place, folder, {}):
         content = json.dumps({"name": BUCKET}).encode()
-        ask = urllib.request.Request(f"{place}?project=p", content, {"Content-Type": "application/json"})
+        ask = urllib.request.Request(
+            f"{place}?project=p", content, {"Content-Type": "application/json"}
+        )
         urllib.request.urlopen(ask, timeout=10)
         yield wire
         wire.close()

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported; tests that render skip where it fails
+    os.environ.setdefault(
+        "MUJOCO_GL", "egl"
+    )  # before mujoco is imported; tests that render skip where it fails
 
 from arm import write_arm
 
@@ -57,9 +59,13 @@ def paper_network() -> Path:
 
 
 @pytest.fixture(scope="session")
-def real_dataset(sage_so101: Path, so101: RobotSpec, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def real_dataset(
+    sage_so101: Path, so101: RobotSpec, tmp_path_factory: pytest.TempPathFactory
+) -> Dataset:
     """The public SO-101 logs, imported once; read only."""
     model = build_model(so101)
     out = tmp_path_factory.mktemp("real") / "so101"
     gravity = lambda qpos, mass, side: static_torque(model, qpos)  # noqa: E731
-    return import_logs(sage_so101, so101, "lab", 0.0, out, gravity=gravity, simulator="nominal").dataset
+    return import_logs(
+        sage_so101, so101, "lab", 0.0, out, gravity=gravity, simulator="nominal"
+    ).dataset

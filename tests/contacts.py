@@ -33,10 +33,16 @@ class Contacts:
                 geom.contype = geom.conaffinity = int(body.name not in shelled)
         for c in table["capsule"]:
             spec.body(c["body"]).add_geom(
-                type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*c["from"], *c["to"]], size=[c["radius"], 0, 0], mass=0
+                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+                fromto=[*c["from"], *c["to"]],
+                size=[c["radius"], 0, 0],
+                mass=0,
             )
         spec.worldbody.add_geom(
-            name="plane", type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0, 0, table["plane"]["height"]], size=[5, 5, 1]
+            name="plane",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            pos=[0, 0, table["plane"]["height"]],
+            size=[5, 5, 1],
         )
         groups = [tuple(group.split()) for group in table["same_limb"]]
         bodies = [body.name for body in spec.bodies if body.name != "world"]
@@ -61,7 +67,9 @@ class Contacts:
         if not found:
             return 0.0, ""
         depth, geoms = max(found, key=lambda f: f[0])
-        return float(depth), " and ".join(self.model.body(self.model.geom_bodyid[g]).name for g in geoms)
+        return float(depth), " and ".join(
+            self.model.body(self.model.geom_bodyid[g]).name for g in geoms
+        )
 
     def along(self, ctrl: np.ndarray, step: float = 0.01) -> tuple[float, str]:
         """The deepest along a command (T, n) rad, joint lines between its rows divided into at most `step` rad."""

@@ -23,7 +23,10 @@ def environment(name: str, version: str, *installs: tuple[str, ...]) -> str:
     give_up = pytest.fail if os.environ.get("CI") else pytest.skip
     if not (cache / "done").is_file():
         pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
-        named = [shutil.which(f"python{version}"), *map(str, pyenv.glob(f"versions/{version}.*/bin/python"))]
+        named = [
+            shutil.which(f"python{version}"),
+            *map(str, pyenv.glob(f"versions/{version}.*/bin/python")),
+        ]
         runs = lambda path: subprocess.run([path, "-c", ""], capture_output=True).returncode == 0  # noqa: E731
         found = next((path for path in named if path and runs(path)), None)
         if found is None:
@@ -31,7 +34,9 @@ def environment(name: str, version: str, *installs: tuple[str, ...]) -> str:
         subprocess.run([found, "-m", "venv", "--clear", cache], check=True)
         plain = {k: v for k, v in os.environ.items() if k not in ("PIP_CONSTRAINT", "PYTHONPATH")}
         for arguments in installs:
-            if subprocess.run([made, "-m", "pip", "install", "-q", *arguments], env=plain).returncode:
+            if subprocess.run(
+                [made, "-m", "pip", "install", "-q", *arguments], env=plain
+            ).returncode:
                 give_up(f"{' '.join(arguments)} cannot be installed here")
         (cache / "done").touch()
     return str(made)

@@ -49,9 +49,14 @@ def commands(robot: RobotSpec, seed: int) -> np.ndarray:
     low, high = np.clip(robot.qpos_range.T, -1.2, 1.2) * 0.8
     at, parts = robot.qpos_home.copy(), []
     while sum(map(len, parts)) * dt < SECONDS - 6:
-        goal = np.where(np.isin(robot.joint_names, robot.operated), rng.uniform(low, high), robot.qpos_home)
+        goal = np.where(
+            np.isin(robot.joint_names, robot.operated), rng.uniform(low, high), robot.qpos_home
+        )
         s = np.linspace(0, 1, round(rng.uniform(1.0, 2.0) / dt))[:, None]
-        parts += [at + (goal - at) * (10 * s**3 - 15 * s**4 + 6 * s**5), np.repeat(goal[None], round(1 / dt), axis=0)]
+        parts += [
+            at + (goal - at) * (10 * s**3 - 15 * s**4 + 6 * s**5),
+            np.repeat(goal[None], round(1 / dt), axis=0),
+        ]
         at = goal
     t = np.arange(round(6 / dt))[:, None] * dt
     wave = (
@@ -80,8 +85,13 @@ def recordings(robot: RobotSpec, kp: float = 0.9) -> list[Recording]:
             data.ctrl[:] = ctrl[max(t - DELAY, 0)]
             mujoco.mj_step(model, data, robot.decimation)
         qpos, qvel, tau = (np.array(x) for x in zip(*state, strict=True))
-        read = [x + size * rng.standard_normal(x.shape) for x, size in ((qpos, 3e-4), (qvel, 5e-3), (tau, 5e-3))]
-        found.append(Recording(f"m{seed}", mass, 0.5 + robot.dt * np.arange(len(ctrl)), ctrl, *read))
+        read = [
+            x + size * rng.standard_normal(x.shape)
+            for x, size in ((qpos, 3e-4), (qvel, 5e-3), (tau, 5e-3))
+        ]
+        found.append(
+            Recording(f"m{seed}", mass, 0.5 + robot.dt * np.arange(len(ctrl)), ctrl, *read)
+        )
     return found
 
 
@@ -99,7 +109,9 @@ def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Calla
             kp = (
                 ()
                 if gain is None
-                else tuple(f"{n}={gain * k}" for n, k in zip(robot.joint_names, robot.kp, strict=True))
+                else tuple(
+                    f"{n}={gain * k}" for n, k in zip(robot.joint_names, robot.kp, strict=True)
+                )
             )
             report = import_logs(folder / f"{mass:g}", robot, "a", mass, folder / "data", kp=kp)
         return DoctorResult.of(report.dataset, robot, gravity_model=gravity_of(robot))
@@ -112,7 +124,9 @@ def all_of(logs: list[Recording], change: Callable[[Recording], Recording]) -> l
     return [change(log) for log in logs]
 
 
-def one_of(logs: list[Recording], change: Callable[[Recording], Recording], which: int = 2) -> list[Recording]:
+def one_of(
+    logs: list[Recording], change: Callable[[Recording], Recording], which: int = 2
+) -> list[Recording]:
     """A fault in one log."""
     return [change(log) if i == which else log for i, log in enumerate(logs)]
 
@@ -142,7 +156,9 @@ def delayed(x: np.ndarray, rows: int = 5) -> np.ndarray:
     return np.concatenate([np.repeat(x[:1], rows, axis=0), x[:-rows]])
 
 
-def at(rows: slice, values: Callable[[np.ndarray], np.ndarray] | float) -> Callable[[np.ndarray], np.ndarray]:
+def at(
+    rows: slice, values: Callable[[np.ndarray], np.ndarray] | float
+) -> Callable[[np.ndarray], np.ndarray]:
     """Other values in some rows."""
 
     def change(x: np.ndarray) -> np.ndarray:

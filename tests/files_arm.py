@@ -45,7 +45,9 @@ FACES = [(1, 2, 4), (1, 4, 3), (5, 8, 6), (5, 7, 8), (1, 6, 2), (1, 5, 6), (3, 4
          (2, 6, 8), (2, 8, 4)]  # fmt: skip
 
 
-def write_files_arm(folder: Path, contacts: bool = False, scale: float = 1.0, **parts: str) -> RobotSpec:
+def write_files_arm(
+    folder: Path, contacts: bool = False, scale: float = 1.0, **parts: str
+) -> RobotSpec:
     """The arm in a folder of its own; parts: other text of toml, xml or common."""
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
     xml = parts.get("xml", XML).replace("CONTACT", "enable" if contacts else "disable")

@@ -25,7 +25,9 @@ class FakeHub(ThreadingHTTPServer):
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
         self.url = f"http://127.0.0.1:{self.server_port}"
-        self.repos: dict[str, list[tuple[str, Files]]] = {}  # "datasets/me/x" → commits, newest last
+        self.repos: dict[
+            str, list[tuple[str, Files]]
+        ] = {}  # "datasets/me/x" → commits, newest last
         self.tags: dict[str, dict[str, str]] = {}  # repository → tag → commit
         self.blobs: dict[str, bytes] = {}  # large files that arrived, by SHA-256
         self.sent: Counter[str] = Counter()  # large files uploaded, by SHA-256
@@ -48,7 +50,9 @@ class Handler(BaseHTTPRequestHandler):
     def log_message(self, *args: object) -> None:
         pass
 
-    def answer(self, value: object = None, status: int = 200, headers: dict[str, str] | None = None) -> None:
+    def answer(
+        self, value: object = None, status: int = 200, headers: dict[str, str] | None = None
+    ) -> None:
         body = value if isinstance(value, bytes) else json.dumps(value).encode()
         self.send_response(status)
         for name, text in {"Content-Length": str(len(body)), **(headers or {})}.items():
@@ -74,7 +78,9 @@ class Handler(BaseHTTPRequestHandler):
         """A commit, by its hash, its tag or the name of its branch; answers where there is none."""
         commits = self.server.repos.get(repo)
         revision = self.server.tags.get(repo, {}).get(revision, revision)
-        found = [c for c in commits or () if c[0] == revision] or (commits or [])[-1:] * (revision == "main")
+        found = [c for c in commits or () if c[0] == revision] or (commits or [])[-1:] * (
+            revision == "main"
+        )
         if not found:
             self.refuse(404, "RepoNotFound" if commits is None else "RevisionNotFound")
         return found[0] if found else None
@@ -86,8 +92,17 @@ class Handler(BaseHTTPRequestHandler):
         path = unquote(urlsplit(self.path).path)
         if m := re.fullmatch(rf"{REPO}(?:/revision/([^/]+))?", path):
             if found := self.at(m[1], m[2] or "main"):
-                files = [{"rfilename": name, "size": len(content)} for name, content in found[1].items()]
-                self.answer({"id": m[1].partition("/")[2], "sha": found[0], "siblings": files, "private": False})
+                files = [
+                    {"rfilename": name, "size": len(content)} for name, content in found[1].items()
+                ]
+                self.answer(
+                    {
+                        "id": m[1].partition("/")[2],
+                        "sha": found[0],
+                        "siblings": files,
+                        "private": False,
+                    }
+                )
         elif m := re.fullmatch(rf"{REPO}/tree/([^/]+)", path):
             if found := self.at(m[1], m[2]):
                 self.answer([entry(name, content) for name, content in sorted(found[1].items())])
@@ -127,7 +142,9 @@ class Handler(BaseHTTPRequestHandler):
             there = repo in self.server.repos
             if not there:
                 self.server.commit(repo, {".gitattributes": b"*.parquet filter=lfs\n"})
-            self.answer({"url": f"{self.server.url}/{repo.removeprefix('models/')}"}, 409 if there else 200)
+            self.answer(
+                {"url": f"{self.server.url}/{repo.removeprefix('models/')}"}, 409 if there else 200
+            )
         elif path == "/api/validate-yaml":
             self.answer({"errors": [], "warnings": []})
         elif re.fullmatch(rf"{REPO}/preupload/[^/]+", path):
@@ -137,7 +154,12 @@ class Handler(BaseHTTPRequestHandler):
                 for f in json.loads(data)["files"]
             ]})  # fmt: skip
         elif re.fullmatch(r"/(datasets/)?([^/]+/[^/]+)\.git/info/lfs/objects/batch", path):
-            self.answer({"transfer": "basic", "objects": [self.batch(o) for o in json.loads(data)["objects"]]})
+            self.answer(
+                {
+                    "transfer": "basic",
+                    "objects": [self.batch(o) for o in json.loads(data)["objects"]],
+                }
+            )
         elif m := re.fullmatch(rf"{REPO}/tag/([^/]+)", path):
             if found := self.at(m[1], m[2]):
                 self.server.tags.setdefault(m[1], {})[json.loads(data)["tag"]] = found[0]
@@ -152,7 +174,9 @@ class Handler(BaseHTTPRequestHandler):
         upload = {"upload": {"href": f"{self.server.url}/lfs/{asked['oid']}"}}
         return asked if asked["oid"] in self.server.blobs else asked | {"actions": upload}
 
-    def commit(self, repo: str, parent: tuple[str, Files], lines: list[dict[str, dict[str, str]]]) -> None:
+    def commit(
+        self, repo: str, parent: tuple[str, Files], lines: list[dict[str, dict[str, str]]]
+    ) -> None:
         files = dict(parent[1])
         for line in lines:
             key, value = line["key"], line["value"]
@@ -166,7 +190,13 @@ class Handler(BaseHTTPRequestHandler):
             elif key == "deletedFile":
                 del files[value["path"]]
         oid = self.server.commit(repo, files)
-        self.answer({"commitUrl": f"{self.server.url}/{repo}/commit/{oid}", "commitOid": oid, "hookOutput": ""})
+        self.answer(
+            {
+                "commitUrl": f"{self.server.url}/{repo}/commit/{oid}",
+                "commitOid": oid,
+                "hookOutput": "",
+            }
+        )
 
 
 def etag(name: str, content: bytes) -> str:
@@ -178,7 +208,12 @@ def etag(name: str, content: bytes) -> str:
 
 def entry(name: str, content: bytes) -> dict[str, object]:
     """A line of a listing."""
-    found: dict[str, object] = {"type": "file", "path": name, "size": len(content), "oid": etag(name, content)}
+    found: dict[str, object] = {
+        "type": "file",
+        "path": name,
+        "size": len(content),
+        "oid": etag(name, content),
+    }
     if name.endswith(LARGE):
         found["lfs"] = {"oid": etag(name, content), "size": len(content), "pointerSize": 130}
     return found

@@ -17,7 +17,9 @@ SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_rol
 PERIOD_US = 20060.0  # the public SO-101 logs' own
 
 
-def wave(rows: int, n: int, dt: float = 0.02006, amplitude: float = 0.3, hertz: float = 0.5) -> np.ndarray:
+def wave(
+    rows: int, n: int, dt: float = 0.02006, amplitude: float = 0.3, hertz: float = 0.5
+) -> np.ndarray:
     """Targets (rows, n): a sine of another phase and pace for every joint."""
     t = np.arange(rows)[:, None] * dt
     return amplitude * np.sin(2 * np.pi * hertz * t * (1 + 0.37 * np.arange(n)) + np.arange(n))
@@ -25,7 +27,11 @@ def wave(rows: int, n: int, dt: float = 0.02006, amplitude: float = 0.3, hertz: 
 
 def late(ctrl: np.ndarray, steps: int) -> np.ndarray:
     """The same `steps` rows later, first row held."""
-    return np.concatenate([np.repeat(ctrl[:1], steps, axis=0), ctrl[:-steps]]) if steps else ctrl.copy()
+    return (
+        np.concatenate([np.repeat(ctrl[:1], steps, axis=0), ctrl[:-steps]])
+        if steps
+        else ctrl.copy()
+    )
 
 
 def write_sage(
@@ -41,7 +47,9 @@ def write_sage(
     folder.mkdir(parents=True, exist_ok=True)
     time = 7.1 + PERIOD_US * np.arange(len(ctrl)) if time is None else time
     (folder / "joint_list.txt").write_text("\n".join(names) + "\n")
-    (folder / "event.csv").write_text("type,timestamp,event\nEVENT,0,CONTROL_MODE_ENABLE\nEVENT,7.1,MOTION_START\n")
+    (folder / "event.csv").write_text(
+        "type,timestamp,event\nEVENT,0,CONTROL_MODE_ENABLE\nEVENT,7.1,MOTION_START\n"
+    )
     numbers = lambda row: '"[' + ", ".join(repr(float(x)) for x in row) + ']"'  # noqa: E731
     qvel = np.zeros_like(qpos) if qvel is None else qvel
     tau = np.zeros_like(qpos) if tau is None else tau
@@ -51,7 +59,9 @@ def write_sage(
         for t, q, v, f in zip(time, qpos, qvel, tau, strict=True)
     ]
     (folder / "control.csv").write_text("\n".join(["type,timestamp,positions", *control]) + "\n")
-    (folder / "state_motor.csv").write_text("\n".join(["type,timestamp,positions,velocities,torques", *state]) + "\n")
+    (folder / "state_motor.csv").write_text(
+        "\n".join(["type,timestamp,positions,velocities,torques", *state]) + "\n"
+    )
     return folder
 
 
@@ -73,7 +83,11 @@ def stock(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    values = [np.full((n, 6), 10.0) + np.arange(n)[:, None] / 10 for n in rows] if values is None else values
+    values = (
+        [np.full((n, 6), 10.0) + np.arange(n)[:, None] / 10 for n in rows]
+        if values is None
+        else values
+    )
     feature = {"dtype": "float32", "shape": [6], "names": [f"{n}.pos" for n in names]}
     video = {"dtype": "video", "shape": [48, 64, 3], "names": None}
     info = {"codebase_version": "v3.0", "fps": 30, "robot_type": "so101_follower",
@@ -82,7 +96,10 @@ def stock(
     for place in ("meta/episodes/chunk-000", "data/chunk-000"):
         (folder / place).mkdir(parents=True, exist_ok=True)
     (folder / "meta" / "info.json").write_text(json.dumps(info | changes))
-    pq.write_table(pa.table({"task_index": [0], "__index_level_0__": ["Pick up!"]}), folder / "meta" / "tasks.parquet")
+    pq.write_table(
+        pa.table({"task_index": [0], "__index_level_0__": ["Pick up!"]}),
+        folder / "meta" / "tasks.parquet",
+    )
     starts = np.cumsum([0, *map(len, values)])
     pq.write_table(pa.Table.from_pylist([
         {"episode_index": i, "tasks": ["Pick up!"], "length": len(v), "data/chunk_index": 0, "data/file_index": 0,
@@ -103,7 +120,10 @@ def stock(
 def table_text(columns: dict[str, np.ndarray]) -> str:
     """CSV."""
     rows = zip(*columns.values(), strict=True)
-    return "\n".join([",".join(columns), *(",".join(repr(float(x)) for x in row) for row in rows)]) + "\n"
+    return (
+        "\n".join([",".join(columns), *(",".join(repr(float(x)) for x in row) for row in rows)])
+        + "\n"
+    )
 
 
 def arm_columns(rows: int = 60, dt: float = 0.02, lag: int = 2) -> dict[str, np.ndarray]:
@@ -116,7 +136,12 @@ def arm_columns(rows: int = 60, dt: float = 0.02, lag: int = 2) -> dict[str, np.
 
 
 def arm_sequence(
-    robot: RobotSpec, ctrl: np.ndarray, qpos: np.ndarray, motion: str = "m", payload: float = 0.0, **fields: object
+    robot: RobotSpec,
+    ctrl: np.ndarray,
+    qpos: np.ndarray,
+    motion: str = "m",
+    payload: float = 0.0,
+    **fields: object,
 ) -> Sequence:
     """A sequence of any robot at its own rate; qvel is the derivative unless given."""
     notes = fields.pop("notes", {})
@@ -133,7 +158,9 @@ def repeated_motions(folder: Path, robot: RobotSpec) -> Dataset:
             for k in range(3):
                 ctrl = wave(120, 2, hertz=0.4 + 0.2 * motion)
                 qpos = late(ctrl, 2 + (unit == "b")) + 0.002 * k
-                one = arm_sequence(robot, ctrl, qpos, f"m{motion}", unit=unit, payload=0.5 * (unit == "b"))
+                one = arm_sequence(
+                    robot, ctrl, qpos, f"m{motion}", unit=unit, payload=0.5 * (unit == "b")
+                )
                 data.append(replace(one, meta=replace(one.meta, repetition=k)))
     return data
 
@@ -146,6 +173,13 @@ def write_bam(file: Path, rows: int = 60, off: int | None = None, **changes: obj
          "goal_position": u, "torque_enable": off is None or i < off}
         for i, (u, q) in enumerate(zip(ctrl.tolist(), qpos.tolist(), strict=True))
     ]  # fmt: skip
-    head = {"mass": 0.49, "length": 0.1, "kp": 400, "vin": 7.4, "motor": "xl330", "trajectory": "sin_sin"}
+    head = {
+        "mass": 0.49,
+        "length": 0.1,
+        "kp": 400,
+        "vin": 7.4,
+        "motor": "xl330",
+        "trajectory": "sin_sin",
+    }
     file.write_text(json.dumps(head | {"entries": entries} | changes))
     return file

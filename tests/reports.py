@@ -24,7 +24,9 @@ CONFIG = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std
           "dataset": "../data", "dataset_hash": "0123", "command": "gaponet train data --out run"}  # fmt: skip
 
 
-def evaluated_run(arm: RobotSpec, data: Dataset, folder: Path, simulator: RobotSpec | None = None) -> Path:
+def evaluated_run(
+    arm: RobotSpec, data: Dataset, folder: Path, simulator: RobotSpec | None = None
+) -> Path:
     """Evaluated on motions in which only the elbow moves; 3 of 10 rounds of its supervised pre-training are done."""
     for sequence in recordings(arm, 4, rows=160, kp=0.5):
         ctrl = sequence.ctrl * [0.0, 1.0]

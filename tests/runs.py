@@ -19,9 +19,13 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
 
 TINY_TRAINING = TrainConfig(
-    model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
+    model=ModelConfig(
+        history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)
+    ),
     pretraining=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
-    ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
+    ppo=PPOConfig(
+        num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9
+    ),
     episode_s=0.5,
     validate_every=2,
 )
@@ -38,22 +42,38 @@ def differences(a: Any, b: Any, where: str = "") -> list[str]:
         assert a.keys() == b.keys()
         return [d for k in a for d in differences(a[k], b[k], f"{where}/{k}")]
     if isinstance(a, (list, tuple)):
-        return [d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{where}/{i}")]
+        return [
+            d
+            for i, (x, y) in enumerate(zip(a, b, strict=True))
+            for d in differences(x, y, f"{where}/{i}")
+        ]
     same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b or (a != a and b != b)
     return [] if same or where.endswith("/seconds") else [where]
 
 
-def untrained(folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gaponet", **parts: tuple[str, ...]) -> Path:
+def untrained(
+    folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gaponet", **parts: tuple[str, ...]
+) -> Path:
     """A run that was trained, validated and tested on these motions of a dataset."""
     config = ModelConfig(kind=kind, history=2, num_probes=2)  # type: ignore[arg-type]
     net = build_network(config, len(robot.operated)).eval()
     motions = {part: sorted(parts.get(part, ())) for part in ("train", "val", "test")}
-    card = make_card(config, robot, dt=[robot.dt], motions=motions, payload_seen=[0.0, 0.2], units=["a"], seed=0)
+    card = make_card(
+        config, robot, dt=[robot.dt], motions=motions, payload_seen=[0.0, 0.2], units=["a"], seed=0
+    )
     export(net, folder / "model", card, np.zeros((4, net.features.dim), np.float32))
-    split = {part: {e.id: e.hash for e in data.entries if e.meta.motion in names} for part, names in motions.items()}
+    split = {
+        part: {e.id: e.hash for e in data.entries if e.meta.motion in names}
+        for part, names in motions.items()
+    }
     (folder / "split.json").write_text(json.dumps(split))
     (folder / "delay_offset.json").write_text(
-        json.dumps({"delay": dict.fromkeys(robot.operated, 0.0), "offset": dict.fromkeys(robot.operated, 0.0)})
+        json.dumps(
+            {
+                "delay": dict.fromkeys(robot.operated, 0.0),
+                "offset": dict.fromkeys(robot.operated, 0.0),
+            }
+        )
     )
     save_robot(robot, folder / "robot")
     return folder
@@ -61,17 +81,26 @@ def untrained(folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gapone
 
 def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
     """A run whose operator adds the same to every target, rad: what it is told makes no difference."""
-    config = ModelConfig(history=2, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,))
+    config = ModelConfig(
+        history=2, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,)
+    )
     net = build_network(config, len(robot.operated)).eval()
     torch.nn.init.zeros_(net.trunk[-1].weight)
     torch.nn.init.zeros_(net.trunk[-1].bias)
     torch.nn.init.constant_(net.bias, delta)
-    export(net, folder / "model", make_card(config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2]), sample_inputs(net))
+    export(
+        net,
+        folder / "model",
+        make_card(config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2]),
+        sample_inputs(net),
+    )
     save_robot(robot, folder / "robot")
     return GapModel.load(folder)
 
 
-def random_run(folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] = (0.0, 0.2), **how: object) -> GapModel:
+def random_run(
+    folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] = (0.0, 0.2), **how: object
+) -> GapModel:
     """A run whose operator answers anything, up to some 0.1 rad: whatever it is told makes a difference."""
     small = {"history": 2, "stride": 2, "num_probes": 4}
     small |= dict.fromkeys(("branch_hidden", "trunk_hidden", "sensor_hidden"), (8,))
@@ -82,13 +111,20 @@ def random_run(folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] =
             p.add_(0.1 * torch.randn_like(p))
     net.features.standardise.std.fill_(0.3)
     card = make_card(net.config, robot, dt=[robot.dt], payload_seen=list(payload_seen))
-    export(net, folder / "model", card, torch.randn(20, net.config.input_dim(len(robot.operated))).numpy())
+    export(
+        net,
+        folder / "model",
+        card,
+        torch.randn(20, net.config.input_dim(len(robot.operated))).numpy(),
+    )
     torch.save({"best_state": net.state_dict()}, folder / "checkpoint.pt")
     save_robot(robot, folder / "robot")
     return GapModel.load(folder)
 
 
-SMALL = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
+SMALL = ModelConfig(
+    history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)
+)
 
 
 def small_model(robot: RobotSpec, folder: Path) -> GapModel:

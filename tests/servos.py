@@ -55,7 +55,11 @@ class Servos:
         said = b""
         while True:
             at = self._pending.find(b"\xff\xff")
-            if at < 0 or len(self._pending) < at + 4 or len(self._pending) < at + 4 + self._pending[at + 3]:
+            if (
+                at < 0
+                or len(self._pending) < at + 4
+                or len(self._pending) < at + 4 + self._pending[at + 3]
+            ):
                 return said
             end = at + 4 + self._pending[at + 3]
             request, self._pending = self._pending[at:end], self._pending[end:]
@@ -66,7 +70,9 @@ class Servos:
     def _obey(self, who: int, instruction: int, words: bytes) -> bytes:
         everyone = range(1, 7)
         if instruction == 0x82:  # sync read
-            return b"".join(self._reply(s, self.table[s - 1][words[0] : words[0] + words[1]]) for s in words[2:])
+            return b"".join(
+                self._reply(s, self.table[s - 1][words[0] : words[0] + words[1]]) for s in words[2:]
+            )
         if instruction == 0x83:  # sync write
             step = words[1] + 1
             for at in range(2, len(words), step):
@@ -77,13 +83,17 @@ class Servos:
                 self._store(servo, words[0], words[1:])
         if who not in everyone:
             return b""
-        return self._reply(who, self.table[who - 1][words[0] : words[0] + words[1]] if instruction == 2 else b"")
+        return self._reply(
+            who, self.table[who - 1][words[0] : words[0] + words[1]] if instruction == 2 else b""
+        )
 
     def _store(self, servo: int, at: int, data: bytes) -> None:
         self.table[servo - 1][at : at + len(data)] = data
         if self.get(servo, "torque"):
             self.set(
-                servo, "position", min(max(self.get(servo, "goal"), self.get(servo, "low")), self.get(servo, "high"))
+                servo,
+                "position",
+                min(max(self.get(servo, "goal"), self.get(servo, "low")), self.get(servo, "high")),
             )
 
     def _reply(self, servo: int, data: bytes) -> bytes:

@@ -23,21 +23,38 @@ def motion(rows: int = ROWS) -> tuple[np.ndarray, np.ndarray]:
 def write_npz(folder: Path, rows: int = ROWS) -> None:
     """A plain one."""
     ctrl, qpos = motion(rows)
-    np.savez(folder / "a.npz", target=ctrl, q=qpos, time=0.02 * np.arange(rows), joint_names=np.array(JOINTS))
-    (folder / "logs.toml").write_text('ctrl = "target"\nqpos = "q"\ntime_unit = "s"\nposition_unit = "rad"\n')
+    np.savez(
+        folder / "a.npz",
+        target=ctrl,
+        q=qpos,
+        time=0.02 * np.arange(rows),
+        joint_names=np.array(JOINTS),
+    )
+    (folder / "logs.toml").write_text(
+        'ctrl = "target"\nqpos = "q"\ntime_unit = "s"\nposition_unit = "rad"\n'
+    )
 
 
 def write_gaponet(folder: Path, rows: int = ROWS, objects: bool = True) -> None:
     """GAPONet's own motion file of two motions: arrays of objects, or one padded array."""
     ctrl, qpos = motion(rows)
-    parts = {"real_dof_positions_cmd": ctrl, "real_dof_positions": qpos, "real_dof_velocities": 0 * qpos}
+    parts = {
+        "real_dof_positions_cmd": ctrl,
+        "real_dof_positions": qpos,
+        "real_dof_velocities": 0 * qpos,
+    }
     pad = lambda x: np.concatenate([x, np.zeros((5, 2))])  # noqa: E731
     stack = {k: np.stack([pad(v), pad(v[::-1])]) for k, v in parts.items()}
     if objects:
         for name, x in parts.items():
             stack[name] = np.empty(2, object)
             stack[name][:] = [x, x[::-1][:-3]]
-    np.savez(folder / "a.npz", **stack, joint_sequence=np.array(JOINTS, object), payloads=np.array([0.0, 0.2]))
+    np.savez(
+        folder / "a.npz",
+        **stack,
+        joint_sequence=np.array(JOINTS, object),
+        payloads=np.array([0.0, 0.2]),
+    )
     (folder / "logs.toml").write_text("rate = 50.0\n")
 
 
@@ -59,7 +76,8 @@ def write_mat(folder: Path, rows: int = ROWS) -> None:
     ctrl, qpos = motion(rows)
     savemat(folder / "a.mat", {"log": {"cmd": ctrl, "q": qpos}, "t": 20.0 * np.arange(rows)})
     (folder / "logs.toml").write_text(
-        TOML + 'time = "t"\ntime_unit = "ms"\nposition_unit = "rad"\nctrl = "log.cmd"\nqpos = "log.q"\n'
+        TOML
+        + 'time = "t"\ntime_unit = "ms"\nposition_unit = "rad"\nctrl = "log.cmd"\nqpos = "log.q"\n'
     )
 
 
@@ -69,14 +87,19 @@ def write_pace(folder: Path, rows: int = ROWS) -> None:
 
     ctrl, qpos = map(torch.tensor, motion(rows))
     gains = {"kp": np.array([20.0, 30.0]), "kd": np.array([1.0, 1.5])}
-    torch.save({"time": 0.02 * torch.arange(rows), "dof_pos": qpos, "des_dof_pos": ctrl} | gains, folder / "a.pt")
+    torch.save(
+        {"time": 0.02 * torch.arange(rows), "dof_pos": qpos, "des_dof_pos": ctrl} | gains,
+        folder / "a.pt",
+    )
     (folder / "logs.toml").write_text(TOML)
 
 
 def write_asap(folder: Path, rows: int = ROWS) -> None:
     """Actions as ASAP's policy gives them: a quarter of them is added to home."""
     ctrl, qpos = motion(rows)
-    (folder / "a.pkl").write_bytes(pickle.dumps({"walk": {"dof": qpos, "action": ctrl / 0.25, "fps": 50}}))
+    (folder / "a.pkl").write_bytes(
+        pickle.dumps({"walk": {"dof": qpos, "action": ctrl / 0.25, "fps": 50}})
+    )
     (folder / "logs.toml").write_text(TOML + "action_scale = 0.25\n")
 
 
@@ -111,7 +134,9 @@ def write_bag(
     for name, text in HG.items():
         store.register(get_types_from_msg(text, f"unitree_hg/msg/{name}"))
     store.register(get_types_from_msg(CUSTOM, "my_robot_msgs/msg/JointCommand"))
-    store.register(get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState"))
+    store.register(
+        get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState")
+    )
     make = lambda kind, **fields: store.types[kind](**fields)  # noqa: E731
     ctrl, qpos = motion(rows)
     none = np.array([])
@@ -122,7 +147,9 @@ def write_bag(
 
     def state(t: float, x: np.ndarray) -> tuple[str, object]:
         kind = "sensor_msgs/msg/JointState"
-        return kind, make(kind, header=header(t), name=list(JOINTS), position=x, velocity=none, effort=none)
+        return kind, make(
+            kind, header=header(t), name=list(JOINTS), position=x, velocity=none, effort=none
+        )
 
     def point(x: np.ndarray) -> object:
         zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
@@ -142,11 +169,18 @@ def write_bag(
         if kind == "custom":
             told = "my_robot_msgs/msg/JointCommand"
             return told, make(
-                told, header=header(t), joints=list(JOINTS), position=x, gains=np.ones(3, np.float32), mode=2
+                told,
+                header=header(t),
+                joints=list(JOINTS),
+                position=x,
+                gains=np.ones(3, np.float32),
+                mode=2,
             )
         if kind == "array":
             layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-            return "std_msgs/msg/Float64MultiArray", make("std_msgs/msg/Float64MultiArray", layout=layout, data=x)
+            return "std_msgs/msg/Float64MultiArray", make(
+                "std_msgs/msg/Float64MultiArray", layout=layout, data=x
+            )
         if kind == "controller":
             told = "control_msgs/msg/JointTrajectoryControllerState"
             return told, make(told, header=header(t), joint_names=list(JOINTS), reference=point(x), feedback=point(x),
@@ -179,7 +213,11 @@ def write_bag(
         for i in range(rows):
             t = 100.0 + 0.02 * i
             for _ in range(1 + twice):
-                send("/joint_states", t + 0.001, low_state(qpos[i]) if command == "unitree" else state(t, qpos[i]))
+                send(
+                    "/joint_states",
+                    t + 0.001,
+                    low_state(qpos[i]) if command == "unitree" else state(t, qpos[i]),
+                )
             if i % 2 == 0 and with_command:
                 told = message(command, t + 0.004 + away + drift * (t - 100.0), ctrl[i])
                 send("/arm/commands", t + 0.005, told)

@@ -18,7 +18,9 @@ def test_public_names_are_there_and_what_is_not_says_what_is():
     assert {"import_logs", "train", "evaluate", "GapModel"} <= set(dir(gp))
     for name in dir(gp):
         assert getattr(gp, name) is not None
-    with pytest.raises(AttributeError, match=r"no attribute 'fit'; it offers adapt_model, adapt_robot, check"):
+    with pytest.raises(
+        AttributeError, match=r"no attribute 'fit'; it offers adapt_model, adapt_robot, check"
+    ):
         gp.fit  # noqa: B018
 
 
@@ -28,7 +30,9 @@ def test_no_public_name_hides_behind_a_module_of_the_same_name():
         "mods = [m.name for m in pkgutil.iter_modules(gp.__path__)]\n"
         "print(sorted(set(mods) & set(dir(gp))))"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert out.strip() == "[]"
 
 
@@ -41,10 +45,16 @@ def test_from_a_dataset_to_an_evaluated_model(tmp_path, capsys):
     nominal = gp.gap(data, robot=robot).mpjae["nominal"]
     assert gp.doctor(data, robot=robot).verdict
     small = TrainConfig(
-        ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-        pretraining=PretrainingConfig(rounds=2, num_envs=16, steps=60, gradient_steps=60, batch_size=256),
+        ModelConfig(
+            history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)
+        ),
+        pretraining=PretrainingConfig(
+            rounds=2, num_envs=16, steps=60, gradient_steps=60, batch_size=256
+        ),
     )
-    model = gp.train(data, out=tmp_path / "run", budget=str(2 * 16 * 60), config=small, robot=robot).model
+    model = gp.train(
+        data, out=tmp_path / "run", budget=str(2 * 16 * 60), config=small, robot=robot
+    ).model
     found = gp.evaluate(model, data, robot=robot)
     assert found.unseen
     assert found.mpjae["gaponet"] < 0.8 * nominal

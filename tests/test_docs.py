@@ -21,7 +21,10 @@ FOLDERS = sorted(p.name for p in SOURCE.iterdir() if p.is_dir() and any(p.glob("
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 ALL_PAGES = sorted((ROOT / "docs").glob("**/*.md"))
 MODEL, TRAIN, START = ModelConfig(), TrainConfig(), TRAINING.pretraining
-ONLINE = ("https://github.com/gaponet/gaponet/blob/main/", "https://raw.githubusercontent.com/gaponet/gaponet/main/")
+ONLINE = (
+    "https://github.com/gaponet/gaponet/blob/main/",
+    "https://raw.githubusercontent.com/gaponet/gaponet/main/",
+)
 
 
 def text(page: str) -> str:
@@ -62,7 +65,9 @@ def test_words_for_fractions_are_the_code_s_too():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_source_file_that_a_page_names_is_there(page):
-    for name in re.findall(rf"`((?:{'|'.join(FOLDERS)})/[a-z0-9_/]*(?:\.py)?)`", page.read_text(encoding="utf-8")):
+    for name in re.findall(
+        rf"`((?:{'|'.join(FOLDERS)})/[a-z0-9_/]*(?:\.py)?)`", page.read_text(encoding="utf-8")
+    ):
         assert (SOURCE / name).exists(), f"{page.name}: {name}"
 
 
@@ -71,7 +76,9 @@ def test_the_architecture_page_names_every_folder_once_and_each_step_of_the_walk
     rows = re.findall(r"^\| `([a-z]+)/` \|", page, re.MULTILINE)
     assert sorted(rows) == FOLDERS
     for walk in (
-        section for section in page.split("\n## ") if section.startswith(("One CSV row", "One control period"))
+        section
+        for section in page.split("\n## ")
+        if section.startswith(("One CSV row", "One control period"))
     ):
         steps = re.findall(r"^\d\. (?:.|\n(?!\d\. |\n))+", walk, re.MULTILINE)
         assert len(steps) >= 5
@@ -84,7 +91,9 @@ def test_the_architecture_page_names_every_folder_once_and_each_step_of_the_walk
 
 def test_the_api_page_describes_every_public_name_where_it_lives():
     described = re.findall(
-        r"^::: (gaponet\w*\.[\w.]+)", (ROOT / "docs/api.md").read_text(encoding="utf-8"), re.MULTILINE
+        r"^::: (gaponet\w*\.[\w.]+)",
+        (ROOT / "docs/api.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
     )
     homes = {path.rpartition(".")[2]: path.rpartition(".")[0] for path in described}
     assert len(homes) == len(described)
@@ -116,7 +125,9 @@ def test_the_navigation_of_the_site_has_every_page():
 def anchors(page: Path) -> set[str]:
     """Return the anchors of a page's headings: lower case, no punctuation, hyphens for spaces."""
     heads = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return {re.sub(r"[ -]+", "-", re.sub(r"[^\w\s-]", "", head.lower())).strip("-") for head in heads}
+    return {
+        re.sub(r"[ -]+", "-", re.sub(r"[^\w\s-]", "", head.lower())).strip("-") for head in heads
+    }
 
 
 def test_every_link_of_a_page_leads_to_a_page_and_a_heading_that_are_there():
@@ -133,7 +144,11 @@ def test_every_link_of_a_page_leads_to_a_page_and_a_heading_that_are_there():
 def test_every_step_of_the_results_page_is_a_command_of_make_results():
     page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
     steps = tomllib.loads((ROOT / "benchmarks/results.toml").read_text(encoding="utf-8"))["steps"]
-    tables = [t for t in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE) if "| step" in t.partition("\n")[0]]
+    tables = [
+        t
+        for t in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE)
+        if "| step" in t.partition("\n")[0]
+    ]
     cells = [row.strip("|\n").rpartition("|")[2] for t in tables for row in t.splitlines()[2:]]
     assert len(cells) > 15
     for cell in cells:
@@ -141,7 +156,9 @@ def test_every_step_of_the_results_page_is_a_command_of_make_results():
     assert set(re.findall(r"[sS]tep ([a-z]\w+_\w+)", page)) <= steps.keys()
 
 
-@pytest.mark.parametrize(("page", "limit"), [("docs/results.md", 1500), ("docs/results/did-not-work.md", 1000)])
+@pytest.mark.parametrize(
+    ("page", "limit"), [("docs/results.md", 1500), ("docs/results/did-not-work.md", 1000)]
+)
 def test_the_results_stay_short(page, limit):
     assert len(re.findall(r"\S*\w\S*", text(page))) <= limit
 
@@ -154,7 +171,11 @@ def test_the_tables_of_real_robots_are_those_of_the_measured_rows(monkeypatch):
         assert line in readme
     page = text("docs/results.md").partition("### Causes")[0]
     shares = {r["set"]: f"{r['of_nominal']:.2f}" for r in rows if r["method"] == "identification"}
-    new = {"h1_2": next(r for r in rows if (r["set"], r["method"]) == ("h1_2", "identification"))["of_nominal"]}
+    new = {
+        "h1_2": next(r for r in rows if (r["set"], r["method"]) == ("h1_2", "identification"))[
+            "of_nominal"
+        ]
+    }
     for name in ("so101", "g1_arms", "go2", "go2_other_lab", "aliengo", "z1", "xl330"):
         assert f" {shares[name]}" in page, name
     assert f"new commands {new['h1_2']:.2f}" in page

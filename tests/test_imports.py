@@ -27,7 +27,18 @@ INNER = {
     "experiments": ("virtual",),
 }
 BESIDE = {"report": {"report"}}  # modules above the folders beside them
-HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
+HEAVY = (
+    "mujoco",
+    "torch",
+    "pyarrow",
+    "scipy",
+    "rich",
+    "tyro",
+    "matplotlib",
+    "onnxruntime",
+    "rsl_rl",
+    "pydantic",
+)
 MODULES = {
     ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): file
     for file in PACKAGE.rglob("*.py")
@@ -60,7 +71,9 @@ def imported(file: Path) -> set[str]:
         if isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {f"{node.module}.{a.name}" for a in node.names} & MODULES.keys() or {node.module}
+            found |= {f"{node.module}.{a.name}" for a in node.names} & MODULES.keys() or {
+                node.module
+            }
     return found & MODULES.keys()
 
 
@@ -84,7 +97,9 @@ def circle(edges: dict[str, set[str]]) -> list[str]:
 
 def test_import_gaponet_loads_numpy_alone():
     code = f"import sys, gaponet; print([m for m in {HEAVY!r} if m in sys.modules])"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert out.strip() == "[]"
 
 
@@ -104,17 +119,27 @@ def test_every_sub_package_has_a_rank():
 
 
 def test_what_the_tables_of_commands_formats_and_writers_name_is_there():
-    homes = {PACKAGE / "data" / kind / f"{name}.py" for kind in ("formats", "writers") for name in ("npz", "lerobot")}
+    homes = {
+        PACKAGE / "data" / kind / f"{name}.py"
+        for kind in ("formats", "writers")
+        for name in ("npz", "lerobot")
+    }
     assert homes <= {MODULES[where] for where in (*FORMATS.values(), *WRITERS.values())}
     for where in (*COMMANDS.values(), *FORMATS.values(), *WRITERS.values()):
         module, _, name = where.partition(":")
         tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
-        assert not name or name in {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}, where
+        assert not name or name in {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}, (
+            where
+        )
 
 
 def test_no_module_imports_one_that_imports_it_not_even_in_a_function():
-    facade = {"gaponet"}  # names its public functions for type checkers, and imports them at their first use
-    assert circle({name: imported(file) for name, file in MODULES.items() if name not in facade}) == []
+    facade = {
+        "gaponet"
+    }  # names its public functions for type checkers, and imports them at their first use
+    assert (
+        circle({name: imported(file) for name, file in MODULES.items() if name not in facade}) == []
+    )
 
 
 def test_no_folder_is_more_than_a_newcomer_can_hold():
@@ -130,7 +155,9 @@ def test_torch_is_imported_only_where_networks_live():
     for file in MODULES.values():
         place = file.relative_to(PACKAGE).as_posix()
         names = top_level_imports(ast.parse(file.read_text(encoding="utf-8")))
-        uses = "import torch" in file.read_text(encoding="utf-8") or any(n.split(".")[0] == "rsl_rl" for n in names)
+        uses = "import torch" in file.read_text(encoding="utf-8") or any(
+            n.split(".")[0] == "rsl_rl" for n in names
+        )
         assert not uses or place in allowed or place.startswith(free), place
 
 
@@ -161,5 +188,9 @@ def test_scripts_import_names_that_exist(folder):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gaponet."):
                 there = names(MODULES[node.module]) if node.module in MODULES else set()
-                absent += [f"{file.name}: {node.module}.{a.name}" for a in node.names if a.name not in there]
+                absent += [
+                    f"{file.name}: {node.module}.{a.name}"
+                    for a in node.names
+                    if a.name not in there
+                ]
     assert absent == []

@@ -53,12 +53,17 @@ BROKEN = {
     "the module raises": ("raise ValueError('two\\nlines')", "(ValueError: two"),
     "the module ends Python": ("raise SystemExit(3)", "(SystemExit"),
     "it is no reader": ("", "(AttributeError"),
-    "it fails on a file": ("EXTRA = ''\ndef detects(path): raise RuntimeError('no')", "(RuntimeError: no"),
+    "it fails on a file": (
+        "EXTRA = ''\ndef detects(path): raise RuntimeError('no')",
+        "(RuntimeError: no",
+    ),
 }
 
 
 @pytest.mark.parametrize(("source", "said"), BROKEN.values(), ids=BROKEN)
-def test_a_broken_format_is_one_warning_and_every_other_is_read(installed, tmp_path, caplog, source, said):
+def test_a_broken_format_is_one_warning_and_every_other_is_read(
+    installed, tmp_path, caplog, source, said
+):
     installed("[gaponet.formats]\nwav = HERE_wav\n", wav=source)
     (tmp_path / "log.npz").touch()
     for _ in range(2):
@@ -108,7 +113,9 @@ def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, c
 def test_the_format_of_the_architecture_page_is_listed_and_read(installed, tmp_path, capsys):
     page = (Path(__file__).parents[1] / "docs/architecture.md").read_text(encoding="utf-8")
     section = page.partition("## A package of your own")[2]
-    project, module = (re.findall(rf"```{kind}\n(.*?)```", section, re.DOTALL)[0] for kind in ("toml", "python"))
+    project, module = (
+        re.findall(rf"```{kind}\n(.*?)```", section, re.DOTALL)[0] for kind in ("toml", "python")
+    )
     points = tomllib.loads(project)["project"]["entry-points"]
     assert set(points) <= set(plugins.GROUPS)
     (tmp_path / f"{points['gaponet.formats']['mylog']}.py").write_text(module)
@@ -128,7 +135,9 @@ def test_the_format_of_the_architecture_page_is_listed_and_read(installed, tmp_p
 
 
 def test_run_lists_and_opens_the_drivers_of_extensions(installed, tmp_path):
-    installed("[gaponet.drivers]\ntoy = HERE_toy:Toy\n", toy="def Toy(robot, port): raise OSError(port)")
+    installed(
+        "[gaponet.drivers]\ntoy = HERE_toy:Toy\n", toy="def Toy(robot, port): raise OSError(port)"
+    )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
 
     def said(*words: str) -> str:
@@ -148,7 +157,10 @@ def test_a_broken_driver_is_refused(installed):
 
 
 def test_a_driver_that_lacks_a_member_is_refused(installed):
-    installed("[gaponet.drivers]\ntoy = HERE_toy:Toy\n", toy="class Toy:\n    def __init__(self, robot): pass")
+    installed(
+        "[gaponet.drivers]\ntoy = HERE_toy:Toy\n",
+        toy="class Toy:\n    def __init__(self, robot): pass",
+    )
     with pytest.raises(UsageError, match=r"driver 'toy' lacks address, .* watchdog"):
         open_driver("toy", "so101")
 

@@ -29,12 +29,20 @@ def watch(place: Path) -> None:
     compare = ranks.require_equal
 
     def digest(*states):
-        digests.append(hashlib.sha256(b"".join(x.numpy().tobytes() for s in states for x in s.values())).hexdigest())
+        digests.append(
+            hashlib.sha256(
+                b"".join(x.numpy().tobytes() for s in states for x in s.values())
+            ).hexdigest()
+        )
         compare(*states)
 
     def opened(event, args):
-        writes = event == "open" and (set(str(args[1] or "")) & set("wax+") or args[2] & (os.O_WRONLY | os.O_RDWR))
-        if (writes or event in ("os.mkdir", "os.rename", "os.remove")) and str(args[0]).startswith(f"{place}/run"):
+        writes = event == "open" and (
+            set(str(args[1] or "")) & set("wax+") or args[2] & (os.O_WRONLY | os.O_RDWR)
+        )
+        if (writes or event in ("os.mkdir", "os.rename", "os.remove")) and str(args[0]).startswith(
+            f"{place}/run"
+        ):
             written.append(str(args[0]))
 
     ranks.require_equal = digest
@@ -43,7 +51,10 @@ def watch(place: Path) -> None:
 
 def together(rank: int) -> dict:
     """What ranks agree on, by numbers that are known."""
-    mean, samples = torch.tensor([1.0 + rank, 2.0]), torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
+    mean, samples = (
+        torch.tensor([1.0 + rank, 2.0]),
+        torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)),
+    )
     ranks.average(mean)
     whole, part = Standardise(3), Standardise(3)
     whole.fit(samples)
@@ -68,7 +79,12 @@ def together(rank: int) -> dict:
 
 def train(place: Path, name: str, resume: bool = False) -> dict:
     return api.train(
-        place / "data", out=place / name, budget=str(STEPS), config=TINY_TRAINING, robot=place / "arm", resume=resume
+        place / "data",
+        out=place / name,
+        budget=str(STEPS),
+        config=TINY_TRAINING,
+        robot=place / "arm",
+        resume=resume,
     ).card
 
 

@@ -31,7 +31,10 @@ from gaponet.robot.spec import RobotSpec, load_robot
 DEFAULT_RATE = 30.0  # Hz: LeRobot's own
 FOLLOWERS = ("so_follower", "so101_follower")  # LeRobot's names of its own robot, newest first
 MEMORY_PERIODS = 50  # control periods after which a correction no longer depends on its start
-MAX_START_S, MAX_RETURN_S = 180.0, 60.0  # until the first state; until the arm is back at its first position
+MAX_START_S, MAX_RETURN_S = (
+    180.0,
+    60.0,
+)  # until the first state; until the arm is back at its first position
 
 
 class Units:
@@ -46,7 +49,9 @@ class Units:
 
     def rad(self, action: dict[str, Any]) -> np.ndarray:
         """Convert to (n,) rad; NaN for a joint that is not named."""
-        return self.zero + self.scale * np.array([float(action.get(key, np.nan)) for key in self.keys])
+        return self.zero + self.scale * np.array(
+            [float(action.get(key, np.nan)) for key in self.keys]
+        )
 
     def named(self, qpos: np.ndarray) -> dict[str, float]:
         """Convert (n,) rad to LeRobot's values."""
@@ -58,7 +63,9 @@ _last_observation: dict[str, float] = {}
 
 def set_observation(observation: dict[str, Any]) -> None:
     """Tell gaponet_motion where the arm is. gaponet_so101 calls this; with another robot, the program must."""
-    _last_observation.update({key: float(value) for key, value in observation.items() if key.endswith(".pos")})
+    _last_observation.update(
+        {key: float(value) for key, value in observation.items() if key.endswith(".pos")}
+    )
 
 
 @dataclass
@@ -83,7 +90,9 @@ class _Controller:
         folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
         address, start = f"ipc://{folder.name}/targets", time.monotonic()
         with Path(folder.name, "messages").open("wb") as log:
-            process = subprocess.Popen(command(address), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            process = subprocess.Popen(
+                command(address), stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
         remote = RemoteRobot(address, patience=0.5)
         controller = cls(process, remote, iter(remote), folder)
         try:
@@ -93,7 +102,9 @@ class _Controller:
                     break
                 except (DriverError, StopIteration):
                     if process.poll() is not None or time.monotonic() - start > MAX_START_S:
-                        raise DeviceNotConnectedError(f"gaponet run: {controller.messages()}") from None
+                        raise DeviceNotConnectedError(
+                            f"gaponet run: {controller.messages()}"
+                        ) from None
                     controller.states = iter(remote)
         except BaseException:  # Ctrl-C, too: nobody else knows the process
             remote.close(end=False)
@@ -129,8 +140,12 @@ class GaponetSO101Config(RobotConfig):
     # Calibration file, compared with the servos; default that of --robot.id, without an id the servos' counts.
     calibration: Path | None = None
     known: Path | None = None  # robot folder of gaponet identify, for compensation
-    model: Path | None = None  # run of gaponet train, in addition; without both, targets are not corrected
-    fps: float | None = None  # control rate, Hz, equal to LeRobot's; default that of the model, else 30
+    model: Path | None = (
+        None  # run of gaponet train, in addition; without both, targets are not corrected
+    )
+    fps: float | None = (
+        None  # control rate, Hz, equal to LeRobot's; default that of the model, else 30
+    )
     yes: bool = False  # do not ask before the arm moves
     options: str = ""  # further options of gaponet run: "--payload-mass 0.1 --safety.speed 2"
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
@@ -169,7 +184,9 @@ class GaponetSO101(Robot):
 
     @property
     def is_connected(self) -> bool:
-        return self._controller is not None and all(camera.is_connected for camera in self.cameras.values())
+        return self._controller is not None and all(
+            camera.is_connected for camera in self.cameras.values()
+        )
 
     @property
     def is_calibrated(self) -> bool:
@@ -198,7 +215,8 @@ class GaponetSO101(Robot):
 
         if not self.config.yes:
             require_consent(
-                f"The SO-101 at {self.config.port} will move as LeRobot commands.", option="--robot.yes=true"
+                f"The SO-101 at {self.config.port} will move as LeRobot commands.",
+                option="--robot.yes=true",
             )
         self._controller = _Controller.start(self._command)
         for camera in self.cameras.values():
@@ -210,7 +228,15 @@ class GaponetSO101(Robot):
             from gaponet.nn.artifact import GapModel
 
             rate = 1 / GapModel.load(config.model).card["dt"][0]
-        words = ["--driver", "so101", "--port", config.port, "--rate", str(rate or DEFAULT_RATE), "--yes"]
+        words = [
+            "--driver",
+            "so101",
+            "--port",
+            config.port,
+            "--rate",
+            str(rate or DEFAULT_RATE),
+            "--yes",
+        ]
         words += ["--targets", "zmq", "--live.address", address]
         words += ["--robot", str(config.known.absolute()), "--compensate"] if config.known else []
         words += ["--model", str(config.model)] if config.model else []
@@ -222,7 +248,9 @@ class GaponetSO101(Robot):
         state = next(self._controller.states, None) if self._controller else None
         if state is None:
             end = self._controller.messages().splitlines()[-2:] if self._controller else []
-            raise DeviceNotConnectedError(f"{self} is not connected, or was stopped: {' '.join(end)}")
+            raise DeviceNotConnectedError(
+                f"{self} is not connected, or was stopped: {' '.join(end)}"
+            )
         set_observation(self.units.named(state.qpos))
         return self.units.named(state.qpos) | {name: read() for name, _, read in self._pictures()}
 
@@ -310,7 +338,11 @@ class GaponetMotion(Teleoperator):
         from gaponet.sysid.motion.library import Library
 
         given, dt = self.config.motions, 1 / self.config.fps
-        files = sorted(str(f) for f in Path(given).iterdir() if f.suffix in SUFFIXES) if Path(given).is_dir() else []
+        files = (
+            sorted(str(f) for f in Path(given).iterdir() if f.suffix in SUFFIXES)
+            if Path(given).is_dir()
+            else []
+        )
         library = Library(self.spec, max_payload=self.config.payload_mass)
         one = ControlConfig(blend=1.0, blend_out=False)
         planner = Planner(self.spec, self.spec.joint_names, one, limits=library.limits)
@@ -366,18 +398,27 @@ class GaponetCorrect(ProcessorStep):
         from gaponet.nn.artifact import GapModel
 
         if bool(self.model) == bool(self.known):
-            raise ValueError("gaponet_correct: give either model, a run, or known, a robot folder of gaponet identify")
+            raise ValueError(
+                "gaponet_correct: give either model, a run, or known, a robot folder of gaponet identify"
+            )
         network = GapModel.load(self.model) if self.model else None
         self.spec = load_robot(Path(self.known)) if network is None else network.simulator()
-        self.units, self.dt = Units(self.spec), self.spec.dt if network is None else network.card["dt"][0]
-        self.compensator = Compensator(self.spec, network, CompensatorConfig(dynamics=self.dynamics), self.dt)
+        self.units, self.dt = (
+            Units(self.spec),
+            self.spec.dt if network is None else network.card["dt"][0],
+        )
+        self.compensator = Compensator(
+            self.spec, network, CompensatorConfig(dynamics=self.dynamics), self.dt
+        )
         self.limits = Limits.from_robot(self.spec, self.spec.joint_names, SafetyConfig())
         self._bounded = limit_delta
         self.reset()
 
     def reset(self) -> None:
         self._delta: np.ndarray | None = None
-        self._chunk: np.ndarray | None = None  # rows of the last chunk, after those that it continued
+        self._chunk: np.ndarray | None = (
+            None  # rows of the last chunk, after those that it continued
+        )
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         transition = transition.copy()
@@ -386,12 +427,16 @@ class GaponetCorrect(ProcessorStep):
         if not named and action.reshape(-1, len(self.units.keys)).shape[0] > 1:
             transition[TransitionKey.ACTION] = self._corrected_chunk(action)
             return transition
-        given = action if named else dict(zip(self.units.keys, action.flatten().tolist(), strict=True))
+        given = (
+            action if named else dict(zip(self.units.keys, action.flatten().tolist(), strict=True))
+        )
         seen = transition.get(TransitionKey.OBSERVATION) or {}
         state = self.units.rad(seen) if all(key in seen for key in self.units.keys) else None
         sent = self.units.named(self._corrected(self.units.rad(given), state))
         transition[TransitionKey.ACTION] = (
-            action | sent if named else torch.tensor(list(sent.values()), dtype=action.dtype).reshape(action.shape)
+            action | sent
+            if named
+            else torch.tensor(list(sent.values()), dtype=action.dtype).reshape(action.shape)
         )
         return transition
 
@@ -399,9 +444,14 @@ class GaponetCorrect(ProcessorStep):
         """Correct all rows of a chunk. LeRobot does not tell how many rows of the last chunk were sent: the correction
         continues after the rows before the nearest one of that chunk."""
         if action.ndim > 2 and action.shape[:-2].numel() != 1:
-            raise ValueError(f"gaponet_correct corrects one robot's chunk, not {tuple(action.shape)}")
+            raise ValueError(
+                f"gaponet_correct corrects one robot's chunk, not {tuple(action.shape)}"
+            )
         keys = self.units.keys
-        rows = [self.units.rad(dict(zip(keys, x.tolist(), strict=True))) for x in action.reshape(-1, len(keys))]
+        rows = [
+            self.units.rad(dict(zip(keys, x.tolist(), strict=True)))
+            for x in action.reshape(-1, len(keys))
+        ]
         chunk = np.array(rows)
         before = chunk[:0]
         if self._chunk is not None:
@@ -415,7 +465,9 @@ class GaponetCorrect(ProcessorStep):
 
     def _corrected(self, target: np.ndarray, qpos: np.ndarray | None) -> np.ndarray:
         if not np.isfinite(target).all():
-            raise ValueError("gaponet_correct: the action lacks a joint, or holds a value that is not a number")
+            raise ValueError(
+                "gaponet_correct: the action lacks a joint, or holds a value that is not a number"
+            )
         if self._delta is None:
             self.compensator.reset(target, self.payload_mass)
             self._delta = np.zeros_like(target)
@@ -424,7 +476,12 @@ class GaponetCorrect(ProcessorStep):
         return np.clip(target + self._delta, self.limits.low, self.limits.high)
 
     def get_config(self) -> dict[str, Any]:
-        return {"model": self.model, "known": self.known, "payload_mass": self.payload_mass, "dynamics": self.dynamics}
+        return {
+            "model": self.model,
+            "known": self.known,
+            "payload_mass": self.payload_mass,
+            "dynamics": self.dynamics,
+        }
 
     def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
         return features

@@ -71,7 +71,9 @@ else:
         """Import a public name at its first use (PEP 562)."""
         if name in _MODULES:
             return getattr(import_module(_MODULES[name]), name)
-        raise AttributeError(f"module 'gaponet' has no attribute '{name}'; it offers {', '.join(_MODULES)}")
+        raise AttributeError(
+            f"module 'gaponet' has no attribute '{name}'; it offers {', '.join(_MODULES)}"
+        )
 
     def __dir__() -> list[str]:
         return ["GAPONetError", "__version__", *_MODULES]

@@ -64,7 +64,9 @@ def check_robot(job: Job) -> Night:
     uncertainty, adapted, advice = ParameterUncertainty.require(spec), None, checked.advice
     if checked.verdict == "drifted" and job.out is not None:
         try:
-            made = adapt_robot(spec, job.logs, out=job.out, unit=job.unit, payload_mass=job.payload_mass)
+            made = adapt_robot(
+                spec, job.logs, out=job.out, unit=job.unit, payload_mass=job.payload_mass
+            )
             adapted = 1e3 * made.before, 1e3 * made.after
         except NoGainError:
             advice += "; an adaptation does not reduce the error on these logs"
@@ -93,7 +95,9 @@ def check_fleet(
     """
     folders = sorted(p.parent for p in robots.glob("*/robot.toml"))
     if not folders:
-        raise UsageError(f"{robots}: holds no robot folders; give a folder with one of gaponet identify for each robot")
+        raise UsageError(
+            f"{robots}: holds no robot folders; give a folder with one of gaponet identify for each robot"
+        )
     one_dataset = (logs / "dataset.json").is_file()
     with lock_folder(out, KIND):
         nights = {f.name: load_nights(out / f"{f.name}.json") for f in folders}
@@ -108,7 +112,9 @@ def check_fleet(
             jobs.append(Job(f.name, f, source, unit, name, adapted, payload_mass))
         with open_pool(executor, workers, 1) as pool:
             for outcome in pool.run(check_robot, jobs):
-                if outcome.error is not None and not isinstance(outcome.error, GAPONetError | OSError):
+                if outcome.error is not None and not isinstance(
+                    outcome.error, GAPONetError | OSError
+                ):
                     raise outcome.error
                 none: Night = {
                     "night": name, "verdict": FAILED, "advice": str(outcome.error), "moved": [], "numbers": [],
@@ -123,7 +129,11 @@ def check_fleet(
 
 def load_nights(file: Path) -> list[Night]:
     """Return a robot's nights, the first one first."""
-    return read_json(list[Night], file, UsageError, "remove it to forget its nights") if file.is_file() else []
+    return (
+        read_json(list[Night], file, UsageError, "remove it to forget its nights")
+        if file.is_file()
+        else []
+    )
 
 
 def changed_since(nights: list[Night]) -> str:

@@ -33,7 +33,10 @@ def registry(group: str, builtin: Mapping[str, str]) -> dict[str, str]:
     entries = dict(builtin)
     for point in _points(group):
         if entries.setdefault(point.name, point.value) != point.value:
-            _warn(f"{_package(point)}: '{point.name}' of {group}", "exists already and is not replaced")
+            _warn(
+                f"{_package(point)}: '{point.name}' of {group}",
+                "exists already and is not replaced",
+            )
     return entries
 
 
@@ -48,7 +51,9 @@ def require(group: str, name: str, builtin: Mapping[str, str], what: str) -> Any
         raise UsageError(f"no {what} '{name}'; use one of {', '.join(known)}")
     entries = attempt(known[name], lambda: load(known[name]), None)
     if entries is None:
-        raise UsageError(f"the package that brings {what} '{name}' is broken; update or uninstall it")
+        raise UsageError(
+            f"the package that brings {what} '{name}' is broken; update or uninstall it"
+        )
     return entries
 
 
@@ -63,10 +68,15 @@ def attempt(where: str, call: Callable[[], Result], otherwise: Result) -> Result
     try:
         return call()
     except (Exception, SystemExit) as error:
-        package = next((_package(p) for group in GROUPS for p in _points(group) if p.value == where), "")
+        package = next(
+            (_package(p) for group in GROUPS for p in _points(group) if p.value == where), ""
+        )
         if not package:
             raise
-        _warn(f"{package}: {where}", f"failed ({type(error).__name__}: {error}); gaponet continues without it")
+        _warn(
+            f"{package}: {where}",
+            f"failed ({type(error).__name__}: {error}); gaponet continues without it",
+        )
         return otherwise
 
 

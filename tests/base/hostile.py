@@ -21,7 +21,18 @@ from gaponet.base import sandbox
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 
-IMPORT = ("import", "{}/logs", "--robot", "{}/arm", "--unit-id", "a", "--payload-mass", "0", "--out", "{}/set")
+IMPORT = (
+    "import",
+    "{}/logs",
+    "--robot",
+    "{}/arm",
+    "--unit-id",
+    "a",
+    "--payload-mass",
+    "0",
+    "--out",
+    "{}/set",
+)
 IMPORT = (*IMPORT, "--position-unit", "rad", "--time-unit", "s")
 CHECK = ("robot", "check", "{}/arm")
 
@@ -65,7 +76,11 @@ def network(nodes: Callable[[object], list[object]], folder: Path) -> None:
     zero = helper.make_node("MatMul", ["x", "w"], ["nothing"])
     weights = [helper.make_tensor("w", TensorProto.FLOAT, [width, 2], [0.0] * 2 * width)]
     graph = helper.make_graph(
-        [zero, *nodes(weights), helper.make_node("Add", ["nothing", "odd"], ["delta"])], "g", [x], [delta], weights
+        [zero, *nodes(weights), helper.make_node("Add", ["nothing", "odd"], ["delta"])],
+        "g",
+        [x],
+        [delta],
+        weights,
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
     model.ir_version = 8
@@ -83,8 +98,15 @@ def loop(weights: list[object]) -> list[object]:
     weights.append(helper.make_tensor("go", TensorProto.BOOL, [], [True]))
     weights.append(helper.make_tensor("start", TensorProto.FLOAT, [], [0.0]))
     value = helper.make_tensor_value_info
-    often, go, number = value("i", TensorProto.INT64, []), value("c", TensorProto.BOOL, []), TensorProto.FLOAT
-    nodes = [helper.make_node("Identity", ["c"], ["c2"]), helper.make_node("Add", ["v", "v"], ["v2"])]
+    often, go, number = (
+        value("i", TensorProto.INT64, []),
+        value("c", TensorProto.BOOL, []),
+        TensorProto.FLOAT,
+    )
+    nodes = [
+        helper.make_node("Identity", ["c"], ["c2"]),
+        helper.make_node("Add", ["v", "v"], ["v2"]),
+    ]
     after = [value("c2", TensorProto.BOOL, []), value("v2", number, [])]
     body = helper.make_graph(nodes, "body", [often, go, value("v", number, [])], after)
     return [helper.make_node("Loop", ["often", "go", "start"], ["odd"], body=body)]
@@ -101,7 +123,9 @@ def outer(weights: list[object]) -> list[object]:
             helper.make_node("ReduceSum", ["many", "axes"], ["odd"], keepdims=0)]  # fmt: skip
 
 
-def logs(name: str, logs_toml: str = "") -> Callable[[Callable[[Path], None]], Callable[[Path], None]]:
+def logs(
+    name: str, logs_toml: str = ""
+) -> Callable[[Callable[[Path], None]], Callable[[Path], None]]:
     """Decorate a function that writes a log: the test arm is written beside it."""
 
     def wrapped(write: Callable[[Path], None]) -> Callable[[Path], None]:
@@ -167,9 +191,15 @@ def mat_zeros(file: Path) -> None:
 
     rows = 120_000_000
     size = rows * 2 * 8
-    head = element(6, struct.pack("<II", 6, 0)) + element(5, struct.pack("<ii", rows, 2)) + element(1, b"q")
+    head = (
+        element(6, struct.pack("<II", 6, 0))
+        + element(5, struct.pack("<ii", rows, 2))
+        + element(1, b"q")
+    )
     packer = zlib.compressobj(9)
-    body = packer.compress(struct.pack("<II", 14, len(head) + 8 + size) + head + struct.pack("<II", 9, size))
+    body = packer.compress(
+        struct.pack("<II", 14, len(head) + 8 + size) + head + struct.pack("<II", 9, size)
+    )
     block = bytes(1 << 20)
     body += (
         b"".join(packer.compress(block) for _ in range(size >> 20))
@@ -177,7 +207,11 @@ def mat_zeros(file: Path) -> None:
         + packer.flush()
     )
     file.write_bytes(
-        b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM" + struct.pack("<II", 15, len(body)) + body
+        b"MATLAB 5.0 MAT-file".ljust(124)
+        + struct.pack("<H", 0x0100)
+        + b"IM"
+        + struct.pack("<II", 15, len(body))
+        + body
     )
 
 
@@ -247,7 +281,9 @@ def pickled(code: bytes) -> Callable[[Path], None]:
     )
 
 
-DOUBLED = b"\x80\x04]\x94" + b"".join(b"h" + bytes([i]) + b"h" + bytes([i]) + b"\x86\x94" for i in range(60))
+DOUBLED = b"\x80\x04]\x94" + b"".join(
+    b"h" + bytes([i]) + b"h" + bytes([i]) + b"\x86\x94" for i in range(60)
+)
 
 
 @logs("a.npz", 'rate = 50.0\nctrl = "q"\nqpos = "q"\njoints = ["shoulder", "elbow"]\n')
@@ -311,10 +347,14 @@ NKEY = before('<size nkey="300000000"/>')
 LONG = b"\x80\x04cbuiltins\nbytearray\n\x8a\x08" + struct.pack("<q", 5_900_000_000) + b"\x85R."
 CASES = {
     "mjcf cone": Case(CONE, CHECK),
-    "mjcf supersphere": Case(asset('<mesh name="m" builtin="supersphere" params="30000 1 1"/>'), CHECK),
+    "mjcf supersphere": Case(
+        asset('<mesh name="m" builtin="supersphere" params="30000 1 1"/>'), CHECK
+    ),
     "mjcf nuser_geom": Case(before('<size nuser_geom="300000000"/>'), CHECK),
     "mjcf nkey": Case(NKEY, CHECK),
-    "mjcf iterations": Case(mjcf("<option ", '<option iterations="2000000000" tolerance="0" '), CHECK),
+    "mjcf iterations": Case(
+        mjcf("<option ", '<option iterations="2000000000" tolerance="0" '), CHECK
+    ),
     "pull cone": Case(pushed(CONE), PULL),
     "onnx Loop": Case(lambda folder: network(loop, folder), BENCH),
     "onnx outer": Case(lambda folder: network(outer, folder), BENCH),

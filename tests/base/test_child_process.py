@@ -13,7 +13,10 @@ from arm import write_arm
 
 from gaponet.cli.main import COMMANDS
 
-NAMES = sorted({*sys.stdlib_module_names, *importlib.metadata.packages_distributions()} - {"gaponet", "__main__"})
+NAMES = sorted(
+    {*sys.stdlib_module_names, *importlib.metadata.packages_distributions()}
+    - {"gaponet", "__main__"}
+)
 MARK = "ran.txt"
 POISON = f"import os; open(os.path.join(os.path.dirname(__file__), {MARK!r}), 'a').write(__name__ + '\\n')\n"
 
@@ -76,7 +79,11 @@ def python(folder: Path, code: str, *words: str, **env: str) -> str:
     script = folder / "elsewhere" / "script.py"
     script.write_text(code)
     done = subprocess.run(
-        [sys.executable, str(script), *words], cwd=folder, capture_output=True, text=True, env=os.environ | env
+        [sys.executable, str(script), *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env=os.environ | env,
     )
     return done.stdout + done.stderr
 
@@ -107,14 +114,29 @@ def test_no_child_imports_modules_of_the_current_folder(poisoned):
 def test_a_command_started_by_m_or_pythonpath_imports_none_of_them(poisoned, how):
     """Modules that Python imports before gaponet are exempt."""
     started = [sys.executable, "-c", "import sys; print(*sys.modules)"]
-    loaded = subprocess.run(started, cwd="/", capture_output=True, text=True).stdout.split()  # by .pth files as well
-    library = sys.stdlib_module_names - {"json", "tomllib", "hashlib", "subprocess", "multiprocessing", "csv"}
+    loaded = subprocess.run(
+        started, cwd="/", capture_output=True, text=True
+    ).stdout.split()  # by .pth files as well
+    library = sys.stdlib_module_names - {
+        "json",
+        "tomllib",
+        "hashlib",
+        "subprocess",
+        "multiprocessing",
+        "csv",
+    }
     for name in library.union(loaded):
         (poisoned / f"{name}.py").unlink(missing_ok=True)
     if how == "-m":
         words = [sys.executable, "-m", "gaponet", "import", "--formats"]
         said = subprocess.run(words, cwd=poisoned, capture_output=True, text=True).stdout
     else:
-        said = python(poisoned, SCRIPT, "import", "--formats", PYTHONPATH=f":{os.environ.get('PYTHONPATH', '')}")
+        said = python(
+            poisoned,
+            SCRIPT,
+            "import",
+            "--formats",
+            PYTHONPATH=f":{os.environ.get('PYTHONPATH', '')}",
+        )
     assert "rosbag" in said
     assert ran(poisoned) == []

@@ -70,7 +70,17 @@ def test_ray_is_imported_on_request_and_a_missing_ray_is_named(tmp_path, capsys,
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "False\n"
     monkeypatch.setitem(sys.modules, "ray", None)
-    command = ["collect", "--robot", "so101", "--recipe", "arm", "--executor", "ray", "--out", str(tmp_path / "ray")]
+    command = [
+        "collect",
+        "--robot",
+        "so101",
+        "--recipe",
+        "arm",
+        "--executor",
+        "ray",
+        "--out",
+        str(tmp_path / "ray"),
+    ]
     assert main(command) == 2
     assert "pip install 'gaponet[ray]'" in capsys.readouterr().err
 

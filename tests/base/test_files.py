@@ -8,7 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from gaponet.base.errors import FolderError
-from gaponet.base.files import FOLDER_MARKER, atomic_write, lock_folder, require_own_folder, write_text
+from gaponet.base.files import (
+    FOLDER_MARKER,
+    atomic_write,
+    lock_folder,
+    require_own_folder,
+    write_text,
+)
 
 
 def names(folder):
@@ -35,7 +41,9 @@ def test_a_new_folder_is_marked_with_its_kind(tmp_path):
     assert (tmp_path / "a" / "b" / FOLDER_MARKER).read_text() == "run\n"
     with lock_folder(tmp_path / "a" / "b", "run"), lock_folder(tmp_path / "a" / "b", "run"):
         pass
-    with pytest.raises(FolderError, match="b: holds gaponet's run, not dataset; choose another folder"):
+    with pytest.raises(
+        FolderError, match="b: holds gaponet's run, not dataset; choose another folder"
+    ):
         require_own_folder(tmp_path / "a" / "b", "dataset")
 
 
@@ -62,7 +70,10 @@ def test_a_block_that_fails_after_writing_removes_nothing(tmp_path):
 @pytest.mark.parametrize("name", ["notes.txt", ".env", "dataset"])
 def test_a_folder_of_another_program_is_refused_and_unchanged(tmp_path, name):
     (tmp_path / name).mkdir()
-    with pytest.raises(FolderError, match=f"holds {name}, so it is no run of gaponet"), lock_folder(tmp_path, "run"):
+    with (
+        pytest.raises(FolderError, match=f"holds {name}, so it is no run of gaponet"),
+        lock_folder(tmp_path, "run"),
+    ):
         pass
     assert names(tmp_path) == [name]
 
@@ -74,7 +85,9 @@ def test_a_second_writer_is_refused_or_waits_for_the_first(tmp_path):
 
     with ThreadPoolExecutor(1) as pool:
         with lock_folder(tmp_path / "a", "run"):
-            with pytest.raises(FolderError, match=rf"another gaponet \(process {os.getpid()}\) is writing here"):
+            with pytest.raises(
+                FolderError, match=rf"another gaponet \(process {os.getpid()}\) is writing here"
+            ):
                 pool.submit(other, 0.0).result()
             patient = pool.submit(other, 60.0)
         assert patient.result()

@@ -19,7 +19,10 @@ from gaponet.data.formats import parquet, read_logs
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import load_robot
 
-MAX_PROCESSOR_S, MAX_MEMORY = 10.0, 1 << 30  # of a command that opens a hostile file, with all its processes
+MAX_PROCESSOR_S, MAX_MEMORY = (
+    10.0,
+    1 << 30,
+)  # of a command that opens a hostile file, with all its processes
 MAX_ADDRESSES = 12 << 30  # bytes, so that a failure does not take the machine with it
 limited = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
 
@@ -36,17 +39,30 @@ def test_results_are_returned_unchanged(tmp_path):
     ("how", "said"),
     [
         ("refuses", "x: no log"),
-        ("ends", "x: is not readable (its parser ended with code -11: damaged, or too large); copy or make it again"),
-        ("fails", "x: is not readable (ZeroDivisionError: what nobody thought of); copy or make it again"),
+        (
+            "ends",
+            "x: is not readable (its parser ended with code -11: damaged, or too large); copy or make it again",
+        ),
+        (
+            "fails",
+            "x: is not readable (ZeroDivisionError: what nobody thought of); copy or make it again",
+        ),
         pytest.param(
-            "wants memory", "x: takes more than 960 MiB to be read, more than a file may; cut it", marks=limited
+            "wants memory",
+            "x: takes more than 960 MiB to be read, more than a file may; cut it",
+            marks=limited,
         ),
         ("never ends", "x: is not read after 1 s, longer than a file of its size may take; cut it"),
-        ("writes", "x: is not readable (OSError: [Errno 27] File too large); copy or make it again"),
+        (
+            "writes",
+            "x: is not readable (OSError: [Errno 27] File too large); copy or make it again",
+        ),
     ],
 )
 @limited
-def test_a_failing_parser_gives_one_line_and_the_next_file_is_read(tmp_path, monkeypatch, how, said):
+def test_a_failing_parser_gives_one_line_and_the_next_file_is_read(
+    tmp_path, monkeypatch, how, said
+):
     monkeypatch.setattr(sandbox, "PROCESSOR_S", 1.0)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(LogError) as error:
@@ -67,13 +83,17 @@ def test_one_child_serves_all_files_and_ends_with_its_parent(tmp_path):
     assert parsed(tmp_path, "prints") == parsed(tmp_path, "prints")
     code = "from pathlib import Path; from base.hostile import parsed; print(parsed(Path('x'), 'prints'))"
     words = [sys.executable, "-c", code]
-    done = subprocess.run(words, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": ":".join(sys.path)})
+    done = subprocess.run(
+        words, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": ":".join(sys.path)}
+    )
     with pytest.raises(ProcessLookupError):
         os.kill(int(done.stdout), 0)
 
 
 @limited
-@pytest.mark.parametrize("name", ["mjcf cone", "mjcf supersphere", "mjcf nkey", "mjcf nuser_geom", "mjcf iterations"])
+@pytest.mark.parametrize(
+    "name", ["mjcf cone", "mjcf supersphere", "mjcf nkey", "mjcf nuser_geom", "mjcf iterations"]
+)
 def test_a_robot_beyond_the_limits_is_refused(tmp_path, name):
     hostile.CASES[name].make(tmp_path)
     with pytest.raises(RobotError):
@@ -95,7 +115,11 @@ def test_a_log_beyond_the_limits_is_refused(tmp_path, name, monkeypatch):
     hostile.CASES[name].make(tmp_path)
     robot = load_robot(tmp_path / "arm")
     with pytest.raises(LogError):
-        list(read_logs(tmp_path / "logs", robot, allow_pickle=True, position_unit="rad", time_unit="s"))
+        list(
+            read_logs(
+                tmp_path / "logs", robot, allow_pickle=True, position_unit="rad", time_unit="s"
+            )
+        )
 
 
 def test_a_plain_or_already_accepted_robot_starts_no_child(tmp_path, monkeypatch):
@@ -113,7 +137,9 @@ def test_a_plain_or_already_accepted_robot_starts_no_child(tmp_path, monkeypatch
 def test_rows_are_counted_before_reading(tmp_path):
     pq.write_table(pa.table({"time": pa.nulls(70_000_000, pa.int8())}), tmp_path / "a.parquet")
     assert (tmp_path / "a.parquet").stat().st_size < 1e6
-    with pytest.raises(LogError, match="70,000,000 rows of 1 columns are 70,000,000 values, more than 512 MiB"):
+    with pytest.raises(
+        LogError, match="70,000,000 rows of 1 columns are 70,000,000 values, more than 512 MiB"
+    ):
         parquet.read(tmp_path / "a.parquet", ["time"])
 
 
@@ -122,12 +148,23 @@ def test_rows_are_counted_before_reading(tmp_path):
 @pytest.mark.parametrize("name", hostile.CASES)
 def test_a_command_ends_with_one_line_within_the_limits(tmp_path, name):
     hostile.CASES[name].make(tmp_path)
-    words = [sys.executable, "-m", "gaponet", *(word.format(tmp_path) for word in hostile.CASES[name].words)]
+    words = [
+        sys.executable,
+        "-m",
+        "gaponet",
+        *(word.format(tmp_path) for word in hostile.CASES[name].words),
+    ]
     limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESSES, MAX_ADDRESSES))  # noqa: E731
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(words, capture_output=True, text=True, errors="replace", preexec_fn=limit, timeout=300)
+    done = subprocess.run(
+        words, capture_output=True, text=True, errors="replace", preexec_fn=limit, timeout=300
+    )
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    lines = [x for x in done.stderr.splitlines() if not x.startswith(("reading", "checking", "downloading"))]
+    lines = [
+        x
+        for x in done.stderr.splitlines()
+        if not x.startswith(("reading", "checking", "downloading"))
+    ]
     assert (done.returncode, len(lines)) in ((2, 1), (0, 0)), done.stderr
     assert used.ru_utime + used.ru_stime - before.ru_utime - before.ru_stime < MAX_PROCESSOR_S
     assert used.ru_maxrss << 10 < MAX_MEMORY

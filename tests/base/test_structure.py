@@ -53,7 +53,9 @@ def test_an_invalid_table_gives_one_line_with_file_field_and_hint(data, said):
     assert len(text) < 250
 
 
-@pytest.mark.parametrize("text", [b"", b"{", b"\xff", b"[" * 100_000, b'{"gain": ' + b"9" * 5000 + b"}", b'"\\ud800"'])
+@pytest.mark.parametrize(
+    "text", [b"", b"{", b"\xff", b"[" * 100_000, b'{"gain": ' + b"9" * 5000 + b"}", b'"\\ud800"']
+)
 def test_invalid_json_gives_one_line(text):
     with pytest.raises(RobotError, match="Invalid JSON"):
         parse_json(Servo, text, "card.json", RobotError)
@@ -69,7 +71,9 @@ def test_missing_files_folders_and_huge_files_are_refused_before_reading(tmp_pat
                 read(Servo, path, RobotError)
 
 
-@pytest.mark.parametrize("text", [b"gain = ", b"gain = nan", b"\xff", b"gain = " + b"[" * 5000, b"gain=" + b"9" * 5000])
+@pytest.mark.parametrize(
+    "text", [b"gain = ", b"gain = nan", b"\xff", b"gain = " + b"[" * 5000, b"gain=" + b"9" * 5000]
+)
 def test_invalid_toml_gives_one_line(tmp_path, text):
     file = tmp_path / "robot.toml"
     file.write_bytes(text)

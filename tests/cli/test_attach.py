@@ -15,7 +15,9 @@ from arm import write_arm
 from gaponet.cli.main import main
 from gaponet.robot.folder import save_robot
 
-PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
+PLUGIN = (
+    Path(__file__).parents[2] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
+)
 POLICY = {
     "name": "policy_postprocessor",
     "steps": [
@@ -27,7 +29,9 @@ POLICY = {
 
 @pytest.fixture
 def known(tmp_path):
-    robot = write_arm(tmp_path / "arm").with_servos({"elbow": {"kp": 14.0, "delay": 0.03, "frictionloss": 0.2}})
+    robot = write_arm(tmp_path / "arm").with_servos(
+        {"elbow": {"kp": 14.0, "delay": 0.03, "frictionloss": 0.2}}
+    )
     save_robot(robot, tmp_path / "known")
     return tmp_path / "known"
 
@@ -70,13 +74,29 @@ def plugin(monkeypatch):
     return module
 
 
-def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_off(tmp_path, known, plugin, capsys):
+def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_off(
+    tmp_path, known, plugin, capsys
+):
     policy = tmp_path / "policy"
     policy.mkdir()
     file = policy / "policy_postprocessor.json"
     file.write_text(json.dumps(POLICY))
     for mass in ("0.1", "0.2"):
-        assert main(["export", str(known), "--to", "lerobot", "--into", str(policy), "--payload-mass", mass]) == 0
+        assert (
+            main(
+                [
+                    "export",
+                    str(known),
+                    "--to",
+                    "lerobot",
+                    "--into",
+                    str(policy),
+                    "--payload-mass",
+                    mass,
+                ]
+            )
+            == 0
+        )
     *before, step = json.loads(file.read_text())["steps"]
     assert before == POLICY["steps"]
     assert (step["registry_name"], step["config"]["payload_mass"]) == ("gaponet_correct", 0.2)
@@ -91,9 +111,13 @@ def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_of
         assert said in capsys.readouterr().err
 
 
-def test_a_chunk_is_corrected_as_its_rows_would_be_and_the_next_goes_on_where_it_overlaps(known, plugin):
+def test_a_chunk_is_corrected_as_its_rows_would_be_and_the_next_goes_on_where_it_overlaps(
+    known, plugin
+):
     time = 0.02 * np.arange(90)[:, None]
-    rows = torch.from_numpy(np.degrees(0.3 * np.sin(2 * np.pi * np.array([0.4, 0.6]) * time))).float()
+    rows = torch.from_numpy(
+        np.degrees(0.3 * np.sin(2 * np.pi * np.array([0.4, 0.6]) * time))
+    ).float()
     one, many = plugin.GaponetCorrect(known=str(known)), plugin.GaponetCorrect(known=str(known))
     single = torch.stack([one({"action": row[None]})["action"][0] for row in rows])
     first = many({"action": rows[None, :50]})["action"]
@@ -114,5 +138,7 @@ def test_the_arms_calibration_is_found_by_the_id_it_was_calibrated_under(tmp_pat
     (tmp_path / "so_follower" / "mine.json").write_text("{}")
     words = robot._command("ipc://x")
     assert words[words.index("--calibration") + 1] == str(tmp_path / "so_follower" / "mine.json")
-    with pytest.raises(NotImplementedError, match=r"--robot.type=so101_follower, with --robot.id=mine"):
+    with pytest.raises(
+        NotImplementedError, match=r"--robot.type=so101_follower, with --robot.id=mine"
+    ):
         robot.calibrate()

@@ -91,7 +91,9 @@ def test_a_word_of_its_own_is_asked_for_and_yes_is_not_it(person):
 def test_without_a_terminal_nobody_consents_and_the_option_is_named(monkeypatch):
     for stream in (io.StringIO("yes\n"), None):
         monkeypatch.setattr("sys.stdin", stream)
-        with pytest.raises(UsageError, match="no terminal to ask on, so nothing was commanded; give --free"):
+        with pytest.raises(
+            UsageError, match="no terminal to ask on, so nothing was commanded; give --free"
+        ):
             require_consent("It will move.", option="--free")
 
 
@@ -112,7 +114,16 @@ def test_without_yes_no_servo_is_written_to(command, person, bus, first, tmp_pat
     port, servos = bus
     words = ["run", *first]
     if command == "record":
-        words = ["record", *first, "--payload-mass", "0", "--unit-id", "a", "--out", str(tmp_path / "set")]
+        words = [
+            "record",
+            *first,
+            "--payload-mass",
+            "0",
+            "--unit-id",
+            "a",
+            "--out",
+            str(tmp_path / "set"),
+        ]
     if command == "live":
         pytest.importorskip("zmq", reason="pip install 'gaponet[zmq]'")
         words = ["run", "--targets", "zmq", "--live.address", f"ipc://{tmp_path}/targets"]

@@ -23,9 +23,13 @@ def place(tmp_path_factory):
     return folder
 
 
-def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(place, capsys, monkeypatch):
+def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(
+    place, capsys, monkeypatch
+):
     def identify(train, robot, val, progress):
-        return SimpleNamespace(robot=robot.with_servos({joint: {"kp": 10.0} for joint in robot.operated}))
+        return SimpleNamespace(
+            robot=robot.with_servos({joint: {"kp": 10.0} for joint in robot.operated})
+        )
 
     monkeypatch.setattr("gaponet.experiments.compare.identify", identify)
     words = ["experiment", "compare", str(place / "data"), "--out", str(place / "out"), "--robot", str(place / "arm"),
@@ -37,12 +41,24 @@ def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(place, 
     found = json.loads(captured.out)
     assert "1 trainings (1 settings), 0 there already" in captured.err
     totals = {row[0]: row[2] for row in found["tables"]["totals"]["rows"]}
-    assert list(totals) == ["nominal simulator", "delay + offset", "identification", "MLP, full coupling"]
+    assert list(totals) == [
+        "nominal simulator",
+        "delay + offset",
+        "identification",
+        "MLP, full coupling",
+    ]
     assert totals["identification"]["mean"] < totals["nominal simulator"]["mean"]
     assert found["facts"]["unseen"] is True
     assert found["virtual"].startswith("VIRTUAL arm")
     assert str(place) not in found["facts"]["command"]
-    for name in ("compare.md", "compare.csv", "compare.svg", "compare.png", "report.html", "cells/mlp-0/cell.json"):
+    for name in (
+        "compare.md",
+        "compare.csv",
+        "compare.svg",
+        "compare.png",
+        "report.html",
+        "cells/mlp-0/cell.json",
+    ):
         assert (place / "out" / name).is_file(), name
     assert main(words) == 0
     captured = capsys.readouterr()

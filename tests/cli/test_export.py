@@ -18,7 +18,9 @@ from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 
-CONFIG = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
+CONFIG = ModelConfig(
+    history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)
+)
 
 
 @pytest.fixture
@@ -59,10 +61,19 @@ def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--to", "mjcf", "--engine", "mjlab"], "--to mjcf does not use --engine, --scope, --units"),
+        (
+            ["--to", "mjcf", "--engine", "mjlab"],
+            "--to mjcf does not use --engine, --scope, --units",
+        ),
         (["--to", "json", "--into", "scene.xml"], "--to json does not use --into and --prefix"),
-        (["--to", "randomization", "--payload-mass", "0.1"], "--to randomization does not use --payload-mass"),
-        (["--to", "lerobot", "--into", "policy", "--out", "mine"], "--to lerobot does not use --out;"),
+        (
+            ["--to", "randomization", "--payload-mass", "0.1"],
+            "--to randomization does not use --payload-mass",
+        ),
+        (
+            ["--to", "lerobot", "--into", "policy", "--out", "mine"],
+            "--to lerobot does not use --out;",
+        ),
     ],
 )
 def test_options_of_another_form_are_refused(tmp_path, capsys, words, message):
@@ -77,12 +88,20 @@ def test_without_a_checkpoint_onnx_cannot_be_written_again(run, capsys):
     assert "no checkpoint.pt" in capsys.readouterr().err
 
 
-def test_the_help_explains_every_form_and_breaks_lines_at_the_edge_of_the_screen_only(capsys, monkeypatch):
+def test_the_help_explains_every_form_and_breaks_lines_at_the_edge_of_the_screen_only(
+    capsys, monkeypatch
+):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
         main(["export", "--help"])
     lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
     text = " ".join(lines)
-    for form in ("mjcf (plain MuJoCo)", "onnx (model.onnx", "torch (delta.pt2", "actuator-net (one", "lerobot: add"):
+    for form in (
+        "mjcf (plain MuJoCo)",
+        "onnx (model.onnx",
+        "torch (delta.pt2",
+        "actuator-net (one",
+        "lerobot: add",
+    ):
         assert form in text
     assert "urdf (damping, friction, effort limits)" in text

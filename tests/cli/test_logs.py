@@ -34,7 +34,9 @@ def logs(tmp_path):
     return tmp_path / "logs"
 
 
-def test_import_says_what_came_in_and_that_nothing_was_applied_and_the_same_again_adds_nothing(logs, tmp_path, capsys):
+def test_import_says_what_came_in_and_that_nothing_was_applied_and_the_same_again_adds_nothing(
+    logs, tmp_path, capsys
+):
     assert import_so101(logs, tmp_path / "data") == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "1 recordings, 0.1 min at 49.85 Hz, robot so101, unit lab, payload 0 kg" in told
@@ -49,7 +51,11 @@ def test_import_says_what_came_in_and_that_nothing_was_applied_and_the_same_agai
 def test_import_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
     assert import_so101(logs, tmp_path / "data", "--json") == 0
     result = json.loads(capsys.readouterr().out)
-    assert (result["sequences"], result["rate_hz"], result["offsets_applied"]) == (1, [49.85], False)
+    assert (result["sequences"], result["rate_hz"], result["offsets_applied"]) == (
+        1,
+        [49.85],
+        False,
+    )
     assert result["offsets"]["elbow_flex"]["rests_up"] == 0
     (delays,) = result["delay_s"].values()
     assert delays["elbow_flex"] == pytest.approx(0.04, abs=0.003)
@@ -57,9 +63,24 @@ def test_import_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
 
 
 def test_the_payload_must_be_said(logs, tmp_path, capsys):
-    assert main(["import", str(logs), "--robot", "so101", "--unit-id", "lab", "--out", str(tmp_path / "data")]) == 2
     assert (
-        "this format does not state unit or payload: give --payload-mass 0 (kg in each hand" in capsys.readouterr().err
+        main(
+            [
+                "import",
+                str(logs),
+                "--robot",
+                "so101",
+                "--unit-id",
+                "lab",
+                "--out",
+                str(tmp_path / "data"),
+            ]
+        )
+        == 2
+    )
+    assert (
+        "this format does not state unit or payload: give --payload-mass 0 (kg in each hand"
+        in capsys.readouterr().err
     )
     assert main(["import", str(logs), "--robot", "so101", "--out", str(tmp_path / "data")]) == 2
     assert "give --unit-id NAME and --payload-mass 0 (kg" in capsys.readouterr().err  # all at once
@@ -75,10 +96,17 @@ def test_names_are_mapped_one_option_each(tmp_path):
 
 def test_a_map_that_is_none_says_how_to_write_it(logs, tmp_path, capsys):
     assert import_so101(logs, tmp_path / "data", "--map", "Elbow") == 2
-    assert capsys.readouterr().err.strip().endswith("Usage: --map Elbow: write NAME_IN_LOG=NAME_OF_ROBOT")
+    assert (
+        capsys.readouterr()
+        .err.strip()
+        .endswith("Usage: --map Elbow: write NAME_IN_LOG=NAME_OF_ROBOT")
+    )
     twice = ["--map", "j1=shoulder_pan", "--map", "j1=elbow_flex"]
     assert import_so101(logs, tmp_path / "data", *twice) == 2
-    assert "--map j1=shoulder_pan j1=elbow_flex: names one joint of the log twice" in capsys.readouterr().err
+    assert (
+        "--map j1=shoulder_pan j1=elbow_flex: names one joint of the log twice"
+        in capsys.readouterr().err
+    )
 
 
 def sage_with(old: str, new: str, name: str) -> Callable[[Path], Path]:
@@ -116,11 +144,17 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_a_broken_input_is_one_line_that_says_what_where_and_what_to_do(what, arm, tmp_path, capsys):
+def test_a_broken_input_is_one_line_that_says_what_where_and_what_to_do(
+    what, arm, tmp_path, capsys
+):
     """And leaves no dataset; the readers' own tests have every message."""
     make, message = BROKEN[what]
     logs, out = make(tmp_path / "logs"), tmp_path / "data"
-    code = import_arm(logs, arm, out, *SI) if what == "half-written Parquet" else import_so101(logs, out)
+    code = (
+        import_arm(logs, arm, out, *SI)
+        if what == "half-written Parquet"
+        else import_so101(logs, out)
+    )
     assert code == 2
     error = capsys.readouterr().err.strip().split("\n")[-1]
     assert message in error
@@ -153,11 +187,14 @@ def test_a_table_asks_for_its_units(arm, tmp_path, capsys):
     table.write_text(table_text(arm_columns()))
     assert import_arm(table, arm, tmp_path / "data") == 2
     assert (
-        "the table's time unit is not given; say it with --position-unit rad --time-unit s" in capsys.readouterr().err
+        "the table's time unit is not given; say it with --position-unit rad --time-unit s"
+        in capsys.readouterr().err
     )
 
 
-def test_doctor_ends_with_a_verdict_and_what_comes_next_or_prints_one_json_object(logs, tmp_path, capsys):
+def test_doctor_ends_with_a_verdict_and_what_comes_next_or_prints_one_json_object(
+    logs, tmp_path, capsys
+):
     import_so101(logs, tmp_path / "data")
     capsys.readouterr()
     assert main(["doctor", str(tmp_path / "data")]) == 0

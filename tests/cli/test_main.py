@@ -24,14 +24,19 @@ def test_help_imports_no_command():
         "import sys; from gaponet.cli.main import main; main(['--help'])\n"
         "print({'tyro', 'torch', 'mujoco', 'gaponet.cli.train'} & {*sys.modules})"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.splitlines()
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True
+    ).stdout.splitlines()
     assert "gaponet COMMAND --help" in said[0]
     assert said[-1] == "set()"
 
 
 def test_a_mistyped_command_is_told_its_neighbour(capsys):
     assert main(["trian"]) == 2
-    assert capsys.readouterr().err == "Usage: no command 'trian'; do you mean train? gaponet --help lists them all\n"
+    assert (
+        capsys.readouterr().err
+        == "Usage: no command 'trian'; do you mean train? gaponet --help lists them all\n"
+    )
 
 
 def test_a_fault_that_a_virtual_robot_does_not_have_is_refused(capsys):

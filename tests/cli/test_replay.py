@@ -17,7 +17,13 @@ FOUND = {"kp": 14.0, "delay": 0.04}
 def write_rollout(path, sequence):
     """As a simulator's script leaves it."""
     time = sequence.dt * np.arange(len(sequence))
-    np.savez(path, time=time, target=sequence.ctrl, q=sequence.qpos, joint_names=np.array(sequence.joint_names))
+    np.savez(
+        path,
+        time=time,
+        target=sequence.ctrl,
+        q=sequence.qpos,
+        joint_names=np.array(sequence.joint_names),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -28,21 +34,44 @@ def place(tmp_path_factory):
     save_robot(robot.with_servos(dict.fromkeys(robot.operated, FOUND)), folder / "found")
     (folder / "logs").mkdir()
     for seed in range(4):
-        write_rollout(folder / f"logs/m{seed}.npz", record(robot, commands(200, seed), f"m{seed}", **REAL))
-    (folder / "logs.toml").write_text('ctrl = "target"\nqpos = "q"\ntime_unit = "s"\nposition_unit = "rad"\n')
+        write_rollout(
+            folder / f"logs/m{seed}.npz", record(robot, commands(200, seed), f"m{seed}", **REAL)
+        )
+    (folder / "logs.toml").write_text(
+        'ctrl = "target"\nqpos = "q"\ntime_unit = "s"\nposition_unit = "rad"\n'
+    )
     words = ["--unit-id", "a", "--payload-mass", "0", "--logs", str(folder / "logs.toml")]
     assert (
-        main(["import", str(folder / "logs"), "--robot", str(folder / "arm"), "--out", str(folder / "data"), *words])
+        main(
+            [
+                "import",
+                str(folder / "logs"),
+                "--robot",
+                str(folder / "arm"),
+                "--out",
+                str(folder / "data"),
+                *words,
+            ]
+        )
         == 0
     )
     for name, how in (("simulator", {}), ("robot", REAL)):
         (folder / name).mkdir()
-        write_rollout(folder / name / "policy.npz", record(robot, commands(250, 9), "policy", **how))
+        write_rollout(
+            folder / name / "policy.npz", record(robot, commands(250, 9), "policy", **how)
+        )
     return folder
 
 
 def asked(place, rollout, capsys, *words):
-    found = ["--robot", str(place / "found"), "--data", str(place / "data"), "--described", str(place / "logs.toml")]
+    found = [
+        "--robot",
+        str(place / "found"),
+        "--data",
+        str(place / "data"),
+        "--described",
+        str(place / "logs.toml"),
+    ]
     capsys.readouterr()
     assert main(["replay", str(place / rollout), *found, "--json", *words]) == 0
     return json.loads(capsys.readouterr().out)
@@ -64,8 +93,12 @@ def test_what_the_robot_would_do_can_be_kept(place, capsys, tmp_path):
 
 
 def test_a_band_holds_nine_tenths_of_what_a_robot_does_that_was_identified_a_little_wrong(arm):
-    wrong = arm.with_servos({j: {"kp": 14.5, "delay": 0.038, "frictionloss": 0.06} for j in arm.operated})
-    known = validation_error(wrong, [s for s in recordings(arm, 8, **REAL) if not s.meta.payload_mass])
+    wrong = arm.with_servos(
+        {j: {"kp": 14.5, "delay": 0.038, "frictionloss": 0.06} for j in arm.operated}
+    )
+    known = validation_error(
+        wrong, [s for s in recordings(arm, 8, **REAL) if not s.meta.payload_mass]
+    )
     fresh = [record(arm, commands(300, seed), f"new{seed}", **REAL) for seed in range(20, 26)]
     found = summary(predict(wrong, fresh, known), arm.operated)
     assert all(0.8 < s["inside"] <= 1.0 for s in found.values())

@@ -10,7 +10,9 @@ from gaponet.cli.main import main
 from gaponet.robot.spec import packaged_robots
 
 
-@pytest.mark.parametrize("name", sorted({*packaged_robots()} - {"xl330_bench"}))  # a bench has no shapes
+@pytest.mark.parametrize(
+    "name", sorted({*packaged_robots()} - {"xl330_bench"})
+)  # a bench has no shapes
 def test_the_packages_robots_are_listed_and_right(name, capsys):
     assert main(["robot", "list", "--json"]) == 0
     assert name in [r["name"] for r in json.loads(capsys.readouterr().out)["robots"]]
@@ -42,10 +44,22 @@ def test_a_users_folder_is_checked_and_shown(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("toml", "xml", "warning"),
     [
-        (TOML.replace("kp = 20.0", "kp = 20.0\nhome = 2.0", 1), XML, "home 2 lies outside its range [-1.50, 1.50]"),
-        (TOML.replace("kp = 20.0", "kp = 0.0", 1), XML, "shoulder: kp is 0; a position-controlled joint needs kp > 0"),
+        (
+            TOML.replace("kp = 20.0", "kp = 20.0\nhome = 2.0", 1),
+            XML,
+            "home 2 lies outside its range [-1.50, 1.50]",
+        ),
+        (
+            TOML.replace("kp = 20.0", "kp = 0.0", 1),
+            XML,
+            "shoulder: kp is 0; a position-controlled joint needs kp > 0",
+        ),
         (TOML, XML.replace(' range="-1.5 1.5"', "", 1), "shoulder: has no range in the MJCF"),
-        (TOML.split("[[payload_mount]]")[0], XML, "no [[payload_mount]]: payloads other than 0 will be refused"),
+        (
+            TOML.split("[[payload_mount]]")[0],
+            XML,
+            "no [[payload_mount]]: payloads other than 0 will be refused",
+        ),
     ],
 )
 def test_what_compiles_and_is_doubtful_is_a_warning(tmp_path, capsys, toml, xml, warning):
@@ -58,13 +72,23 @@ def test_what_compiles_and_is_doubtful_is_a_warning(tmp_path, capsys, toml, xml,
 def test_check_without_a_name_says_which_there_are(capsys):
     assert main(["robot", "check"]) == 2
     assert (
-        "needs a robot name (fr3, g1_23, g1_29, h1_2, so101, ur10e, xl330_bench) or a folder" in capsys.readouterr().err
+        "needs a robot name (fr3, g1_23, g1_29, h1_2, so101, ur10e, xl330_bench) or a folder"
+        in capsys.readouterr().err
     )
 
 
 def test_new_makes_checks_and_shows_a_robot_from_a_vendor_s_model(tmp_path, capsys):
     model = write_mjcf(tmp_path / "repo")
-    told = ["robot", "new", str(model), "--out", str(tmp_path / "mine"), "--joints", "shoulder", "elbow"]
+    told = [
+        "robot",
+        "new",
+        str(model),
+        "--out",
+        str(tmp_path / "mine"),
+        "--joints",
+        "shoulder",
+        "elbow",
+    ]
     assert main([*told, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert [joint["kp"] for joint in result["joints"]] == [60.0, 40.0]

@@ -21,7 +21,19 @@ from gaponet.hw.targets.policy import NotYet
 from gaponet.robot.folder import save_robot
 from gaponet.sysid.motion.motion import Motion
 
-FAST = ["--fast", "--yes", "--json", "--blend", "0.2", "--blend-speed", "4", "--settle", "0.1", "--damp", "0.1"]
+FAST = [
+    "--fast",
+    "--yes",
+    "--json",
+    "--blend",
+    "0.2",
+    "--blend-speed",
+    "4",
+    "--settle",
+    "0.1",
+    "--damp",
+    "0.1",
+]
 
 
 @pytest.fixture
@@ -33,15 +45,37 @@ def motion(arm, tmp_path):
 
 def test_record_makes_a_dataset_with_unit_payload_and_gains(arm, motion, tmp_path, capsys):
     out = tmp_path / "set"
-    command = ["record", "--motion", motion, "--out", str(out), "--unit-id", "4", "--payload-mass", "0.1"]
-    command += ["--robot", str(arm.mjcf.parent), "--payload-side", "hand", "--repetitions", "2", *FAST]
+    command = [
+        "record",
+        "--motion",
+        motion,
+        "--out",
+        str(out),
+        "--unit-id",
+        "4",
+        "--payload-mass",
+        "0.1",
+    ]
+    command += [
+        "--robot",
+        str(arm.mjcf.parent),
+        "--payload-side",
+        "hand",
+        "--repetitions",
+        "2",
+        *FAST,
+    ]
     assert main(command) == 0
     result = json.loads(capsys.readouterr().out)
     data = Dataset(out)
     assert len(data) == 2
     assert result["written"] == [e.id for e in data.entries]
     first, second = data.entries
-    assert (first.meta.unit_id, first.meta.payload_mass, first.meta.virtual) == ("virtual-4", 0.1, True)
+    assert (first.meta.unit_id, first.meta.payload_mass, first.meta.virtual) == (
+        "virtual-4",
+        0.1,
+        True,
+    )
     assert (first.meta.repetition, second.meta.repetition) == (0, 1)
     assert first.meta.notes["controller"]["kp"] == arm.kp.tolist()
     sequence = data.read(first)
@@ -52,7 +86,17 @@ def test_record_makes_a_dataset_with_unit_payload_and_gains(arm, motion, tmp_pat
 
 def test_a_stopped_run_says_so_and_is_not_added(arm, motion, tmp_path, capsys):
     out = tmp_path / "set"
-    command = ["record", "--motion", motion, "--out", str(out), "--unit-id", "4", "--payload-mass", "0"]
+    command = [
+        "record",
+        "--motion",
+        motion,
+        "--out",
+        str(out),
+        "--unit-id",
+        "4",
+        "--payload-mass",
+        "0",
+    ]
     command += ["--robot", str(arm.mjcf.parent), *FAST, "--safety.temperature", "20"]
     assert main(command) == 2
     assert "it was not added" in capsys.readouterr().err
@@ -63,7 +107,16 @@ def test_a_stopped_run_says_so_and_is_not_added(arm, motion, tmp_path, capsys):
 
 def test_a_refused_plan_leaves_nothing_behind(tmp_path, capsys):
     (tmp_path / "down.csv").write_text("time,shoulder_lift,elbow_flex\n0,1.7,0.3\n0.5,1.7,0.3\n")
-    command = ["record", "--robot", "so101", "--motion", str(tmp_path / "down.csv"), "--payload-mass", "0", *FAST]
+    command = [
+        "record",
+        "--robot",
+        "so101",
+        "--motion",
+        str(tmp_path / "down.csv"),
+        "--payload-mass",
+        "0",
+        *FAST,
+    ]
     assert main([*command, "--out", str(tmp_path / "set"), "--unit", "1"]) == 2
     assert "'down' begins with" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "set").exists()
@@ -71,7 +124,18 @@ def test_a_refused_plan_leaves_nothing_behind(tmp_path, capsys):
 
 def test_the_plan_says_the_payload_that_it_is_for_and_how_a_stop_ends(capsys):
     """And a motion of the library is for that payload, not for the 3 kg that an SO-101 cannot hold."""
-    command = ["run", "--robot", "so101", "--motion", "tour-all-0", "--unit", "1", "--payload-mass", "0.1", *FAST]
+    command = [
+        "run",
+        "--robot",
+        "so101",
+        "--motion",
+        "tour-all-0",
+        "--unit",
+        "1",
+        "--payload-mass",
+        "0.1",
+        *FAST,
+    ]
     assert main([x for x in command if x != "--json"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     share = re.search(r"most torque, [^:]*0\.1 kg[^:]*: \w+, (\d\.\d\d) of what may be used", said)
@@ -87,7 +151,9 @@ def test_a_motion_of_legs_is_refused_before_anything_is_opened(tmp_path, capsys)
     ctrl = np.repeat(robot.qpos_home[None], 20, axis=0)
     ctrl[:, robot.index(["left_knee_joint"])] = np.linspace(0, 0.1, 20)[:, None]
     write_motion(tmp_path / "knee.npz", Motion("knee", "joint", 0.02, ctrl), robot)
-    assert main(["run", "--driver", "unitree", "--motion", str(tmp_path / "knee.npz"), "--yes"]) == 2
+    assert (
+        main(["run", "--driver", "unitree", "--motion", str(tmp_path / "knee.npz"), "--yes"]) == 2
+    )
     assert "moves left_knee_joint, which unitree dds domain 0 does not command" in " ".join(
         capsys.readouterr().err.split()
     )
@@ -105,7 +171,9 @@ def test_a_real_robot_is_not_moved_without_asking(arm, tmp_path, capsys, monkeyp
         assert "no terminal to ask on" in capsys.readouterr().err
 
 
-def test_a_model_runs_on_the_robot_that_its_run_keeps_and_on_no_other(arm, motion, tmp_path, capsys):
+def test_a_model_runs_on_the_robot_that_its_run_keeps_and_on_no_other(
+    arm, motion, tmp_path, capsys
+):
     model = untrained(tmp_path / "run", arm, Dataset.create(tmp_path / "set", arm))
     write_arm(tmp_path / "stiffer", TOML.replace("kp = 20.0", "kp = 40.0"))
     for place in (model, model / "model"):
@@ -113,7 +181,9 @@ def test_a_model_runs_on_the_robot_that_its_run_keeps_and_on_no_other(arm, motio
         assert main(words) == 0
         assert json.loads(capsys.readouterr().out)["robot"] == arm.name
         assert main([*words, "--robot", str(tmp_path / "stiffer")]) == 2
-        assert "another robot, or other gains or inertias" in " ".join(capsys.readouterr().err.split())
+        assert "another robot, or other gains or inertias" in " ".join(
+            capsys.readouterr().err.split()
+        )
 
 
 def test_compensation_needs_a_robot_folder_and_no_model(arm, motion, tmp_path, capsys):
@@ -121,9 +191,13 @@ def test_compensation_needs_a_robot_folder_and_no_model(arm, motion, tmp_path, c
     save_robot(soft, tmp_path / "soft")
     missed = {}
     for name, words in (("raw", []), ("compensated", ["--compensate"])):
-        assert main(["run", "--motion", motion, "--robot", str(tmp_path / "soft"), *words, *FAST]) == 0
+        assert (
+            main(["run", "--motion", motion, "--robot", str(tmp_path / "soft"), *words, *FAST]) == 0
+        )
         result = json.loads(capsys.readouterr().out)
-        assert result["kp"] == arm.kp.tolist()  # the servos are told their own gains, not what was identified
+        assert (
+            result["kp"] == arm.kp.tolist()
+        )  # the servos are told their own gains, not what was identified
         missed[name] = result["tracking_error_rad"]["mean"]
     assert missed["compensated"] < 0.7 * missed["raw"]
     assert result["compensated_by"] == str(tmp_path / "soft")
@@ -133,7 +207,9 @@ def test_a_motion_or_live_targets_and_not_faster_than_time(arm, motion, capsys, 
     robot = ["--robot", str(arm.mjcf.parent)]
     for words in ([], ["--motion", motion, "--targets", "zmq"]):
         assert main(["run", *robot, *words]) == 2
-        assert "give either --motion, what to play, or --targets" in " ".join(capsys.readouterr().err.split())
+        assert "give either --motion, what to play, or --targets" in " ".join(
+            capsys.readouterr().err.split()
+        )
     assert main(["run", *robot, "--targets", "zmq", "--fast"]) == 2
     assert "live targets come in real time" in capsys.readouterr().err
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
@@ -147,7 +223,10 @@ def test_options_that_would_do_nothing_are_refused(arm, motion, tmp_path, capsys
     run = ["run", "--motion", motion, "--robot", str(arm.mjcf.parent), *FAST]
     record = ["record", *run[1:], "--payload-mass", "0", "--out", str(tmp_path / "set")]
     for words, message in (
-        ([*run, "--compensation.dynamics"], "settings of the compensation are given, and it is off; add --compensate"),
+        (
+            [*run, "--compensation.dynamics"],
+            "settings of the compensation are given, and it is off; add --compensate",
+        ),
         ([*run, "--live.hold", "2"], "settings of live targets are given, and this is a motion"),
         ([*record, "--repetitions", "0"], "--repetitions 0: give 1 or more"),
         ([*record, "--unit-id", "2"], "--unit-id 2: a virtual robot is chosen by --unit 4"),
@@ -159,8 +238,14 @@ def test_options_that_would_do_nothing_are_refused(arm, motion, tmp_path, capsys
 @pytest.mark.parametrize(("kind", "needs"), [("zmq", "zmq"), ("dds", "cyclonedds")])
 def test_live_targets_are_listened_for_where_it_says(arm, kind, needs, tmp_path):
     pytest.importorskip(needs)
-    asked = RunArgs(targets=kind, live=Live(address=f"ipc://{tmp_path}/targets"), connection=Connection(domain=29))
-    targets = listen(Out(False), asked, arm, SimpleNamespace(commanded=arm.joint_names), SimulatedClock())
+    asked = RunArgs(
+        targets=kind,
+        live=Live(address=f"ipc://{tmp_path}/targets"),
+        connection=Connection(domain=29),
+    )
+    targets = listen(
+        Out(False), asked, arm, SimpleNamespace(commanded=arm.joint_names), SimulatedClock()
+    )
     said = targets(0, State(0.0, *np.zeros((4, 2))))
     assert isinstance(said, NotYet)
     assert targets.transport.address in said.text

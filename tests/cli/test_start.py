@@ -13,7 +13,9 @@ from arm import XML, commands, record, write_arm
 from gaponet.cli import start
 from gaponet.cli.main import main
 
-SERVOS = "".join(f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow"))
+SERVOS = "".join(
+    f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow")
+)
 ORDER = ["robot", "import", "doctor", "gap", "identify", "gap", "export", "report"]
 
 
@@ -28,7 +30,9 @@ def place(tmp_path, monkeypatch):
         s = record(robot, commands(300, seed), f"swing_{seed}", kp=0.7, delay=2)
         table = np.concatenate([1e3 * s.dt * np.arange(300)[:, None], s.ctrl, s.qpos], axis=1)
         head = "time_ms,shoulder_des,elbow_des,shoulder_meas,elbow_meas"
-        np.savetxt(f"logs/swing_{seed}.csv", table, delimiter=",", header=head, comments="", fmt="%.6f")
+        np.savetxt(
+            f"logs/swing_{seed}.csv", table, delimiter=",", header=head, comments="", fmt="%.6f"
+        )
     return tmp_path
 
 
@@ -38,7 +42,9 @@ def test_a_dry_run_says_what_was_understood_and_writes_nothing(place, capsys):
     said = json.loads(capsys.readouterr().out)
     assert (said["joints"], said["recordings"], said["rate_hz"]) == (["shoulder", "elbow"], 5, 50.0)
     assert 'time_unit = "ms"' in said["logs_toml"]
-    assert 'motion = "{motion}"' in said["logs_toml"]  # other commands: a number at a name's end counts no repetitions
+    assert (
+        'motion = "{motion}"' in said["logs_toml"]
+    )  # other commands: a number at a name's end counts no repetitions
     assert [shlex.split(line)[1] for line in said["commands"]] == ORDER
     assert sorted(place.rglob("*")) == before
 
@@ -71,21 +77,43 @@ def test_an_interrupted_start_goes_on_and_keeps_the_commands_that_ran(place, mon
 
     monkeypatch.setattr(start, "main", stopping)
     every = start.make_commands
-    monkeypatch.setattr(start, "make_commands", lambda *args: [c for c in every(*args) if c[0] in ORDER[:5]])
+    monkeypatch.setattr(
+        start, "make_commands", lambda *args: [c for c in every(*args) if c[0] in ORDER[:5]]
+    )
     assert main(["start", "arm.xml", "logs"]) == 2
     assert "stopped at: gaponet identify started/data" in capsys.readouterr().err
     assert main(["start", "arm.xml", "logs"]) == 0
-    assert ran == ["robot", "import", "gap", "identify", "identify", "gap"]  # the doctor is asked directly
+    assert ran == [
+        "robot",
+        "import",
+        "gap",
+        "identify",
+        "identify",
+        "gap",
+    ]  # the doctor is asked directly
     lines = Path("started/commands.sh").read_text().splitlines()
-    assert [shlex.split(line)[1] for line in lines] == ["robot", "import", "doctor", "gap", "identify", "gap"]
+    assert [shlex.split(line)[1] for line in lines] == [
+        "robot",
+        "import",
+        "doctor",
+        "gap",
+        "identify",
+        "gap",
+    ]
 
 
-def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_from_them(place, monkeypatch, capsys):
+def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_from_them(
+    place, monkeypatch, capsys
+):
     ran, look = [], start.api.doctor
     monkeypatch.setattr(start, "main", lambda words: ran.append(words[0]) or main(words))
     every = start.make_commands
-    monkeypatch.setattr(start, "make_commands", lambda *args: [c for c in every(*args) if c[0] in ORDER[:3]])
-    monkeypatch.setattr(start.api, "doctor", lambda data, **how: ran.append("doctor") or look(data, **how))
+    monkeypatch.setattr(
+        start, "make_commands", lambda *args: [c for c in every(*args) if c[0] in ORDER[:3]]
+    )
+    monkeypatch.setattr(
+        start.api, "doctor", lambda data, **how: ran.append("doctor") or look(data, **how)
+    )
     last = Path("logs/swing_4.csv").rename("swing_4.csv")
     assert main(["start", "arm.xml", "logs"]) == 0
     shutil.copytree("logs", "other")
@@ -108,9 +136,16 @@ def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_fr
     Path("logs/swing_3.csv").unlink()
     for logs, more in (("other", []), ("other", ["--dry-run"]), ("logs", [])):
         assert main(["start", "arm.xml", logs, *more]) == 2
-        gone = "swing_3.csv, swing_4.csv are missing or changed in other" if logs == "other" else "swing_3.csv is"
+        gone = (
+            "swing_3.csv, swing_4.csv are missing or changed in other"
+            if logs == "other"
+            else "swing_3.csv is"
+        )
         assert gone in (said := capsys.readouterr().err)
-        assert "Give another --out for these logs, or the same logs again; or delete started/data" in said
+        assert (
+            "Give another --out for these logs, or the same logs again; or delete started/data"
+            in said
+        )
     assert {file: file.read_bytes() for file in before} == before
     shutil.rmtree("started/data")
     assert main(["start", "arm.xml", "logs"]) == 0
@@ -122,24 +157,52 @@ def test_what_is_said_of_the_logs_reaches_their_import(place, capsys):
     for file in Path("logs").iterdir():
         table = np.loadtxt(file, delimiter=",", skiprows=1)
         head = file.read_text().split("\n", 1)[0].replace("shoulder", "a1")
-        np.savetxt(file, np.c_[table[:, :1], np.rad2deg(table[:, 1:])], delimiter=",", header=head, comments="")
-    said = ["--map", "a1=shoulder", "--position-unit", "deg", "--time-unit", "ms", "--cut", "3", "--skip-bad"]
+        np.savetxt(
+            file,
+            np.c_[table[:, :1], np.rad2deg(table[:, 1:])],
+            delimiter=",",
+            header=head,
+            comments="",
+        )
+    said = [
+        "--map",
+        "a1=shoulder",
+        "--position-unit",
+        "deg",
+        "--time-unit",
+        "ms",
+        "--cut",
+        "3",
+        "--skip-bad",
+    ]
     assert main(["start", "arm.xml", "logs", "--dry-run", "--json", *said]) == 0
     found = json.loads(capsys.readouterr().out)
     words = shlex.split(found["commands"][1])
     assert (found["joints"], found["rate_hz"]) == (["shoulder", "elbow"], 50.0)
-    assert {"--map=a1=shoulder", "--position-unit=deg", "--time-unit=ms", "--cut=3.0", "--skip-bad"} < set(words)
+    assert {
+        "--map=a1=shoulder",
+        "--position-unit=deg",
+        "--time-unit=ms",
+        "--cut=3.0",
+        "--skip-bad",
+    } < set(words)
 
 
 @pytest.mark.parametrize("name", ["a1", "x"])
-def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, monkeypatch, capsys, name):
+def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(
+    place, monkeypatch, capsys, name
+):
     for file in Path("logs").iterdir():
         text = file.read_text()
-        file.write_text(text.replace("shoulder", name) if name == "a1" else text.replace("meas", name))
+        file.write_text(
+            text.replace("shoulder", name) if name == "a1" else text.replace("meas", name)
+        )
     assert main(["start", "arm.xml", "logs", "--dry-run"]) == (0 if name == "a1" else 2)
     said = capsys.readouterr()
     assert "\\n" not in said.err
-    assert re.search('^ *"a1" = "shoulder"' if name == "a1" else '^ *# qpos = "…"', said.out, re.MULTILINE)
+    assert re.search(
+        '^ *"a1" = "shoulder"' if name == "a1" else '^ *# qpos = "…"', said.out, re.MULTILINE
+    )
     assert main(["start", "arm.xml", "logs"]) == 2
     said = capsys.readouterr()
     assert "they are in started/logs.toml: check those with a ?" in said.err
@@ -151,7 +214,9 @@ def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, 
     assert main(["start", "arm.xml", "logs", "--dry-run"]) == 0, text
     monkeypatch.setattr(start, "main", lambda words: 2)
     assert main(["start", "arm.xml", "logs"]) == 2
-    assert "stopped at: gaponet robot new" in capsys.readouterr().err  # the folder that holds the guess is its own
+    assert (
+        "stopped at: gaponet robot new" in capsys.readouterr().err
+    )  # the folder that holds the guess is its own
 
 
 def test_logs_with_an_error_are_not_fitted(place, monkeypatch, capsys):
@@ -159,7 +224,9 @@ def test_logs_with_an_error_are_not_fitted(place, monkeypatch, capsys):
         head, *rows = file.read_text().splitlines()
         values = np.array([[float(x) for x in row.split(",")] for row in rows])
         values[:, 1] *= -1
-        file.write_text("\n".join([head, *(",".join(f"{x:.6f}" for x in row) for row in values)]) + "\n")
+        file.write_text(
+            "\n".join([head, *(",".join(f"{x:.6f}" for x in row) for row in values)]) + "\n"
+        )
     assert main(["start", "arm.xml", "logs"]) == 2
     assert "no fit repairs it" in capsys.readouterr().err
     assert not Path("started/identified").exists()

@@ -24,7 +24,9 @@ def view(place, *words):
 
 
 def test_a_picture_is_written_and_the_numbers_printed(place, capsys):
-    code = view(place, "--render", str(place / "a.png"), "--width", "240", "--duration", "0.5", "--json")
+    code = view(
+        place, "--render", str(place / "a.png"), "--width", "240", "--duration", "0.5", "--json"
+    )
     captured = capsys.readouterr()
     if code == 2 and "render off screen" in captured.err:
         pytest.skip(captured.err.strip())

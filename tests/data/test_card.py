@@ -21,14 +21,21 @@ def dataset(arm, tmp_path):
     """Unit a empty (50 rows) and with 0.2 kg (100 rows), unit b empty (100 rows); 0.02 s a row."""
     data = Dataset.create(tmp_path / "data", arm)
     data.append(arm_sequence(arm, ramp(50, 0.4), ramp(50, 0.4), "up"))
-    data.append(arm_sequence(arm, ramp(100, 0.8), ramp(100, 0.6), "up", 0.2, tau=np.full((100, 2), -3.0)))
+    data.append(
+        arm_sequence(arm, ramp(100, 0.8), ramp(100, 0.6), "up", 0.2, tau=np.full((100, 2), -3.0))
+    )
     data.append(arm_sequence(arm, -ramp(100, 0.8), -ramp(100, 0.8), "down", unit="b"))
     return data
 
 
 def test_counts_come_from_the_files(dataset):
     card = make_card(dataset)
-    assert card["total"] == {"sequences": 3, "hours": pytest.approx(250 * 0.02 / 3600), "frames": 250, "motions": 2}
+    assert card["total"] == {
+        "sequences": 3,
+        "hours": pytest.approx(250 * 0.02 / 3600),
+        "frames": 250,
+        "motions": 2,
+    }
     shares = card["shares"]
     assert {k: v["frames"] for k, v in shares["payload_kg"].items()} == {"0": 150, "0.2": 100}
     assert {k: v["sequences"] for k, v in shares["unit"].items()} == {"a": 2, "b": 1}
@@ -43,7 +50,9 @@ def test_ranges_are_those_of_the_samples(dataset):
     every = np.concatenate([dataset.read(e).qpos[:, 0] for e in dataset.entries])
     assert shoulder["mean"] == pytest.approx(every.mean(), abs=1e-6)
     assert shoulder["std"] == pytest.approx(every.std(), rel=1e-5)
-    assert (shoulder["p1"], shoulder["p99"]) == pytest.approx(np.percentile(every, [1, 99]), rel=1e-5)
+    assert (shoulder["p1"], shoulder["p99"]) == pytest.approx(
+        np.percentile(every, [1, 99]), rel=1e-5
+    )
     tau = card["signals"]["tau"]
     assert (tau["sequences"], tau["unit"], tau["joints"]["elbow"]["mean"]) == (1, "N·m", -3.0)
     assert "temperature" not in card["signals"]
@@ -61,7 +70,9 @@ def test_repeatability_is_the_spread_over_repetitions(arm, tmp_path):
     found = make_card(data)["repeatability"]
     assert (found["groups"], found["sequences"], found["left_out_other_command"]) == (1, 3, 1)
     assert found["channels"]["qpos"]["joints"] == {"shoulder": pytest.approx(0.01, rel=1e-3)}
-    assert found["channels"]["qvel"]["mean"] == pytest.approx(0, abs=2e-3)  # the ends of derivatives differ
+    assert found["channels"]["qvel"]["mean"] == pytest.approx(
+        0, abs=2e-3
+    )  # the ends of derivatives differ
 
 
 def test_virtual_is_said_in_the_first_line(dataset):

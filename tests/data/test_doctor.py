@@ -115,7 +115,9 @@ def test_a_fault_in_one_recording_is_found_and_named(arm, tmp_path, fault):
     ctrl, qpos = good()
     change, check, level, words = FAULTS[fault]
     recorded = {"ctrl": ctrl, "qpos": qpos} | change(ctrl, qpos)
-    diagnosis = examine(arm, tmp_path, arm_sequence(arm, recorded.pop("ctrl"), recorded.pop("qpos"), **recorded))
+    diagnosis = examine(
+        arm, tmp_path, arm_sequence(arm, recorded.pop("ctrl"), recorded.pop("qpos"), **recorded)
+    )
     assert words in found(diagnosis, check, level).message
 
 
@@ -124,12 +126,16 @@ def test_swapped_joints_are_an_error(arm, tmp_path):
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos[:, ::-1]))
     texts = [f.message for f in diagnosis.findings if f.check == "order" and f.level == "error"]
     assert len(texts) == 2
-    assert texts[0].startswith("the command of shoulder moves elbow, not shoulder (correlation 1.00, 1 of 1 motions)")
+    assert texts[0].startswith(
+        "the command of shoulder moves elbow, not shoulder (correlation 1.00, 1 of 1 motions)"
+    )
     assert '[columns] "ctrl.elbow" =' in texts[0]
     assert diagnosis.verdict.startswith("Do not train on this yet: 2 errors")
 
 
-def test_columns_in_a_wrong_order_are_named_one_by_one_without_what_follows_from_them(so101, tmp_path):
+def test_columns_in_a_wrong_order_are_named_one_by_one_without_what_follows_from_them(
+    so101, tmp_path
+):
     rng = np.random.default_rng(0)
     logs = []
     for motion in ("a", "b", "c"):
@@ -165,7 +171,9 @@ def test_a_state_that_comes_before_its_command_is_an_error(arm, tmp_path):
     ctrl, qpos = good()
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, qpos, ctrl))
     said = [f.message for f in diagnosis.findings if (f.check, f.level) == ("copied", "error")]
-    assert re.match(r"shoulder moves 6\d ms before its command in 1 of 1 motions: are command and", said[0])
+    assert re.match(
+        r"shoulder moves 6\d ms before its command in 1 of 1 motions: are command and", said[0]
+    )
 
 
 def lively(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +188,9 @@ def lively(seed: int) -> tuple[np.ndarray, np.ndarray]:
      "clock", "each recording follows its commands sooner"),
     (lambda i, q: late(q, 3) if i == 2 else q, "lag", "m2 (a, 0 kg) follows its commands"),
 ], ids=["clocks that drift", "one late recording"])  # fmt: skip
-def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(arm, tmp_path, odd, check, words):
+def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(
+    arm, tmp_path, odd, check, words
+):
     logs = [(f"m{i}", *lively(i)) for i in range(5)]
     fine = examine(arm, tmp_path / "fine", *(arm_sequence(arm, u, q, motion=m) for m, u, q in logs))
     assert not {f.check for f in fine.findings if f.level in ("warning", "error")} & {
@@ -190,13 +200,21 @@ def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(a
         "averaged",
     }
     bad = examine(
-        arm, tmp_path / "bad", *(arm_sequence(arm, u, odd(i, q), motion=m) for i, (m, u, q) in enumerate(logs))
+        arm,
+        tmp_path / "bad",
+        *(arm_sequence(arm, u, odd(i, q), motion=m) for i, (m, u, q) in enumerate(logs)),
     )
-    assert any(f.check == check and words in f.message for f in bad.findings if f.level in ("warning", "error"))
+    assert any(
+        f.check == check and words in f.message
+        for f in bad.findings
+        if f.level in ("warning", "error")
+    )
 
 
 @pytest.mark.parametrize(("middle", "told"), [(0.5, True), (2.5, False)], ids=["drift", "jumps"])
-def test_a_clock_that_drifts_is_late_by_half_in_the_middle_and_motions_that_differ_are_no_drift(middle, told):
+def test_a_clock_that_drifts_is_late_by_half_in_the_middle_and_motions_that_differ_are_no_drift(
+    middle, told
+):
     """A trajectory generator follows quick parts of a motion later than slow ones, from one part to the next."""
     surveys = [SimpleNamespace(response=SimpleNamespace(duration=12.0))] * 6
     end = 0.02 * np.array([0.7, 0.9, 1.0, 1.0, 1.1, 1.3])
@@ -227,7 +245,11 @@ def test_rows_of_zeros_are_a_warning(arm, tmp_path, where):
 
 def test_steps_from_and_to_zero_are_no_rows_of_zeros(arm, tmp_path):
     ctrl = np.repeat(((np.arange(ROWS) // 50) % 2 * 0.3)[:, None], 2, axis=1)
-    assert found(examine(arm, tmp_path, arm_sequence(arm, ctrl, late(lowpass(ctrl, 0.02, 2.0), 3))), "jumps", "ok")
+    assert found(
+        examine(arm, tmp_path, arm_sequence(arm, ctrl, late(lowpass(ctrl, 0.02, 2.0), 3))),
+        "jumps",
+        "ok",
+    )
 
 
 def hanging(arm, payload: float = 0.0) -> Sequence:
@@ -244,7 +266,9 @@ def weigh(arm, tmp_path, *sequences) -> DoctorResult:
     for sequence in sequences:
         dataset.append(sequence)
     return DoctorResult.of(
-        dataset, arm, gravity_model=lambda qpos, mass, side: static_torque(build_model(arm, mass, side), qpos)
+        dataset,
+        arm,
+        gravity_model=lambda qpos, mass, side: static_torque(build_model(arm, mass, side), qpos),
     )
 
 
@@ -257,13 +281,19 @@ def test_torques_that_hold_up_the_arm_as_logged_are_fine(arm, tmp_path, payload)
 
 def test_few_torques_and_rests_say_nothing_about_gravity(arm, tmp_path):
     short = arm_sequence(arm, wave(40, 2), late(wave(40, 2), 3))
-    assert "too few torques and rests" in found(weigh(arm, tmp_path, short), "gravity", "ok").message
+    assert (
+        "too few torques and rests" in found(weigh(arm, tmp_path, short), "gravity", "ok").message
+    )
 
 
 @pytest.mark.parametrize(("joint", "turn"), [(0, 0.6), (1, 0.8), (0, -1.2)])
 def test_a_zero_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_path, joint, turn):
     s, shift = hanging(arm), turn * np.eye(2)[joint]
-    finding = found(weigh(arm, tmp_path, replace(s, ctrl=s.ctrl + shift, qpos=s.qpos + shift)), "gravity", "warning")
+    finding = found(
+        weigh(arm, tmp_path, replace(s, ctrl=s.ctrl + shift, qpos=s.qpos + shift)),
+        "gravity",
+        "warning",
+    )
     assert finding.joints == (arm.joint_names[joint],)
     assert finding.message.startswith("with its zero turned by")
 
@@ -301,7 +331,9 @@ def standing(arm, seed: int, share: float, behind_gears: bool = False) -> Sequen
 def test_a_torque_fed_forward_beside_the_command_is_told_from_a_servo_that_sags(
     arm, tmp_path, share, behind_gears, level
 ):
-    data = write_dataset(tmp_path / "data", arm, [standing(arm, seed, share, behind_gears) for seed in range(4)])
+    data = write_dataset(
+        tmp_path / "data", arm, [standing(arm, seed, share, behind_gears) for seed in range(4)]
+    )
     diagnosis = DoctorResult.of(data, arm, gravity_model=gravity_of(arm))
     finding = found(diagnosis, "feed-forward", level)
     if level == "ok":
@@ -309,7 +341,9 @@ def test_a_torque_fed_forward_beside_the_command_is_told_from_a_servo_that_sags(
         return
     assert finding.joints == arm.joint_names
     assert list(finding.values.values()) == pytest.approx([share, share], abs=0.05)
-    assert not any(f.check in ("rests", "gains", "offset") for f in diagnosis.findings)  # the missing sag is its effect
+    assert not any(
+        f.check in ("rests", "gains", "offset") for f in diagnosis.findings
+    )  # the missing sag is its effect
 
 
 def test_a_few_rests_do_not_tell_what_holds_the_arm(arm, tmp_path):
@@ -327,25 +361,34 @@ def test_a_motor_too_weak_for_its_load_is_no_error_of_the_commands(arm, tmp_path
 
 
 @pytest.mark.parametrize("rows", ["uniform 12 to 40 Hz", "slower and slower"])
-def test_rows_at_12_to_40_hz_are_no_error_of_clocks_and_say_which_times_are_not_known(arm, tmp_path, rows):
+def test_rows_at_12_to_40_hz_are_no_error_of_clocks_and_say_which_times_are_not_known(
+    arm, tmp_path, rows
+):
     even = rows.startswith("uniform")
     folder = tmp_path / "logs"
     folder.mkdir()
     for seed in range(4):
         rng = np.random.default_rng(seed)
         time = np.cumsum(1 / (rng.uniform(12, 40, 700) if even else np.linspace(40, 12, 700)))
-        clock, ctrl = 0.005 * np.arange(8000), lowpass(np.repeat(rng.uniform(-1, 1, (40, 2)), 200, axis=0), 0.005, 0.8)
+        clock, ctrl = (
+            0.005 * np.arange(8000),
+            lowpass(np.repeat(rng.uniform(-1, 1, (40, 2)), 200, axis=0), 0.005, 0.8),
+        )
         at = lambda x, t, clock=clock: np.stack([np.interp(t, clock, c) for c in x.T], axis=1)  # noqa: E731
         held, state = at(ctrl, np.floor(time / 0.02) * 0.02), at(ctrl, time - 0.06)
         names = [f"{c}.{j}" for c in ("ctrl", "qpos") for j in arm.joint_names]
         columns = dict(zip(names, np.concatenate([held, state], axis=1).T, strict=True))
         (folder / f"m{seed}.csv").write_text(table_text({"time": time} | columns))
-    data = import_logs(folder, arm, "a", 0.0, tmp_path / "data", position_unit="rad", time_unit="s").dataset
+    data = import_logs(
+        folder, arm, "a", 0.0, tmp_path / "data", position_unit="rad", time_unit="s"
+    ).dataset
     assert "apart, and shorter delays are not known" in data.entries[0].meta.notes["why_resampled"]
     diagnosis = DoctorResult.of(data, arm)
-    assert [f.message for f in diagnosis.findings if f.level == "error" or f.check in ("copied", "averaged")] == [
-        "no state comes before its command"
-    ]
+    assert [
+        f.message
+        for f in diagnosis.findings
+        if f.level == "error" or f.check in ("copied", "averaged")
+    ] == ["no state comes before its command"]
     assert "cannot be told between such rows" in found(diagnosis, "jitter", "warning").message
 
 
@@ -357,9 +400,16 @@ def test_a_load_that_sags_far_is_not_taken_for_a_stop(arm, tmp_path):
 
 
 def test_missing_samples_and_jitter_are_reported_from_the_logs_own_clock(arm, tmp_path):
-    notes = {"rate_hz": 50.0, "jitter_ms": 80.0, "longest_gap_ms": 100.0, "rows": "resampled to 50.00 Hz"}
+    notes = {
+        "rate_hz": 50.0,
+        "jitter_ms": 80.0,
+        "longest_gap_ms": 100.0,
+        "rows": "resampled to 50.00 Hz",
+    }
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), notes=notes))
-    assert found(diagnosis, "gaps", "warning").message.startswith("1 sequence(s) miss samples, at worst 100 ms (m)")
+    assert found(diagnosis, "gaps", "warning").message.startswith(
+        "1 sequence(s) miss samples, at worst 100 ms (m)"
+    )
     assert found(diagnosis, "jitter", "warning").values == {"jitter_ms": 80.0}
     assert found(diagnosis, "rate", "note").message == "1 sequence(s) were put on a uniform grid: m"
 
@@ -400,8 +450,13 @@ def test_a_lag_of_three_periods_is_reported_as_60_ms(arm, tmp_path):
 def test_sag_is_reported_for_the_lightest_and_the_heaviest_payload(arm, tmp_path):
     ctrl, qpos = good()
     still = np.repeat(ctrl[-1:], 60, axis=0)
-    rest = lambda sag: (np.concatenate([ctrl, still]), np.concatenate([qpos, still + np.array([sag, 0])]))  # noqa: E731
-    sequences = [arm_sequence(arm, *rest(0.03 + 0.1 * mass), payload=mass) for mass in (0.0, 0.5, 1.0)]
+    rest = lambda sag: (  # noqa: E731
+        np.concatenate([ctrl, still]),
+        np.concatenate([qpos, still + np.array([sag, 0])]),
+    )
+    sequences = [
+        arm_sequence(arm, *rest(0.03 + 0.1 * mass), payload=mass) for mass in (0.0, 0.5, 1.0)
+    ]
     finding = found(examine(arm, tmp_path, *sequences), "sag", "note")
     assert finding.joints == ("shoulder",)
     assert "shoulder +30" in finding.message
@@ -427,7 +482,10 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
     dataset = Dataset.create(tmp_path / "data", arm)
     dataset.append(arm_sequence(arm, *good()))
     dataset.append(arm_sequence(arm, *good(), payload=1.5, unit="b"))
-    assert DoctorResult.inventory(dataset) == "2 recordings, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
+    assert (
+        DoctorResult.inventory(dataset)
+        == "2 recordings, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
+    )
 
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
@@ -438,7 +496,9 @@ def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset
         assert 0.08 <= lags[joint]["median"] <= 0.16
         assert 0.07 <= lags[joint]["min"] <= lags[joint]["max"] <= 0.16
     assert found(diagnosis, "sag", "note").joints == ("shoulder_lift", "elbow_flex")
-    assert found(diagnosis, "unit", "note").message.startswith("gripper is logged as 0..1, not in rad")
+    assert found(diagnosis, "unit", "note").message.startswith(
+        "gripper is logged as 0..1, not in rad"
+    )
     torque = [f.message for f in diagnosis.findings if f.check == "torque"]
     assert torque[0].startswith("torque is unsigned")
     assert torque[1].startswith("torque spikes")

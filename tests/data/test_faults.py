@@ -20,19 +20,31 @@ NAMED = {
     "scale of 1.2": ("scale", "warning", "elbow_flex goes 1.2"),
     "spike of a state": ("jumps", "warning", "elbow_flex jumps and comes back"),
     "frozen channel": ("stuck", "warning", "elbow_flex repeats one number"),
-    "command and state swapped in one": ("copied", "error", "before their commands in m2, not in other recordings"),
+    "command and state swapped in one": (
+        "copied",
+        "error",
+        "before their commands in m2, not in other recordings",
+    ),
     "two robots in one": ("unit_id", "warning", "m2 rests +10"),
     "wrong gains": ("gains", "warning", "times as far as the stated kp says"),
     "wrong payload label": ("payload", "warning", "m2 rests as with 0"),
     "joint order": ("gravity", "warning", "the order of joints one place back"),
-    "zero of command and state": ("gravity", "warning", "with its zero turned by +0.60 rad at elbow_flex"),
+    "zero of command and state": (
+        "gravity",
+        "warning",
+        "with its zero turned by +0.60 rad at elbow_flex",
+    ),
     "torque of the other sign": ("gravity", "warning", "with its torque negated at elbow_flex"),
     "quantised": ("resolution", "warning", "come in steps of up to 10.0 mrad"),
     "saturated torque": ("saturation", "warning", "torque of elbow_flex is cut off flat at"),
     "saturated command": ("unit", "warning", "elbow_flex goes 1."),
     "truncated at a row's end": ("", "", "its states end"),
 }
-MENDED = ("sign of command and state", "zero of command and state", "joint order")  # by lines for logs.toml
+MENDED = (
+    "sign of command and state",
+    "zero of command and state",
+    "joint order",
+)  # by lines for logs.toml
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +61,21 @@ def logs(robot):
 def test_good_logs_of_soft_and_stiff_motors_are_good(robot, tmp_path, kp):
     diagnosis = examine(robot, recordings(robot, kp), tmp_path)
     assert diagnosis.verdict == "Good: no error and no warning."
-    assert not {f.check for f in diagnosis.findings} & {"offset", "scale", "gains", "payload", "unit_id"}
+    assert not {f.check for f in diagnosis.findings} & {
+        "offset",
+        "scale",
+        "gains",
+        "payload",
+        "unit_id",
+    }
     assert Finding.proposal(diagnosis.findings) == "# gaponet doctor --fix: nothing to mend.\n"
 
 
 def test_encoder_steps_of_12_bits_are_no_fault(robot, logs, tmp_path):
     step = 2 * np.pi / 4096
-    coarse = all_of(logs, lambda log: log.change(slice(None), qpos=lambda x: np.round(x / step) * step))
+    coarse = all_of(
+        logs, lambda log: log.change(slice(None), qpos=lambda x: np.round(x / step) * step)
+    )
     assert examine(robot, coarse, tmp_path).verdict.startswith("Good")
 
 
@@ -68,9 +88,18 @@ def test_a_fault_is_found_and_named_or_refused(robot, logs, tmp_path, fault):
         assert isinstance(answer, GAPONetError)
         assert words in str(answer)
         return
-    assert [f for f in answer.findings if (f.check, f.level) == (check, level) and words in f.message]
+    assert [
+        f for f in answer.findings if (f.check, f.level) == (check, level) and words in f.message
+    ]
     others = {f.check for f in answer.findings if f.level in ("warning", "error")} - {check}
-    assert others <= {"jitter", "blocked", "jumps", "unit", "stuck", "range"}  # what follows from it
+    assert others <= {
+        "jitter",
+        "blocked",
+        "jumps",
+        "unit",
+        "stuck",
+        "range",
+    }  # what follows from it
     if fault in MENDED:
         proposed = Finding.proposal(answer.findings)
         assert "applied to nothing" in proposed
@@ -83,4 +112,6 @@ def test_each_finding_has_a_picture(robot, logs, tmp_path):
     findings = examine(robot, change(logs), tmp_path).findings
     written = draw_findings(Dataset(tmp_path / "data"), robot, findings, tmp_path)
     assert (tmp_path / "01-jumps.png") in written
-    assert len(written) == 2 * sum(f.level != "ok" and (f.level != "note" or bool(f.joints)) for f in findings)
+    assert len(written) == 2 * sum(
+        f.level != "ok" and (f.level != "note" or bool(f.joints)) for f in findings
+    )

@@ -31,16 +31,29 @@ def logs(tmp_path):
 def test_every_motion_becomes_a_sequence_with_its_origin(logs, so101, tmp_path):
     seen = []
     report = import_logs(
-        logs, so101, "lab", 0.0, tmp_path / "data", level="joint", progress=lambda *what: seen.append(what)
+        logs,
+        so101,
+        "lab",
+        0.0,
+        tmp_path / "data",
+        level="joint",
+        progress=lambda *what: seen.append(what),
     )
     assert seen == [(1, 2, "down"), (2, 2, "up")]
     assert [e.meta.motion for e in report.entries] == ["down", "up"]
-    assert report.entries[0].findings["delay_s"]["elbow_flex"] == pytest.approx(2 * 0.02006, abs=0.003)
+    assert report.entries[0].findings["delay_s"]["elbow_flex"] == pytest.approx(
+        2 * 0.02006, abs=0.003
+    )
     for file in (tmp_path / "data").glob("*.json*"):
         assert str(tmp_path) not in file.read_text()  # no absolute path enters a dataset
     assert len(Dataset(tmp_path / "data")) == 2
     meta = report.entries[0].meta
-    assert (meta.unit_id, meta.payload_mass, meta.level, meta.virtual) == ("lab", 0.0, "joint", False)
+    assert (meta.unit_id, meta.payload_mass, meta.level, meta.virtual) == (
+        "lab",
+        0.0,
+        "joint",
+        False,
+    )
     assert meta.source == "logs/real/so101/custom/down"
     folder = logs / "real" / "so101" / "custom" / "down"
     both = (folder / "control.csv").read_bytes() + (folder / "state_motor.csv").read_bytes()
@@ -59,7 +72,9 @@ def test_what_is_there_is_counted_and_the_rest_is_added(logs, so101, tmp_path):
 def test_one_recording_twice_in_the_source_is_refused(logs, so101, tmp_path):
     custom = logs / "real" / "so101" / "custom"
     shutil.copytree(custom / "up", custom / "up_again")
-    with pytest.raises(DatasetError, match=r"1 of 3 recordings are there twice .*up_again is logs/.*/up\."):
+    with pytest.raises(
+        DatasetError, match=r"1 of 3 recordings are there twice .*up_again is logs/.*/up\."
+    ):
         import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
@@ -69,7 +84,9 @@ def test_other_payloads_and_units_are_appended(logs, so101, tmp_path):
     for lag, unit, mass, side in ((3, "lab", 0.2, "hand"), (4, "roof", 0.0, None)):
         ctrl = wave(200, 6)
         write_sage(tmp_path / unit / "up", ctrl, late(ctrl, lag))
-        report = import_logs(tmp_path / unit, so101, unit, mass, tmp_path / "data", payload_side=side)
+        report = import_logs(
+            tmp_path / unit, so101, unit, mass, tmp_path / "data", payload_side=side
+        )
     assert [(e.meta.unit_id, e.meta.payload_mass) for e in report.dataset.entries[1:]] == [
         ("lab", 0.0), ("lab", 0.2), ("roof", 0.0),
     ]  # fmt: skip
@@ -81,7 +98,10 @@ def test_known_samples_under_new_labels_are_refused_and_can_be_had_once_the_old_
 ):
     dataset = import_logs(logs, so101, "lab", 0.0, tmp_path / "data").dataset
     write_so101(logs / "real" / "so101" / "custom" / "new")
-    with pytest.raises(DatasetError, match=r"down: known samples under new labels: .* gaponet data remove .* down-lab"):
+    with pytest.raises(
+        DatasetError,
+        match=r"down: known samples under new labels: .* gaponet data remove .* down-lab",
+    ):
         import_logs(logs, so101, unit, mass, tmp_path / "data")
     assert len(Dataset(tmp_path / "data")) == 2
     assert [e.meta.motion for e in dataset.remove(("*-lab-0kg-*",))] == ["down", "up"]
@@ -104,7 +124,9 @@ def test_one_bad_file_leaves_nothing_behind(logs, so101, tmp_path):
     assert not (tmp_path / "data").exists()
 
 
-def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(logs, so101, tmp_path, monkeypatch):
+def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(
+    logs, so101, tmp_path, monkeypatch
+):
     """Every operation on the disk fails once; the journal lists all files, whole ones; the end is always the same."""
     whole = import_logs(logs, so101, "lab", 0.0, tmp_path / "whole", gravity=lambda q, m, s: 0 * q)
     real = {name: getattr(os, name) for name in ("replace", "fsync", "pwrite", "mkdir")}
@@ -139,14 +161,18 @@ def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(logs, so1
             assert not out.exists()
         import_logs(logs, so101, "lab", 0.0, out, gravity=lambda q, m, s: 0 * q)
         assert Dataset(out).entries == whole.dataset.entries
-        assert sorted(f.name for f in out.rglob("*")) == sorted(f.name for f in whole.dataset.path.rglob("*"))
+        assert sorted(f.name for f in out.rglob("*")) == sorted(
+            f.name for f in whole.dataset.path.rglob("*")
+        )
     assert n > 20
 
 
 def test_a_folder_with_something_else_in_it_is_left_as_it_is(logs, so101, tmp_path):
     (tmp_path / "proj" / ".git").mkdir(parents=True)
     (tmp_path / "proj" / ".env").write_text("mine")
-    with pytest.raises(FolderError, match=r"proj: holds \.env, \.git, so it is no dataset of gaponet"):
+    with pytest.raises(
+        FolderError, match=r"proj: holds \.env, \.git, so it is no dataset of gaponet"
+    ):
         import_logs(logs, so101, "lab", 0.0, tmp_path / "proj")
     assert sorted(f.name for f in (tmp_path / "proj").iterdir()) == [".env", ".git"]
 
@@ -170,7 +196,9 @@ def test_another_robots_dataset_is_refused_before_anything_is_read(logs, so101, 
 
 
 def test_a_hand_the_robot_does_not_have_is_refused(logs, so101, tmp_path):
-    with pytest.raises(UsageError, match="payload side 'left' is unknown to so101; use one of both, hand"):
+    with pytest.raises(
+        UsageError, match="payload side 'left' is unknown to so101; use one of both, hand"
+    ):
         import_logs(logs, so101, "lab", 0.2, tmp_path / "data", payload_side="left")
 
 
@@ -181,7 +209,9 @@ def test_offsets_are_fitted_where_a_gravity_is_given(logs, so101, tmp_path):
         asked.append((payload_mass, payload_side))
         return np.zeros_like(qpos)
 
-    report = import_logs(logs, so101, "lab", 0.2, tmp_path / "data", gravity=weightless, simulator="abc")
+    report = import_logs(
+        logs, so101, "lab", 0.2, tmp_path / "data", gravity=weightless, simulator="abc"
+    )
     assert asked[0] == (0.2, "both")
     assert list(report.offsets) == list(so101.operated)
     assert json.loads((tmp_path / "data" / FILE).read_text())["units"]["lab"]["simulator"] == "abc"
@@ -203,7 +233,9 @@ def test_a_source_named_by_a_dot_is_known_by_its_folder(so101, tmp_path, monkeyp
 def test_gains_are_the_robots_unless_said_by_joint_or_for_all(logs, so101, tmp_path):
     first = import_logs(logs, so101, "lab", 0.0, tmp_path / "a").entries[0].meta
     assert first.kp == tuple(so101.kp)
-    said = import_logs(logs, so101, "lab", 0.0, tmp_path / "b", kp=("elbow_flex=9", "gripper=4"), kd=("0.1",))
+    said = import_logs(
+        logs, so101, "lab", 0.0, tmp_path / "b", kp=("elbow_flex=9", "gripper=4"), kd=("0.1",)
+    )
     meta = Dataset(tmp_path / "b").entries[0].meta
     assert meta == said.entries[0].meta
     assert dict(zip(so101.joint_names, meta.kp, strict=True)) == (
@@ -234,6 +266,8 @@ def test_a_journal_from_before_gains_were_kept_still_opens(logs, so101, tmp_path
 def test_a_motion_with_a_name_of_many_letters_is_stored(arm, tmp_path):
     file = tmp_path / ("a" * 240 + ".csv")
     file.write_text(table_text(arm_columns()))
-    data = import_logs(file, arm, "b" * 300, 0.0, tmp_path / "out", position_unit="rad", time_unit="s").dataset
+    data = import_logs(
+        file, arm, "b" * 300, 0.0, tmp_path / "out", position_unit="rad", time_unit="s"
+    ).dataset
     assert len(data.read(data.entries[0])) == 60
     assert data.entries[0].meta.motion == "a" * 240

@@ -28,7 +28,9 @@ def test_a_log_without_commands_is_refused():
 def test_a_value_that_is_not_finite_is_named_by_file_line_and_joint():
     values = VALUES.copy()
     values[1, 1] = np.nan
-    with pytest.raises(LogError, match=r"state\.csv:3: qpos of b is not finite; repair or cut the row"):
+    with pytest.raises(
+        LogError, match=r"state\.csv:3: qpos of b is not finite; repair or cut the row"
+    ):
         log(qpos=Channel(TIME, values))
 
 
@@ -44,10 +46,14 @@ def test_one_row_is_nothing_to_learn_from():
 
 
 def test_columns_must_match_the_joints():
-    with pytest.raises(LogError, match=r"channel tau has shape \(3, 1\), expected \(3, 2\) for joints a, b"):
+    with pytest.raises(
+        LogError, match=r"channel tau has shape \(3, 1\), expected \(3, 2\) for joints a, b"
+    ):
         log(tau=Channel(TIME, VALUES[:, :1]))
 
 
 def test_a_channel_nobody_knows_is_refused():
-    with pytest.raises(LogError, match="unknown channel 'current'; known are ctrl, qpos, qvel, tau, temperature"):
+    with pytest.raises(
+        LogError, match="unknown channel 'current'; known are ctrl, qpos, qvel, tau, temperature"
+    ):
         log(current=Channel(TIME, VALUES))

@@ -32,7 +32,9 @@ def test_even_rows_are_kept_as_recorded_at_their_own_rate(arm):
 def test_a_missing_sample_puts_the_log_on_a_grid(arm):
     time = np.delete(0.02 * np.arange(ROWS), 20)
     sequence = to_sequence(arm_log(time), arm, META)
-    assert sequence.meta.notes["rows"] == "resampled to 50.00 Hz: commands held, states interpolated"
+    assert (
+        sequence.meta.notes["rows"] == "resampled to 50.00 Hz: commands held, states interpolated"
+    )
     assert sequence.meta.notes["longest_gap_ms"] == pytest.approx(40)
     assert len(sequence) == ROWS
     assert sequence.qpos[20, 0] == pytest.approx(0.4)  # on the line between its neighbours
@@ -48,12 +50,18 @@ def test_commands_and_states_on_different_clocks_meet_where_they_overlap(arm):
 
 def test_channels_that_do_not_overlap_are_refused(arm):
     time = 0.02 * np.arange(ROWS)
-    with pytest.raises(LogError, match=r"command and state channels overlap for .* s only; check the clocks"):
+    with pytest.raises(
+        LogError, match=r"command and state channels overlap for .* s only; check the clocks"
+    ):
         to_sequence(arm_log(time, ctrl_time=time + 10), arm, META)
 
 
-JUMPED = np.r_[0.02 * np.arange(25), 3600 + 0.02 * np.arange(25)]  # an hour, twice the samples of a second
-BURSTS = (0.1 * np.arange(10)[:, None] + 2e-4 * np.arange(5)).ravel()  # five samples at once, ten times a second
+JUMPED = np.r_[
+    0.02 * np.arange(25), 3600 + 0.02 * np.arange(25)
+]  # an hour, twice the samples of a second
+BURSTS = (
+    0.1 * np.arange(10)[:, None] + 2e-4 * np.arange(5)
+).ravel()  # five samples at once, ten times a second
 
 
 @pytest.mark.parametrize(
@@ -87,13 +95,21 @@ def test_half_a_second_without_samples_is_still_filled(arm):
 
 
 def test_a_stated_period_that_the_timestamps_contradict_is_refused(arm):
-    with pytest.raises(LogError, match=r"the period is said to be 0\.0333333 s, but the timestamps are 0\.02 s apart"):
+    with pytest.raises(
+        LogError,
+        match=r"the period is said to be 0\.0333333 s, but the timestamps are 0\.02 s apart",
+    ):
         to_sequence(arm_log(0.02 * np.arange(ROWS), dt=1 / 30), arm, META)
 
 
 def test_joints_go_into_the_robots_order_and_absent_ones_stand_at_home(arm):
     log = arm_log(0.02 * np.arange(ROWS))
-    one = Log("arm", ("elbow",), {k: Channel(c.time, c.values[:, 1:]) for k, c in log.channels.items()}, "wave.csv")
+    one = Log(
+        "arm",
+        ("elbow",),
+        {k: Channel(c.time, c.values[:, 1:]) for k, c in log.channels.items()},
+        "wave.csv",
+    )
     sequence = to_sequence(one, arm, META)
     assert sequence.joint_names == ("shoulder", "elbow")
     assert not sequence.qpos[:, 0].any()
@@ -116,7 +132,10 @@ def test_velocity_of_a_joint_logged_as_a_fraction_is_computed_too(arm):
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        *(("payload_mass", mass, r"payload_mass is .*; give kg, 0 when empty") for mass in (-0.1, np.nan, 1000.0)),
+        *(
+            ("payload_mass", mass, r"payload_mass is .*; give kg, 0 when empty")
+            for mass in (-0.1, np.nan, 1000.0)
+        ),
         ("level", "legs", "level 'legs' is not one of joint, upper_body, whole_body"),
     ],
 )
@@ -133,8 +152,14 @@ def test_samples_that_are_not_numbers_are_refused(arm):
 
 def test_identity_is_samples_unit_and_payload_and_not_the_name(arm):
     sequence = to_sequence(arm_log(0.02 * np.arange(ROWS)), arm, META)
-    assert replace(sequence, meta=replace(META, motion="other")).content_hash() == sequence.content_hash()
-    assert replace(sequence, meta=replace(META, payload_mass=1.0)).content_hash() != sequence.content_hash()
+    assert (
+        replace(sequence, meta=replace(META, motion="other")).content_hash()
+        == sequence.content_hash()
+    )
+    assert (
+        replace(sequence, meta=replace(META, payload_mass=1.0)).content_hash()
+        != sequence.content_hash()
+    )
     assert replace(sequence, qpos=sequence.qpos + 0.001).content_hash() != sequence.content_hash()
 
 
@@ -155,11 +180,16 @@ def test_gains_that_are_none_are_refused(arm, kp):
 
 
 def test_recordings_with_different_gains_are_not_taken_together_unless_they_do_not_say():
-    soft, stiff = replace(META, kp=(5.0, 5.0)), replace(META, kp=(5.0, 10.0), motion="stiff", unit_id="b")
+    soft, stiff = (
+        replace(META, kp=(5.0, 5.0)),
+        replace(META, kp=(5.0, 10.0), motion="stiff", unit_id="b"),
+    )
     joints = ("shoulder", "elbow")
     require_same_gains([soft, META, replace(soft, kp=(5.0, 5.0 * (1 + 1e-5)))], joints, joints)
     require_same_gains([soft, stiff], joints, ("shoulder",))
-    with pytest.raises(UsageError, match=r"kp of elbow was 5 in 'wave' of a and 10 in 'stiff' of b.*--mixed-gains"):
+    with pytest.raises(
+        UsageError, match=r"kp of elbow was 5 in 'wave' of a and 10 in 'stiff' of b.*--mixed-gains"
+    ):
         require_same_gains([soft, stiff], joints, joints)
 
 
@@ -168,11 +198,15 @@ def test_time_is_never_stretched(arm, short):
     """Two in three periods are 20 ms, one is a little shorter: the median is no clock."""
     time = np.concatenate([[0.0], np.cumsum(np.where(np.arange(1499) % 3, 0.02, 0.02 - short))])
     truth = lambda t: np.stack([np.sin(t), np.cos(2 * t)], axis=1)  # noqa: E731
-    log = Log("arm", ("shoulder", "elbow"), {n: Channel(time, truth(time)) for n in ("ctrl", "qpos")}, "x")
+    log = Log(
+        "arm", ("shoulder", "elbow"), {n: Channel(time, truth(time)) for n in ("ctrl", "qpos")}, "x"
+    )
     sequence = to_sequence(log, arm, SequenceMeta("arm", "a", "m", 0.0))
     rows = sequence.dt * np.arange(len(sequence))
     assert rows[-1] == pytest.approx(time[-1], abs=sequence.dt)
-    assert np.abs(sequence.qpos - truth(rows)).max() < 0.5 * sequence.dt * 2 + 1e-3  # half a period at 2 rad/s
+    assert (
+        np.abs(sequence.qpos - truth(rows)).max() < 0.5 * sequence.dt * 2 + 1e-3
+    )  # half a period at 2 rad/s
     assert sequence.dt == pytest.approx(0.02 - short / 3 if short else 0.02, abs=2e-5)
 
 

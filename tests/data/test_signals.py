@@ -24,19 +24,33 @@ def smooth_noise(rows: int, seed: int = 0) -> np.ndarray:
 
 
 def test_a_state_between_two_samples_lies_on_the_line():
-    assert resample_linear(TIME, VALUES, np.array([0.05, 0.1, 0.2, 0.4]))[:, 0].tolist() == pytest.approx(
-        [0.5, 1, 2, 4]
-    )
+    assert resample_linear(TIME, VALUES, np.array([0.05, 0.1, 0.2, 0.4]))[
+        :, 0
+    ].tolist() == pytest.approx([0.5, 1, 2, 4])
 
 
 def test_a_command_holds_until_the_next_arrives():
-    assert resample_zoh(TIME, VALUES, np.linspace(0.0, 0.4, 9))[:, 0].tolist() == [0, 0, 1, 1, 1, 1, 1, 1, 4]
+    assert resample_zoh(TIME, VALUES, np.linspace(0.0, 0.4, 9))[:, 0].tolist() == [
+        0,
+        0,
+        1,
+        1,
+        1,
+        1,
+        1,
+        1,
+        4,
+    ]
     assert resample_zoh(TIME, VALUES, np.array([0.08, 0.12]))[:, 0].tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("jitter", [0.0, 4e-4])
 def test_commands_that_share_a_loops_stamps_with_faster_states_are_of_their_instant(jitter):
-    states = 1_700_000_000.123 + 0.01 * np.arange(3001) + jitter * np.random.default_rng(0).uniform(-1, 1, 3001)
+    states = (
+        1_700_000_000.123
+        + 0.01 * np.arange(3001)
+        + jitter * np.random.default_rng(0).uniform(-1, 1, 3001)
+    )
     sent = np.arange(1501.0)[:, None]
     grid = states[0] + 0.01 * np.arange(3001)
     held = resample_zoh(states[::2], sent, grid)[:, 0]
@@ -79,7 +93,9 @@ def test_a_best_shift_at_the_limit_of_the_search_is_no_delay():
     u = smooth_noise(1000)
     qpos = np.concatenate([np.full(20, u[0]), u[:-20]])
     assert np.isnan(estimate_delay(u[:, None], qpos[:, None], DT, max_delay=0.4)[0])
-    assert estimate_delay(u[:, None], qpos[:, None], DT, max_delay=0.6)[0] == pytest.approx(0.4, abs=0.003)
+    assert estimate_delay(u[:, None], qpos[:, None], DT, max_delay=0.6)[0] == pytest.approx(
+        0.4, abs=0.003
+    )
 
 
 def test_fast_speed_is_what_a_joint_does_in_its_fastest_twentieth():

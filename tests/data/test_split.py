@@ -46,13 +46,19 @@ def values(entries, field):
 def test_a_split_holds_every_motion_once():
     motions = [f"m{i}" for i in range(40)]
     split = split_motions(motions)
-    assert {part: len(names) for part, names in split.items()} == {"train": 25, "val": 5, "test": 10}
+    assert {part: len(names) for part, names in split.items()} == {
+        "train": 25,
+        "val": 5,
+        "test": 10,
+    }
     assert sorted(name for names in split.values() for name in names) == sorted(motions)
     assert split == split_motions([*reversed(motions), *motions])
 
 
 def test_two_motions_cannot_be_split_in_three():
-    with pytest.raises(UsageError, match=r"2 motion\(s\) \(.*\): a split by motion needs 3 or more"):
+    with pytest.raises(
+        UsageError, match=r"2 motion\(s\) \(.*\): a split by motion needs 3 or more"
+    ):
         split_motions(["a", "b"])
 
 
@@ -91,9 +97,17 @@ def test_payloads_are_numbers_however_they_are_written(dataset):
     ("by", "holdout", "complaint"),
     [
         ("motion", ("dance",), "no motion 'dance' to hold out; it holds a, b, c, d, e, f, g, h"),
-        ("unit", ("one", "two", "three"), "holding out unit one, three, two leaves nothing for train"),
+        (
+            "unit",
+            ("one", "two", "three"),
+            "holding out unit one, three, two leaves nothing for train",
+        ),
         ("payload", ("heavy",), "--holdout heavy: payloads are numbers, kg"),
-        ("motion", tuple("abcdefg"), r"leaves nothing for train \(1 motion\(s\) remain\); hold out less"),
+        (
+            "motion",
+            tuple("abcdefg"),
+            r"leaves nothing for train \(1 motion\(s\) remain\); hold out less",
+        ),
     ],
     ids=["stranger", "everything", "not a number", "too much"],
 )
@@ -106,10 +120,15 @@ def test_the_same_samples_under_another_unit_are_found(dataset):
     twice = dataset.read(dataset.entries[0])
     dataset.append(replace(twice, meta=replace(twice.meta, unit_id="two")))
     told = []
-    require_distinct_samples(dataset, make_split(dataset, "motion"), lambda *what: told.append(what))
+    require_distinct_samples(
+        dataset, make_split(dataset, "motion"), lambda *what: told.append(what)
+    )
     assert told[-1][:2] == (len(dataset), len(dataset))
     parts = make_split(dataset, "unit", ("two",))
-    with pytest.raises(DatasetError, match=r"'a-two-0kg-.*' \(test\) and 'a-one-0kg-.*' \(.*\) hold the same samples"):
+    with pytest.raises(
+        DatasetError,
+        match=r"'a-two-0kg-.*' \(test\) and 'a-one-0kg-.*' \(.*\) hold the same samples",
+    ):
         require_distinct_samples(dataset, parts)
 
 
@@ -122,13 +141,19 @@ def test_a_split_file_is_read_back(dataset):
     assert (record["by"], record["held_out"], record["virtual"]) == ("unit", ["two"], False)
 
 
-def test_a_split_finds_sequences_by_content_and_is_refused_where_one_is_missing(dataset, arm, tmp_path):
+def test_a_split_finds_sequences_by_content_and_is_refused_where_one_is_missing(
+    dataset, arm, tmp_path
+):
     path = write_split(dataset, make_split(dataset, "motion"), "motion")
     copy = Dataset.create(tmp_path / "copy", arm)
     for entry in reversed(dataset.entries):
         copy.append(dataset.read(entry))
-    assert {e.hash for e in read_split(path, copy)["test"]} == {e.hash for e in read_split(path, dataset)["test"]}
-    with pytest.raises(DatasetError, match=r"motion\.json: '.*' is not in .*other; split that dataset anew"):
+    assert {e.hash for e in read_split(path, copy)["test"]} == {
+        e.hash for e in read_split(path, dataset)["test"]
+    }
+    with pytest.raises(
+        DatasetError, match=r"motion\.json: '.*' is not in .*other; split that dataset anew"
+    ):
         read_split(path, Dataset.create(tmp_path / "other", arm))
 
 
@@ -147,7 +172,9 @@ def test_a_split_file_with_a_sequence_in_two_parts_is_refused(dataset):
     "change",
     [
         pytest.param(lambda text: re.sub(rb'"train": .', b'"train": [], "was": {', text), id="244"),
-        pytest.param(lambda text: re.sub(rb'("train": \{\s*"[^"]*": )"[^"]*"', rb'\1["x"]', text), id="301"),
+        pytest.param(
+            lambda text: re.sub(rb'("train": \{\s*"[^"]*": )"[^"]*"', rb'\1["x"]', text), id="301"
+        ),
         pytest.param(lambda text: text[:126] + b"\xff" + text[126:], id="518"),
         pytest.param(lambda text: b"[1]", id="no object"),
     ],
@@ -185,7 +212,11 @@ def walk(rows, seed, dt=0.02, shift=0.0):
     """Smooth commands of two joints, as a function of time."""
     t = dt * np.arange(rows)[:, None] + shift
     rng = np.random.default_rng(seed)
-    a, f, p = rng.uniform(0.2, 0.5, (3, 2)), rng.uniform(0.1, 0.6, (3, 2)), rng.uniform(0, 6, (3, 2))
+    a, f, p = (
+        rng.uniform(0.2, 0.5, (3, 2)),
+        rng.uniform(0.1, 0.6, (3, 2)),
+        rng.uniform(0, 6, (3, 2)),
+    )
     return sum(a[k] * np.sin(2 * np.pi * f[k] * t + p[k]) for k in range(3))
 
 
@@ -194,7 +225,9 @@ def walk(rows, seed, dt=0.02, shift=0.0):
     [
         lambda c: c,
         lambda c: c[: len(c) // 2],  # cut short
-        lambda c: np.concatenate([np.repeat(c[:1], 70, axis=0), c, np.repeat(c[-1:], 9, axis=0)]),  # a wait around it
+        lambda c: np.concatenate(
+            [np.repeat(c[:1], 70, axis=0), c, np.repeat(c[-1:], 9, axis=0)]
+        ),  # a wait around it
         lambda c: np.repeat(c, 2, axis=0),  # logged at twice the rate
         lambda c: walk(400, 3, shift=0.013),  # computed anew, at other moments
     ],
@@ -204,7 +237,12 @@ def test_a_command_is_known_again_and_others_are_not_taken_for_it(again):
     dt = 0.01 if len(again(first)) == 800 else 0.02
     assert equal_commands([fingerprint(first, 0.02), fingerprint(again(first), dt)]) == [(0, 1)]
     assert (
-        equal_commands([fingerprint(again(first), dt), *(fingerprint(walk(400, seed), 0.02) for seed in range(4, 60))])
+        equal_commands(
+            [
+                fingerprint(again(first), dt),
+                *(fingerprint(walk(400, seed), 0.02) for seed in range(4, 60)),
+            ]
+        )
         == []
     )
 
@@ -220,10 +258,12 @@ def test_motions_that_rest_at_one_place_are_not_one():
     walks = [np.concatenate([steps(), walk(400, seed), steps(park)]) for seed in range(4, 8)]
     others = [steps((0.7, 0.1), park), steps((-0.4, 0.3), park), steps(), *walks]
     assert equal_commands([fingerprint(x, 0.02) for x in (steps(there, park), *others)]) == []
-    assert equal_commands([fingerprint(steps(there, park), 0.02), fingerprint(steps(there, park, rests=70), 0.02)]) == [
-        (0, 1)
-    ]
-    assert equal_commands([fingerprint(steps(there), 0.02), fingerprint(steps(there, rests=70), 0.02)]) == [(0, 1)]
+    assert equal_commands(
+        [fingerprint(steps(there, park), 0.02), fingerprint(steps(there, park, rests=70), 0.02)]
+    ) == [(0, 1)]
+    assert equal_commands(
+        [fingerprint(steps(there), 0.02), fingerprint(steps(there, rests=70), 0.02)]
+    ) == [(0, 1)]
 
 
 def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_path):
@@ -235,17 +275,25 @@ def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_pat
             data.append(arm_sequence(arm, ctrl, late(ctrl, lag), name, payload))
     journal = data.path / "sequences.jsonl"
     lines = [json.loads(line) for line in journal.read_text().splitlines()]
-    old = [line | {"command": None} if i % 3 else line for i, line in enumerate(lines)]  # before sketches were kept
+    old = [
+        line | {"command": None} if i % 3 else line for i, line in enumerate(lines)
+    ]  # before sketches were kept
     journal.write_text("".join(json.dumps(line) + "\n" for line in old))
     data = Dataset(data.path)
     assert len(set(canonical_motions(data).values())) == 12
     for parts in (split_entries(data), make_split(data, "motion"), make_split(data, "motion", ("lift3_1kg",)),
                   make_split(data, "payload", ("1",))):  # fmt: skip
-        sides = {part: {re.sub("_.*", "", e.meta.motion) for e in entries} for part, entries in parts.items()}
+        sides = {
+            part: {re.sub("_.*", "", e.meta.motion) for e in entries}
+            for part, entries in parts.items()
+        }
         if {e.meta.payload_mass for e in parts["test"]} == {0.0, 1.0}:
             assert not sides["test"] & (sides["train"] | sides["val"])
         assert not sides["train"] & sides["val"]
-    assert values(make_split(data, "motion", ("lift3_1kg",))["test"], "motion") == {"lift3_0kg", "lift3_1kg"}
+    assert values(make_split(data, "motion", ("lift3_1kg",))["test"], "motion") == {
+        "lift3_0kg",
+        "lift3_1kg",
+    }
 
 
 def test_motions_that_are_all_one_are_repetitions_and_no_motions(arm, tmp_path):
@@ -253,7 +301,11 @@ def test_motions_that_are_all_one_are_repetitions_and_no_motions(arm, tmp_path):
     for lag in range(4):
         data.append(arm_sequence(arm, walk(100, 1), late(walk(100, 1), lag), f"m{lag}"))
     parts = split_entries(data)
-    assert [[e.meta.motion for e in parts[part]] for part in SPLITS] == [["m0", "m1"], ["m2"], ["m3"]]
+    assert [[e.meta.motion for e in parts[part]] for part in SPLITS] == [
+        ["m0", "m1"],
+        ["m2"],
+        ["m3"],
+    ]
     with pytest.raises(UsageError, match="all 4 motions have equal commands, so they are one"):
         make_split(data, "motion")
 
@@ -264,14 +316,29 @@ def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(a
         played = arm_sequence(arm, whole, late(whole, 2) + 1e-3 * i, "chirp")
         data.append(replace(played, meta=replace(played.meta, repetition=i)))
     first = split_entries(data)
-    assert [sorted(e.meta.repetition for e in first[part]) for part in SPLITS] == [[0, 1, 2, 3], [4], [5, 6]]
+    assert [sorted(e.meta.repetition for e in first[part]) for part in SPLITS] == [
+        [0, 1, 2, 3],
+        [4],
+        [5, 6],
+    ]
     parts = make_split(data, "repetition", ("2",))
-    assert [sorted(e.meta.repetition for e in parts[part]) for part in SPLITS] == [[0, 1, 3, 4, 5], [6], [2]]
+    assert [sorted(e.meta.repetition for e in parts[part]) for part in SPLITS] == [
+        [0, 1, 3, 4, 5],
+        [6],
+        [2],
+    ]
     with pytest.raises(UsageError, match="needs 3 pieces of one recording"):
         make_split(data, "time")
     (tmp_path / "long.csv").write_text(table_text(arm_columns(900)))
     report = import_logs(
-        tmp_path / "long.csv", arm, "a", 0.0, tmp_path / "cut", cut=4.0, position_unit="rad", time_unit="s"
+        tmp_path / "long.csv",
+        arm,
+        "a",
+        0.0,
+        tmp_path / "cut",
+        cut=4.0,
+        position_unit="rad",
+        time_unit="s",
     )
     assert [(e.meta.motion, e.rows) for e in report.entries] == [("long@0s", 225), ("long@4s", 225), ("long@9s", 225),
                                                                  ("long@14s", 225)]  # fmt: skip

@@ -47,14 +47,20 @@ def test_a_joint_that_moved_long_ago_and_others_since_remember_their_approach(ar
     holds = StaticPoses.of(sequence, BOTH)
     assert len(sequence) > 4000
     rest, near = 0, []
-    for t in range(len(sequence)):  # row by row, what a hold's joint was doing when it was last away from its rest
+    for t in range(
+        len(sequence)
+    ):  # row by row, what a hold's joint was doing when it was last away from its rest
         if rest < len(holds) and (np.abs(sequence.ctrl[t] - holds.ctrl[rest]) < 1e-6).all():
             near.append(t)
         elif near:
             away = np.abs(sequence.qpos[: near[-1] + 1] - holds.qpos[rest]) > 0.01
             for joint in range(2):
                 last = np.flatnonzero(away[:, joint])
-                side = -np.sign(sequence.qpos[last[-1], joint] - holds.qpos[rest, joint]) if len(last) else 0
+                side = (
+                    -np.sign(sequence.qpos[last[-1], joint] - holds.qpos[rest, joint])
+                    if len(last)
+                    else 0
+                )
                 assert holds.approach[rest, joint] == side
             rest, near = rest + 1, []
     assert rest >= 55
@@ -84,9 +90,13 @@ def test_sag_lies_half_way_between_both_approaches(arm):
 
 def test_one_side_alone_is_not_balanced(arm):
     ctrl = staircase([0.0, 0.1, 0.2, 0.3, 0.4])
-    error = StaticPoses.of(arm_sequence(arm, ctrl, sticking(ctrl, 0.04, 0.03)), BOTH).static_error(0)
+    error = StaticPoses.of(arm_sequence(arm, ctrl, sticking(ctrl, 0.04, 0.03)), BOTH).static_error(
+        0
+    )
     assert not error.balanced
-    assert error.middle == pytest.approx(0.01, abs=1e-4)  # sag less stiction: what was seen, and no more
+    assert error.middle == pytest.approx(
+        0.01, abs=1e-4
+    )  # sag less stiction: what was seen, and no more
 
 
 def test_no_holds_are_no_error():

@@ -55,7 +55,10 @@ def test_what_was_appended_is_on_the_disk_before_append_returns(dataset, sequenc
 
     monkeypatch.setattr(os, "fsync", noted)
     entry = dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
-    for file in (dataset.path / "sequences.jsonl", dataset.path / "sequences" / f"{entry.id}.parquet"):
+    for file in (
+        dataset.path / "sequences.jsonl",
+        dataset.path / "sequences" / f"{entry.id}.parquet",
+    ):
         assert synced.get(file.stat().st_ino) == file.stat().st_size, file
     assert (dataset.path / "sequences").stat().st_ino in synced, "its name too"
 
@@ -78,7 +81,9 @@ def test_what_is_removed_leaves_no_file_and_the_rest_stays_as_it_is(dataset, seq
     simulated = dataset.path / "replays/abc" / f"{other.id}.parquet"
     simulated.parent.mkdir(parents=True)
     simulated.touch()
-    with pytest.raises(DatasetError, match=r"no sequence '\*-3kg-\*'; sequences.jsonl in it lists the ids"):
+    with pytest.raises(
+        DatasetError, match=r"no sequence '\*-3kg-\*'; sequences.jsonl in it lists the ids"
+    ):
         dataset.remove(("*-1kg-*", "*-3kg-*"))
     assert dataset.remove(("*-1kg-*",)) == [other]
     assert not simulated.exists()
@@ -131,7 +136,9 @@ def test_what_another_writer_appended_meanwhile_is_known(dataset, sequence):
 def test_a_damaged_line_is_named(dataset):
     journal = dataset.path / "sequences.jsonl"
     journal.write_text("{}\n" + journal.read_text())
-    with pytest.raises(DatasetError, match=r"sequences\.jsonl:1: id: is missing .* delete the line and import"):
+    with pytest.raises(
+        DatasetError, match=r"sequences\.jsonl:1: id: is missing .* delete the line and import"
+    ):
         Dataset(dataset.path)
 
 
@@ -142,7 +149,9 @@ def test_a_listed_file_that_is_gone_is_named(dataset):
 
 
 def test_a_dataset_belongs_to_one_robot(dataset, so101):
-    with pytest.raises(DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'so101' .* use --robot arm"):
+    with pytest.raises(
+        DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'so101' .* use --robot arm"
+    ):
         Dataset.create(dataset.path, so101)
 
 
@@ -157,16 +166,22 @@ def test_peeking_makes_nothing(arm, tmp_path):
 def test_a_half_written_file_is_named(dataset):
     file = next((dataset.path / "sequences").iterdir())
     file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(DatasetError, match=r"\.parquet: not a readable Parquet file .* import the log again"):
+    with pytest.raises(
+        DatasetError, match=r"\.parquet: not a readable Parquet file .* import the log again"
+    ):
         dataset.read(dataset.entries[0])
 
 
-def test_a_newer_format_asks_for_an_upgrade_and_another_folder_says_how_to_make_a_dataset(dataset, tmp_path):
+def test_a_newer_format_asks_for_an_upgrade_and_another_folder_says_how_to_make_a_dataset(
+    dataset, tmp_path
+):
     header = dataset.path / "dataset.json"
     header.write_text(json.dumps(json.loads(header.read_text()) | {"format": 99}))
     with pytest.raises(DatasetError, match="format 99 is newer than this gaponet reads"):
         Dataset(dataset.path)
-    with pytest.raises(DatasetError, match=r"not a dataset \(no dataset.json\); make one with gaponet import"):
+    with pytest.raises(
+        DatasetError, match=r"not a dataset \(no dataset.json\); make one with gaponet import"
+    ):
         Dataset(tmp_path)
 
 
@@ -190,8 +205,13 @@ def test_files_of_earlier_versions_are_read_as_before(dataset, sequence):
     file = next((dataset.path / "sequences").iterdir())
     n, columns = 2, ("ctrl", "qpos", "qvel", "tau")
     arrays = [pa.array(np.arange(40) * 0.02)]
-    arrays += [pa.FixedSizeListArray.from_arrays(pa.array(getattr(sequence, c).ravel()), n) for c in columns]
-    pq.write_table(pa.table(arrays, names=["time", *columns]), file, compression="zstd")  # nullable, other compression
+    arrays += [
+        pa.FixedSizeListArray.from_arrays(pa.array(getattr(sequence, c).ravel()), n)
+        for c in columns
+    ]
+    pq.write_table(
+        pa.table(arrays, names=["time", *columns]), file, compression="zstd"
+    )  # nullable, other compression
     assert dataset.read(dataset.entries[0]).content_hash() == sequence.content_hash()
 
 
@@ -229,21 +249,27 @@ def test_opening_parses_only_how_a_line_begins_and_the_rest_when_it_is_asked_for
     journal.write_bytes(whole[:-9] + b"\n")  # its end is gone, its line is not
     again = Dataset(dataset.path)
     assert again.find(here.hash).rows == here.rows
-    with pytest.raises(DatasetError, match=r"sequences\.jsonl:1: .*delete the line and import that log again"):
+    with pytest.raises(
+        DatasetError, match=r"sequences\.jsonl:1: .*delete the line and import that log again"
+    ):
         again.read(again.entries[0])
 
 
 def test_a_line_that_another_program_wrote_is_the_same_entry(dataset):
     journal = dataset.path / "sequences.jsonl"
     line = json.loads(journal.read_text())
-    journal.write_text(json.dumps(dict(reversed(line.items())), indent=None, separators=(",", ":")) + "\n")
+    journal.write_text(
+        json.dumps(dict(reversed(line.items())), indent=None, separators=(",", ":")) + "\n"
+    )
     assert Dataset(dataset.path).entries == dataset.entries
 
 
 def test_a_line_listed_twice_is_refused(dataset):
     journal = dataset.path / "sequences.jsonl"
     journal.write_text(2 * journal.read_text())
-    with pytest.raises(DatasetError, match=r"sequences\.jsonl:2: .* is listed already; delete this line"):
+    with pytest.raises(
+        DatasetError, match=r"sequences\.jsonl:2: .* is listed already; delete this line"
+    ):
         Dataset(dataset.path)
 
 
@@ -277,7 +303,9 @@ def test_samples_of_another_shape_are_refused(dataset, table, said):
 
 
 def test_a_name_that_is_not_text_is_written_and_read_with_its_bytes_escaped(dataset, sequence):
-    odd = replace(sequence.meta, motion="\udcff\n[red]", source="/logs/\u2028\udcff.csv", payload_mass=2.0)
+    odd = replace(
+        sequence.meta, motion="\udcff\n[red]", source="/logs/\u2028\udcff.csv", payload_mass=2.0
+    )
     dataset.append(replace(sequence, meta=odd))
     assert Dataset(dataset.path).entries[1].meta.motion == "\\udcff\n[red]"
 
@@ -299,5 +327,7 @@ def test_where_a_recording_came_from_is_words_and_is_never_opened(dataset, monke
 def test_a_robot_with_other_joints_and_the_same_name_is_another_robot(dataset, tmp_path):
     swapped = write_arm(tmp_path / "swapped")
     object.__setattr__(swapped, "joint_names", ("elbow", "shoulder"))
-    with pytest.raises(DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'arm' \(elbow, shoulder\)"):
+    with pytest.raises(
+        DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'arm' \(elbow, shoulder\)"
+    ):
         dataset.require_robot(swapped)

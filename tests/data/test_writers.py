@@ -20,7 +20,17 @@ HOLDS = {  # channels beside command, position and velocity
     "lerobot": set(ARRAYS), "npz": set(ARRAYS), "asap": set(ARRAYS), "sage": {"tau"}, "mcap": {"tau"},
 }  # fmt: skip
 ALWAYS = {"ctrl", "qpos", "qvel"}
-SAID = ("motion", "unit_id", "payload_mass", "payload_side", "level", "repetition", "virtual", "kp", "kd")
+SAID = (
+    "motion",
+    "unit_id",
+    "payload_mass",
+    "payload_side",
+    "level",
+    "repetition",
+    "virtual",
+    "kp",
+    "kd",
+)
 
 
 @pytest.fixture
@@ -29,10 +39,24 @@ def dataset(arm, tmp_path):
     data = Dataset.create(tmp_path / "data", arm)
     for i, gains in enumerate(((20.0, 20.0), (12.5, 0.1))):
         ctrl = wave(50, 2, hertz=0.4 + 0.13 * i) + 0.1 * i
-        more = {"tau": 2 * ctrl, "qacc": 3 * ctrl, "tau_eq": ctrl, "temperature": 30 + ctrl} if i else {"tau": ctrl}
-        sequence = arm_sequence(arm, ctrl, late(ctrl, 2), f"wave {i}", 0.1 * i, unit=f"u{i}", **more)
-        meta = {"kp": gains, "kd": (0.0, 1 / 3), "virtual": bool(i), "level": "joint", "repetition": 4}
-        data.append(replace(sequence, dt=1 / 30 if i else 0.02006, meta=replace(sequence.meta, **meta)))
+        more = (
+            {"tau": 2 * ctrl, "qacc": 3 * ctrl, "tau_eq": ctrl, "temperature": 30 + ctrl}
+            if i
+            else {"tau": ctrl}
+        )
+        sequence = arm_sequence(
+            arm, ctrl, late(ctrl, 2), f"wave {i}", 0.1 * i, unit=f"u{i}", **more
+        )
+        meta = {
+            "kp": gains,
+            "kd": (0.0, 1 / 3),
+            "virtual": bool(i),
+            "level": "joint",
+            "repetition": 4,
+        }
+        data.append(
+            replace(sequence, dt=1 / 30 if i else 0.02006, meta=replace(sequence.meta, **meta))
+        )
     return data
 
 
@@ -61,7 +85,9 @@ def test_a_gripper_goes_out_and_comes_back_as_a_share_of_its_range(so101, tmp_pa
     import_logs(tmp_path / "out", so101, None, None, tmp_path / "again")
     one, other = (Dataset(tmp_path / d) for d in ("data", "again"))
     assert one.entries[0].hash == other.entries[0].hash
-    assert np.allclose(one.read(one.entries[0]).qvel, other.read(other.entries[0]).qvel, atol=1e-5)  # derived again
+    assert np.allclose(
+        one.read(one.entries[0]).qvel, other.read(other.entries[0]).qvel, atol=1e-5
+    )  # derived again
 
 
 def test_asap_finds_its_fields_and_the_targets_that_its_action_means(dataset, arm, tmp_path):
@@ -84,9 +110,15 @@ def test_asap_finds_its_fields_and_the_targets_that_its_action_means(dataset, ar
 
 
 def test_the_command_says_how_to_come_back_and_overwrites_nothing(dataset, tmp_path, capsys):
-    assert main(["data", "export", str(dataset.path), "--out", str(tmp_path / "npz"), "--to", "npz"]) == 0
+    assert (
+        main(["data", "export", str(dataset.path), "--out", str(tmp_path / "npz"), "--to", "npz"])
+        == 0
+    )
     assert f"gaponetimport{tmp_path / 'npz'}" in "".join(capsys.readouterr().out.split())
-    assert main(["data", "export", str(dataset.path), "--out", str(tmp_path / "npz"), "--to", "npz"]) == 2
+    assert (
+        main(["data", "export", str(dataset.path), "--out", str(tmp_path / "npz"), "--to", "npz"])
+        == 2
+    )
     assert "exists and is not an empty folder" in capsys.readouterr().err
 
 
@@ -104,5 +136,7 @@ def test_what_an_export_says_of_a_recording_is_checked(dataset, arm, tmp_path):
     told = json.loads(str(held["gaponet"]))
     told["stated"]["payload_mass"] = "heavy"
     np.savez(file, **held | {"gaponet": np.array(json.dumps(told))})
-    with pytest.raises(LogError, match=r"payload_mass: should be a valid number, not 'heavy'; export it again"):
+    with pytest.raises(
+        LogError, match=r"payload_mass: should be a valid number, not 'heavy'; export it again"
+    ):
         import_logs(tmp_path / "out", arm, None, None, tmp_path / "again")

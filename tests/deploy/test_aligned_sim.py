@@ -36,7 +36,9 @@ def test_it_is_the_replay_with_the_corrector(robot, model):
     for t in range(39):
         sim.step(np.stack([s.ctrl[t] for s in sequences]))
         np.testing.assert_allclose(
-            sim.delta, np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(replays, sequences, strict=True)]), atol=1e-6
+            sim.delta,
+            np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(replays, sequences, strict=True)]),
+            atol=1e-6,
         )
         np.testing.assert_allclose(sim.qpos, np.stack([w.qpos[t + 1] for w in replays]), atol=1e-6)
     assert np.abs(sim.delta).max() > 1e-3
@@ -87,7 +89,11 @@ def test_late_servos_follow_the_target_in_force_at_the_start(robot, tmp_path):
 
 def test_a_users_mujoco_loop_is_aligned_by_one_call_per_period(robot, model):
     mj_model = build_model(robot, 0.2)
-    data, align, sim = mujoco.MjData(mj_model), MujocoAligner(model, mj_model, 0.02, 0.2), AlignedSim(robot, model, 0.2)
+    data, align, sim = (
+        mujoco.MjData(mj_model),
+        MujocoAligner(model, mj_model, 0.02, 0.2),
+        AlignedSim(robot, model, 0.2),
+    )
     for _ in range(2):
         mujoco.mj_resetData(mj_model, data)
         align.reset()
@@ -102,7 +108,10 @@ def test_a_users_mujoco_loop_is_aligned_by_one_call_per_period(robot, model):
 def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_path):
     with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 40\.0 Hz"):
         AlignedSim(robot, model, dt=0.025)
-    bare, other = small_model(robot, tmp_path / "model"), write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0"))
+    bare, other = (
+        small_model(robot, tmp_path / "model"),
+        write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0")),
+    )
     with pytest.raises(ModelError, match="which does not lie beside it"):
         AlignedSim(other, bare)
     with pytest.raises(UsageError, match="'elbow' is corrected by the model and cannot be locked"):
@@ -113,7 +122,9 @@ def test_a_scene_that_does_not_fit_is_refused(robot, model):
     mj_model = build_model(robot)
     with pytest.raises(ModelError, match=r"trained at 50\.0 Hz"):
         MujocoAligner(model, mj_model, 0.025, 0.0)
-    with pytest.raises(ModelError, match="moves joint 'left/shoulder', the scene has shoulder, elbow"):
+    with pytest.raises(
+        ModelError, match="moves joint 'left/shoulder', the scene has shoulder, elbow"
+    ):
         MujocoAligner(model, mj_model, 0.02, 0.0, prefix="left/")
 
 
@@ -121,7 +132,11 @@ def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
     law = {"kp": 15.0, "frictionloss": 0.05, "stribeck": 0.05, "stribeck_speed": 0.1}
     known = robot.with_servos(dict.fromkeys(robot.joint_names, law))
     mj_model = build_model(robot, 0.2)
-    data, align, sim = mujoco.MjData(mj_model), MujocoAligner(known, mj_model, 0.02, 0.2), AlignedSim(known, None, 0.2)
+    data, align, sim = (
+        mujoco.MjData(mj_model),
+        MujocoAligner(known, mj_model, 0.02, 0.2),
+        AlignedSim(known, None, 0.2),
+    )
     plain, apart = AlignedSim(robot, None, 0.2), []
     for target in commands(60, 3):
         data.ctrl[:] = align(data, target)

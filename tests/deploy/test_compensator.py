@@ -87,13 +87,17 @@ def test_with_aim_simulator_the_robot_moves_like_the_nominal_simulator(robot, mo
         nominal.step(target[None])
     config = replace(NOW, aim="simulator", feedback=0.0)
     raw, _ = play(WeakArm(robot, 0.2), targets)
-    q, _ = play(WeakArm(robot, 0.2), targets, Compensator(robot, model, config, payload_step=0.1), 0.2)
+    q, _ = play(
+        WeakArm(robot, 0.2), targets, Compensator(robot, model, config, payload_step=0.1), 0.2
+    )
     assert error(q, expected) < 0.1 * error(raw, expected)
 
 
 @pytest.mark.parametrize("given", [{}, {"limit": 0.05}])
 def test_a_command_is_no_further_from_its_target_than_the_limit(robot, given):
-    soft = robot.with_servos({name: {"kp": 1.0} for name in robot.joint_names})  # gravity asks for more than 0.5 rad
+    soft = robot.with_servos(
+        {name: {"kp": 1.0} for name in robot.joint_names}
+    )  # gravity asks for more than 0.5 rad
     compensate = Compensator(soft, config=CompensatorConfig(blend=0.0, **given))
     target = np.zeros(2)
     compensate.reset(target)
@@ -130,7 +134,9 @@ def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
         arm.load(heavy)
         compensator.set_payload(mass)
 
-    q, u = play(arm, targets, compensator, 0.0, {200: lambda: load(1, 0.4), 350: lambda: load(0, 0.0)})
+    q, u = play(
+        arm, targets, compensator, 0.0, {200: lambda: load(1, 0.4), 350: lambda: load(0, 0.0)}
+    )
     assert np.abs(u - targets).max() <= NOW.limit + 1e-12
     for end in (150, 300, 450):
         assert np.abs(np.diff(u[end - 20 : end], axis=0)).max() < 1e-3
@@ -139,13 +145,17 @@ def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
 
 def test_the_default_feedback_is_stable_on_a_weakly_damped_arm(tmp_path):
     swinging = write_arm(
-        tmp_path, TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.0"), XML.replace('damping="0.5"', 'damping="0.05"')
+        tmp_path,
+        TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.0"),
+        XML.replace('damping="0.5"', 'damping="0.05"'),
     )
     model = GapModel(Path("exact"), make_card(CONFIG, swinging, dt=[0.02]), CONFIG, Operator(1.0))
     targets = np.repeat([[0.3, -0.2], [-0.4, 0.5]], 400, axis=0)
     calm = {}
     for name, config in (("default", NOW), ("fast", replace(NOW, feedback=5.0, feedback_time=0.0))):
-        q, _ = play(WeakArm(swinging, 0.4, late=4), targets, Compensator(swinging, model, config), 0.4)
+        q, _ = play(
+            WeakArm(swinging, 0.4, late=4), targets, Compensator(swinging, model, config), 0.4
+        )
         calm[name] = float(np.abs(np.diff(q[-100:], axis=0)).max())
     assert calm["default"] < 1e-3 < calm["fast"]
 
@@ -154,7 +164,9 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     targets = np.repeat([[0.3, -0.2]], 500, axis=0)
     arm, compensator = WeakArm(robot), Compensator(robot, model, NOW, payload_step=0.1)
     q, _ = play(arm, targets, compensator, None, {100: lambda: arm.load(1)})
-    assert compensator.payload_mass[0] == pytest.approx(0.4, abs=0.12)  # the servo law overrates torque by 1 / 0.8
+    assert compensator.payload_mass[0] == pytest.approx(
+        0.4, abs=0.12
+    )  # the servo law overrates torque by 1 / 0.8
     assert np.abs(q[-20:] - targets[-20:]).max() < 0.02
     assert np.abs(np.diff(q[-50:], axis=0)).max() < 1e-3
 
@@ -163,9 +175,14 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     ("held", "told", "doubted"), [(0, 0.4, True), (1, 0.0, True), (0, 0.0, False), (1, 0.4, False)]
 )
 def test_a_stated_payload_is_compared_with_the_servo_torques(robot, model, held, told, doubted):
-    arm, compensator = WeakArm(robot, WeakArm.masses[held]), Compensator(robot, model, NOW, payload_step=0.1)
+    arm, compensator = (
+        WeakArm(robot, WeakArm.masses[held]),
+        Compensator(robot, model, NOW, payload_step=0.1),
+    )
     play(arm, np.repeat([[0.3, -0.2]], 200, axis=0), compensator, told)
-    assert (f"{told:g} kg were stated, but the torques are those of about" in compensator.doubt) == doubted
+    assert (
+        f"{told:g} kg were stated, but the torques are those of about" in compensator.doubt
+    ) == doubted
     assert compensator.payload_mass[0] == told
 
 
@@ -176,7 +193,9 @@ def test_torques_unlike_a_payload_give_mass_zero(robot, model):
     per_kg = np.subtract(*compensator.payload_estimate.gravity(target)[::-1])
     across = 6.0 * np.array([-per_kg[1], per_kg[0]]) + 2.0 * per_kg  # mostly what no payload does
     for _ in range(200):
-        compensator.step(target, target, np.zeros(2), compensator.payload_estimate.gravity(target)[0] + across)
+        compensator.step(
+            target, target, np.zeros(2), compensator.payload_estimate.gravity(target)[0] + across
+        )
     assert compensator.payload_mass[0] == 0.0
 
 
@@ -215,7 +234,9 @@ def test_several_robots_are_compensated_as_each_alone(robot, model):
         c.reset(targets[0, i], (0.0, 0.3)[i])
     for target in targets:
         u = both.step(target, 0.9 * target)
-        np.testing.assert_allclose(u, [c.step(a, 0.9 * a) for c, a in zip(alone, target, strict=True)], atol=1e-9)
+        np.testing.assert_allclose(
+            u, [c.step(a, 0.9 * a) for c, a in zip(alone, target, strict=True)], atol=1e-9
+        )
 
 
 def test_a_step_before_a_start_is_refused(robot):
@@ -228,13 +249,20 @@ def test_other_arrays_and_robots_are_refused(robot, model):
         Compensator(robot, model).reset(np.zeros(3), 0.0)
     with pytest.raises(UsageError, match="target to begin at"):
         Compensator(robot, model).reset(np.array([0.0, np.nan]), 0.0)
-    with pytest.raises(LogError, match=r"target to begin at of shoulder is 45\.000.* look like degrees"):
+    with pytest.raises(
+        LogError, match=r"target to begin at of shoulder is 45\.000.* look like degrees"
+    ):
         Compensator(robot, model).reset(np.array([45.0, 0.0]), 0.0)
     in_degrees = Compensator(robot, model)
     in_degrees.reset(np.zeros(2), 0.0)
     with pytest.raises(LogError, match=r"the position of elbow is -45\.000.* look like degrees"):
         in_degrees.step(np.zeros(2), np.array([0.0, -45.0]))
-    for name, wrong in {"gain": 0.0, "feedback_limit": -0.1, "feedback_time": np.nan, "aim": "Simulator"}.items():
+    for name, wrong in {
+        "gain": 0.0,
+        "feedback_limit": -0.1,
+        "feedback_time": np.nan,
+        "aim": "Simulator",
+    }.items():
         with pytest.raises(UsageError, match="gain must be"):
             CompensatorConfig(**{name: wrong})
 
@@ -269,9 +297,13 @@ def test_without_a_model_what_was_identified_is_fed_forward(robot):
 
 
 def test_without_a_model_servos_with_other_gains_and_absurd_payloads_are_refused(robot):
-    compensator = Compensator(robot.with_servos({"elbow": {"kp": 12.0}}), config=CompensatorConfig(payload_max=0.5))
+    compensator = Compensator(
+        robot.with_servos({"elbow": {"kp": 12.0}}), config=CompensatorConfig(payload_max=0.5)
+    )
     joints, kd = robot.joint_names, np.zeros(2)
-    compensator.require_gains(joints, np.array([20.0, 20.1]), kd)  # as robot.toml says, not as identified
+    compensator.require_gains(
+        joints, np.array([20.0, 20.1]), kd
+    )  # as robot.toml says, not as identified
     with pytest.raises(RobotError, match="kp of elbow is 20 there, the servo has 12"):
         compensator.require_gains(joints, np.array([20.0, 12.0]), kd)
     for mass in (np.nan, -1.0, 0.6):
@@ -281,7 +313,12 @@ def test_without_a_model_servos_with_other_gains_and_absurd_payloads_are_refused
 
 def test_payloads_beyond_the_training_data_are_refused_without_extrapolate(robot):
     def trained(*seen):
-        return GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02], payload_seen=seen), CONFIG, Operator(1.0))
+        return GapModel(
+            Path("exact"),
+            make_card(CONFIG, robot, dt=[0.02], payload_seen=seen),
+            CONFIG,
+            Operator(1.0),
+        )
 
     light, loaded = Compensator(robot, trained(0.0, 0.2)), Compensator(robot, trained(0.1, 0.2))
     light.reset(np.zeros(2), 0.2)
@@ -329,11 +366,19 @@ def test_an_adapted_unit_follows_where_the_model_alone_does_not(robot):
     ignorant = GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02]), CONFIG, Operator(0.0))
     targets = np.tile([0.4, 0.8], (200, 1))
     still = replace(NOW, feedback=0.0)
-    servos = {j: {"kp": WEAK * float(k), "delay": 0.0} for j, k in zip(robot.joint_names, robot.kp, strict=True)}
+    servos = {
+        j: {"kp": WEAK * float(k), "delay": 0.0}
+        for j, k in zip(robot.joint_names, robot.kp, strict=True)
+    }
     unit = Adaptation("a", "weights", servos, (), 30.0, 0.0, 0.0)
     error = {}
     for name, adaptation in (("common", None), ("unit", unit)):
-        q, _ = play(WeakArm(robot, 0.4), targets, Compensator(robot, ignorant, still, adaptation=adaptation), 0.4)
+        q, _ = play(
+            WeakArm(robot, 0.4),
+            targets,
+            Compensator(robot, ignorant, still, adaptation=adaptation),
+            0.4,
+        )
         error[name] = np.abs(q[1:] - targets[:-1])[100:].mean()
     assert error["unit"] < 0.2 * error["common"]
 

@@ -31,7 +31,12 @@ def test_feed_forward_equals_inverse_dynamics(robot):
     model = next(iter(sim.models.values()))
     data.qacc[:] = moving.qacc[0]
     mujoco.mj_inverse(model, data)
-    expected = data.qfrc_inverse - data.qfrc_bias + 0.5 * moving.qvel[0] + 0.05 * np.tanh(moving.qvel[0] / 0.05)
+    expected = (
+        data.qfrc_inverse
+        - data.qfrc_bias
+        + 0.5 * moving.qvel[0]
+        + 0.05 * np.tanh(moving.qvel[0] / 0.05)
+    )
     friction = data.qfrc_constraint  # of standing still, which mj_inverse counts
     np.testing.assert_allclose(moving.torque()[0], expected + friction, atol=1e-9)
 

@@ -34,12 +34,17 @@ def test_the_tracking_environment_keeps_gymnasiums_rules(robot, model):
 
     from gaponet.deploy.gym import TrackingEnv
 
-    check_env(TrackingEnv(AlignedSim(robot, model), [commands(30, 0), commands(40, 1)]), skip_render_check=True)
+    check_env(
+        TrackingEnv(AlignedSim(robot, model), [commands(30, 0), commands(40, 1)]),
+        skip_render_check=True,
+    )
 
 
 def test_gymnasium_makes_it_by_name():
     how = {"robot": "so101", "motions": ["chirp-elbow_flex"], "preview": 1}
-    env = gymnasium.make_vec("gaponet.deploy.gym:gaponet/Tracking-v0", num_envs=2, vectorization_mode="sync", **how)
+    env = gymnasium.make_vec(
+        "gaponet.deploy.gym:gaponet/Tracking-v0", num_envs=2, vectorization_mode="sync", **how
+    )
     observation, _ = env.reset(seed=0)
     assert observation.shape == env.observation_space.shape == (2, 15)
     assert (env.step(env.action_space.sample())[1] < 0).all()

@@ -16,7 +16,9 @@ from gaponet.robot.spec import Table, Tip
 from gaponet.sim.model import build_model
 
 STRONG = TOML.replace("effort_limit = 5.0", "effort_limit = 50.0")
-ONE_STEP = STRONG.replace("timestep = 0.005", "timestep = 0.02")  # a period: nothing happens within it
+ONE_STEP = STRONG.replace(
+    "timestep = 0.005", "timestep = 0.02"
+)  # a period: nothing happens within it
 HEAVY = XML.replace('armature="0.02"', 'armature="0.1"')
 TARGETS = np.concatenate([commands(60, 5), commands(60, 6)])  # with a jump
 PUSHED = slice(30, 40)
@@ -35,7 +37,9 @@ def model(robot, tmp_path_factory):
 def other(robot, **factors):
     """The robot with some of its numbers multiplied."""
     model = build_model(robot)
-    own = {f: getattr(model, f"dof_{f}") for f in ("damping", "frictionloss", "armature")} | {"kp": robot.kp}
+    own = {f: getattr(model, f"dof_{f}") for f in ("damping", "frictionloss", "armature")} | {
+        "kp": robot.kp
+    }
     return replace(robot, **{f: factor * own[f] for f, factor in factors.items()})
 
 
@@ -55,11 +59,19 @@ def test_twice_the_gain_follows_the_reference_to_a_microradian(tmp_path):
     reference = write_arm(tmp_path / "arm", ONE_STEP, HEAVY)
     target, there = other(reference, kp=2.0), follow(AlignedSim(reference, None))
     assert np.abs(follow(AlignedSim(target, None)) - there).max() > 0.05
-    np.testing.assert_allclose(follow(AlignedSim(target, reference, extrapolate=True)), there, atol=1e-6)
+    np.testing.assert_allclose(
+        follow(AlignedSim(target, reference, extrapolate=True)), there, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
-    "factors", [{"kp": 0.5}, {"kp": 2.2, "frictionloss": 3.0}, {"damping": 2.0, "armature": 2.0}, {"frictionloss": 0.0}]
+    "factors",
+    [
+        {"kp": 0.5},
+        {"kp": 2.2, "frictionloss": 3.0},
+        {"damping": 2.0, "armature": 2.0},
+        {"frictionloss": 0.0},
+    ],
 )
 def test_the_target_moves_like_the_reference_with_its_model(robot, model, factors):
     there, target = follow(AlignedSim(robot, model)), other(robot, **factors)
@@ -74,7 +86,9 @@ def test_transfer_follows_saturated_motors(tmp_path):
     )
     there, target = follow(AlignedSim(weak, None, 0.2)), other(weak, kp=3.0)
     assert np.abs(follow(AlignedSim(strong, None, 0.2)) - there).max() > 0.05
-    alone, given = (np.abs(follow(AlignedSim(target, like, 0.2)) - there).mean() for like in (None, weak))
+    alone, given = (
+        np.abs(follow(AlignedSim(target, like, 0.2)) - there).mean() for like in (None, weak)
+    )
     assert given < 0.1 * alone
 
 
@@ -82,7 +96,9 @@ def test_jumps_that_saturate_motors_cause_no_windup(tmp_path):
     weak = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.7"), HEAVY)
     jumps = np.repeat([[-0.6, -0.6], [0.6, 0.6], [-0.6, -0.6]], [20, 60, 60], axis=0)
     there, target = follow(AlignedSim(weak, None), jumps), other(weak, kp=0.5)
-    alone, given = (np.abs(follow(AlignedSim(target, like), jumps) - there).mean() for like in (None, weak))
+    alone, given = (
+        np.abs(follow(AlignedSim(target, like), jumps) - there).mean() for like in (None, weak)
+    )
     assert given < 0.1 * alone
 
 
@@ -112,11 +128,15 @@ def test_servos_that_are_late_like_the_reference_and_those_that_are_later(robot)
     reference = replace(robot, delay=np.array([0.03, 0.02]))
     there = follow(AlignedSim(reference, None))
     same = follow(AlignedSim(replace(other(robot, kp=1.5), delay=reference.delay), reference))
-    assert np.abs(same - there).mean() < 0.2 * np.abs(follow(AlignedSim(robot, None)) - there).mean()
+    assert (
+        np.abs(same - there).mean() < 0.2 * np.abs(follow(AlignedSim(robot, None)) - there).mean()
+    )
     later = replace(robot, delay=np.array([0.03, 0.06]))
     with pytest.raises(ModelError, match=r"40 ms later than the reference's, and cannot follow it"):
         AlignedSim(later, reference)
-    late = replace(robot, delay=np.array([0.06, 0.06]))  # whoever wants it so all the same is not made worse
+    late = replace(
+        robot, delay=np.array([0.06, 0.06])
+    )  # whoever wants it so all the same is not made worse
     sims = (AlignedSim(late, given, extrapolate=True) for given in (reference, None))
     apart = [np.abs(follow(sim) - there).mean() for sim in sims]
     assert apart[0] <= apart[1]
@@ -126,7 +146,9 @@ def test_transfer_is_causal(robot, model):
     target = other(robot, kp=2.0)
     changed = TARGETS.copy()
     changed[80:] += 0.3
-    np.testing.assert_array_equal(*(follow(AlignedSim(target, model), rows)[:80] for rows in (TARGETS, changed)))
+    np.testing.assert_array_equal(
+        *(follow(AlignedSim(target, model), rows)[:80] for rows in (TARGETS, changed))
+    )
 
 
 @pytest.mark.parametrize("factors", [{"kp": 2.0}, {"damping": 0.5}, {"frictionloss": 3.0}])
@@ -149,7 +171,10 @@ def test_in_the_simulator_of_training_nothing_is_transferred(robot, model):
 
 def test_a_simulator_outside_the_measured_range_is_refused(robot, model):
     far = other(robot, kp=9.0)
-    with pytest.raises(ModelError, match=r"joint 'shoulder': kp, as a ratio .* is 9; transfer was measured from 0\.15"):
+    with pytest.raises(
+        ModelError,
+        match=r"joint 'shoulder': kp, as a ratio .* is 9; transfer was measured from 0\.15",
+    ):
         AlignedSim(far, model)
     AlignedSim(far, model, extrapolate=True)
 

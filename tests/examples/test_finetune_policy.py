@@ -47,7 +47,9 @@ def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task, monkey
     from gaponet.testing.fleet import Fleet
     from gaponet.testing.physics import neutral
 
-    monkeypatch.setattr(example, "load_fleet", lambda *_: Fleet("none", 0, (), {"unit": neutral(2)}))
+    monkeypatch.setattr(
+        example, "load_fleet", lambda *_: Fleet("none", 0, (), {"unit": neutral(2)})
+    )
     unit = example.Unit(robot, task, "unit", np.array([0.0, 0.4]))
     sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, nthread=1)
     on_unit, in_sim = (example.follow(task, plant, Reader(task)) for plant in (unit, sim))

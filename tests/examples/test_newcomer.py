@@ -49,7 +49,10 @@ def test_the_robot_of_the_page_is_recorded(tmp_path, monkeypatch):
     assert [c[1] for c in others] == ["identify", "identify", "gap"]
     (tmp_path / "short.toml").write_text((ROOT / "examples" / "friction_motions.toml").read_text().replace(
         '"tour-all-*", "creep-*", "multisine-*"', '"multisine-shoulder_pan"'))  # fmt: skip
-    words = [{"examples/friction_motions.toml": str(tmp_path / "short.toml")}.get(w, w) for w in collect[1:]]
+    words = [
+        {"examples/friction_motions.toml": str(tmp_path / "short.toml")}.get(w, w)
+        for w in collect[1:]
+    ]
     assert main([*words[:-1], str(tmp_path / "data"), "--nproc", "1"]) == 0
     assert Dataset(tmp_path / "data").entries[0].meta.virtual
 
@@ -57,12 +60,16 @@ def test_the_robot_of_the_page_is_recorded(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_change_of_the_page_reaches_numpy_and_what_numba_compiles(tmp_path):
     said = {}
-    shutil.copytree(ROOT / "src" / "gaponet", tmp_path / "gaponet", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        ROOT / "src" / "gaponet", tmp_path / "gaponet", ignore=shutil.ignore_patterns("__pycache__")
+    )
     law = tmp_path / "gaponet" / "sim" / "servo.py"
     for name, change in (("before", str), ("after", lambda t: t.replace(LINES[0][1], LINES[1][1]))):
         law.write_text(change(law.read_text(encoding="utf-8")), encoding="utf-8")
         words = [sys.executable, "-c", PLAY, str(ROOT / "tests"), str(tmp_path / "arm")]
-        done = subprocess.run(words, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
+        done = subprocess.run(
+            words, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(tmp_path)}
+        )
         assert done.returncode == 0, done.stderr
         compiled, arrays, _ = done.stdout.split(maxsplit=2)
         said[name] = float(compiled)

@@ -26,7 +26,9 @@ def test_the_notebook_goes_from_logs_to_a_model_that_is_better_than_the_simulato
 ):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
-    kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=str(tmp_path_factory.mktemp("k") / "s"))
+    kernel = AsyncKernelManager(
+        kernel_name="python3", transport="ipc", ip=str(tmp_path_factory.mktemp("k") / "s")
+    )
     notebook = nbformat.read(FILE, 4)
     for cell in notebook.cells:  # a third of its training
         cell.source = cell.source.replace("rounds=3", "rounds=1").replace('"14400"', '"4800"')
@@ -36,7 +38,11 @@ def test_the_notebook_goes_from_logs_to_a_model_that_is_better_than_the_simulato
     said = "\n".join(texts(notebook))
     error = {name: float(x) for name, x in re.findall(r"'(\w+)': '([\d.]+) mrad'", said)}
     assert error["gaponet"] < error["nominal"]
-    assert any("image/png" in out.get("data", {}) for cell in notebook.cells for out in cell.get("outputs", ()))
+    assert any(
+        "image/png" in out.get("data", {})
+        for cell in notebook.cells
+        for out in cell.get("outputs", ())
+    )
 
 
 def test_the_notebook_as_it_is_kept_shows_results_and_no_place_of_the_machine_that_made_them():

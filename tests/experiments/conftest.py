@@ -22,7 +22,11 @@ def make_study(arm, tmp_path):
                 for payload in payloads:
                     for unit in units:
                         ctrl = commands(40, seed, 1 / rate)
-                        data.append(record(robot, ctrl, f"motion{seed}", payload, kp=0.5, delay=2, unit=unit))
+                        data.append(
+                            record(
+                                robot, ctrl, f"motion{seed}", payload, kp=0.5, delay=2, unit=unit
+                            )
+                        )
         return Study.from_options(data, arm, tmp_path / "out", Options(**how))
 
     return make

@@ -17,7 +17,9 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 
 SMALL = TrainConfig(
-    pretraining=PretrainingConfig(rounds=1, num_envs=16, steps=40, gradient_steps=40, batch_size=128),
+    pretraining=PretrainingConfig(
+        rounds=1, num_envs=16, steps=40, gradient_steps=40, batch_size=128
+    ),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1),
 )
 
@@ -40,13 +42,20 @@ def cells(data, arm, out, words=("mlp",), seeds=(0,), budget="640", base=SMALL):
 
 def test_cells_come_seed_by_seed_in_folders_of_their_own(data, arm, tmp_path):
     made = cells(data, arm, tmp_path / "out", ("gaponet", "mlp:mlp_hidden=8,8"), (0, 1))
-    assert [c.folder.name for c in made] == ["gaponet-0", "mlp_mlp_hidden=8_8-0", "gaponet-1", "mlp_mlp_hidden=8_8-1"]
+    assert [c.folder.name for c in made] == [
+        "gaponet-0",
+        "mlp_mlp_hidden=8_8-0",
+        "gaponet-1",
+        "mlp_mlp_hidden=8_8-1",
+    ]
 
 
 def test_a_cell_that_fails_leaves_the_others_alone(data, arm, tmp_path, local, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
     made, shown = cells(data, arm, tmp_path / "out", seeds=(0, 1, 2, 3)), []
-    failed = run_cells(made, note_threads, local, lambda running, done: shown.append((len(running), done)))
+    failed = run_cells(
+        made, note_threads, local, lambda running, done: shown.append((len(running), done))
+    )
     assert failed["mlp seed 1"] == "no such thing"
     assert failed["mlp seed 2"].startswith("ZeroDivisionError: a bug (see ")
     assert failed["mlp seed 3"].startswith("3 workers died of it, out of memory?")
@@ -96,7 +105,9 @@ def test_an_interrupted_cell_is_resumed_and_a_trained_one_is_not_trained_again(d
         train_cell(cell, interrupt)
     facts = train_cell(cell, lambda share, note: told.append(note))
     assert facts["steps"] >= 1200
-    assert facts["parameters"] == sum(a * b + b for a, b in ((31, 512), (512, 256), (256, 128), (128, 2)))
+    assert facts["parameters"] == sum(
+        a * b + b for a, b in ((31, 512), (512, 256), (256, 128), (128, 2))
+    )
     assert train_cell(cell, lambda share, note: pytest.fail("trained again")) == facts
 
 
@@ -107,7 +118,10 @@ def test_a_cell_with_another_setup_is_refused(data, arm, tmp_path):
         cells(data, arm, tmp_path / "out")
     (cell.folder / SETUP_FILE).write_text(json.dumps(cell.setup(data)))
     cells(data, arm, tmp_path / "out", base=replace(SMALL, threads=2))
-    with pytest.raises(UsageError, match=r"mlp-0: belongs to a comparison with another budget; choose another --out"):
+    with pytest.raises(
+        UsageError,
+        match=r"mlp-0: belongs to a comparison with another budget; choose another --out",
+    ):
         cells(data, arm, tmp_path / "out", budget="641")
 
 

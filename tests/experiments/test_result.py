@@ -28,7 +28,9 @@ def result():
         ("method", "MPJAE, mrad", "runs"),
         (("A|B", MeanStd.from_values([0.001, 0.003], 1e3), 1234), ("C", None, 2)),
     )
-    second = ResultTable("by_joint", ("joint", "mrad"), (("elbow", 1.23456),), "Of every joint.", digits=1)
+    second = ResultTable(
+        "by_joint", ("joint", "mrad"), (("elbow", 1.23456),), "Of every joint.", digits=1
+    )
     figures = {"bars": drawing(), "curve": drawing()}
     return Result("thing", "A thing", "VIRTUAL arm: nothing real.", {"command": "gaponet", "seeds": [0, 1]},
                   (first, second), figures, ("It is < 3.",))  # fmt: skip
@@ -58,9 +60,16 @@ def test_every_form_is_written_and_files_are_exact(result, tmp_path):
     assert rows[0] == ["method", "MPJAE, mrad", "MPJAE, mrad: std", "MPJAE, mrad: n", "runs"]
     assert rows[1] == ["A|B", "2.0", pytest.approx("1.4142135623730951"), "2", "1234"]
     assert rows[2] == ["C", "", "", "", "2"]
-    assert list(csv.reader((tmp_path / "out" / "thing-by_joint.csv").open()))[1] == ["elbow", "1.23456"]
+    assert list(csv.reader((tmp_path / "out" / "thing-by_joint.csv").open()))[1] == [
+        "elbow",
+        "1.23456",
+    ]
     kept = json.loads((tmp_path / "out" / "thing.json").read_text())
-    assert kept["tables"][0]["rows"][0][1] == {"mean": 2.0, "std": pytest.approx(2**0.5), "count": 2}
+    assert kept["tables"][0]["rows"][0][1] == {
+        "mean": 2.0,
+        "std": pytest.approx(2**0.5),
+        "count": 2,
+    }
     markdown = (tmp_path / "out" / "thing.md").read_text()
     assert "| A\\|B | 2.00 ± 1.41 | 1,234 |" in markdown
     assert "![](thing-curve.svg)" in markdown
@@ -107,4 +116,6 @@ def test_facts_and_label_come_from_the_dataset(arm, tmp_path):
     assert found["budget"] == "1m"
     assert found["units"] == ["a"]
     assert set(found["versions"]) == {"gaponet", "mujoco", "numpy", "torch"}
-    assert describe_provenance(data) == "VIRTUAL arm: these numbers say nothing about real hardware."
+    assert (
+        describe_provenance(data) == "VIRTUAL arm: these numbers say nothing about real hardware."
+    )

@@ -17,13 +17,20 @@ def test_settings_that_a_word_does_not_name_come_from_the_base():
 
 
 def test_fields_of_model_and_training_are_changed():
-    variant = parse_variant("identified+mlp:mlp_hidden=256,128:payload_input=off:ppo.gamma=0.9:validate_every=3", BASE)
+    variant = parse_variant(
+        "identified+mlp:mlp_hidden=256,128:payload_input=off:ppo.gamma=0.9:validate_every=3", BASE
+    )
     assert variant.identified
     assert variant.config.model.mlp_hidden == (256, 128)
     assert variant.config.model.payload_input is False
     assert variant.config.ppo.gamma == 0.9
     assert variant.config.validate_every == 3
-    assert variant.changes == ("mlp_hidden=256,128", "payload_input=off", "ppo.gamma=0.9", "validate_every=3")
+    assert variant.changes == (
+        "mlp_hidden=256,128",
+        "payload_input=off",
+        "ppo.gamma=0.9",
+        "validate_every=3",
+    )
 
 
 def test_every_kind_of_model_can_be_named():

@@ -22,10 +22,23 @@ KINDS = {
     "jnt": mujoco.mjtObj.mjOBJ_JOINT, "dof": mujoco.mjtObj.mjOBJ_JOINT, "body": mujoco.mjtObj.mjOBJ_BODY,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
 }  # fmt: skip
-NOT_COMPARED = ("id", "adr", "num", "group", "user", "plugin", "sameframe", "simple", "sensor", "ctrlspec")  # numbering
+NOT_COMPARED = (
+    "id",
+    "adr",
+    "num",
+    "group",
+    "user",
+    "plugin",
+    "sameframe",
+    "simple",
+    "sensor",
+    "ctrlspec",
+)  # numbering
 
 
-def environment(folder: str, num_envs: int, start: torch.Tensor, names: list[str]) -> ManagerBasedRlEnv:
+def environment(
+    folder: str, num_envs: int, start: torch.Tensor, names: list[str]
+) -> ManagerBasedRlEnv:
     sys.path.insert(0, folder)
     import gaponet_action as gaponet
 
@@ -35,14 +48,23 @@ def environment(folder: str, num_envs: int, start: torch.Tensor, names: list[str
         for name, where in (("robot", start), ("other", start.roll(2, 0))):
             robot = env.scene[name]
             order = [names.index(name) for name in robot.joint_names]
-            robot.write_joint_state_to_sim(where[env_ids][:, order], 0.0 * where[env_ids], env_ids=env_ids)
+            robot.write_joint_state_to_sim(
+                where[env_ids][:, order], 0.0 * where[env_ids], env_ids=env_ids
+            )
 
     cfg = ManagerBasedRlEnvCfg(
         decimation=decimation,
-        scene=SceneCfg(num_envs=num_envs, entities={name: gaponet.mjlab_entity(folder) for name in ("robot", "other")}),
+        scene=SceneCfg(
+            num_envs=num_envs,
+            entities={name: gaponet.mjlab_entity(folder) for name in ("robot", "other")},
+        ),
         actions={
-            "joint_pos": gaponet.mjlab_action(folder, entity_name="robot", actuator_names=tuple(reversed(names))),
-            "other": gaponet.mjlab_action(folder, entity_name="other", actuator_names=tuple(sorted(names))),
+            "joint_pos": gaponet.mjlab_action(
+                folder, entity_name="robot", actuator_names=tuple(reversed(names))
+            ),
+            "other": gaponet.mjlab_action(
+                folder, entity_name="other", actuator_names=tuple(sorted(names))
+            ),
         },
         events={"begin": EventTermCfg(func=begin, mode="reset")},
         sim=SimulationCfg(mujoco=options),
@@ -58,9 +80,13 @@ def fields(env: ManagerBasedRlEnv) -> dict[str, np.ndarray]:
         if kind is None or field.endswith(NOT_COMPARED) or not isinstance(compiled, np.ndarray):
             continue
         values = getattr(device, field).numpy() if hasattr(device, field) else compiled
-        values = values[0] if values.ndim > compiled.ndim or len(values) != len(compiled) else values  # of one world
+        values = (
+            values[0] if values.ndim > compiled.ndim or len(values) != len(compiled) else values
+        )  # of one world
         for i in range(len(values)):
-            name = mujoco.mj_id2name(model, kind, int(model.dof_jntid[i]) if field.startswith("dof_") else i)
+            name = mujoco.mj_id2name(
+                model, kind, int(model.dof_jntid[i]) if field.startswith("dof_") else i
+            )
             if name and name.startswith("robot/"):
                 found[f"{field} {name.removeprefix('robot/')}"] = np.array(values[i], float)
     for name in dir(model.opt):
@@ -92,7 +118,9 @@ def main(folder: str, given: str, out: str) -> None:
         beside.append(other.data.joint_pos[:, order].roll(-2, 0).clone())
         qpos.append(robot.data.joint_pos[:, order].clone())
         sent.append(robot.data.joint_pos_target[:, order].clone())
-    np.savez(out, qpos=torch.stack(qpos), beside=torch.stack(beside), sent=torch.stack(sent), **simulated)
+    np.savez(
+        out, qpos=torch.stack(qpos), beside=torch.stack(beside), sent=torch.stack(sent), **simulated
+    )
 
 
 if __name__ == "__main__":

@@ -55,7 +55,9 @@ def test_the_torque_of_a_late_servo_follows_from_the_past_of_error_and_speed():
     q = 0.005 * (np.cumsum(v[::-1])[::-1])
     late = 0.6 * target[1] + 0.4 * target[2]  # 7 ms are 1.4 steps
     torque = 20.0 * (late + 0.1 - q[0]) - 0.5 * v[0]
-    assert net(torch.tensor(np.r_[target - q, v][None], dtype=torch.float32)).item() == pytest.approx(torque, abs=1e-5)
+    assert net(
+        torch.tensor(np.r_[target - q, v][None], dtype=torch.float32)
+    ).item() == pytest.approx(torque, abs=1e-5)
     assert net(torch.full((1, 8), 9.0)).item() == 3.0
 
 
@@ -81,7 +83,10 @@ def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(run, tmp_
 
 
 def test_what_is_of_robots_is_refused(run, tmp_path, capsys):
-    assert main(["export", str(run), "--to", "actuator-net", "--into", str(tmp_path / "scene.xml")]) == 2
+    assert (
+        main(["export", str(run), "--to", "actuator-net", "--into", str(tmp_path / "scene.xml")])
+        == 2
+    )
     assert "does not use --into and --prefix" in capsys.readouterr().err
 
 
@@ -98,7 +103,9 @@ def test_a_payload_that_nobody_recorded_is_refused(run, tmp_path):
 def test_engines_play_the_networks_as_plain_mujoco_does_here(run, tmp_path, name, package, check):
     made = export_networks(GapModel.load(run), run, tmp_path)
     python = environment(name, "3.11", (package,))
-    said = subprocess.run([python, check], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        [python, check], cwd=tmp_path, capture_output=True, text=True, check=True
+    ).stdout
     there, here = re.findall(r": ([\d.]+) mrad; in gaponet ([\d.]+)", said)[0]
     assert float(here) == pytest.approx(1e3 * made.errors["actuator networks"], abs=0.01)
     assert float(there) == pytest.approx(float(here), rel=0.05, abs=0.05)

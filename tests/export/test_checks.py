@@ -35,11 +35,20 @@ ENGINES = {  # name → what is exported, what is run, Python, what is installed
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A VIRTUAL SO-101 with late servos and a law for every engine; motions of 2 to 4 s, so that worlds end apart."""
     folder, robot = tmp_path_factory.mktemp("engines"), load_robot("so101")
-    law = {"stribeck": 0.03, "stribeck_speed": 0.05, "friction_motor": 0.08, "friction_external": 0.15}
-    found = {j: {"delay": 0.006 * i, "offset": 0.01 * i} | law for i, j in enumerate(robot.operated, 1)}
+    law = {
+        "stribeck": 0.03,
+        "stribeck_speed": 0.05,
+        "friction_motor": 0.08,
+        "friction_external": 0.15,
+    }
+    found = {
+        j: {"delay": 0.006 * i, "offset": 0.01 * i} | law for i, j in enumerate(robot.operated, 1)
+    }
     robot = robot.with_servos(found)
     motions = [s.rows(slice(0, 100 + 27 * i)) for i, s in enumerate(own_motions(robot, count=5))]
-    with pytest.MonkeyPatch.context() as patch:  # the nearest numbers are searched for in test_export_robot.py
+    with (
+        pytest.MonkeyPatch.context() as patch
+    ):  # the nearest numbers are searched for in test_export_robot.py
         patch.setattr(
             exporting,
             "fit_plain_servos",
@@ -56,7 +65,9 @@ def test_late_servos_with_a_law_move_there_as_here_in_worlds_that_begin_anew_by_
 ) -> None:
     to, check, version, packages = ENGINES[name]
     python = environment(name, version, *((package,) for package in packages))
-    said = subprocess.run([python, check], cwd=exported / to, capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        [python, check], cwd=exported / to, capture_output=True, text=True, check=True
+    ).stdout
     print(said)
     pairs = re.findall(r": ([\d.]+) mrad; in gaponet ([\d.]+)", said)
     assert pairs
@@ -65,11 +76,22 @@ def test_late_servos_with_a_law_move_there_as_here_in_worlds_that_begin_anew_by_
 
 
 @pytest.mark.parametrize("name", ["mjlab-1.6", "isaaclab-3"])
-def test_a_drawn_unit_moves_in_an_engine_as_in_gaponet(exported: Path, tmp_path: Path, name: str) -> None:
+def test_a_drawn_unit_moves_in_an_engine_as_in_gaponet(
+    exported: Path, tmp_path: Path, name: str
+) -> None:
     to, script, version, packages = ENGINES[name]
     check, rng = Check(exported / to), np.random.default_rng(0)
     joints, servos = check.facts["corrected"], check.facts["joints" if to == "mjlab" else "plain"]
-    fields = ("kp", "damping", "frictionloss", "armature", "offset", "effort_limit", "delay", *SERVO_TERMS)
+    fields = (
+        "kp",
+        "damping",
+        "frictionloss",
+        "armature",
+        "offset",
+        "effort_limit",
+        "delay",
+        *SERVO_TERMS,
+    )
     now = {f: np.array([servos[j][f] for j in joints]) for f in fields if f in servos[joints[0]]}
     units = {f: (x * rng.uniform(0.6, 1.6, (3, len(joints)))).tolist() for f, x in now.items()}
     if to == "mjlab":  # it keeps the delays
@@ -78,10 +100,17 @@ def test_a_drawn_unit_moves_in_an_engine_as_in_gaponet(exported: Path, tmp_path:
     file.write_text(json.dumps({"joints": joints, "units": units}))
     python = environment(name, version, *((package,) for package in packages))
     command = [python, script, str(file), "2"]
-    said = subprocess.run(command, cwd=exported / to, capture_output=True, text=True, check=True).stdout
-    unit = load_robot("so101").with_servos({j: {f: x[2][i] for f, x in units.items()} for i, j in enumerate(joints)})
+    said = subprocess.run(
+        command, cwd=exported / to, capture_output=True, text=True, check=True
+    ).stdout
+    unit = load_robot("so101").with_servos(
+        {j: {f: x[2][i] for f, x in units.items()} for i, j in enumerate(joints)}
+    )
     meta = SequenceMeta(unit.name, "itself", "m", 0.0, virtual=True)
-    motions = [Sequence(meta, unit.joint_names, float(m["dt"]), m["ctrl"], m["qpos"], m["qvel"]) for m in check.motions]
+    motions = [
+        Sequence(meta, unit.joint_names, float(m["dt"]), m["ctrl"], m["qpos"], m["qvel"])
+        for m in check.motions
+    ]
     here = 1e3 * rollout_error(motions, unit)
     (there,) = (float(x) for x in re.findall(r": ([\d.]+) mrad; in gaponet", said))
     print(f"{said}the unit in gaponet: {here:.2f}")

@@ -37,7 +37,10 @@ from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.servo import friction_limit, servo_torque
 
-LATE = {"shoulder": {"delay": 0.007, "offset": 0.02, "zero": 0.01}, "elbow": {"delay": 0.013, "stop_low": -1.2}}
+LATE = {
+    "shoulder": {"delay": 0.007, "offset": 0.02, "zero": 0.01},
+    "elbow": {"delay": 0.013, "stop_low": -1.2},
+}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +63,9 @@ def drawn(num_envs, columns=2, seed=0):
     return [torch.from_numpy(rng.uniform(-0.5, 0.5, (num_envs, columns))).float() for _ in range(3)]
 
 
-def test_an_aligner_follows_the_loop_over_any_number_of_worlds_with_some_beginning_anew(place, model):
+def test_an_aligner_follows_the_loop_over_any_number_of_worlds_with_some_beginning_anew(
+    place, model
+):
     for num_envs in (1, 5):
         aligner = Aligner(place / "torch", ["shoulder", "elbow"], num_envs, "cpu")
         loop = model.loop(num_envs)
@@ -104,7 +109,9 @@ def test_a_past_made_in_inference_mode_is_begun_anew_outside_it(place):
 
 
 @pytest.mark.parametrize(("bad", "when"), [(float("nan"), 0), (float("inf"), 2)])
-def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(place, model, bad, when):
+def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(
+    place, model, bad, when
+):
     aligners = [Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu") for _ in range(2)]
     step = program(delta_step(model, place / "run")).module()
     frames, fresh = [torch.zeros(3, 3, 6)] * 2, torch.ones(3, dtype=torch.bool)
@@ -118,7 +125,10 @@ def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(plac
         sent = [aligner(q, v, target) for aligner, target in zip(aligners, targets, strict=True)]
         assert torch.equal(*sent)
         assert sent[0].isfinite().all()
-        made = [step(q, v, b, torch.zeros(3), f, fresh) for b, f in zip((targets[0], held), frames, strict=True)]
+        made = [
+            step(q, v, b, torch.zeros(3), f, fresh)
+            for b, f in zip((targets[0], held), frames, strict=True)
+        ]
         frames, fresh = [f for _, f in made], torch.zeros_like(fresh)
         assert torch.equal(made[0][0], made[1][0])
         assert torch.equal(*frames)
@@ -146,19 +156,33 @@ def test_facts_are_the_compiled_simulators(place, model):
     assert facts["corrected"] == ["shoulder", "elbow"]
     assert (facts["dt"], facts["decimation"], facts["payload_mass"]) == (0.02, 4, 0.1)
     joint = facts["joints"]["shoulder"]
-    assert (joint["kp"], joint["effort_limit"], joint["delay"], joint["offset"]) == (20.0, 5.0, 0.007, 0.02)
+    assert (joint["kp"], joint["effort_limit"], joint["delay"], joint["offset"]) == (
+        20.0,
+        5.0,
+        0.007,
+        0.02,
+    )
     assert joint["mujoco"]["actuator_forcerange"] == [-5.0, 5.0]
     assert joint["mujoco"]["dof_solimp"] == compiled.dof_solimp[0].tolist()
     assert facts["options"]["integrator"] == "implicitfast"
     assert facts["options"]["timestep"] == 0.005
-    built = compiled.dof_invweight0[0] / mujoco.MjModel.from_xml_path(str(place / "torch/robot.xml")).dof_invweight0[0]
+    built = (
+        compiled.dof_invweight0[0]
+        / mujoco.MjModel.from_xml_path(str(place / "torch/robot.xml")).dof_invweight0[0]
+    )
     assert facts["dof_invweight0_factor"] == pytest.approx(built)
 
 
 @pytest.mark.parametrize("name", ["so101", "h1_2"])
 def test_an_mjcf_with_servos_is_the_simulator(name):
     robot = load_robot(name)
-    found = {"delay": 0.011, "offset": -0.01, "zero": 0.02, "friction_external": 0.1, "damping": 0.7}
+    found = {
+        "delay": 0.011,
+        "offset": -0.01,
+        "zero": 0.02,
+        "friction_external": 0.1,
+        "damping": 0.7,
+    }
     robot = robot.with_servos({robot.operated[1]: found})
     dt = 1 / 60  # no round number of physics steps: all digits count
     again = mujoco.MjModel.from_xml_string(mjcf_text(robot, dt, 0.5))
@@ -179,7 +203,9 @@ def test_an_mjcf_with_servos_is_the_simulator(name):
         (lambda m: m.actuator_biasprm.fill(0.0), "actuator_biasprm of shoulder"),
     ],
 )
-def test_a_scene_that_is_not_the_simulator_of_training_is_refused_with_the_field(place, change, said):
+def test_a_scene_that_is_not_the_simulator_of_training_is_refused_with_the_field(
+    place, change, said
+):
     scene = mujoco.MjModel.from_xml_path(str(place / "torch" / "robot.xml"))
     require_scene(scene, "", place / "torch")
     change(scene)
@@ -193,11 +219,15 @@ def test_late_servos_of_a_world_that_begins_stay_where_it_begins(place, model):
     late = torch.full((3, own.batch.bind("history").shape[1]), 7.0)
     named = re.sub('="(shoulder|elbow)"', r'="robot/\1"', (place / "torch/robot.xml").read_text())
     scene = mujoco.MjModel.from_xml_string(named)
-    sim = SimpleNamespace(mj_model=scene, device="cpu", data=SimpleNamespace(history=late, time=torch.zeros(3)))
+    sim = SimpleNamespace(
+        mj_model=scene, device="cpu", data=SimpleNamespace(history=late, time=torch.zeros(3))
+    )
     q = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
     own.reset(slice(None), q, 0 * q, past=q[:, None])
     fresh = torch.tensor([True, False, True])
-    DelayBuffers(sim, "robot", ["elbow", "shoulder"]).restart(fresh, torch.tensor(q[:, ::-1].copy()))
+    DelayBuffers(sim, "robot", ["elbow", "shoulder"]).restart(
+        fresh, torch.tensor(q[:, ::-1].copy())
+    )
     np.testing.assert_allclose(late[[0, 2]], own.batch.bind("history")[[0, 2]], atol=1e-7)
     assert (late[1] == 7.0).all()
 
@@ -250,16 +280,24 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
 def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     rng, values = np.random.default_rng(0), (0.1, 0.2, 0.05, 0.08, 0.3, 0.02, 3.0, 0.0)
     law = dict(zip(SERVO_TERMS, values, strict=True))
-    robot = write_arm(tmp_path / "arm").with_servos({"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}})
-    scene = mujoco.MjModel.from_xml_string(re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt)))
+    robot = write_arm(tmp_path / "arm").with_servos(
+        {"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}}
+    )
+    scene = mujoco.MjModel.from_xml_string(
+        re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt))
+    )
     q, v, torque, load, ctrl = rng.uniform(-0.2, 0.2, (5, 20, 2))
     seen = {"qpos": q, "qvel": v, "actuator_force": torque, "qfrc_bias": load}
-    model = SimpleNamespace(dof_frictionloss=torch.zeros(20, 2), actuator_biasprm=torch.zeros(20, 2, 10))
+    model = SimpleNamespace(
+        dof_frictionloss=torch.zeros(20, 2), actuator_biasprm=torch.zeros(20, 2, 10)
+    )
     model.actuator_forcerange = torch.tensor([[-5.0, 5.0]]).repeat(20, 2, 1)
     data = SimpleNamespace(**{name: torch.tensor(x).float() for name, x in seen.items()})
     sim = SimpleNamespace(mj_model=scene, model=model, data=data, device="cpu", num_envs=20)
     sim.expand_model_fields, entity = lambda fields: None, SimpleNamespace(update=lambda dt: None)
-    found = ServoModel(sim, entity, "robot", ["shoulder", "elbow"], simulator_facts(robot, robot.dt))
+    found = ServoModel(
+        sim, entity, "robot", ["shoulder", "elbow"], simulator_facts(robot, robot.dt)
+    )
     entity.update(0.005)
     found.before(torch.tensor(ctrl).float())
     terms, kp = {name: getattr(robot, name) for name in SERVO_TERMS}, robot.kp
@@ -270,7 +308,9 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     limits = np.stack([np.full(20, 5.0), 5.0 * np.minimum(1 - v[:, 1] / 3.0, 1)], axis=1)
     np.testing.assert_allclose(model.actuator_forcerange[:, :, 1], limits, atol=1e-5)
     found.restart(torch.ones(20, dtype=torch.bool), torch.full((20, 2), 0.01))
-    np.testing.assert_allclose(found.torque, np.tile(kp * (robot.offset + 0.01), (20, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        found.torque, np.tile(kp * (robot.offset + 0.01), (20, 1)), atol=1e-6
+    )
 
 
 def isaac_lab(monkeypatch):
@@ -312,7 +352,9 @@ def test_isaac_labs_classes_are_found_by_name_as_hydra_looks_for_them(place, mon
     config = gaponet_action.isaaclab_action(place / "torch")
     there = f"{config.class_type.__module__}:{config.class_type.__qualname__}"
     assert there == "gaponet.export.shipped.gaponet_action:IsaacLabTerm"
-    assert config.class_type is gaponet_action.IsaacLabTerm is gaponet_action.__dict__["IsaacLabTerm"]
+    assert (
+        config.class_type is gaponet_action.IsaacLabTerm is gaponet_action.__dict__["IsaacLabTerm"]
+    )
     assert config.class_type.__doc__
     assert config.folder == str(place / "torch")
     (servos,) = isaaclab_actuators(place / "torch").values()
@@ -332,7 +374,12 @@ def test_a_joint_with_a_no_load_speed_is_isaac_labs_dc_motor(tmp_path, monkeypat
 
 def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_rest():
     class Engine:
-        num_envs, device, servo_offset, _env = 2, "cpu", torch.tensor([0.1, 0.0]), SimpleNamespace(physics_dt=0.005)
+        num_envs, device, servo_offset, _env = (
+            2,
+            "cpu",
+            torch.tensor([0.1, 0.0]),
+            SimpleNamespace(physics_dt=0.005),
+        )
         aligner = SimpleNamespace(past=SimpleNamespace(fresh=torch.tensor([True, True])))
 
         def apply_actions(self):
@@ -358,22 +405,37 @@ def test_friction_is_made_to_hold_in_every_world_of_a_model_that_they_share(plac
     scene = mujoco.MjModel.from_xml_string(
         re.sub('="(shoulder|elbow)"', r'="robot/\1"', (place / "torch/robot.xml").read_text())
     )
-    shared = torch.tensor(scene.dof_invweight0)[None].expand(3, -1)  # as mjlab has it: one row for all
+    shared = torch.tensor(scene.dof_invweight0)[None].expand(
+        3, -1
+    )  # as mjlab has it: one row for all
 
     def expand(fields):
         sim.model.dof_invweight0 = shared.clone()
 
-    sim = SimpleNamespace(mj_model=scene, model=SimpleNamespace(dof_invweight0=shared), expand_model_fields=expand)
+    sim = SimpleNamespace(
+        mj_model=scene, model=SimpleNamespace(dof_invweight0=shared), expand_model_fields=expand
+    )
     hold_friction(sim, "robot", place / "torch")
     np.testing.assert_allclose(sim.model.dof_invweight0, 0.1 * shared)
 
 
 def test_the_command_writes_a_folder_that_needs_no_gaponet(place, capsys):
     files = {f.name for f in (place / "torch").iterdir()}
-    shared = {"facts.json", "robot.xml", "gaponet_action.py", "servo_law.py", "mujoco_servos.py", "scene_facts.py"}
+    shared = {
+        "facts.json",
+        "robot.xml",
+        "gaponet_action.py",
+        "servo_law.py",
+        "mujoco_servos.py",
+        "scene_facts.py",
+    }
     shared |= {"unit_events.py"}
     assert files == shared | {".gaponet", "delta.pt2", "robot_without_servos.xml"}
-    assert not [f for f in (place / "torch").glob("*.py") if re.search(r"^(from|import) gaponet", f.read_text(), re.M)]
+    assert not [
+        f
+        for f in (place / "torch").glob("*.py")
+        if re.search(r"^(from|import) gaponet", f.read_text(), re.M)
+    ]
     assert mujoco.MjModel.from_xml_path(str(place / "torch/robot_without_servos.xml")).nu == 0
     assert main(["export", str(place / "run"), "--to", "torch", "--payload-mass", "9"]) == 2
     assert "9 kg is outside" in capsys.readouterr().err

@@ -27,7 +27,14 @@ from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
 
 FOUND = {
-    "shoulder": {"kp": 16.0, "damping": 0.8, "frictionloss": 0.1, "delay": 0.013, "offset": 0.02, "zero": 0.01},
+    "shoulder": {
+        "kp": 16.0,
+        "damping": 0.8,
+        "frictionloss": 0.1,
+        "delay": 0.013,
+        "offset": 0.02,
+        "zero": 0.01,
+    },
     "elbow": {"kp": 24.0, "armature": 0.03, "delay": 0.006, "stop_low": -1.2},
 }
 LAWS = {joint: {"stribeck": 0.3, "stribeck_speed": 0.1, "friction_motor": 0.1} for joint in FOUND}
@@ -106,22 +113,32 @@ def quick(monkeypatch, robot):
     )
 
 
-def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(lawful, mine, tmp_path, quick):
+def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(
+    lawful, mine, tmp_path, quick
+):
     made = export_robot(lawful, "mjcf", tmp_path / "out", source=mine)
     assert made.virtual
     assert made.errors["in gaponet"] == pytest.approx(0.0, abs=1e-9)
     assert made.errors["scene.xml with servo_law.py"] < 2e-5
-    assert made.errors["scene.xml alone"] == pytest.approx(made.errors["in gaponet, without the servo model"], rel=0.02)
+    assert made.errors["scene.xml alone"] == pytest.approx(
+        made.errors["in gaponet, without the servo model"], rel=0.02
+    )
     assert made.errors["scene.xml alone"] > 0.003
     assert any("elbow met something at -1.20 rad" in note for note in made.notes)
     before, now = (mujoco.MjModel.from_xml_path(str(f)) for f in (mine, made.file))
     assert np.array_equal(before.key_qpos, now.key_qpos)
     assert [now.actuator(i).name for i in range(3)] == ["first", "thumb", "second"]
-    assert np.degrees(now.actuator_ctrlrange[0]) == pytest.approx([-80 * 180 / np.pi, 80 * 180 / np.pi])
+    assert np.degrees(now.actuator_ctrlrange[0]) == pytest.approx(
+        [-80 * 180 / np.pi, 80 * 180 / np.pi]
+    )
     assert now.actuator_gear[1, 0] == 2
     assert now.sensor_type.tolist() == before.sensor_type.tolist()
     assert now.site("tip").pos.tolist() == before.site("tip").pos.tolist()
-    assert (now.nsite, now.ntendon, now.nmesh) == (before.nsite, before.ntendon, before.nmesh) == (1, 1, 1)
+    assert (
+        (now.nsite, now.ntendon, now.nmesh)
+        == (before.nsite, before.ntendon, before.nmesh)
+        == (1, 1, 1)
+    )
     assert now.qpos0[now.joint("shoulder").qposadr[0]] == pytest.approx(-0.01)
     text = made.file.read_text() + (tmp_path / "out/parts/arm.xml").read_text()
     assert "<!-- mine -->" in text
@@ -132,7 +149,9 @@ def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(lawf
         for x in (tmp_path / "out/changes.diff").read_text().splitlines()
         if x[:1] in "+-" and x[:3] not in ("+++", "---")
     ]
-    assert len(changed) == 9  # two joints, of which one is of two lines, two servos, and the solver's tolerance
+    assert (
+        len(changed) == 9
+    )  # two joints, of which one is of two lines, two servos, and the solver's tolerance
     assert mine.read_text() == MAIN.format(step=0.005)
 
 
@@ -140,7 +159,11 @@ def test_the_check_travels(robot, mine, tmp_path):
     made = export_robot(robot, "mjcf", tmp_path / "out", source=mine)
     assert not [f for f in (tmp_path / "out").glob("*.py") if "from gaponet" in f.read_text()]
     said = subprocess.run(
-        [sys.executable, "check.py"], cwd=tmp_path / "out", check=True, capture_output=True, text=True
+        [sys.executable, "check.py"],
+        cwd=tmp_path / "out",
+        check=True,
+        capture_output=True,
+        text=True,
     )
     assert "the MJCF alone: 0.0" in said.stdout
     assert made.errors["scene.xml alone"] < 2e-5
@@ -168,21 +191,30 @@ def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_
     assert servo.ctrlrange.tolist() == pytest.approx([-90 * 0.42 / 24, 90 * 0.42 / 24])
     assert "targets of elbow were not in rad before (degrees?)" in made.notes[-1]
     assert made.errors["scene.xml with servo_law.py"] < 2e-5
-    assert f'-    <general name="second" joint="elbow" {degrees}/>' in (tmp_path / "out/changes.diff").read_text()
+    assert (
+        f'-    <general name="second" joint="elbow" {degrees}/>'
+        in (tmp_path / "out/changes.diff").read_text()
+    )
 
 
 def test_a_joint_that_turns_without_end_leaves_beside_one_that_does_not(tmp_path, quick):
-    xml = XML.replace(' range="-1.5 1.5"/>', "/>", 1).replace("<option ", '<option timestep="0.005" ')
+    xml = XML.replace(' range="-1.5 1.5"/>', "/>", 1).replace(
+        "<option ", '<option timestep="0.005" '
+    )
     endless = write_arm(tmp_path / "arm", xml=xml).with_servos(LAWS)
     made = export_robot(endless, "mjcf", tmp_path / "out")
     assert made.errors["robot.xml with servo_law.py"] < 2e-5
 
 
-def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_names(robot, lawful, tmp_path, quick):
+def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_names(
+    robot, lawful, tmp_path, quick
+):
     body = """<body name="{0}upper"><joint name="{0}shoulder" axis="0 1 0"/><geom size=".1" mass=".3"/>
         <body pos=".2 0 0"><joint name="{0}elbow" axis="0 1 0"/><geom size=".1" mass=".2"/></body></body>"""
     scene = tmp_path / "scene.xml"
-    scene.write_text(f"<mujoco><worldbody>{body.format('left_')}{body.format('right_')}</worldbody></mujoco>")
+    scene.write_text(
+        f"<mujoco><worldbody>{body.format('left_')}{body.format('right_')}</worldbody></mujoco>"
+    )
     first = export_robot(robot, "mjcf", tmp_path / "one", source=scene, prefix="left_")
     both = export_robot(lawful, "mjcf", tmp_path / "two", source=first.file, prefix="right_")
     model = mujoco.MjModel.from_xml_path(str(both.file))
@@ -213,7 +245,9 @@ def test_an_engine_with_another_order_of_joints_is_told_by_name(lawful, tmp_path
     free = 'type="capsule" size=".1 .1" mass=".3" contype="0" conaffinity="0"'
     other = f'<body name="other"><joint name="elbow_of_another" axis="0 1 0"/><geom {free}/></body>'
     servos = [("a", "elbow", 3), ("z", "elbow_of_another", 7), ("b", "shoulder", 5)]
-    drives = "".join(f'<position name="{name}" joint="{joint}" kp="{kp}"/>' for name, joint, kp in servos)
+    drives = "".join(
+        f'<position name="{name}" joint="{joint}" kp="{kp}"/>' for name, joint, kp in servos
+    )
     text = lawful.mjcf.read_text().replace("<option ", '<option timestep="0.005" ')
     text = text.replace("<worldbody>", f"<worldbody>{other}").replace(
         "</mujoco>", f"<actuator>{drives}</actuator></mujoco>"
@@ -228,7 +262,9 @@ def test_an_engine_with_another_order_of_joints_is_told_by_name(lawful, tmp_path
 
 
 def test_a_joint_with_two_servos_is_refused(robot, mine, tmp_path):
-    text = mine.read_text().replace('<motor name="thumb" joint="thumb"', '<velocity name="thumb" joint="elbow"')
+    text = mine.read_text().replace(
+        '<motor name="thumb" joint="thumb"', '<velocity name="thumb" joint="elbow"'
+    )
     mine.write_text(text)
     with pytest.raises(RobotError, match="has 2 servos of 'elbow'; one is needed"):
         export_robot(robot, "mjcf", tmp_path / "out", source=mine)
@@ -245,10 +281,17 @@ def test_a_delay_buffer_of_five_lines_is_mujocos_own_delay(robot, tmp_path):
     late.opt.timestep = model.opt.timestep = 0.005
     (motion,) = own_motions(robot, count=1)
     native = play(
-        late, facts, {"ctrl": motion.ctrl, "qpos": motion.qpos, "qvel": motion.qvel, "dt": 0.02}, form="plain"
+        late,
+        facts,
+        {"ctrl": motion.ctrl, "qpos": motion.qpos, "qvel": motion.qvel, "dt": 0.02},
+        form="plain",
     )
     weights, data = delay_weights([0.013, 0.006], 0.005), mujoco.MjData(model)
-    data.qpos[:], past, found = motion.qpos[0], np.tile(motion.ctrl[0], (len(weights), 1)), [motion.qpos[0]]
+    data.qpos[:], past, found = (
+        motion.qpos[0],
+        np.tile(motion.ctrl[0], (len(weights), 1)),
+        [motion.qpos[0]],
+    )
     for ctrl in motion.ctrl[:-1]:
         for _ in range(4):
             past = np.concatenate([ctrl[None], past[:-1]])
@@ -270,15 +313,25 @@ def test_the_nearest_servos_without_a_law_are_nearer_than_those_with_the_law_str
 def test_an_export_of_an_unchanged_robot_does_not_fit_again(lawful, tmp_path, monkeypatch):
     save_robot(lawful, tmp_path / "identified")
     fits, motions = [], own_motions(lawful, count=2)
-    fitted = lambda sequences, start, **_: SimpleNamespace(robot=start.with_servos({"elbow": {"kp": 23.0}}))  # noqa: E731
-    monkeypatch.setattr(plain_servos, "identify", lambda *given, **how: fits.append(given) or fitted(*given, **how))
-    first, again = (fit_plain_servos(load_robot(tmp_path / "identified"), motions) for _ in range(2))
+    fitted = lambda sequences, start, **_: SimpleNamespace(  # noqa: E731
+        robot=start.with_servos({"elbow": {"kp": 23.0}})
+    )
+    monkeypatch.setattr(
+        plain_servos, "identify", lambda *given, **how: fits.append(given) or fitted(*given, **how)
+    )
+    first, again = (
+        fit_plain_servos(load_robot(tmp_path / "identified"), motions) for _ in range(2)
+    )
     assert len(fits) == 1
     assert not first.has_servo_model
-    assert all(np.array_equal(getattr(first, f), getattr(again, f), equal_nan=True) for f in SERVO_FIELDS)
+    assert all(
+        np.array_equal(getattr(first, f), getattr(again, f), equal_nan=True) for f in SERVO_FIELDS
+    )
     assert model_hash(first) == model_hash(again)
     assert again.nominal is not None
-    fit_plain_servos(load_robot(tmp_path / "identified"), [replace(s, qvel=s.qvel + 1.0) for s in motions])
+    fit_plain_servos(
+        load_robot(tmp_path / "identified"), [replace(s, qvel=s.qvel + 1.0) for s in motions]
+    )
     assert len(fits) == 2
     (tmp_path / "identified" / "plain_servos.json").write_text("damaged")
     fit_plain_servos(load_robot(tmp_path / "identified"), motions)
@@ -297,7 +350,9 @@ def test_check_motions_run_in_worlds_that_restart(robot, tmp_path, capsys):
             assert np.array_equal(ctrl[world], motion["ctrl"][0])
             recorded[world] = iter(motion["qpos"][1:])
 
-    path = check.run(start, lambda ctrl: np.array([next(recorded[w], np.zeros(2)) for w in range(check.worlds)]))
+    path = check.run(
+        start, lambda ctrl: np.array([next(recorded[w], np.zeros(2)) for w in range(check.worlds)])
+    )
     check.report("recorded", path)
     assert capsys.readouterr().out == "recorded, 3 worlds: 0.00 mrad; in gaponet 0.00\n"
 
@@ -312,12 +367,16 @@ def test_recordings_at_another_period_than_the_robots_are_checked_at_their_own(r
 
 def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path, capsys):
     alone = (
-        "import sys; from gaponet.cli.main import main; sys.exit(main(sys.argv[1:]) or 9 * ('torch' in sys.modules))"
+        "import sys; from gaponet.cli.main import main; "
+        "sys.exit(main(sys.argv[1:]) or 9 * ('torch' in sys.modules))"
     )
     words = ["export", str(robot.folder), "--to", "mjcf", "--out", str(tmp_path / "alone")]
     subprocess.run([sys.executable, "-c", alone, *words], check=True)
     for to in ("mjcf", "newton", "drake", "json", "mjlab", "isaaclab"):
-        assert main(["export", str(robot.folder), "--to", to, "--out", str(tmp_path / to), "--json"]) == 0
+        assert (
+            main(["export", str(robot.folder), "--to", to, "--out", str(tmp_path / to), "--json"])
+            == 0
+        )
         told = json.loads(capsys.readouterr().out)
         assert told["robot"] == "arm"
         facts = json.loads((tmp_path / to / "facts.json").read_text())

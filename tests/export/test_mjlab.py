@@ -54,7 +54,12 @@ def play(model: GapModel, payload_mass: float, folder: Path) -> dict[str, np.nda
         sim.step(target)
         qpos.append(sim.qpos.copy())
         sent.append(sim.target.copy())
-    given = {"names": np.array(robot.joint_names), "targets": targets, "start": start, "reset_ids": half}
+    given = {
+        "names": np.array(robot.joint_names),
+        "targets": targets,
+        "start": start,
+        "reset_ids": half,
+    }
     np.savez(folder / "in.npz", **given, reset_at=PERIODS // 2)
     return {"qpos": np.array(qpos), "sent": np.array(sent), "targets": targets}
 
@@ -64,7 +69,9 @@ def compare(python: str, model: GapModel, payload_mass: float, folder: Path, wha
     export_model(model, model.path.parent, folder / "torch", payload_mass)
     own = play(model, payload_mass, folder)
     peer = str(Path(__file__).parent / "mjlab_peer.py")
-    subprocess.run([python, peer, *(str(folder / name) for name in ("torch", "in.npz", "out.npz"))], check=True)
+    subprocess.run(
+        [python, peer, *(str(folder / name) for name in ("torch", "in.npz", "out.npz"))], check=True
+    )
     there = dict(np.load(folder / "out.npz"))
     apart, corrected = np.abs(there.pop("qpos") - own["qpos"]), model.simulator().operated_index
     beside = np.abs(there.pop("beside") - own["qpos"]).max()
@@ -72,8 +79,12 @@ def compare(python: str, model: GapModel, payload_mass: float, folder: Path, wha
     moved = np.abs(own["sent"] - own["targets"])[..., corrected].mean()
     compiled = build_model(model.simulator(), payload_mass)
     other = [text for key, value in there.items() if (text := differs(compiled, key, value))]
-    print(f"\n{what}: corrected by {1e3 * moved:.1f} mrad on average; mjlab and AlignedSim {apart.max():.1e} rad apart")
-    print(f"over {PERIODS} periods of {WORLDS} worlds (targets {sent:.1e}); of {len(there)} fields {len(other)} differ")
+    print(
+        f"\n{what}: corrected by {1e3 * moved:.1f} mrad on average; mjlab and AlignedSim {apart.max():.1e} rad apart"
+    )
+    print(
+        f"over {PERIODS} periods of {WORLDS} worlds (targets {sent:.1e}); of {len(there)} fields {len(other)} differ"
+    )
     assert moved > 1e-4
     assert apart.max() < TOLERANCE
     assert beside < TOLERANCE  # the other robot of the scene
@@ -94,12 +105,29 @@ def differs(model: mujoco.MjModel, key: str, value: np.ndarray) -> str:
     count = min(own.size, value.size)  # MuJoCo's versions differ in how many zeros end a field
     pairs = own.ravel(), value.ravel()
     same = np.allclose(pairs[0][:count], pairs[1][:count], rtol=SINGLE, atol=1e-9)
-    return "" if same and not any(x[count:].any() for x in pairs) else f"{key}: {value} there, {own} here"
+    return (
+        ""
+        if same and not any(x[count:].any() for x in pairs)
+        else f"{key}: {value} there, {own} here"
+    )
 
 
 def test_identified_servos_move_in_mjlab_as_here(python, tmp_path):
     robot = load_robot("so101")
-    law = {"stribeck": 0.03, "stribeck_speed": 0.05, "friction_motor": 0.08, "friction_external": 0.15}
-    found = {j: {"delay": 0.006 * i, "offset": 0.01 * i} | law for i, j in enumerate(robot.operated, 1)}
+    law = {
+        "stribeck": 0.03,
+        "stribeck_speed": 0.05,
+        "friction_motor": 0.08,
+        "friction_external": 0.15,
+    }
+    found = {
+        j: {"delay": 0.006 * i, "offset": 0.01 * i} | law for i, j in enumerate(robot.operated, 1)
+    }
     model = random_run(tmp_path / "run", robot.with_servos(found))
-    compare(python, model, 0.0, tmp_path, "SO-101, servos late by 6 to 30 ms with a law of friction, random network")
+    compare(
+        python,
+        model,
+        0.0,
+        tmp_path,
+        "SO-101, servos late by 6 to 30 ms with a law of friction, random network",
+    )

@@ -22,10 +22,22 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sim.links import COORDINATES, LinkAxes
 from gaponet.sim.model import build_model
-from gaponet.sysid.uncertainty import JointUncertainty, LinkUncertainty, ParameterUncertainty, to_axes
+from gaponet.sysid.uncertainty import (
+    JointUncertainty,
+    LinkUncertainty,
+    ParameterUncertainty,
+    to_axes,
+)
 
 FIELDS = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
-SERVO_FIELDS = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
+SERVO_FIELDS = {
+    "kp": 16.0,
+    "damping": 0.5,
+    "frictionloss": 0.05,
+    "armature": 0.02,
+    "offset": 0.0,
+    "delay": 0.02,
+}
 ERRORS = np.array([0.05, 0.001, 1e-4, 1e-4, 2e-3, 1e-3])
 
 
@@ -46,10 +58,15 @@ def written(arm, folder, servo=SERVO_FIELDS, errors=ERRORS, sources=1, links=Non
     covariance = like * np.outer(errors, errors)
     none = tuple(np.zeros(7))
     joints = {
-        j: JointUncertainty(tuple(v), tuple(map(tuple, covariance)), none, (none,) * 7, none, 1e-3, 2e-3, 3e-3)
+        j: JointUncertainty(
+            tuple(v), tuple(map(tuple, covariance)), none, (none,) * 7, none, 1e-3, 2e-3, 3e-3
+        )
         for j, v in values.items()
     }
-    days = [{j: v + k * np.array([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0]) for j, v in values.items()} for k in range(sources)]
+    days = [
+        {j: v + k * np.array([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0]) for j, v in values.items()}
+        for k in range(sources)
+    ]
     said = tuple(source(v, days=(f"2026-11-{20 + k}",)) for k, v in enumerate(days[::-1]))
     ParameterUncertainty(FIELDS, joints, said, 24, True, links).save(folder)
     return folder
@@ -81,13 +98,17 @@ def test_units_scatter_as_the_values_err_and_together(arm, tmp_path, capsys):
     code, said = exported(capsys, folder)
     assert code == 0
     made = json.loads((folder / "randomization" / "randomization.json").read_text())
-    kp, damping, friction = (np.array(made["units"][f])[:, 1] for f in ("kp", "damping", "frictionloss"))
+    kp, damping, friction = (
+        np.array(made["units"][f])[:, 1] for f in ("kp", "damping", "frictionloss")
+    )
     assert np.log(kp).std() == pytest.approx(0.05, rel=0.2)
     assert np.corrcoef(damping / kp, friction / kp)[0, 1] < -0.8
     low, high = (said["ranges"]["elbow"]["kp"][k] for k in (0, 2))
     np.testing.assert_allclose([np.log(low / 16), np.log(high / 16)], [-0.0822, 0.0822], atol=0.006)
     assert min(np.min(made["units"][f]) for f in FIELDS if f != "offset") >= 0
-    np.testing.assert_allclose(np.array(made["units"]["effort_limit"])[:, 1] / arm.effort_limit[1], kp / 16, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.array(made["units"]["effort_limit"])[:, 1] / arm.effort_limit[1], kp / 16, rtol=1e-5
+    )
 
 
 def test_drawn_links_are_physical_and_servos_follow_them(arm, tmp_path):
@@ -108,17 +129,27 @@ def test_drawn_links_are_physical_and_servos_follow_them(arm, tmp_path):
     assert abs(np.corrcoef(mass[:, 0], np.log(together.units["kp"][:, 0]))[0, 1]) < 0.2
 
 
-def test_an_exported_unit_has_its_links_in_mujoco_and_isaac_lab_says_that_it_has_none(arm, tmp_path, capsys):
+def test_an_exported_unit_has_its_links_in_mujoco_and_isaac_lab_says_that_it_has_none(
+    arm, tmp_path, capsys
+):
     folder = written(arm, tmp_path / "known", links=heavy_links())
     assert exported(capsys, folder, "--engine", "mujoco", "--out", tmp_path / "out")[0] == 0
-    functions, model = runpy.run_path(str(tmp_path / "out" / "mujoco_randomization.py")), mujoco.MjModel
-    moved, drawn = model.from_xml_path(str(arm.mjcf)), functions["units"](tmp_path / "out" / "randomization.json")
+    functions, model = (
+        runpy.run_path(str(tmp_path / "out" / "mujoco_randomization.py")),
+        mujoco.MjModel,
+    )
+    moved, drawn = (
+        model.from_xml_path(str(arm.mjcf)),
+        functions["units"](tmp_path / "out" / "randomization.json"),
+    )
     functions["apply"](moved, drawn, 7)
     unit = sample_units(folder)
     robot = drawn_robots.robots_of(load_robot(folder), unit.units)[7]
     wanted = build_model(robot)
     for name in ("body_mass", "body_ipos", "body_inertia", "body_subtreemass"):
-        np.testing.assert_allclose(getattr(moved, name), getattr(wanted, name)[:3], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(
+            getattr(moved, name), getattr(wanted, name)[:3], rtol=1e-5, atol=1e-9
+        )
     assert wanted.body_mass[1] != build_model(load_robot(folder)).body_mass[1]
     assert exported(capsys, folder, "--engine", "isaaclab", "--out", tmp_path / "isaac")[0] == 0
     content = json.loads((tmp_path / "isaac" / "randomization.json").read_text())
@@ -149,7 +180,9 @@ def test_any_day_needs_two_days_and_any_robot_three(arm, tmp_path, capsys):
     close = exported(capsys, two)[1]["ranges"]["elbow"]["frictionloss"]
     assert wide[2] - wide[0] > 1.5 * (close[2] - close[0])
     other = written(arm, tmp_path / "other", SERVO_FIELDS | {"kp": 24.0})
-    low, _, high = exported(capsys, one, "--scope", "any-robot", "--units", two, other)[1]["ranges"]["elbow"]["kp"]
+    low, _, high = exported(capsys, one, "--scope", "any-robot", "--units", two, other)[1][
+        "ranges"
+    ]["elbow"]["kp"]
     assert low < 16
     assert high > 24
 
@@ -158,7 +191,10 @@ def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys):
     folder = written(arm, tmp_path / "known")
     assert exported(capsys, folder, "--engine", "mujoco", "--out", tmp_path / "out")[0] == 0
     (tmp_path / "robot.xml").write_text(
-        XML.replace("</mujoco>", '<actuator><position joint="elbow" kp="20" forcerange="-3 3"/></actuator></mujoco>')
+        XML.replace(
+            "</mujoco>",
+            '<actuator><position joint="elbow" kp="20" forcerange="-3 3"/></actuator></mujoco>',
+        )
     )
     code = (
         "import sys; sys.path.insert(0, sys.argv[1])\nimport mujoco, mujoco_randomization as r\n"
@@ -169,18 +205,24 @@ def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys):
         "assert abs(m.actuator_biasprm[0, 0] - u['units']['kp'][7][1] * u['units']['offset'][7][1]) < 1e-6\n"
         "assert 'gaponet' not in sys.modules\n"
     )
-    subprocess.run([sys.executable, "-c", code, tmp_path / "out", tmp_path / "robot.xml"], check=True)
+    subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "out", tmp_path / "robot.xml"], check=True
+    )
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml")).nu == 1
 
 
 @pytest.mark.parametrize("engine", ["mjlab", "isaaclab"])
-def test_the_file_of_an_engine_needs_no_gaponet_and_reads_whole_units(arm, tmp_path, capsys, engine):
+def test_the_file_of_an_engine_needs_no_gaponet_and_reads_whole_units(
+    arm, tmp_path, capsys, engine
+):
     folder = written(arm, tmp_path / "known")
     assert exported(capsys, folder, "--engine", engine)[0] == 0
     file = folder / "randomization" / f"{engine}_randomization.py"
     assert not re.search(r"^(from|import) gaponet", file.read_text(), re.M)
     events, env = runpy.run_path(str(file)), SimpleNamespace(num_envs=9, device="cpu")
-    ids, joints, units = events["draw_units"](file.parent / "randomization.json", "plain_units", env, None, None)
+    ids, joints, units = events["draw_units"](
+        file.parent / "randomization.json", "plain_units", env, None, None
+    )
     assert (len(ids), joints) == (9, ["shoulder", "elbow"])
     stored = json.loads((file.parent / "randomization.json").read_text())["units"]
     row = int(np.abs(np.array(stored["kp"])[:, 0] - float(units["kp"][4, 0])).argmin())
@@ -188,7 +230,9 @@ def test_the_file_of_an_engine_needs_no_gaponet_and_reads_whole_units(arm, tmp_p
         np.testing.assert_allclose(values[4], stored[field][row], rtol=1e-6)
 
 
-def test_units_that_follow_the_recordings_are_retained_and_stored_and_worse_ones_refused(arm, tmp_path, monkeypatch):
+def test_units_that_follow_the_recordings_are_retained_and_stored_and_worse_ones_refused(
+    arm, tmp_path, monkeypatch
+):
     monkeypatch.setattr(drawn_robots, "DRAWN", 32)
     monkeypatch.setattr(drawn_robots, "JUDGED", 4)
     folder = written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3]))
@@ -197,15 +241,26 @@ def test_units_that_follow_the_recordings_are_retained_and_stored_and_worse_ones
     recordings, drawn = (motions[::2], motions[1::2]), sample_units(robot)
     made = drawn_robots.draw_robots(robot, drawn.units, recordings)
     assert made.errors["exported"] < 1e-4  # the motions are the robot's own
-    first = np.mean([rollout_error(motions[1::2], r) for r in drawn_robots.robots_of(robot, drawn.units)[:8]])
+    first = np.mean(
+        [rollout_error(motions[1::2], r) for r in drawn_robots.robots_of(robot, drawn.units)[:8]]
+    )
     assert made.errors["units"] < 0.5 * first
     assert len(made.units["kp"]) == 8
     other_gains = [replace(s, meta=replace(s.meta, kp=(5.0, 5.0))) for s in motions]
-    assert "were not compared with recordings" in judge_units(drawn, robot, (other_gains, other_gains)).notes[-1]
+    assert (
+        "were not compared with recordings"
+        in judge_units(drawn, robot, (other_gains, other_gains)).notes[-1]
+    )
     with pytest.raises(NoGainError, match=r"nothing is written: .* drawn units are \d"):
-        replace(made, errors=made.errors | {"by hand": made.errors["units"] / 2}).require_better_than_by_hand()
+        replace(
+            made, errors=made.errors | {"by hand": made.errors["units"] / 2}
+        ).require_better_than_by_hand()
     rollouts = []
-    monkeypatch.setattr(drawn_robots, "rollout_error", lambda *given: rollouts.append(given) or rollout_error(*given))
+    monkeypatch.setattr(
+        drawn_robots,
+        "rollout_error",
+        lambda *given: rollouts.append(given) or rollout_error(*given),
+    )
     again = judge_units(drawn, robot, recordings)
     assert not rollouts
     np.testing.assert_array_equal(again.units["kp"], made.units["kp"])
@@ -218,15 +273,23 @@ def test_units_that_follow_the_recordings_are_retained_and_stored_and_worse_ones
 def test_units_for_an_engine_with_a_torque_speed_line_have_one_each(arm, tmp_path, monkeypatch):
     monkeypatch.setattr(drawn_robots, "DRAWN", 8)
     monkeypatch.setattr(drawn_robots, "JUDGED", 2)
-    robot = load_robot(written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3])))
+    robot = load_robot(
+        written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3]))
+    )
     drawn = {field: values[:8] for field, values in sample_units(robot).units.items()}
     plain = replace(robot, no_load_speed=np.array([3.0, 0.0]))
     robot = replace(plain, stribeck=np.full(2, 0.01), stribeck_speed=np.full(2, 0.05))
-    monkeypatch.setattr(drawn_robots, "fit_plain_servos", lambda robot, recordings, progress, terms: plain)
+    monkeypatch.setattr(
+        drawn_robots, "fit_plain_servos", lambda robot, recordings, progress, terms: plain
+    )
     motions = [s.rows(slice(0, 100)) for s in own_motions(robot, count=2)]
-    drawn["no_load_speed"] = np.array([3.0, 0.0]) * np.random.default_rng(0).uniform(0.9, 1.1, (8, 2))
+    drawn["no_load_speed"] = np.array([3.0, 0.0]) * np.random.default_rng(0).uniform(
+        0.9, 1.1, (8, 2)
+    )
     drawn["stribeck"] = np.full((8, 2), 0.01)
-    made = drawn_robots.draw_robots(robot, drawn, (motions[:1], motions[1:]), True, engine_terms=("no_load_speed",))
+    made = drawn_robots.draw_robots(
+        robot, drawn, (motions[:1], motions[1:]), True, engine_terms=("no_load_speed",)
+    )
     assert "stribeck" not in made.units
     speed = np.array(made.units["no_load_speed"])
     assert ((speed[:, 0] > 2.5) & (speed[:, 0] < 3.5)).all()

@@ -47,7 +47,9 @@ def group(*names, implicit=False, limit="effort_limit", delayed=False):
     made.stiffness = torch.full((WORLDS, len(names)), 7.0)
     setattr(made, limit, made.stiffness.clone())
     if delayed:
-        made.positions_delay_buffer, made.velocities_delay_buffer, made.efforts_delay_buffer = (Buffer() for _ in "pve")
+        made.positions_delay_buffer, made.velocities_delay_buffer, made.efforts_delay_buffer = (
+            Buffer() for _ in "pve"
+        )
     return made
 
 
@@ -85,7 +87,9 @@ class Robot2(Robot):
         self.note("dynamic", joint_dynamic_friction_coeff, joint_ids, env_ids)
         self.note("damping", joint_viscous_friction_coeff, joint_ids, env_ids)
 
-    def write_joint_dynamic_friction_coefficient_to_sim(self, joint_dynamic_friction_coeff, joint_ids, env_ids):
+    def write_joint_dynamic_friction_coefficient_to_sim(
+        self, joint_dynamic_friction_coeff, joint_ids, env_ids
+    ):
         raise AssertionError("it may not exceed the static coefficient of the unit before")
 
 
@@ -124,7 +128,11 @@ class Action(DelayedAction):
 def environment(robot, term):
     actions = SimpleNamespace(get_term={"joint_pos": term}.__getitem__)
     return SimpleNamespace(
-        num_envs=WORLDS, device="cpu", physics_dt=STEP, scene={"robot": robot}, action_manager=actions
+        num_envs=WORLDS,
+        device="cpu",
+        physics_dt=STEP,
+        scene={"robot": robot},
+        action_manager=actions,
     )
 
 
@@ -137,15 +145,24 @@ def stored(file, joint):
 ROBOT = SimpleNamespace(name="robot")
 
 
-@pytest.mark.parametrize(("kind", "limit"), [(Robot2, "effort_limit"), (Robot3, "actuator_effort_limit")])
+@pytest.mark.parametrize(
+    ("kind", "limit"), [(Robot2, "effort_limit"), (Robot3, "actuator_effort_limit")]
+)
 def test_every_world_of_isaac_lab_gets_all_numbers_of_one_unit_by_joint_name(file, kind, limit):
     torch.manual_seed(0)
-    robot, term = kind(group("shoulder", implicit=True), group("head", "elbow", limit=limit)), Action()
+    robot, term = (
+        kind(group("shoulder", implicit=True), group("head", "elbow", limit=limit)),
+        Action(),
+    )
     implicit, explicit = robot.actuators.values()
     apply_units(environment(robot, term), torch.tensor([0, 1, 2, 3, 5]), ROBOT, file)
     rows = set()
     for world in (0, 1, 2, 3, 5):
-        (row,) = {int((stored(file, "elbow")["armature"] - robot.sim["armature"][world, 1]).abs().argmin())}
+        (row,) = {
+            int(
+                (stored(file, "elbow")["armature"] - robot.sim["armature"][world, 1]).abs().argmin()
+            )
+        }
         rows.add(row)
         for joint, column, place in (("elbow", 1, 0), ("shoulder", 2, 2)):
             unit = {field: float(x[row]) for field, x in stored(file, joint).items()}
@@ -153,12 +170,22 @@ def test_every_world_of_isaac_lab_gets_all_numbers_of_one_unit_by_joint_name(fil
                 assert float(robot.sim[field][world, column]) == pytest.approx(unit[field])
             assert float(term.servo_offset[world, place]) == pytest.approx(unit["offset"])
             assert float(term.delay[world, place]) == pytest.approx(unit["delay"])
-            in_engine = robot.sim["kp"][world, 2] if joint == "shoulder" else explicit.stiffness[world, 1]
+            in_engine = (
+                robot.sim["kp"][world, 2] if joint == "shoulder" else explicit.stiffness[world, 1]
+            )
             assert float(in_engine) == pytest.approx(unit["kp"])
-            of_actuator = implicit.effort_limit[world, 0] if joint == "shoulder" else getattr(explicit, limit)[world, 1]
+            of_actuator = (
+                implicit.effort_limit[world, 0]
+                if joint == "shoulder"
+                else getattr(explicit, limit)[world, 1]
+            )
             assert float(of_actuator) == pytest.approx(unit["effort_limit"])
     assert len(rows) > 1
-    untouched = [x[4] for x in robot.sim.values()] + [x[:, 0] for x in robot.sim.values()] + [explicit.stiffness[:, 0]]
+    untouched = (
+        [x[4] for x in robot.sim.values()]
+        + [x[:, 0] for x in robot.sim.values()]
+        + [explicit.stiffness[:, 0]]
+    )
     assert all((x == 7.0).all() for x in untouched)
     assert (robot.sim["kp"][:, 1] == 7.0).all()  # the simulation has no gain of explicit actuators
     assert (term.servo_offset[4] == 0.5).all()
@@ -176,7 +203,9 @@ def test_rows_may_be_given_and_commands_are_then_late_by_the_delay_of_each_world
 
     robot, term = Robot3(group("shoulder", "elbow", "head")), Term()
     apply_units(environment(robot, term), None, ROBOT, file, rows=[0, 1, 2, 3, 3, 0])
-    torch.testing.assert_close(robot.sim["armature"][:, 2], stored(file, "shoulder")["armature"][[0, 1, 2, 3, 3, 0]])
+    torch.testing.assert_close(
+        robot.sim["armature"][:, 2], stored(file, "shoulder")["armature"][[0, 1, 2, 3, 3, 0]]
+    )
     term._processed_actions = torch.ones(WORLDS, 3)
     first = torch.zeros(WORLDS)
     for _ in range(6):
@@ -187,12 +216,16 @@ def test_rows_may_be_given_and_commands_are_then_late_by_the_delay_of_each_world
 
 def test_delayed_actuators_are_late_by_whole_steps_where_no_action_term_delays(file):
     robot = Robot3(*(group(name, delayed=True) for name in Robot.joint_names))
-    apply_units(environment(robot, None), slice(0, 3), ROBOT, file, term=None, rows=[0, 1, 2, 3, 3, 3])
+    apply_units(
+        environment(robot, None), slice(0, 3), ROBOT, file, term=None, rows=[0, 1, 2, 3, 3, 3]
+    )
     elbow = robot.actuators["group1"]
     assert elbow.positions_delay_buffer.time_lags.tolist() == [1, 2, 3, 0, 0, 0]
     assert elbow.efforts_delay_buffer.time_lags.tolist() == [1, 2, 3, 0, 0, 0]
     with pytest.raises(ValueError, match="'shoulder' needs a delay: take DelayedPDActuatorCfg"):
-        apply_units(environment(Robot3(group("elbow", "shoulder")), None), None, ROBOT, file, term=None)
+        apply_units(
+            environment(Robot3(group("elbow", "shoulder")), None), None, ROBOT, file, term=None
+        )
     content = json.loads(Path(file).read_text())
     content["plain_units"]["delay"][0][1] = 0.05
     Path(file + "2").write_text(json.dumps(content))
@@ -216,10 +249,12 @@ def test_dc_motors_of_isaac_lab_get_the_torque_speed_line_of_a_unit(file, execut
     own, whole = motor("shoulder"), motor("elbow", "shoulder")
     robot = Robot3(own, group("elbow", "head"))
     if executors:
-        robot.actuators = type("Collection", (dict,), {"_execution_batches": [SimpleNamespace(actuator=whole)]})(
-            robot.actuators
-        )
-    apply_units(environment(robot, Action()), torch.tensor([0, 1, 4]), ROBOT, file, rows=[0, 1, 2, 3, 3, 0])
+        robot.actuators = type(
+            "Collection", (dict,), {"_execution_batches": [SimpleNamespace(actuator=whole)]}
+        )(robot.actuators)
+    apply_units(
+        environment(robot, Action()), torch.tensor([0, 1, 4]), ROBOT, file, rows=[0, 1, 2, 3, 3, 0]
+    )
     limit = stored(file, "shoulder")["effort_limit"]
     for made, column in [(own, 0), (whole, 1)][: 1 + executors]:
         assert made.velocity_limit[:, column].tolist() == [3.0, 4.0, 9.0, 9.0, 6.0, 9.0]
@@ -228,7 +263,9 @@ def test_dc_motors_of_isaac_lab_get_the_torque_speed_line_of_a_unit(file, execut
         assert (made._saturation_effort[[2, 3, 5]] == 7.0).all()
     if executors:
         assert (whole.velocity_limit[[0, 1, 4], 0] == torch.inf).all()  # a speed of 0 is no line
-    with pytest.raises(ValueError, match="joint 'shoulder' needs a torque-speed line: take isaaclab_actuators"):
+    with pytest.raises(
+        ValueError, match="joint 'shoulder' needs a torque-speed line: take isaaclab_actuators"
+    ):
         apply_units(environment(Robot3(group("shoulder", "elbow")), Action()), None, ROBOT, file)
 
 
@@ -244,20 +281,36 @@ def test_a_scene_that_cannot_have_a_number_of_a_unit_is_refused(file):
     other.joint_names = ("head", "elbow")
     refused(other, Action(), "has joint 'shoulder'; joints of the articulation: head, elbow")
     refused(Robot3(group("elbow")), Action(), "has joint 'shoulder'; joints with PD actuators")
-    refused(Robot3(SimpleNamespace(joint_names=["shoulder", "elbow"], network=0)), Action(), "joints with PD actuators")
+    refused(
+        Robot3(SimpleNamespace(joint_names=["shoulder", "elbow"], network=0)),
+        Action(),
+        "joints with PD actuators",
+    )
     refused(Robot3(whole), object(), "'joint_pos' has no delays and offsets; use isaaclab_action")
     refused(Robot(whole), Action(), "write_joint_armature_to_sim is missing")
 
 
-def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_name(file, monkeypatch):
+def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_name(
+    file, monkeypatch
+):
     mark = lambda *fields: lambda func: setattr(func, "fields", fields) or func  # noqa: E731
-    modules = {"mjlab": {}, "mjlab.managers": {}, "mjlab.managers.event_manager": {"requires_model_fields": mark}}
+    modules = {
+        "mjlab": {},
+        "mjlab.managers": {},
+        "mjlab.managers.event_manager": {"requires_model_fields": mark},
+    }
     for name, content in modules.items():
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
     servos = '<position joint="robot/elbow" kp="1"/><position joint="robot/shoulder" kp="1"/>'
-    xml = XML.replace('name="shoulder"', 'name="robot/shoulder"').replace('name="elbow"', 'name="robot/elbow"')
-    xml = xml.replace('name="upper"', 'name="robot/upper"').replace('name="fore"', 'name="robot/fore"')
-    scene = mujoco.MjModel.from_xml_string(xml.replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>"))
+    xml = XML.replace('name="shoulder"', 'name="robot/shoulder"').replace(
+        'name="elbow"', 'name="robot/elbow"'
+    )
+    xml = xml.replace('name="upper"', 'name="robot/upper"').replace(
+        'name="fore"', 'name="robot/fore"'
+    )
+    scene = mujoco.MjModel.from_xml_string(
+        xml.replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>")
+    )
     event = mjlab_units(file, rows=[0, 1, 2, 3, 3, 3])
     fields = {f: torch.tensor(getattr(scene, f)).float() for f in event.fields}
     worlds = {f: x.expand(WORLDS, *x.shape).clone() for f, x in fields.items()}
@@ -272,7 +325,9 @@ def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_
     unit = {field: float(x[3]) for field, x in stored(file, "elbow").items()}
     assert float(worlds["dof_frictionloss"][3, dof]) == pytest.approx(unit["frictionloss"])
     assert float(worlds["actuator_biasprm"][3, 0, 0]) == pytest.approx(unit["kp"] * unit["offset"])
-    assert worlds["actuator_forcerange"][3, 0].tolist() == pytest.approx([-unit["effort_limit"], unit["effort_limit"]])
+    assert worlds["actuator_forcerange"][3, 0].tolist() == pytest.approx(
+        [-unit["effort_limit"], unit["effort_limit"]]
+    )
     link = torch.tensor(json.loads(Path(file).read_text())["plain_units"]["links"])[3]
     for i, name in enumerate(("upper", "fore")):
         one = [
@@ -283,5 +338,7 @@ def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_
     torch.testing.assert_close(worlds["body_subtreemass"][3, :2], link[:, 0].sum().expand(2))
     assert worlds["body_mass"][0, 1] == float(scene.body_mass[1])  # a world that was not reset
     scene.actuator_biastype[:] = 0
-    with pytest.raises(ValueError, match="has joint 'robot/shoulder'; joints with position servos:"):
+    with pytest.raises(
+        ValueError, match="has joint 'robot/shoulder'; joints with position servos:"
+    ):
         event(env, None)

@@ -63,9 +63,14 @@ def test_a_urdf_keeps_all_but_its_dynamics_and_efforts_and_the_loss_has_its_pric
 
 
 def test_links_are_written_where_the_file_has_the_mass_that_was_corrected(robot, tmp_path):
-    file, link = tmp_path / "mine.urdf", Link(0.4, (0.12, 0.0, 0.01), (1e-4, 2e-3, 2e-3, 0.0, 0.0, 0.0))
+    file, link = (
+        tmp_path / "mine.urdf",
+        Link(0.4, (0.12, 0.0, 0.01), (1e-4, 2e-3, 2e-3, 0.0, 0.0, 0.0)),
+    )
     file.write_text(URDF)
-    made = export_robot(replace(robot, links={"upper": link, "fore": link}), "urdf", tmp_path / "out", source=file)
+    made = export_robot(
+        replace(robot, links={"upper": link, "fore": link}), "urdf", tmp_path / "out", source=file
+    )
     model = mujoco.MjModel.from_xml_path(str(made.file))
     assert model.body("upper").mass == pytest.approx(0.4)
     assert model.body("upper").ipos == pytest.approx(link.pos)
@@ -89,7 +94,9 @@ def test_a_file_that_is_none_or_has_other_joints_is_refused(robot, tmp_path, cap
         export_robot(robot, "urdf", tmp_path / "b", source=robot.mjcf)
     file = tmp_path / "other.urdf"
     file.write_text(URDF.replace('"shoulder"', '"left_shoulder"'))
-    with pytest.raises(RobotError, match=r"no joint 'shoulder' \(--prefix\); it has left_shoulder, elbow"):
+    with pytest.raises(
+        RobotError, match=r"no joint 'shoulder' \(--prefix\); it has left_shoulder, elbow"
+    ):
         export_robot(robot, "urdf", tmp_path / "c", source=file)
     assert main(["export", str(robot.folder), "--to", "urdf", "--into", str(file)]) == 2
     assert "no joint 'shoulder'" in capsys.readouterr().err
@@ -110,5 +117,7 @@ def test_drakes_parser_reads_the_damping(robot, tmp_path):
     (tmp_path / "mine.urdf").write_text(URDF)
     made = export_robot(robot, "urdf", tmp_path / "out", source=tmp_path / "mine.urdf")
     python = environment("drake", "3.12", ("drake",))
-    done = subprocess.run([python, "-c", DRAKE, made.file], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [python, "-c", DRAKE, made.file], capture_output=True, text=True, check=True
+    )
     assert json.loads(done.stdout) == {"shoulder": 0.8, "elbow": 0.6}

@@ -24,7 +24,11 @@ GROUPS = {"readers": readers.TARGETS, "structures": structures.TARGETS}
 
 def grouped(failures: list[Failure]) -> list[tuple[str, int, Failure]]:
     """(what, how often, the first of them), most frequent first."""
-    what = lambda f: f"{f.target} {f.kind}: {f.text.strip().splitlines()[-1][:150] if f.text.strip() else ''}"  # noqa: E731
+    what = (  # noqa: E731
+        lambda f: (
+            f"{f.target} {f.kind}: {f.text.strip().splitlines()[-1][:150] if f.text.strip() else ''}"
+        )
+    )
     counts = Counter(map(what, failures))
     first = {what(f): f for f in reversed(failures)}
     return [(text, count, first[text]) for text, count in counts.most_common()]
@@ -35,7 +39,9 @@ def replay(case: Path) -> int:
     name = case.name.partition("-")[2].rpartition("-")[0]
     target = next(t for group in GROUPS.values() for t in group if t.name == name)
     with tempfile.TemporaryDirectory() as place:
-        source = shutil.copytree(case, Path(place) / "in", symlinks=True, ignore=shutil.ignore_patterns(WHY))
+        source = shutil.copytree(
+            case, Path(place) / "in", symlinks=True, ignore=shutil.ignore_patterns(WHY)
+        )
         try:
             target.use(source, Path(place) / "out")
         except GAPONetError as error:
@@ -49,7 +55,9 @@ def replay(case: Path) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--mutants", type=int, default=100_000)
     parser.add_argument("--only", help="targets or groups of them, with commas between")
     parser.add_argument("--seed", type=int, default=0)
@@ -62,11 +70,23 @@ def main() -> int:
     known = {t.name: (t,) for group in GROUPS.values() for t in group} | GROUPS
     chosen = [t for name in (args.only or ",".join(GROUPS)).split(",") for t in known[name]]
     shown = lambda done, failed: print(f"\r{done} done, {failed} failed", end="", file=sys.stderr)  # noqa: E731
-    result = run(chosen, args.mutants, args.seed, args.workers, args.keep, *([shown] if sys.stderr.isatty() else []))
+    result = run(
+        chosen,
+        args.mutants,
+        args.seed,
+        args.workers,
+        args.keep,
+        *([shown] if sys.stderr.isatty() else []),
+    )
     for text, count, failure in grouped(result.failures):
-        print(f"{count:6d}  {text}\n        first: {failure.target} {failure.number}", file=sys.stderr)
+        print(
+            f"{count:6d}  {text}\n        first: {failure.target} {failure.number}", file=sys.stderr
+        )
     kinds = Counter(f.kind for f in result.failures)
-    numbers = asdict(result) | {"failures": dict(kinds), "per_second": round(result.mutants / result.seconds, 1)}
+    numbers = asdict(result) | {
+        "failures": dict(kinds),
+        "per_second": round(result.mutants / result.seconds, 1),
+    }
     print(json.dumps(numbers | {"seed": args.seed}))
     return 1 if result.failures else 0
 

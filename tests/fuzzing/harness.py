@@ -29,7 +29,9 @@ from fuzzing.mutate import Files, mutate
 from gaponet.base.errors import GAPONetError
 
 HANG_S = 5.0
-PATIENCE = 12  # times HANG_S of waiting: a reader may start a process, on a machine that others use too
+PATIENCE = (
+    12  # times HANG_S of waiting: a reader may start a process, on a machine that others use too
+)
 MEMORY = 2 << 30  # bytes
 WHY = "WHY.txt"  # beside the files of a failed mutant
 RENEW = 4000  # mutants after which a worker is replaced: what it leaked is no mutant's fault
@@ -44,10 +46,16 @@ class Target:
     """One kind of input."""
 
     name: str
-    files: Callable[[], Files]  # the untouched files: path below the folder → content; called once in each worker
-    use: Callable[[Path, Path], None]  # reads the first folder, writes below the second only; raises AbsurdError
+    files: Callable[
+        [], Files
+    ]  # the untouched files: path below the folder → content; called once in each worker
+    use: Callable[
+        [Path, Path], None
+    ]  # reads the first folder, writes below the second only; raises AbsurdError
     share: float = 1.0  # of a run's mutants, beside the others' shares
-    only: tuple[str, ...] = ("",)  # suffixes of the files that are changed; the others stand beside them
+    only: tuple[str, ...] = (
+        "",
+    )  # suffixes of the files that are changed; the others stand beside them
 
 
 @dataclass(frozen=True)
@@ -111,7 +119,14 @@ def run(
         for worker in crew:
             worker.close()
     by_target = dict(Counter(t.name for t, _ in plan))
-    return Result(counts.total(), counts["refused"], counts["taken"], time.monotonic() - start, by_target, failures)
+    return Result(
+        counts.total(),
+        counts["refused"],
+        counts["taken"],
+        time.monotonic() - start,
+        by_target,
+        failures,
+    )
 
 
 Outcome = tuple[str, Failure | None]  # "refused", "taken" or "failed", and what went wrong
@@ -126,7 +141,9 @@ class _Worker:
 
     def _start(self) -> None:
         context, memory = mp.get_context("fork"), Path("/dev/shm")
-        self.room = Path(tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
+        self.room = Path(
+            tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None)
+        )
         self.pipe, theirs = context.Pipe(duplex=False)
         what = (list(islice(self.plan, RENEW)), self.seed, self.keep, self.room, theirs)
         self.process = context.Process(target=_work, args=what, daemon=True)
@@ -169,12 +186,16 @@ class _Worker:
         shutil.rmtree(self.room, ignore_errors=True)
 
 
-def _work(plan: list[tuple[Target, int]], seed: int, keep: Path | None, room: Path, pipe: Any) -> None:
+def _work(
+    plan: list[tuple[Target, int]], seed: int, keep: Path | None, room: Path, pipe: Any
+) -> None:
     """Try mutants one after the other, below an empty folder, and report when the first begins and when each ends."""
     untouched = {target.name: target.files() for target, _ in plan}
     for target in {target.name: target for target, _ in plan}.values():
         _lay(untouched[target.name], room)
-        target.use(room / "in", room / "out")  # must be taken: changes of what is refused anyway find nothing
+        target.use(
+            room / "in", room / "out"
+        )  # must be taken: changes of what is refused anyway find nothing
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
@@ -213,7 +234,11 @@ def _attempt(target: Target, files: Files, number: int, seed: int, room: Path) -
         kind, text = "traceback", traceback.format_exc()
     if not kind and time.process_time() - start > HANG_S:
         kind, text = "hang", f"{time.process_time() - start:.1f} s of computing"
-    outside = [*_WATCHED[1:], *(p.name for p in room.iterdir() if p.name not in ("in", "out")), *_changed(mutant, room)]
+    outside = [
+        *_WATCHED[1:],
+        *(p.name for p in room.iterdir() if p.name not in ("in", "out")),
+        *_changed(mutant, room),
+    ]
     _WATCHED.clear()
     if not kind and outside:
         kind, text = "outside", f"written outside the target: {', '.join(outside)}"
@@ -236,21 +261,34 @@ def _lay(files: Files, room: Path) -> None:
 
 def _changed(files: Files, room: Path) -> list[str]:
     """Files below room/in that are not as they were laid."""
-    there = {p.relative_to(room / "in").as_posix(): p for p in (room / "in").rglob("*") if p.is_file()}
+    there = {
+        p.relative_to(room / "in").as_posix(): p for p in (room / "in").rglob("*") if p.is_file()
+    }
     laid = {name: content for name, content in files.items() if content is not None}
     return sorted(there.keys() ^ laid.keys()) + [
         n for n in there.keys() & laid.keys() if there[n].read_bytes() != laid[n]
     ]
 
 
-_WATCHED: list[str] = []  # the folder that may be written while a mutant is tried, then what was written elsewhere
+_WATCHED: list[
+    str
+] = []  # the folder that may be written while a mutant is tried, then what was written elsewhere
 
 
 def _watch(event: str, args: tuple[Any, ...]) -> None:
     """Audit hook: notes what Python opens for writing, makes, renames or deletes outside the folder meant for it."""
-    if not _WATCHED or event not in ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink"):
+    if not _WATCHED or event not in (
+        "open",
+        "os.mkdir",
+        "os.rename",
+        "os.remove",
+        "os.rmdir",
+        "os.symlink",
+    ):
         return
-    if event == "open" and not (isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)):
+    if event == "open" and not (
+        isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+    ):
         return
     path = args[0]
     if isinstance(path, (str, bytes, os.PathLike)):

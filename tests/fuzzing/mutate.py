@@ -15,9 +15,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-Files = dict[str, bytes | None]  # path below a folder → content; None is a folder where a file is expected
+Files = dict[
+    str, bytes | None
+]  # path below a folder → content; None is a folder where a file is expected
 Change = Callable[[bytes, random.Random], bytes]
-UNREADABLE = (ValueError, LookupError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (
+    ValueError,
+    LookupError,
+    EOFError,
+    OSError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 NUMBERS = (
     "nan", "NaN", "inf", "-inf", "1e30", "-1e30", "1e400", "1e-320", "0", "-0.0", "-1", "1", "2", "0.5", "3.3", "100",
@@ -69,7 +79,9 @@ def _of_folder(files: Files, name: str, names: list[str], rng: random.Random) ->
     elif kind == 2:
         files[name] = b""
     else:
-        files[name] = files.get(rng.choice(names))  # None where an earlier change took the only file
+        files[name] = files.get(
+            rng.choice(names)
+        )  # None where an earlier change took the only file
 
 
 def _bytes(content: bytes, rng: random.Random) -> bytes:
@@ -100,7 +112,9 @@ def _text(content: bytes, rng: random.Random) -> bytes:
     elif kind == 3:
         text = _replace(r"[A-Za-z_][\w.]*", rng.choice(WORDS), text, rng)
     elif kind == 4:
-        text = _replace(r"[,\[\]\"={}:]", rng.choice((",", "", "[", '"', "=", "\n", ",,")), text, rng)
+        text = _replace(
+            r"[,\[\]\"={}:]", rng.choice((",", "", "[", '"', "=", "\n", ",,")), text, rng
+        )
     else:
         text = _lines(text, rng)
     return text.encode("utf-8", errors="surrogateescape")
@@ -188,24 +202,34 @@ def _parquet(content: bytes, rng: random.Random) -> bytes:
         table = table.remove_column(at)
     elif kind == 1:
         new = rng.choice((*WORDS, *table.column_names))
-        table = table.rename_columns([new if i == at else n for i, n in enumerate(table.column_names)])
+        table = table.rename_columns(
+            [new if i == at else n for i, n in enumerate(table.column_names)]
+        )
     elif kind == 2:
         table = table.append_column(rng.choice((name, "x")), table.column(at))
     elif kind == 3:
         cut = rng.randrange(rows + 1)
-        table = rng.choice((table.slice(0, cut), table.slice(cut), pa.concat_tables([table, table])))
+        table = rng.choice(
+            (table.slice(0, cut), table.slice(cut), pa.concat_tables([table, table]))
+        )
     elif kind == 4:
-        table = table.set_column(at, name, pa.array([rng.choice((None, True, False, 1, "x"))] * rows))
+        table = table.set_column(
+            at, name, pa.array([rng.choice((None, True, False, 1, "x"))] * rows)
+        )
     elif kind == 5:
         table = table.set_column(
-            at, name, _column([v if rng.random() < 0.5 else None for v in values], rng.choice(TYPES))
+            at,
+            name,
+            _column([v if rng.random() < 0.5 else None for v in values], rng.choice(TYPES)),
         )
     elif values:
         i = rng.randrange(rows)
         number = rng.choice((None, float("nan"), float("inf"), 1e30, -1, 0, 10**9, 2**62, 0.5))
         if isinstance(values[i], list):
             cut = rng.randrange(len(values[i]) + 1)
-            values[i] = rng.choice((values[i][:cut], [*values[i], 1.0], [number] * len(values[i]), None))
+            values[i] = rng.choice(
+                (values[i][:cut], [*values[i], 1.0], [number] * len(values[i]), None)
+            )
         else:
             values[i] = rng.choice(WORDS) if isinstance(values[i], str) else number
         table = table.set_column(at, name, _column(values, None))
@@ -224,7 +248,11 @@ def _column(values: list[Any], kind: pa.DataType | None) -> pa.Array:
         array = pa.array(values, from_pandas=False)
         return array if kind is None else array.cast(kind)
     except (pa.ArrowException, OverflowError, TypeError):
-        return pa.nulls(len(values), kind) if kind else pa.array([None if v is None else str(v) for v in values])
+        return (
+            pa.nulls(len(values), kind)
+            if kind
+            else pa.array([None if v is None else str(v) for v in values])
+        )
 
 
 def _npz(content: bytes, rng: random.Random) -> bytes:
@@ -236,7 +264,9 @@ def _npz(content: bytes, rng: random.Random) -> bytes:
     if kind == 0:
         name = rng.choice(WORDS[:8])
     elif kind == 1:
-        array = rng.choice((array.ravel(), array[None], array[:0], np.float64(3), np.array("x"), array.T))
+        array = rng.choice(
+            (array.ravel(), array[None], array[:0], np.float64(3), np.array("x"), array.T)
+        )
     elif kind == 2:
         array = array.astype(rng.choice(("O", "U9", "complex", "bool", "float16")))
     elif kind == 3:

@@ -13,7 +13,15 @@ import pyarrow.parquet as pq
 from arm import write_arm
 from logs import arm_columns, arm_sequence, late, stock, table_text, wave, write_bam, write_so101
 from motion_files import write_motion
-from strange_logs import write_aloha, write_asap, write_bag, write_gaponet, write_mat, write_npz, write_pace
+from strange_logs import (
+    write_aloha,
+    write_asap,
+    write_bag,
+    write_gaponet,
+    write_mat,
+    write_npz,
+    write_pace,
+)
 
 from fuzzing.harness import AbsurdError, Target
 from fuzzing.mutate import Files
@@ -25,7 +33,9 @@ from gaponet.sysid.motion.files import read_motion
 from gaponet.sysid.motion.motion import Motion
 from gaponet.sysid.motion.recipe import load_recipe, takes
 
-PLACE = tempfile.TemporaryDirectory(prefix="fuzz-")  # deleted when the process that imported this ends
+PLACE = tempfile.TemporaryDirectory(
+    prefix="fuzz-"
+)  # deleted when the process that imported this ends
 ROWS = 40
 MOST_ROWS = 25 * ROWS  # a file may be doubled by a change, and doubled again
 BOUNDS = {"qvel": 1e3, "qacc": 1e6, "tau": 1e3, "tau_eq": 1e6, "temperature": 400.0}
@@ -77,17 +87,23 @@ def require_sane(dataset: Dataset, robot: RobotSpec, inside: Path) -> None:
                 raise AbsurdError(f"{entry.id}: {name} holds NaN")
             if name in ("ctrl", "qpos"):
                 low, high = robot.qpos_range.T
-                if ((values < np.minimum(low - 1, -3.3)) | (values > np.maximum(high + 1, 3.3))).any():
+                if (
+                    (values < np.minimum(low - 1, -3.3)) | (values > np.maximum(high + 1, 3.3))
+                ).any():
                     raise AbsurdError(f"{entry.id}: {name} up to {np.abs(values).max()} rad")
             elif np.abs(values).max() > BOUNDS[name]:
                 raise AbsurdError(f"{entry.id}: {name} up to {np.abs(values).max()}")
 
 
-def importing(robot: Callable[[], RobotSpec], at: str = "", stated: str = "", **options: object) -> Callable[..., None]:
+def importing(
+    robot: Callable[[], RobotSpec], at: str = "", stated: str = "", **options: object
+) -> Callable[..., None]:
     """Import `at` below the folder and look at what was stored."""
 
     def use(source: Path, out: Path) -> None:
-        given = options | ({"logs": str(source / str(options["logs"]))} if "logs" in options else {})
+        given = options | (
+            {"logs": str(source / str(options["logs"]))} if "logs" in options else {}
+        )
         unit, payload = None if stated == "all" else "lab", None if stated else 0.0
         report = import_logs(source / at, robot(), unit, payload, out, **given)  # type: ignore[arg-type]
         require_sane(Dataset(out), robot(), source)
@@ -99,17 +115,27 @@ def importing(robot: Callable[[], RobotSpec], at: str = "", stated: str = "", **
 
 def _tables(folder: Path) -> None:
     columns = arm_columns(ROWS)
-    columns |= {"qvel.shoulder": np.gradient(columns["qpos.shoulder"], 0.02), "tau.elbow": wave(ROWS, 1)[:, 0]}
-    columns |= {"qvel.elbow": np.gradient(columns["qpos.elbow"], 0.02), "tau.shoulder": wave(ROWS, 1)[:, 0]}
+    columns |= {
+        "qvel.shoulder": np.gradient(columns["qpos.shoulder"], 0.02),
+        "tau.elbow": wave(ROWS, 1)[:, 0],
+    }
+    columns |= {
+        "qvel.elbow": np.gradient(columns["qpos.elbow"], 0.02),
+        "tau.shoulder": wave(ROWS, 1)[:, 0],
+    }
     (folder / "a.csv").write_text(table_text(columns))
 
 
 def _parquet(folder: Path) -> None:
-    pq.write_table(pa.table({k: pa.array(v) for k, v in arm_columns(ROWS).items()}), folder / "a.parquet")
+    pq.write_table(
+        pa.table({k: pa.array(v) for k, v in arm_columns(ROWS).items()}), folder / "a.parquet"
+    )
 
 
 def _mapped(folder: Path) -> None:
-    theirs = dict(zip(["t", "cmd_1", "cmd_2", "pos_1", "pos_2"], arm_columns(ROWS).values(), strict=True))
+    theirs = dict(
+        zip(["t", "cmd_1", "cmd_2", "pos_1", "pos_2"], arm_columns(ROWS).values(), strict=True)
+    )
     (folder / "logs").mkdir()
     (folder / "logs" / "a.csv").write_text(table_text(theirs))
     (folder / "map.toml").write_text(
@@ -122,7 +148,9 @@ def _described(folder: Path) -> None:
     """Strange names, a sheet, a sign, and commands in a file of their own."""
     columns = dict(zip(["t", "a_des", "b_des", "a", "b"], arm_columns(ROWS).values(), strict=True))
     (folder / "x.csv").write_text(table_text({k: v for k, v in columns.items() if "des" not in k}))
-    (folder / "x_cmd.csv").write_text(table_text({k: v for k, v in columns.items() if len(k) != 1 or k == "t"}))
+    (folder / "x_cmd.csv").write_text(
+        table_text({k: v for k, v in columns.items() if len(k) != 1 or k == "t"})
+    )
     (folder / "sheet.csv").write_text("file,motion,payload,rep,kp.b\nx,wave,0.1,0,20\n")
     (folder / "logs.toml").write_text(
         'time = "t"\ntime_unit = "s"\nposition_unit = "rad"\nctrl = "{joint}_des"\nqpos = "{joint}"\n'
@@ -136,22 +164,34 @@ def _export(folder: Path) -> None:
         data = Dataset.create(Path(place) / "data", arm())
         for i in range(2):
             ctrl = wave(ROWS, 2, hertz=0.4 + 0.1 * i)
-            data.append(arm_sequence(arm(), ctrl, late(ctrl, 2), f"m{i}", 0.1, tau=ctrl, tau_eq=ctrl, qacc=ctrl))
+            data.append(
+                arm_sequence(
+                    arm(), ctrl, late(ctrl, 2), f"m{i}", 0.1, tau=ctrl, tau_eq=ctrl, qacc=ctrl
+                )
+            )
         data.set_provenance(licence="CC0-1.0")
         export(data, arm(), folder / "set", "lerobot")
 
 
 def _motions(folder: Path) -> None:
     for suffix in (".txt", ".csv", ".npz"):
-        write_motion(folder / f"wave{suffix}", Motion("wave", "whole_body", 0.02, wave(ROWS, 2, 0.02)), arm())
+        write_motion(
+            folder / f"wave{suffix}", Motion("wave", "whole_body", 0.02, wave(ROWS, 2, 0.02)), arm()
+        )
 
 
 def _read_motions(source: Path, out: Path) -> None:
     for file in sorted(source.iterdir()):
         motion = read_motion(file, arm())
         played = motion.sample(0.02)
-        if not 1e-4 <= motion.dt <= 1 or not 2 <= len(played) <= 60 * MOST_ROWS or not np.isfinite(played).all():
-            raise AbsurdError(f"{file.name}: {len(motion.ctrl)} rows of {motion.dt} s, {len(played)} when played")
+        if (
+            not 1e-4 <= motion.dt <= 1
+            or not 2 <= len(played) <= 60 * MOST_ROWS
+            or not np.isfinite(played).all()
+        ):
+            raise AbsurdError(
+                f"{file.name}: {len(motion.ctrl)} rows of {motion.dt} s, {len(played)} when played"
+            )
         if np.abs(motion.ctrl).max() > 1e3:
             raise AbsurdError(f"{file.name}: commands {np.abs(motion.ctrl).max()} rad")
 
@@ -170,7 +210,9 @@ payload_side = "both"
 def _read_recipe(source: Path, out: Path) -> None:
     recipe = load_recipe(source / "mine.toml")
     for take in takes(recipe, ["chirp-left_elbow", "step-left_elbow"]):
-        if not (0 <= take.payload <= 100 and 1 <= take.rate <= 10_000 and isinstance(take.unit, str)):
+        if not (
+            0 <= take.payload <= 100 and 1 <= take.rate <= 10_000 and isinstance(take.unit, str)
+        ):
             raise AbsurdError(f"a take of {take}")
         take.seed(0)
 

@@ -81,7 +81,10 @@ def _use_robot(source: Path, out: Path) -> None:
     model = build_model(robot, 0.5)
     Collision(robot, model).distance(np.zeros((1, model.nq)))
     numbers = [robot.kp, robot.kd, robot.effort_limit, robot.qpos_home, robot.delay, robot.offset]
-    if not all(np.isfinite(x).all() and (np.abs(x) <= 1e6).all() for x in numbers) or np.isnan(robot.qpos_range).any():
+    if (
+        not all(np.isfinite(x).all() and (np.abs(x) <= 1e6).all() for x in numbers)
+        or np.isnan(robot.qpos_range).any()
+    ):
         raise AbsurdError("a robot of numbers that are none")
 
 
@@ -97,7 +100,9 @@ def _fitted() -> Files:
 
     def write(folder: Path) -> None:
         torch.manual_seed(0)
-        config = ModelConfig(history=2, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,))
+        config = ModelConfig(
+            history=2, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,)
+        )
         net = build_network(config, 2).eval()
         torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
         card = make_card(
@@ -120,16 +125,32 @@ def _evaluation(folder: Path) -> None:
     from report.test_run_files import METRICS
 
     parts = {"left": {"nominal": 0.02, "gaponet": 0.01}, "floor": {"both": 0.001}}
-    gap = parts | {"by_joint": {"elbow": parts}, "virtual": False, "unseen": True, "sequences": 1, "robot": "arm"}
+    gap = parts | {
+        "by_joint": {"elbow": parts},
+        "virtual": False,
+        "unseen": True,
+        "sequences": 1,
+        "robot": "arm",
+    }
     config = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1}, "seed": 0,
               "robot": "arm", "dataset": "../set", "dataset_hash": "0123"}  # fmt: skip
-    line = {"stage": "ppo", "steps": 1, "seconds": 0.5, "reward": None, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
+    line = {
+        "stage": "ppo",
+        "steps": 1,
+        "seconds": 0.5,
+        "reward": None,
+        "val_mpjae": 0.1,
+        "nominal_mpjae": 0.2,
+    }
     delays = {"delay": {"shoulder": 0.02, "elbow": 0.02}, "offset": {"shoulder": 0.0, "elbow": 0.0}}
     for name, content in (("metrics", METRICS), ("gap", gap), ("config", config), ("delay_offset", delays),
                           ("split", {"train": {"a": "0"}, "val": {"b": "1"}, "test": {"c": "2"}})):  # fmt: skip
         (folder / f"{name}.json").write_text(json.dumps(content, indent=1))
     (folder / "progress.jsonl").write_text(2 * (json.dumps(line) + "\n"))
-    arrays = {f"0/{m}": np.zeros((5, 2), np.float32) for m in ("recorded", "command", "nominal", "gaponet")}
+    arrays = {
+        f"0/{m}": np.zeros((5, 2), np.float32)
+        for m in ("recorded", "command", "nominal", "gaponet")
+    }
     np.savez(folder / "trajectories.npz", **arrays)
 
 
@@ -147,7 +168,12 @@ def _use_model(source: Path, out: Path) -> None:
 def _use_run(source: Path, out: Path) -> None:
     metrics = run_files.read_metrics(source)
     run_files.read_trajectories(source, metrics, 2)
-    for read in (run_files.read_config, run_files.read_progress, run_files.read_gap, read_run_split):
+    for read in (
+        run_files.read_config,
+        run_files.read_progress,
+        run_files.read_gap,
+        read_run_split,
+    ):
         read(source)
     fitted = DelayOffset.read(source).corrector(arm())
     if not np.isfinite(fitted.delay).all() or (fitted.delay < 0).any() or (fitted.delay > 1).any():
@@ -155,21 +181,32 @@ def _use_run(source: Path, out: Path) -> None:
 
 
 def _fleet(folder: Path) -> None:
-    (folder / "mine.toml").write_text((FLEETS / "easy.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    (folder / "mine.toml").write_text(
+        (FLEETS / "easy.toml").read_text(encoding="utf-8"), encoding="utf-8"
+    )
 
 
 def _use_fleet(source: Path, out: Path) -> None:
     for name, unit in load_fleet(source / "mine.toml", arm()).units.items():
         for field, value in vars(unit).items():
             if np.isnan(value).any() or (
-                np.isinf(value).any() and field not in ("motor_constant", "supply_voltage", "no_load_speed")
+                np.isinf(value).any()
+                and field not in ("motor_constant", "supply_voltage", "no_load_speed")
             ):
                 raise AbsurdError(f"{name}: {field} is {value}")
 
 
 MODEL = ("card.json", "model.onnx", "a.json")
 SAMPLES = (".parquet", "motion.json", "offsets.json", "collect.json")
-RUN = ("metrics.json", "gap.json", "config.json", "delay_offset.json", "split.json", "progress.jsonl", ".npz")
+RUN = (
+    "metrics.json",
+    "gap.json",
+    "config.json",
+    "delay_offset.json",
+    "split.json",
+    "progress.jsonl",
+    ".npz",
+)
 TARGETS = (
     Target("journal", written(_dataset), _open_dataset, 2.5, ("sequences.jsonl", "dataset.json")),
     Target("samples", written(_dataset), _open_dataset, 1.0, SAMPLES),

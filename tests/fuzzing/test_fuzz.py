@@ -16,9 +16,21 @@ from fuzzing.readers import TARGETS
 def test_changed_files_end_in_one_clear_error_or_in_sane_data(group, tmp_path):
     """In a process of its own: its workers are forks, which must not inherit threads of what was tested before."""
     mutants = 25 * len(GROUPS[group])
-    command = [sys.executable, "-m", "fuzzing", "--only", group, "--mutants", str(mutants), "--seed", "7"]
+    command = [
+        sys.executable,
+        "-m",
+        "fuzzing",
+        "--only",
+        group,
+        "--mutants",
+        str(mutants),
+        "--seed",
+        "7",
+    ]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([*command, "--keep", str(tmp_path)], capture_output=True, text=True, env=environment)
+    done = subprocess.run(
+        [*command, "--keep", str(tmp_path)], capture_output=True, text=True, env=environment
+    )
     assert done.stdout, done.stderr
     found = json.loads(done.stdout)
     assert (done.returncode, found["failures"]) == (0, {}), done.stderr
@@ -26,8 +38,12 @@ def test_changed_files_end_in_one_clear_error_or_in_sane_data(group, tmp_path):
     assert found["refused"] > found["mutants"] / 3
 
 
-@pytest.mark.parametrize(("content", "printed"), [(None, "taken"), (b"time,ctrl.elbow\n0,x\n", "refused: ")])
-def test_a_stored_mutant_is_read_again_without_the_file_that_explains_it(tmp_path, capsys, content, printed):
+@pytest.mark.parametrize(
+    ("content", "printed"), [(None, "taken"), (b"time,ctrl.elbow\n0,x\n", "refused: ")]
+)
+def test_a_stored_mutant_is_read_again_without_the_file_that_explains_it(
+    tmp_path, capsys, content, printed
+):
     table = next(t for t in TARGETS if t.name == "table")
     case = tmp_path / "traceback-table-7"
     case.mkdir()

@@ -72,7 +72,9 @@ class NotedArm(VirtualDriver):
 
 def control(driver: NotedArm, **options: Any) -> Controller:
     """A controller of the arm, quick and in simulated time."""
-    return Controller(driver, driver._given[0], config=options.pop("config", QUICK), clock=driver.clock, **options)
+    return Controller(
+        driver, driver._given[0], config=options.pop("config", QUICK), clock=driver.clock, **options
+    )
 
 
 def run(driver: NotedArm, motion: Motion = MOTION, **options: Any) -> Recording:

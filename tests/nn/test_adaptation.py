@@ -29,7 +29,12 @@ def robot(tmp_path_factory):
 def model(robot, tmp_path_factory):
     config, folder = ModelConfig(history=2, num_probes=2), tmp_path_factory.mktemp("run") / "model"
     net = build_network(config, 2).eval()
-    export(net, folder, make_card(config, robot, dt=[0.02]), np.zeros((4, net.features.dim), np.float32))
+    export(
+        net,
+        folder,
+        make_card(config, robot, dt=[0.02]),
+        np.zeros((4, net.features.dim), np.float32),
+    )
     return GapModel.load(folder)
 
 
@@ -82,7 +87,10 @@ def test_recordings_of_two_units_are_refused(model, robot, logs):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"servos": {"elbow": {"kp": float("nan")}}}, r"servos\.elbow\.kp: should be a finite number"),
+        (
+            {"servos": {"elbow": {"kp": float("nan")}}},
+            r"servos\.elbow\.kp: should be a finite number",
+        ),
         ({"servos": {"elbow": {"mass": 1.0}}}, "servos.elbow.mass"),
         ({"servos": []}, "servos: should be an object"),
         ({"logs": "abc"}, "logs: should be"),
@@ -110,7 +118,9 @@ def test_a_robot_folder_is_adapted_without_a_model_or_not_at_all(robot, logs, tm
     assert not (tmp_path / "again" / "robot.toml").exists()
 
 
-def test_one_short_command_adapts_nothing_and_windows_of_several_are_judged_by_motions_left_out(robot, tmp_path):
+def test_one_short_command_adapts_nothing_and_windows_of_several_are_judged_by_motions_left_out(
+    robot, tmp_path
+):
     data = Dataset.create(tmp_path / "data", robot)
     for payload in (0.0, 0.1):
         data.append(record(robot, commands(60, 0), "m0", payload))
@@ -120,4 +130,6 @@ def test_one_short_command_adapts_nothing_and_windows_of_several_are_judged_by_m
     found = adapt(several, robot, judge=True)
     assert (len(found.judged[0]), found.accepted) == (3, True)
     assert (found.judged[1] < 0.5 * found.judged[0]).all()
-    assert not adapt([record(robot, commands(450, seed), f"m{seed}") for seed in range(3)], robot, judge=True).accepted
+    assert not adapt(
+        [record(robot, commands(450, seed), f"m{seed}") for seed in range(3)], robot, judge=True
+    ).accepted

@@ -26,11 +26,15 @@ def robot(tmp_path_factory):
 @pytest.fixture(scope="module")
 def artifact(robot, tmp_path_factory):
     torch.manual_seed(0)
-    config = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
+    config = ModelConfig(
+        history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)
+    )
     net = build_network(config, 2)
     torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
     folder = tmp_path_factory.mktemp("run") / "model"
-    samples = np.random.default_rng(0).normal(size=(32, config.observation_dim(2) + 2)).astype(np.float32)
+    samples = (
+        np.random.default_rng(0).normal(size=(32, config.observation_dim(2) + 2)).astype(np.float32)
+    )
     export(net, folder, make_card(config, robot, dt=[0.02]), samples)
     return folder, net, samples
 
@@ -65,7 +69,9 @@ def test_another_rate_is_refused(artifact, robot):
 def test_a_model_of_another_simulator_is_read_and_refused(copied, robot):
     card = json.loads((copied / "card.json").read_text())
     (copied / "card.json").write_text(json.dumps(card | {"simulator": "a127234c3d89"}))
-    with pytest.raises(ModelError, match=r"trained in simulator a127234c3d89.*before friction held.*train again"):
+    with pytest.raises(
+        ModelError, match=r"trained in simulator a127234c3d89.*before friction held.*train again"
+    ):
         GapModel.load(copied).require(robot)
 
 
@@ -90,14 +96,19 @@ def test_a_damaged_artifact_says_what_to_do(copied, damage):
         card.write_text(json.dumps(json.loads(card.read_text()) | {"format": 99}))
     else:
         (copied / "model.onnx").write_bytes(b"nothing")
-    with pytest.raises(ModelError, match=r"give a run folder|restore it|upgrade|train or copy it again"):
+    with pytest.raises(
+        ModelError, match=r"give a run folder|restore it|upgrade|train or copy it again"
+    ):
         GapModel.load(copied)
 
 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"qpos_range": [[float("nan"), 1.0], [-1.0, 1.0]]}, r"qpos_range\[0\]\[0\]: should be a finite number"),
+        (
+            {"qpos_range": [[float("nan"), 1.0], [-1.0, 1.0]]},
+            r"qpos_range\[0\]\[0\]: should be a finite number",
+        ),
         ({"qpos_range": [[-1.0, 1.0]]}, "qpos_range: should have one entry for each of 2 joints"),
         ({"qpos_range": [[1.0, -1.0], [-1.0, 1.0]]}, "is no range"),
         ({"joint_names": "ab"}, "joint_names: should be"),
@@ -110,7 +121,10 @@ def test_a_damaged_artifact_says_what_to_do(copied, damage):
         ({"model": {"kind": "transformer"}}, "kind: should be .*train again"),
         ({"model": {"history": 3}}, "does not fit its card"),
         ({"model": {"delta_max": 1e-9}}, "does not fit its card"),
-        ({"joint_names": ["a"], "kp": [1.0], "kd": [1.0], "qpos_range": [[-1, 1]]}, "does not fit its card"),
+        (
+            {"joint_names": ["a"], "kp": [1.0], "kd": [1.0], "qpos_range": [[-1, 1]]},
+            "does not fit its card",
+        ),
     ],
 )
 def test_a_card_that_asks_for_another_network_is_refused_with_file_and_field(copied, changed, said):

@@ -9,7 +9,9 @@ from gaponet.sim.replay import replay
 
 def test_a_delay_of_three_periods_is_estimated(tmp_path):
     robot = write_arm(tmp_path)
-    found = DelayOffset.fit([record(robot, commands(400, s), f"m{s}", delay=3) for s in range(3)], robot)
+    found = DelayOffset.fit(
+        [record(robot, commands(400, s), f"m{s}", delay=3) for s in range(3)], robot
+    )
     assert found.delay == {"shoulder": 0.06, "elbow": 0.06}
     assert max(map(abs, found.offset.values())) < 0.002
 

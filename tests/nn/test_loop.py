@@ -25,8 +25,18 @@ LIMITS = np.array([[-10.0, 10.0]] * 2)
 )
 def test_the_parts_of_x_touch_and_fill_it(config):
     layout = Layout(config, 3)
-    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action, layout.sensors, layout.real]
-    assert np.concatenate([np.arange(layout.dim)[part] for part in parts]).tolist() == list(range(layout.dim))
+    parts = [
+        layout.q,
+        layout.v,
+        layout.past,
+        layout.payload,
+        layout.action,
+        layout.sensors,
+        layout.real,
+    ]
+    assert np.concatenate([np.arange(layout.dim)[part] for part in parts]).tolist() == list(
+        range(layout.dim)
+    )
 
 
 class FirstRow:
@@ -66,7 +76,9 @@ def test_training_and_rollout_give_the_network_the_same_inputs(tmp_path, how):
         trained.append(env.get_observations()["actor"].numpy())
         env.advance(np.full((1, 2), 0.01, np.float32))
     assert len(trained) == 13
-    np.testing.assert_allclose(np.concatenate(trained), np.concatenate(free[: len(trained)]), atol=1e-6)
+    np.testing.assert_allclose(
+        np.concatenate(trained), np.concatenate(free[: len(trained)]), atol=1e-6
+    )
 
 
 def looped(config, limits, num_envs, tensors):
@@ -74,10 +86,14 @@ def looped(config, limits, num_envs, tensors):
     weights = np.random.default_rng(0).normal(0, 0.1, (config.input_dim(2), 2)).astype(np.float32)
     if not tensors:
         return DeltaLoop(config, limits, num_envs, lambda x: x @ weights)
-    return DeltaLoop(config, limits, num_envs, lambda x: x @ torch.from_numpy(weights), like=torch.zeros(0))
+    return DeltaLoop(
+        config, limits, num_envs, lambda x: x @ torch.from_numpy(weights), like=torch.zeros(0)
+    )
 
 
-@pytest.mark.parametrize(("bad", "when", "tensors"), [(np.nan, 0, False), (np.inf, 5, False), (np.nan, 5, True)])
+@pytest.mark.parametrize(
+    ("bad", "when", "tensors"), [(np.nan, 0, False), (np.inf, 5, False), (np.nan, 5, True)]
+)
 def test_a_target_that_is_not_finite_affects_one_robot_for_one_period(bad, when, tensors):
     config, limits = ModelConfig(history=3), np.array([[-0.3, 0.3], [-10.0, 10.0]])
     rng = np.random.default_rng(1)
@@ -89,7 +105,10 @@ def test_a_target_that_is_not_finite_affects_one_robot_for_one_period(bad, when,
         if t == when:
             held[1, 0] = np.asarray(clean.applied)[1, 0] if t else q[1, 0]
             a[1, 0] = bad
-        told = [loop.delta(*map(kind, (q, v, ctrl, payload))) for loop, ctrl in ((hit, a), (clean, held))]
+        told = [
+            loop.delta(*map(kind, (q, v, ctrl, payload)))
+            for loop, ctrl in ((hit, a), (clean, held))
+        ]
         np.testing.assert_array_equal(*map(np.asarray, told))
         np.testing.assert_array_equal(*(np.asarray(loop.applied) for loop in (hit, clean)))
 

@@ -97,7 +97,9 @@ def test_a_matched_mlp_has_the_operators_parameters_within_one_percent():
 @pytest.mark.parametrize("n", [2, 10])
 def test_the_shared_mlp_has_the_weights_of_branch_and_trunk_and_of_other_joints_no_past(n):
     config = ModelConfig()
-    operator, shared = (build_network(replace(config, kind=kind), n) for kind in ("gaponet", "shared_mlp"))
+    operator, shared = (
+        build_network(replace(config, kind=kind), n) for kind in ("gaponet", "shared_mlp")
+    )
     assert abs(num_parameters(shared) / num_parameters(operator) - 1) < 0.02
     torch.nn.init.normal_(shared.net[-1].weight)
     data = x(shared.config, n, batch=1).requires_grad_(True)

@@ -28,7 +28,9 @@ def test_layout_is_state_then_frames_newest_first_then_payload_and_action():
 @pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])
 @pytest.mark.parametrize("stride", [1, 3])
 @pytest.mark.parametrize("seed", range(2))
-def test_the_history_equals_a_list_of_past_frames_under_random_pushes_and_resets(make, stride, seed):
+def test_the_history_equals_a_list_of_past_frames_under_random_pushes_and_resets(
+    make, stride, seed
+):
     rng, n, num = np.random.default_rng(seed), 2, 4
     config = ModelConfig(history=int(rng.integers(1, 5)), stride=stride)
     x = make((num, config.input_dim(n)))

@@ -15,7 +15,13 @@ from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, export, onnx_content, sample_inputs
 from gaponet.nn.onnx_network import OnnxNetwork
 
-SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
+SMALL = {
+    "history": 2,
+    "num_probes": 4,
+    "branch_hidden": (16, 8),
+    "trunk_hidden": (16,),
+    "sensor_hidden": (16, 12),
+}
 
 
 def trained(n: int = 2, **how) -> torch.nn.Module:
@@ -94,7 +100,8 @@ def test_a_torch_export_of_other_weights_is_refused(artifact, tmp_path):
     for file in artifact.iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
     torch.save(
-        {"best_state": {k: 0.9 * v for k, v in trained(stride=2).state_dict().items()}}, tmp_path / "checkpoint.pt"
+        {"best_state": {k: 0.9 * v for k, v in trained(stride=2).state_dict().items()}},
+        tmp_path / "checkpoint.pt",
     )
     with pytest.raises(ModelError, match=r"torch.export and .* differ by"):
         export_program(GapModel.load(folder), tmp_path, tmp_path)

@@ -17,7 +17,13 @@ from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.nn.sensor import ProbeOracle
-from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
+from gaponet.nn.training.config import (
+    Budget,
+    PPOConfig,
+    PretrainingConfig,
+    RewardConfig,
+    TrainConfig,
+)
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO
 from gaponet.nn.training.sensor_fit import fit_inputs
@@ -42,7 +48,9 @@ def network(config=PAPER, n=2):
      (4, True, True, 141, 11), (4, True, False, 141, 10)],
 )  # fmt: skip
 def test_inputs_have_the_dimensions_of_table_2(history, payload, trunk, seen, asked):
-    net = build_network(ModelConfig(kind="paper", history=history, payload_input=payload, payload_trunk=trunk), 10)
+    net = build_network(
+        ModelConfig(kind="paper", history=history, payload_input=payload, payload_trunk=trunk), 10
+    )
     assert net.predictor.net[0].in_features == seen
     assert net.branch[0].in_features == 20 * 2 * 10
     assert net.trunk[0].in_features == asked
@@ -134,10 +142,14 @@ def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
         ProbeOracle(robot, replace(PAPER, sensor_target=form), [(0.0, "both", 0.02)])(q, v)
         for form in ("delta", "absolute")
     )
-    np.testing.assert_allclose(state - change, np.tile(np.concatenate([q, 0.02 * v], 1), (1, 4, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        state - change, np.tile(np.concatenate([q, 0.02 * v], 1), (1, 4, 1)), atol=1e-6
+    )
 
 
-def test_with_fixed_probes_the_branch_observes_the_simulator_and_control_loops_are_refused(tmp_path):
+def test_with_fixed_probes_the_branch_observes_the_simulator_and_control_loops_are_refused(
+    tmp_path,
+):
     config, robot = replace(PAPER, sensor_source="fixed"), write_arm(tmp_path / "arm")
     net = network(config)
     assert config.input_dim(2) == PAPER.input_dim(2) + 4 * 2 * 2
@@ -169,14 +181,18 @@ def test_learned_sensors_are_the_predictor_s_answers_to_each_probe():
     config = replace(PAPER, sensor_source="learned")
     net, x = network(config), torch.randn(9, config.input_dim(2))
     z = net.sensor_inputs(x)
-    each = [net.predictor.mean(torch.cat([z, probe.tanh().expand(9, 2)], dim=1)) for probe in net.probes]
+    each = [
+        net.predictor.mean(torch.cat([z, probe.tanh().expand(9, 2)], dim=1)) for probe in net.probes
+    ]
     assert torch.allclose(net.probed(net.sensors(x, z)), torch.cat(each, dim=1), atol=1e-5)
 
 
 def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp_path, monkeypatch):
     monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
     config, robot = replace(PAPER, sensor_source="learned"), write_arm(tmp_path)
-    env = DeltaEnv(recordings(robot, 2, rows=60, kp=0.5), robot, config, 64, 1000, RewardConfig(), nthread=1)
+    env = DeltaEnv(
+        recordings(robot, 2, rows=60, kp=0.5), robot, config, 64, 1000, RewardConfig(), nthread=1
+    )
     net = network(config)
     start, learner = net.probes.clone(), PPO(env, net, TRAINING.ppo)
     assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
@@ -191,7 +207,10 @@ def test_options_add_the_observation_to_the_branch_and_the_lag_to_the_trunk():
     x = torch.randn(5, net.config.input_dim(2))
     relative = net.features(x)
     assert torch.equal(net.prepare(x)[:, :3], relative[:, -3:])  # payload and A − q
-    assert torch.equal(net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)], relative[:, : net.observation.stop])
+    assert torch.equal(
+        net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)],
+        relative[:, : net.observation.stop],
+    )
     assert net.branch[0].in_features == net.config.observation_dim(2) + 16
 
 
@@ -208,7 +227,9 @@ def test_a_hidden_recorded_state_has_no_effect_and_a_visible_one_has():
 
 def test_half_of_the_episodes_show_the_recorded_state(tmp_path):
     config, robot = replace(PAPER, real_state=True), write_arm(tmp_path)
-    env = DeltaEnv(recordings(robot, 2, rows=30), robot, config, 200, 1000, RewardConfig(), nthread=1)
+    env = DeltaEnv(
+        recordings(robot, 2, rows=30), robot, config, 200, 1000, RewardConfig(), nthread=1
+    )
     env.sim.qpos[:] -= 0.1
     real = env.get_observations()["actor"][:, env.loop.layout.real]
     shown = real[:, 4] == 1
@@ -222,7 +243,9 @@ def test_half_of_the_episodes_show_the_recorded_state(tmp_path):
 def test_missing_extra_inputs_are_zero():
     seen = []
     given = loop(
-        lambda x: seen.append(x[0, -21:].copy()) or np.zeros((2, 2), np.float32), sensor_source="fixed", real_state=True
+        lambda x: seen.append(x[0, -21:].copy()) or np.zeros((2, 2), np.float32),
+        sensor_source="fixed",
+        real_state=True,
     )
     for width in (0, 16, 21):  # nothing, the simulator's answers, these and the recorded state
         given.extra = (lambda: np.ones((2, width))) if width else None  # noqa: B023
@@ -275,22 +298,31 @@ def world(tmp_path_factory):
      {"sensor_source": "learned"}],
     ids=["held correction and more inputs", "held fixed probes", "learned probes"],
 )  # fmt: skip
-def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(world, tmp_path, how):
+def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(
+    world, tmp_path, how
+):
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
     update = 8 * 8 * config.model.delta_hold
     run = tmp_path / "whole"
     model = Trainer(*world, run, config, Budget(steps=4 * update)).run()
-    assert GapModel.how_trained(model.card) == "4 updates of PPO from the untrained network, no supervised pre-training"
+    assert (
+        GapModel.how_trained(model.card)
+        == "4 updates of PPO from the untrained network, no supervised pre-training"
+    )
     assert model.card["steps"] == 4 * update
     Trainer(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
     Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
-    whole, parts = (torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts"))
+    whole, parts = (
+        torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts")
+    )
     assert all(torch.equal(x, parts[name]) for name, x in whole.items())
     untrained = build_network(config.model, 2)
     assert whole.keys() == untrained.state_dict().keys()
 
 
-def test_it_trains_by_labels_too_and_eval_says_how_many_corrections_are_at_the_limit(world, tmp_path, capsys):
+def test_it_trains_by_labels_too_and_eval_says_how_many_corrections_are_at_the_limit(
+    world, tmp_path, capsys
+):
     run = tmp_path / "run"
     card = Trainer(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
     assert GapModel.how_trained(card) == "supervised pre-training (1 rounds), 2 updates of PPO"

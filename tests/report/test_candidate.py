@@ -38,11 +38,17 @@ def fitted(arm, data, tmp_path):
 
 def test_an_identified_folder_is_accepted_like_a_run(fitted, data, arm, capsys):
     found = gp.evaluate(fitted, data).to_dict()
-    assert (list(found["methods"]), found["motions"], found["unseen"]) == (["nominal", "identified"], ["motion2"], True)
+    assert (list(found["methods"]), found["motions"], found["unseen"]) == (
+        ["nominal", "identified"],
+        ["motion2"],
+        True,
+    )
     assert found["ratio_to_nominal"]["identified"] < 0.5
     by_cause = gp.gap(data, robot=fitted).to_dict()  # no training for the picture
     assert list(by_cause["left"]) == ["nominal", "gain", "friction", "creep"]
-    assert by_cause["methods"]["identified"]["mpjae"] == pytest.approx(found["methods"]["identified"]["mpjae"])
+    assert by_cause["methods"]["identified"]["mpjae"] == pytest.approx(
+        found["methods"]["identified"]["mpjae"]
+    )
     assert (fitted / "gap.png").is_file()
     shown = side_by_side(data, select_entry(data, (fitted,)), gp.load_robot(fitted))
     assert [m.method for m in shown.motions] == ["target", "nominal", "identified", "recorded"]
@@ -68,13 +74,17 @@ def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_record
 
 
 def test_recordings_that_a_runs_robot_was_identified_from_are_not_unseen(fitted, data, tmp_path):
-    run = untrained(tmp_path / "run", gp.load_robot(fitted), data, train=("motion2",), val=(), test=("motion0",))
+    run = untrained(
+        tmp_path / "run", gp.load_robot(fitted), data, train=("motion2",), val=(), test=("motion0",)
+    )
     assert select_entries([run], data, ("motion0",))[1] is False
 
 
 def test_a_robot_that_is_not_identified_is_refused(arm, data, tmp_path):
     save_robot(arm, tmp_path / "plain")
-    with pytest.raises(UsageError, match="nothing was identified of this robot; gaponet identify DATASET"):
+    with pytest.raises(
+        UsageError, match="nothing was identified of this robot; gaponet identify DATASET"
+    ):
         Candidate.load(tmp_path / "plain", arm)
 
 
@@ -90,8 +100,13 @@ def scores(**errors):
 def test_the_verdict_states_the_gain_of_a_network_even_if_it_is_zero(tmp_path):
     useless = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(3.0, 3.2))
     said = verdict(useless)
-    assert said[1] == "After identification the error is 3.10 mrad, 84 % less, on 2 independent motions."
-    assert "reduces the error of identification by 0.00 ± 0.00 mrad: leave the network out" in said[2]
+    assert (
+        said[1]
+        == "After identification the error is 3.10 mrad, 84 % less, on 2 independent motions."
+    )
+    assert (
+        "reduces the error of identification by 0.00 ± 0.00 mrad: leave the network out" in said[2]
+    )
     assert next_step(useless, "data", tmp_path) == f"gaponet export {tmp_path / 'robot'} --to mjcf"
     useful = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(2.0, 2.1))
     assert "reduces the error of identification by 1.05 ± 0.05 mrad, 34 %." in verdict(useful)[2]

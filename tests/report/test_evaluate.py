@@ -53,9 +53,14 @@ def test_a_folder_named_like_the_robot_in_the_current_directory_changes_nothing(
         found = evaluate([run], dataset, robot).result
         assert found["methods"]["nominal"]["mpjae"] == before
         assert found["simulator_hash"] == model_hash(arm)
-        assert gap_by_step(Candidate.load(run, robot), dataset)["left"]["nominal"] == pytest.approx(before)
+        assert gap_by_step(Candidate.load(run, robot), dataset)["left"]["nominal"] == pytest.approx(
+            before
+        )
     assert main(["gap", str(data.path)]) == 2  # no run here that keeps one
-    assert "stores no robot, and the package has no 'arm'; say which robot it is" in capsys.readouterr().err
+    assert (
+        "stores no robot, and the package has no 'arm'; say which robot it is"
+        in capsys.readouterr().err
+    )
 
 
 def test_another_robots_simulator_is_refused_whatever_its_name(data, run, tmp_path):
@@ -65,26 +70,44 @@ def test_another_robots_simulator_is_refused_whatever_its_name(data, run, tmp_pa
         lambda: gap_by_step(Candidate.load(run, stranger), data),
         lambda: side_by_side(data, data.entries[3], stranger, [run]),
     ):
-        with pytest.raises(ModelError, match=r"run: its nominal simulator is \w{12}, that of .*other.arm is \w{12}: "):
+        with pytest.raises(
+            ModelError,
+            match=r"run: its nominal simulator is \w{12}, that of .*other.arm is \w{12}: ",
+        ):
             ask()
 
 
-def test_an_identified_simulator_of_the_same_robot_is_another_start_and_the_same_baseline(arm, data, run, tmp_path):
+def test_an_identified_simulator_of_the_same_robot_is_another_start_and_the_same_baseline(
+    arm, data, run, tmp_path
+):
     fitted = arm.with_servos({"elbow": {"kp": 11.0}})
-    second = untrained(tmp_path / "fitted", fitted, data, kind="mlp", train=("m0", "m1"), val=("m2",), test=("m3",))
+    second = untrained(
+        tmp_path / "fitted", fitted, data, kind="mlp", train=("m0", "m1"), val=("m2",), test=("m3",)
+    )
     found = evaluate([run, second], data, arm).result
     assert found["simulator_hash"] == model_hash(arm)
     errors = {name: m["mpjae"] for name, m in found["methods"].items()}
     assert errors["identified"] == pytest.approx(errors["identified+mlp"], rel=1e-6)
 
 
-def test_the_dataset_keeps_its_robot_and_takes_no_recordings_of_another_one(data, arm, tmp_path, capsys):
+def test_the_dataset_keeps_its_robot_and_takes_no_recordings_of_another_one(
+    data, arm, tmp_path, capsys
+):
     assert model_hash(load_stored_robot(data.path, "arm")) == model_hash(arm)
     shutil.rmtree(arm.folder)
     assert open_dataset(data.path, None)[1].kp.tolist() == [20.0, 20.0]
     stranger = write_arm(tmp_path / "other" / "arm", toml=STIFF)
     (tmp_path / "new.csv").write_text("time,ctrl.elbow\n")
-    words = ["import", str(tmp_path / "new.csv"), "--out", str(data.path), "--unit-id", "a", "--payload-mass", "0"]
+    words = [
+        "import",
+        str(tmp_path / "new.csv"),
+        "--out",
+        str(data.path),
+        "--unit-id",
+        "a",
+        "--payload-mass",
+        "0",
+    ]
     assert main([*words, "--robot", str(stranger.folder)]) == 2
     assert "its nominal simulator is" in " ".join(capsys.readouterr().err.split())
     words = [
@@ -110,16 +133,22 @@ def test_a_dataset_keeps_the_nominal_robot_where_an_identified_one_is_given(arm,
 
 
 def test_recordings_that_any_run_was_fitted_to_are_not_unseen(arm, data, run, tmp_path):
-    other = untrained(tmp_path / "other", arm, data, kind="mlp", train=("m2", "m3"), val=("m0",), test=("m1",))
+    other = untrained(
+        tmp_path / "other", arm, data, kind="mlp", train=("m2", "m3"), val=("m0",), test=("m1",)
+    )
     assert [e.meta.motion for e in select_entries([run], data)[0]] == ["m3"]
     with pytest.raises(DatasetError, match="every sequence was used in training"):
         select_entries([run, other], data)
     assert select_entries([run], data, ("m3",))[1] is True
     assert select_entries([run, other], data, ("m3",))[1] is False
     assert evaluate([run, other], data, arm, ("m3",)).result["unseen"] is False
-    less = untrained(tmp_path / "less", arm, data, kind="mlp", train=("m0",), val=("m1",), test=("m2", "m3"))
+    less = untrained(
+        tmp_path / "less", arm, data, kind="mlp", train=("m0",), val=("m1",), test=("m2", "m3")
+    )
     assert [e.meta.motion for e in select_entries([less], data)[0]] == ["m2", "m3"]
-    assert [e.meta.motion for e in select_entries([less, run], data)[0]] == ["m3"]  # m2 was the other's to choose by
+    assert [e.meta.motion for e in select_entries([less, run], data)[0]] == [
+        "m3"
+    ]  # m2 was the other's to choose by
 
 
 def test_a_motion_trained_on_is_not_unseen_when_another_unit_plays_it(arm, run, tmp_path):
@@ -139,7 +168,9 @@ def test_a_split_by_unit_tests_motions_that_were_trained_on_with_other_units(arm
     both = Dataset.create(tmp_path / "units", arm)
     for unit in "ab":
         for i in range(3):
-            both.append(record(arm, commands(80, i), f"m{i}", kp=0.5 + 0.1 * (unit == "b"), unit=unit))
+            both.append(
+                record(arm, commands(80, i), f"m{i}", kp=0.5 + 0.1 * (unit == "b"), unit=unit)
+            )
     run = untrained(tmp_path / "by-unit", arm, both, train=("m0", "m1"), val=("m2",))
     ours, theirs = ({e.id: e.hash for e in both.entries if e.meta.unit_id == unit} for unit in "ab")
     val = {i: h for i, h in ours.items() if i.startswith("m2")}
@@ -152,5 +183,7 @@ def test_a_split_by_unit_tests_motions_that_were_trained_on_with_other_units(arm
 def test_an_untrained_model_leaves_the_nominal_simulator_as_it_is(arm, data, run):
     found = evaluate([run], data, arm)
     np.testing.assert_allclose(
-        found.result["methods"]["gaponet"]["mpjae"], found.result["methods"]["nominal"]["mpjae"], rtol=1e-3
+        found.result["methods"]["gaponet"]["mpjae"],
+        found.result["methods"]["nominal"]["mpjae"],
+        rtol=1e-3,
     )

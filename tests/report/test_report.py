@@ -40,7 +40,13 @@ def run(evaluated, tmp_path):
 
 def test_the_page_is_one_offline_file_that_names_the_method_everywhere(evaluated):
     gp.gap(evaluated.parent / "data", run=evaluated)
-    assert list(read_gap(evaluated)["left"]) == ["nominal", "delay", "offset", "gain", "identified+gaponet"]
+    assert list(read_gap(evaluated)["left"]) == [
+        "nominal",
+        "delay",
+        "offset",
+        "gain",
+        "identified+gaponet",
+    ]
     page = write_report(evaluated).read_text()  # the figures are SVG with their words in it
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page)
     for text in (
@@ -59,7 +65,10 @@ def test_the_page_is_one_offline_file_that_names_the_method_everywhere(evaluated
 
 @pytest.mark.parametrize("command", ["report", "eval"])
 def test_a_table_in_the_terminal_names_the_method(evaluated, command, capsys):
-    where = {"report": [evaluated.parent, "--list"], "eval": [evaluated, evaluated.parent / "data"]}[command]
+    where = {
+        "report": [evaluated.parent, "--list"],
+        "eval": [evaluated, evaluated.parent / "data"],
+    }[command]
     assert main([command, *map(str, where)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "GAPONet" in said
@@ -95,15 +104,24 @@ def test_the_robot_is_drawn_or_the_page_says_why_not(evaluated):
 def test_an_incomplete_evaluation_is_refused_with_what_to_do(run, absent):
     metrics = json.loads((run / "metrics.json").read_text())
     (run / "metrics.json").write_text(json.dumps({k: v for k, v in metrics.items() if k != absent}))
-    with pytest.raises(ModelError, match=r"evaluation of identification \+ GAPONet is missing; .* or evaluate again"):
+    with pytest.raises(
+        ModelError,
+        match=r"evaluation of identification \+ GAPONet is missing; .* or evaluate again",
+    ):
         write_report(run)
 
 
 def test_trajectories_show_the_command_and_errors_of_a_motion_on_one_scale_moving_joints_first():
     n, dt = 1500, 0.02
     time = np.arange(n) * dt
-    command = np.stack([0.01 * np.sin(time), np.sin(time), np.full(n, 0.3), np.minimum(time / 5, 2.0)], axis=1)
-    arrays = {"0/command": command, "0/recorded": command, "0/nominal": command + np.array([0.9, 0.01, 0.5, 0.02])}
+    command = np.stack(
+        [0.01 * np.sin(time), np.sin(time), np.full(n, 0.3), np.minimum(time / 5, 2.0)], axis=1
+    )
+    arrays = {
+        "0/command": command,
+        "0/recorded": command,
+        "0/nominal": command + np.array([0.9, 0.01, 0.5, 0.02]),
+    }
     arrays |= {f"1/{k[2:]}": v if k != "0/nominal" else command + 0.2 for k, v in arrays.items()}
     drawn = figures.trajectories(arrays, [{"dt": dt}] * 2, ("a", "b", "c", "d"), ["nominal"])
     axes = [ax for fig in drawn.values() for ax in fig.axes]

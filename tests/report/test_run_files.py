@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import ModelError
-from gaponet.report.run_files import read_config, read_gap, read_metrics, read_progress, read_trajectories
+from gaponet.report.run_files import (
+    read_config,
+    read_gap,
+    read_metrics,
+    read_progress,
+    read_trajectories,
+)
 
 PART = {"mpjae": 0.01}
 JOINT = PART | {"static": 0.01, "dynamic": 0.01}
@@ -43,7 +49,10 @@ def test_absent_numbers_are_nan_and_unknown_fields_are_kept(tmp_path):
 @pytest.mark.parametrize(
     ("metrics", "said"),
     [
-        (changed("methods", "nominal", "mpjae", value="<b>"), "methods.nominal.mpjae: should be a valid number"),
+        (
+            changed("methods", "nominal", "mpjae", value="<b>"),
+            "methods.nominal.mpjae: should be a valid number",
+        ),
         (changed("methods", "<script>", value=SCORES), r"methods\.<script>"),
         (
             changed("methods", "gaponet", "by_joint", value={"wing": JOINT}),
@@ -66,7 +75,9 @@ def test_damaged_metrics_are_refused(tmp_path, metrics, said):
         read_metrics(tmp_path)
 
 
-@pytest.mark.parametrize("bad", [np.zeros((5, 3)), np.zeros(5), np.full((5, 2), np.nan), np.zeros((4, 2))])
+@pytest.mark.parametrize(
+    "bad", [np.zeros((5, 3)), np.zeros(5), np.full((5, 2), np.nan), np.zeros((4, 2))]
+)
 def test_trajectories_of_other_sizes_are_refused(tmp_path, bad):
     good = np.zeros((5, 2), np.float32)
     np.savez(tmp_path / "trajectories.npz", **{f"0/{m}": good for m in ("recorded", "command", "nominal")}, **{
@@ -77,7 +88,14 @@ def test_trajectories_of_other_sizes_are_refused(tmp_path, bad):
 
 
 def test_an_incomplete_last_validation_is_skipped(tmp_path):
-    line = {"stage": "ppo", "steps": 1, "seconds": 0.5, "reward": None, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
+    line = {
+        "stage": "ppo",
+        "steps": 1,
+        "seconds": 0.5,
+        "reward": None,
+        "val_mpjae": 0.1,
+        "nominal_mpjae": 0.2,
+    }
     (tmp_path / "progress.jsonl").write_text(json.dumps(line) + "\n" + json.dumps(line)[:20])
     assert read_progress(tmp_path) == [line]
     (tmp_path / "progress.jsonl").write_text(json.dumps(line | {"steps": "x"}) + "\n")

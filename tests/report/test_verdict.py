@@ -15,7 +15,9 @@ def scores(*errors, motions):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("motions", "words"), [(1, "1.00 mrad (one motion)"), (2, "1.00 ± 0.50 mrad")])
+@pytest.mark.parametrize(
+    ("motions", "words"), [(1, "1.00 mrad (one motion)"), (2, "1.00 ± 0.50 mrad")]
+)
 def test_pieces_of_one_motion_have_no_standard_error(motions, words):
     before, after = (
         scores(5e-3, 5e-3, 6e-3, 6e-3, motions=motions),

@@ -64,7 +64,9 @@ def test_a_robot_without_shapes_is_not_checked(arm):
 
 def test_a_negative_radius_is_an_error(arm):
     file = arm.folder / "collision.toml"
-    file.write_text('capsule = [{ body = "upper", from = [0, 0, 0], to = [0, 0, 1], radius = -50.0 }]')
+    file.write_text(
+        'capsule = [{ body = "upper", from = [0, 0, 0], to = [0, 0, 1], radius = -50.0 }]'
+    )
     with pytest.raises(RobotError, match=r"collision.toml.*radius"):
         read_shapes(arm.folder)
     with pytest.raises(RobotError, match=r"collision.toml.*radius"):
@@ -74,11 +76,15 @@ def test_a_negative_radius_is_an_error(arm):
 def test_a_shape_on_an_unknown_body_is_an_error(arm):
     file = arm.mjcf.parent / "collision.toml"
     file.write_text('capsule = [{ body = "nose", from = [0, 0, 0], to = [0, 0, 1], radius = 0.1 }]')
-    with pytest.raises(RobotError, match="capsule names body 'nose', the MJCF has: world, upper, fore"):
+    with pytest.raises(
+        RobotError, match="capsule names body 'nose', the MJCF has: world, upper, fore"
+    ):
         Collision(arm, build_model(arm))
 
 
-@pytest.mark.parametrize("name", sorted({*packaged_robots()} - {"xl330_bench"}))  # a bench has no shapes
+@pytest.mark.parametrize(
+    "name", sorted({*packaged_robots()} - {"xl330_bench"})
+)  # a bench has no shapes
 def test_packaged_robots_are_free_at_home_and_have_a_plane(name):
     robot = load_robot(name)
     collision = Collision(robot, build_model(robot))
@@ -93,16 +99,24 @@ def test_distances_agree_with_contacts_of_mujoco(so101):
     touching = np.array([judge.deepest(q)[0] > 0 for q in postures])
     free = collision.distance(postures)
     assert 60 < touching.sum() < 240
-    assert (free[touching] < 0.01).all(), "lines of robot.xml may stick out of their shells by a centimetre"
+    assert (free[touching] < 0.01).all(), (
+        "lines of robot.xml may stick out of their shells by a centimetre"
+    )
     assert touching[free < 0].all()
 
 
 def test_the_height_of_the_plane_can_be_set(so101):
     down = so101.qpos_home.copy()
     down[so101.index(["shoulder_lift"])] = 1.0
-    with pytest.raises(RobotError, match=r"the plane is at -75 m; give its height in metres, up to 10 \(--plane\)"):
+    with pytest.raises(
+        RobotError, match=r"the plane is at -75 m; give its height in metres, up to 10 \(--plane\)"
+    ):
         Collision(so101, build_model(so101), height=-75.0)
     lower = Collision(so101, build_model(so101), height=-0.2)
     (free,) = lower.distances(down[None])
-    assert lower.distance(down[None])[0] > 0 > Collision(so101, build_model(so101)).distance(down[None])[0]
+    assert (
+        lower.distance(down[None])[0]
+        > 0
+        > Collision(so101, build_model(so101)).distance(down[None])[0]
+    )
     assert lower.nearest(free).endswith("and the plane at -0.2 m")

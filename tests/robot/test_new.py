@@ -20,7 +20,9 @@ ARM = ("shoulder", "elbow", "roll")
 
 
 def make(tmp_path: Path, model: Path | None = None, **wanted) -> NewRobot:
-    return new_robot(model or write_mjcf(tmp_path / "repo"), tmp_path / "out", RobotOptions(**(GAINS | wanted)))
+    return new_robot(
+        model or write_mjcf(tmp_path / "repo"), tmp_path / "out", RobotOptions(**(GAINS | wanted))
+    )
 
 
 def written(made: NewRobot) -> dict[str, dict]:
@@ -50,7 +52,10 @@ def furthest(made: NewRobot) -> tuple[float, float]:
         mujoco.mj_forward(ours, a)
         mujoco.mj_forward(theirs, b)
         gravity = np.abs(a.qfrc_bias - b.qfrc_bias[dofs]).max()
-        worst = np.maximum(worst, [gravity, np.abs(inertia(ours, a) - inertia(theirs, b)[np.ix_(dofs, dofs)]).max()])
+        worst = np.maximum(
+            worst,
+            [gravity, np.abs(inertia(ours, a) - inertia(theirs, b)[np.ix_(dofs, dofs)]).max()],
+        )
     return float(worst[0]), float(worst[1])
 
 
@@ -85,7 +90,9 @@ def test_fixed_joints_have_the_position_of_the_keyframe(tmp_path):
 def test_the_folder_names_no_file_and_no_dropped_element(tmp_path):
     made = make(tmp_path, joints=ARM)
     text = made.robot.mjcf.read_text(encoding="utf-8")
-    assert not any(word in text for word in ("slide", "file=", "<sensor", "<keyframe", "<tendon", "<equality"))
+    assert not any(
+        word in text for word in ("slide", "file=", "<sensor", "<keyframe", "<tendon", "<equality")
+    )
     spec = read_mjcf(made.robot.mjcf)
     assert not any(g.contype or g.conaffinity for g in spec.geoms)
 
@@ -97,7 +104,9 @@ def test_gains_and_limits_come_from_actuators_with_their_gears_and_sources(tmp_p
     assert joints["shoulder"]["kd"] > 1.0  # dampratio
     assert joints["shoulder"]["effort_limit"] == 9.0
     assert (joints["elbow"]["kp"], joints["elbow"]["kd"]) == (40.0, 2.0)  # gear 2, twice
-    assert joints["elbow"]["effort_limit"] == 6.0  # actuatorfrcrange, before forcerange times gear, 8
+    assert (
+        joints["elbow"]["effort_limit"] == 6.0
+    )  # actuatorfrcrange, before forcerange times gear, 8
     assert joints["roll"]["effort_limit"] == 1.5  # ctrlrange of a motor, times gear
     assert joints["shoulder"]["aliases"] == ["shoulder_servo"]
     text = (made.robot.folder / "robot.toml").read_text(encoding="utf-8")
@@ -109,7 +118,9 @@ def test_gains_and_limits_come_from_actuators_with_their_gears_and_sources(tmp_p
 def test_made_robots_pass_the_check_at_the_model_s_own_step(tmp_path):
     made = make(tmp_path, kp=("20", "hip=200"))
     assert made.robot.timestep == 0.004
-    assert [f.message for f in check_robot(made.robot, (0.0, 0.2)) if f.level in ("warning", "error")] == []
+    assert [
+        f.message for f in check_robot(made.robot, (0.0, 0.2)) if f.level in ("warning", "error")
+    ] == []
 
 
 def test_the_payload_hangs_at_the_tool_s_site(tmp_path):
@@ -130,8 +141,14 @@ def test_missing_meshes_are_omitted_with_a_note(tmp_path):
 
 def test_names_with_a_slash_and_classes_with_a_material_are_accepted(tmp_path):
     model = write_mjcf(tmp_path / "repo")
-    text = model.read_text().replace('"elbow"', '"left/elbow"').replace("<asset>", '<asset><material name="dark"/>')
-    text = text.replace("<default>\n", '<default>\n<default class="dark"><geom material="dark"/></default>\n', 1)
+    text = (
+        model.read_text()
+        .replace('"elbow"', '"left/elbow"')
+        .replace("<asset>", '<asset><material name="dark"/>')
+    )
+    text = text.replace(
+        "<default>\n", '<default>\n<default class="dark"><geom material="dark"/></default>\n', 1
+    )
     model.write_text(text.replace('<body name="wrist"', '<body name="wrist" childclass="dark"'))
     robot = make(tmp_path, model, joints=("*shoulder", "*elbow", "*roll")).robot
     assert robot.joint_names == ("shoulder", "left_elbow", "roll")
@@ -146,9 +163,14 @@ def test_a_urdf_in_its_package_becomes_a_robot(tmp_path):
     assert max(furthest(made)) < 1e-9
     assert made.robot.payload_mounts[0].body == "tool0"
     assert made.vendor.nmesh == 1  # of package://
-    assert any(note.startswith("1 mesh(es) were not found") and "link.dae" in note for note in made.notes)
+    assert any(
+        note.startswith("1 mesh(es) were not found") and "link.dae" in note for note in made.notes
+    )
     spec = read_mjcf(made.robot.mjcf)
-    assert (float(spec.joint("lift").damping[0]), float(spec.joint("lift").frictionloss)) == (0.3, 0.2)
+    assert (float(spec.joint("lift").damping[0]), float(spec.joint("lift").frictionloss)) == (
+        0.3,
+        0.2,
+    )
 
 
 LINK = """<link name="{0}"><inertial><mass value="{1}"/><inertia ixx="{2}" iyy="{2}" izz="{2}" ixy="0" ixz="0" iyz="0"/>
@@ -190,7 +212,10 @@ def test_impossible_inertias_are_replaced_with_a_note(tmp_path):
 def test_an_unreadable_mesh_is_omitted_with_a_note(tmp_path):
     (tmp_path / "bad.stl").write_bytes(b"solid nothing of the kind" * 10)
     shape = '<visual><geometry><mesh filename="bad.stl"/></geometry></visual>'
-    links = [LINK.format(name, 0.5, 0.01, shape) for name in ("left_arm", "left_palm", "left_hand_a", "left_hand_b")]
+    links = [
+        LINK.format(name, 0.5, 0.01, shape)
+        for name in ("left_arm", "left_palm", "left_hand_a", "left_hand_b")
+    ]
     (tmp_path / "r.urdf").write_text(hand(*links))
     made = make(tmp_path, tmp_path / "r.urdf")
     assert any(note.startswith("mesh left out:") for note in made.notes)
@@ -199,7 +224,12 @@ def test_an_unreadable_mesh_is_omitted_with_a_note(tmp_path):
 
 def test_the_folder_of_a_package_is_an_option(tmp_path):
     urdf = write_urdf(tmp_path / "a", URDF.replace("bar_description", "other"))
-    assert make(tmp_path / "b", urdf, kp=("50",), packages=(f"other={tmp_path}/a/bar_description",)).vendor.nmesh == 1
+    assert (
+        make(
+            tmp_path / "b", urdf, kp=("50",), packages=(f"other={tmp_path}/a/bar_description",)
+        ).vendor.nmesh
+        == 1
+    )
 
 
 @pytest.mark.parametrize(
@@ -208,11 +238,20 @@ def test_the_folder_of_a_package_is_an_option(tmp_path):
         ({"joints": ("left_slide",)}, "is a slide joint, and gaponet supports angles only"),
         ({"joints": ("base",)}, "is a free joint"),
         ({"joints": ("*knee*",)}, "no such joint; there are: shoulder, elbow, roll, hip"),
-        ({"kp": ("hip=1",)}, "has no position gain for roll: give those of the controller that recorded"),
+        (
+            {"kp": ("hip=1",)},
+            "has no position gain for roll: give those of the controller that recorded",
+        ),
         ({"kp": ("20", "hip=much")}, "--kp hip=much: give a number from 0"),
         ({"kd": ("toe=2",)}, "--kd toe=2: no such joint"),
-        ({"kp": ("80", "120")}, "--kp 80 120: give one value for all joints first, then shoulder=NUMBER"),
-        ({"kp": ("hip=80", "120")}, "--kp hip=80 120: give one value for all joints first, then shoulder=NUMBER"),
+        (
+            {"kp": ("80", "120")},
+            "--kp 80 120: give one value for all joints first, then shoulder=NUMBER",
+        ),
+        (
+            {"kp": ("hip=80", "120")},
+            "--kp hip=80 120: give one value for all joints first, then shoulder=NUMBER",
+        ),
         ({"effort_limit": ("-3",)}, "--effort-limit -3"),
         ({"keyframe": "high"}, "vendor.xml has home, low"),
         ({"rate": 0.0}, "--rate 0.0"),
@@ -239,10 +278,16 @@ def test_a_folder_that_holds_a_robot_is_left_alone(tmp_path):
         ("arm.urdf.xacro", URDF, "expand it first: xacro"),
         ("arm.urdf", URDF.replace('<mass value="0.7"/>', ""), "arm.urdf"),
         ("arm.urdf", "<robot", "not valid"),
-        ("arm.urdf", URDF.replace('iyy="0.006"', 'iyy="1e308"'), r"arm.urdf: body inertia is above 1e\+10"),
+        (
+            "arm.urdf",
+            URDF.replace('iyy="0.006"', 'iyy="1e308"'),
+            r"arm.urdf: body inertia is above 1e\+10",
+        ),
         (
             "arm.xml",
-            MJCF.replace('"hinge"', "").replace('type="slide"', 'type="ball"').replace("range", "user"),
+            MJCF.replace('"hinge"', "")
+            .replace('type="slide"', 'type="ball"')
+            .replace("range", "user"),
             "arm.xml",
         ),
     ],
@@ -256,13 +301,21 @@ def test_broken_models_are_refused_with_their_file(tmp_path, name, text, words):
 
 
 def test_a_named_servo_type_fills_damping_friction_armature_and_torque_limit(tmp_path):
-    made = make(tmp_path, joints=ARM, servo=("STS3215", "roll=XL330-M288-T"), effort_limit=("elbow=1",))
+    made = make(
+        tmp_path, joints=ARM, servo=("STS3215", "roll=XL330-M288-T"), effort_limit=("elbow=1",)
+    )
     for joint, name in (("shoulder", "STS3215"), ("elbow", "STS3215"), ("roll", "XL330-M288-T")):
         servo, spec = servo_type(name, ""), read_mjcf(made.robot.mjcf).joint(joint)
         for field in ("damping", "frictionloss", "armature"):
             assert np.ravel(getattr(spec, field))[0] == pytest.approx(servo.measured[field].value)
         assert written(made)[joint]["servo"] == name
-        assert written(made)[joint]["effort_limit"] == (1.0 if joint == "elbow" else servo.effort_limit)
-    assert made.drives[0].passive_source.startswith("servo STS3215 (armature, damping, frictionloss: isaac-sim2real")
-    with pytest.raises(RobotError, match=r"--servo STS3216: servo .STS3216. is no .*; nearest: STS3215"):
+        assert written(made)[joint]["effort_limit"] == (
+            1.0 if joint == "elbow" else servo.effort_limit
+        )
+    assert made.drives[0].passive_source.startswith(
+        "servo STS3215 (armature, damping, frictionloss: isaac-sim2real"
+    )
+    with pytest.raises(
+        RobotError, match=r"--servo STS3216: servo .STS3216. is no .*; nearest: STS3215"
+    ):
         make(tmp_path / "other", servo=("STS3216",))

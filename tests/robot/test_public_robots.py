@@ -26,7 +26,15 @@ LINKS = {
 }
 # Names of the SDK's G1JointIndex, in the order of its motors.
 LEG = ("HipPitch", "HipRoll", "HipYaw", "Knee", "AnklePitch", "AnkleRoll")
-ARM = ("ShoulderPitch", "ShoulderRoll", "ShoulderYaw", "Elbow", "WristRoll", "WristPitch", "WristYaw")
+ARM = (
+    "ShoulderPitch",
+    "ShoulderRoll",
+    "ShoulderYaw",
+    "Elbow",
+    "WristRoll",
+    "WristPitch",
+    "WristYaw",
+)
 
 
 def test_g1_has_the_gravity_and_inertia_of_unitrees_urdf():
@@ -43,7 +51,9 @@ def test_g1_has_the_gravity_and_inertia_of_unitrees_urdf():
         for column, unit in zip(columns, np.eye(model.nv), strict=True):
             mujoco.mj_mulM(model, data, column, unit)
         inertia.append(columns.diagonal())
-    np.testing.assert_allclose(np.sqrt(np.mean(np.square(gravity), axis=0)), G1_GRAVITY, rtol=0.01, atol=1e-6)
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(np.square(gravity), axis=0)), G1_GRAVITY, rtol=0.01, atol=1e-6
+    )
     np.testing.assert_allclose(np.mean(inertia, axis=0), G1_INERTIA, rtol=0.01)
     assert model.body_mass.sum() == pytest.approx(33.341, abs=1e-3)
 

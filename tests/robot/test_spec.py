@@ -15,7 +15,9 @@ from gaponet.sim.model import build_model, model_hash
 def test_packaged_robots_are_listed():
     names = packaged_robots()
     assert {"fr3", "g1_23", "g1_29", "h1_2", "so101", "ur10e", "xl330_bench"} <= set(names)
-    assert [load_robot(name).name for name in names] == names  # datasets find their robot by its name
+    assert [
+        load_robot(name).name for name in names
+    ] == names  # datasets find their robot by its name
 
 
 def test_h1_2_operates_the_ten_arm_joints_of_27():
@@ -42,7 +44,9 @@ def test_an_unlimited_joint_has_an_infinite_range(tmp_path):
     assert robot.qpos_range.tolist() == [[-np.inf, np.inf], [-1.5, 1.5]]
 
 
-@pytest.mark.parametrize("name", ["Pitch", "shoulder_lift", "/so101/upper_arm/shoulder_lift", " Pitch "])
+@pytest.mark.parametrize(
+    "name", ["Pitch", "shoulder_lift", "/so101/upper_arm/shoulder_lift", " Pitch "]
+)
 def test_joints_resolve_by_alias_and_by_the_end_of_a_path(so101, name):
     assert so101.resolve(name, "a.csv") == "shoulder_lift"
 
@@ -55,7 +59,9 @@ def test_an_unknown_joint_error_names_the_file_and_similar_joints(so101):
     with pytest.raises(JointMismatchError, match=r"a\.csv names joint 'elbow', which robot 'so101' does not have; "
                        r"nearest: elbow_flex, \w+, \w+\. Map it with --map elbow=elbow_flex$"):  # fmt: skip
         so101.resolve("elbow", "a.csv")
-    with pytest.raises(JointMismatchError, match=r"nearest: elbow_flex, \w+, \w+$"):  # nothing to map there
+    with pytest.raises(
+        JointMismatchError, match=r"nearest: elbow_flex, \w+, \w+$"
+    ):  # nothing to map there
         so101.index(["elbow"])
 
 
@@ -85,9 +91,21 @@ def test_an_unknown_robot_error_lists_the_packaged_ones():
             'name = "elbow"\naliases = ["shoulder"]',
             r"appears twice in shoulder, elbow, shoulder \(names",
         ),
-        ("pos = [0.2,", "pos = [20.0,", r"payload_mount\[0\]\.pos\[0\]: should be less than or equal to 10, not 20.0"),
-        ("timestep = 0.005", "timestep = 0.003", "dt / timestep = 0.02 / 0.003 = 6.667 is not a whole number"),
-        ("kp = 20.0", 'kp = 20.0\nlog_unit = "grad"', r"joint\[0\]\.log_unit: should be 'rad', 'deg' or"),
+        (
+            "pos = [0.2,",
+            "pos = [20.0,",
+            r"payload_mount\[0\]\.pos\[0\]: should be less than or equal to 10, not 20.0",
+        ),
+        (
+            "timestep = 0.005",
+            "timestep = 0.003",
+            "dt / timestep = 0.02 / 0.003 = 6.667 is not a whole number",
+        ),
+        (
+            "kp = 20.0",
+            'kp = 20.0\nlog_unit = "grad"',
+            r"joint\[0\]\.log_unit: should be 'rad', 'deg' or",
+        ),
         ("kp = 20.0", "kp = 20.0\noperated = false", "no joint has operated = true"),
         ("dt = 0.02", "dt = ", "not valid TOML"),
         ("[[joint]]", "[[joints]]", "joint: is missing"),
@@ -111,7 +129,9 @@ def test_a_missing_mjcf_error_names_its_place(tmp_path):
 
 def test_a_folder_stores_identified_values_and_the_nominal_robot(tmp_path):
     robot = write_arm(tmp_path / "arm")
-    fitted = robot.with_servos({"elbow": {"kp": 12.5, "frictionloss": 0.11, "delay": 0.03, "offset": -0.01}})
+    fitted = robot.with_servos(
+        {"elbow": {"kp": 12.5, "frictionloss": 0.11, "delay": 0.03, "offset": -0.01}}
+    )
     save_robot(fitted, tmp_path / "fitted")
     back = load_robot(tmp_path / "fitted")
     assert model_hash(back) == model_hash(fitted) != model_hash(robot)
@@ -177,7 +197,9 @@ def test_collision_shapes_are_copied(tmp_path):
 
 
 def test_identified_tables_belong_to_the_identified_robot_only(tmp_path):
-    robot = write_arm(tmp_path / "arm", TOML.replace("[[payload", "[identified.elbow]\nkp = 9.0\n[[payload"))
+    robot = write_arm(
+        tmp_path / "arm", TOML.replace("[[payload", "[identified.elbow]\nkp = 9.0\n[[payload")
+    )
     save_robot(robot, tmp_path / "both")
     save_robot(robot.nominal, tmp_path / "nominal")
     assert load_robot(tmp_path / "both").kp.tolist() == [20.0, 9.0]

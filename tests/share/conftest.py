@@ -95,7 +95,11 @@ def forge(bucket):
             index["files"][name] = vars(FileRecord.of(bucket / ".new"))
             shutil.move(bucket / ".new", bucket / "sha256" / index["files"][name]["sha256"])
 
-        change(index, put, lambda name: (bucket / "sha256" / index["files"][name]["sha256"]).read_bytes())
+        change(
+            index,
+            put,
+            lambda name: (bucket / "sha256" / index["files"][name]["sha256"]).read_bytes(),
+        )
         (bucket / "gaponet.json").write_text(json.dumps(index))
 
     return forged

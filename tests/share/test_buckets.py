@@ -27,9 +27,14 @@ ENDPOINT = {"s3": "AWS_ENDPOINT_URL", "gs": "STORAGE_EMULATOR_HOST"}
 
 
 @pytest.fixture(scope="module", params=["s3", "gs"])
-def wire(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Wire]:
+def wire(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Wire]:
     start = {"s3": seaweed, "gs": google}[request.param]
-    with start(tmp_path_factory.mktemp(request.param)) as wire, pytest.MonkeyPatch.context() as patch:
+    with (
+        start(tmp_path_factory.mktemp(request.param)) as wire,
+        pytest.MonkeyPatch.context() as patch,
+    ):
         patch.setenv("AWS_ACCESS_KEY_ID", KEY)
         patch.setenv("AWS_SECRET_ACCESS_KEY", SECRET)
         patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
@@ -55,11 +60,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def gaponet(*command: str | Path, **env: str) -> subprocess.CompletedProcess[str]:
     """A command in a process of its own, which must end in time."""
     words = [sys.executable, "-m", "gaponet", *map(str, command)]
-    return subprocess.run(words, capture_output=True, text=True, timeout=BOUND, env=os.environ | env)
+    return subprocess.run(
+        words, capture_output=True, text=True, timeout=BOUND, env=os.environ | env
+    )
 
 
 def killed_on_the_wire(wire: Wire, *command: str | Path) -> None:
-    process = subprocess.Popen([sys.executable, "-m", "gaponet", *map(str, command)], stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gaponet", *map(str, command)], stderr=subprocess.PIPE
+    )
     assert wire.holding.wait(BOUND), process.communicate()
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -82,13 +91,20 @@ def test_killed_in_the_middle_push_and_pull_go_on_and_every_hash_is_right(wire, 
     wire.let_all_pass()
     wire.hold_down = 60e6
     killed_on_the_wire(wire, "pull", address, back)
-    files = (f for f in (tmp_path / ".gaponet-pull-back").rglob("*.parquet") if f.stat().st_size in there.values())
+    files = (
+        f
+        for f in (tmp_path / ".gaponet-pull-back").rglob("*.parquet")
+        if f.stat().st_size in there.values()
+    )
     arrived = sum(file.stat().st_size for file in files)
     done = gaponet("pull", address, back)
     assert not done.returncode, done.stderr
     assert wire.down < sum(there.values()) - arrived + 2e6
     assert {e.hash for e in Dataset(back).entries} == {e.hash for e in dataset.entries}
-    assert "\n0 files of earlier pushes were deleted" in gaponet("push", dataset.path, address, "--prune").stdout
+    assert (
+        "\n0 files of earlier pushes were deleted"
+        in gaponet("push", dataset.path, address, "--prune").stdout
+    )
 
 
 def test_of_two_indexes_written_at_the_same_time_the_server_takes_the_first(wire):
@@ -116,7 +132,9 @@ def test_a_place_that_cannot_be_read_is_one_line_in_a_bounded_time(wire, tmp_pat
     refused("no bucket 'nobody'", "nobody")
     refused("[Cc]onnect", **{ENDPOINT[wire.scheme]: "http://127.0.0.1:9"})
     with socket.create_server(("127.0.0.1", 0), backlog=100) as silent:
-        refused("[Tt]imeout", **{ENDPOINT[wire.scheme]: f"http://127.0.0.1:{silent.getsockname()[1]}"})
+        refused(
+            "[Tt]imeout", **{ENDPOINT[wire.scheme]: f"http://127.0.0.1:{silent.getsockname()[1]}"}
+        )
     if wire.scheme == "s3":  # the stand-in of GCS lets in anybody
         refused("no permission", AWS_SECRET_ACCESS_KEY="wrong")
         refused("no permission", AWS_ACCESS_KEY_ID="nobody")

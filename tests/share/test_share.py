@@ -24,7 +24,9 @@ from .conftest import add, same
 
 @pytest.fixture
 def run(arm, dataset, tmp_path):
-    folder = untrained(tmp_path / "run", arm, dataset, train=("wave 0",), val=("wave 1",), test=("wave 2",))
+    folder = untrained(
+        tmp_path / "run", arm, dataset, train=("wave 0",), val=("wave 1",), test=("wave 2",)
+    )
     config = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1}, "seed": 0, "robot": "arm",
               "dataset": "arm_logs", "dataset_hash": dataset_hash(dataset.entries)}  # fmt: skip
     (folder / "config.json").write_text(json.dumps(config))
@@ -43,11 +45,15 @@ def test_a_dataset_comes_back_by_every_hash_with_split_and_licence(dataset, plac
     assert list(tmp_path.glob(".gaponet-*")) == []
 
 
-def test_a_run_comes_back_with_the_same_network_and_without_what_a_browser_would_run(run, place, tmp_path):
+def test_a_run_comes_back_with_the_same_network_and_without_what_a_browser_would_run(
+    run, place, tmp_path
+):
     push(run, place)
     pull(place, tmp_path / "back")
     assert GapModel.load(tmp_path / "back").weights_hash() == GapModel.load(run).weights_hash()
-    files = lambda folder: {f.relative_to(folder).as_posix() for f in folder.rglob("[!.]*") if f.is_file()}  # noqa: E731
+    files = lambda folder: {  # noqa: E731
+        f.relative_to(folder).as_posix() for f in folder.rglob("[!.]*") if f.is_file()
+    }
     assert files(tmp_path / "back") == files(run) - {"report.html"} | {"README.md"}
     push(tmp_path / "back", place)
 
@@ -63,7 +69,9 @@ def test_what_would_be_lost_is_replaced_only_when_asked(dataset, arm, run, disk,
     same(Dataset(tmp_path / "small"), Dataset(tmp_path / "back"))
 
 
-def test_a_pull_into_a_dataset_brings_what_it_lacks_and_touches_nothing_else(dataset, arm, place, tmp_path, capsys):
+def test_a_pull_into_a_dataset_brings_what_it_lacks_and_touches_nothing_else(
+    dataset, arm, place, tmp_path, capsys
+):
     back, split = tmp_path / "back", tmp_path / "back" / "splits" / "motion.json"
     push(dataset.path, place)
     pull(place, back)
@@ -86,7 +94,9 @@ def many_files(monkeypatch):
     monkeypatch.setattr("gaponet.data.writers.lerobot.SHARE", 0.0)
 
 
-def test_of_a_dataset_that_grew_the_new_files_are_sent_and_fetched(many_files, dataset, arm, hub, bucket, tmp_path):
+def test_of_a_dataset_that_grew_the_new_files_are_sent_and_fetched(
+    many_files, dataset, arm, hub, bucket, tmp_path
+):
     bucket_place, objects = f"file://{bucket}", bucket / "sha256"
     for place in ("me/arm", bucket_place):
         push(dataset.path, place)
@@ -134,7 +144,9 @@ def test_a_push_mends_a_damaged_object_and_a_pull_continues_with_the_files_that_
     assert largest.read_bytes() == content
     opened = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shutil, "copyfile", lambda a, b, copy=shutil.copyfile: opened.append(b) or copy(a, b))
+        patch.setattr(
+            shutil, "copyfile", lambda a, b, copy=shutil.copyfile: opened.append(b) or copy(a, b)
+        )
         pull(place, tmp_path / "back")
     assert not {str(file) for file in arrived} & set(map(str, opened))
     same(dataset, Dataset(tmp_path / "back"))
@@ -171,9 +183,12 @@ def test_an_index_is_replaced_on_condition_of_the_one_that_was_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("written", "error"), [("", "server is down"), ("mine", ""), ("theirs", "somebody else pushed at the same time")]
+    ("written", "error"),
+    [("", "server is down"), ("mine", ""), ("theirs", "somebody else pushed at the same time")],
 )
-def test_a_write_without_an_answer_counts_by_the_index_that_is_there(dataset, bucket, monkeypatch, written, error):
+def test_a_write_without_an_answer_counts_by_the_index_that_is_there(
+    dataset, bucket, monkeypatch, written, error
+):
     place, replace_index = f"file://{bucket}", Bucket._replace_index
 
     def fails(self, before, text):
@@ -189,7 +204,9 @@ def test_a_write_without_an_answer_counts_by_the_index_that_is_there(dataset, bu
         push(dataset.path, place)
 
 
-def test_a_dataset_appears_under_its_name_when_it_is_complete(dataset, bucket, tmp_path, monkeypatch):
+def test_a_dataset_appears_under_its_name_when_it_is_complete(
+    dataset, bucket, tmp_path, monkeypatch
+):
     push(dataset.path, place := f"file://{bucket}")
     append = Dataset.append
 
@@ -219,14 +236,21 @@ def test_a_push_with_nothing_new_reads_no_recording(dataset, place, tmp_path, mo
     assert Dataset(tmp_path / "back").header["licence"] == "MIT"
 
 
-def test_prune_deletes_what_neither_this_push_nor_the_last_names_once_it_is_a_day_old(dataset, arm, bucket, tmp_path):
+def test_prune_deletes_what_neither_this_push_nor_the_last_names_once_it_is_a_day_old(
+    dataset, arm, bucket, tmp_path
+):
     place, objects, states = f"file://{bucket}", bucket / "sha256", []
     for name in ("new", "newer", "newest"):
         for file in objects.glob("*") if name == "newest" else ():
             os.utime(file, (0, 0))
         add(dataset, arm, [name])
         moved = push(dataset.path, place, prune=True)
-        states.append({part["sha256"] for part in json.loads((bucket / "gaponet.json").read_text())["files"].values()})
+        states.append(
+            {
+                part["sha256"]
+                for part in json.loads((bucket / "gaponet.json").read_text())["files"].values()
+            }
+        )
         assert moved.pruned == (len(states[0] - states[1]) if name == "newest" else 0)
     assert {file.name for file in objects.iterdir()} == states[1] | states[2]
     pull(place, tmp_path / "back")
@@ -234,7 +258,9 @@ def test_prune_deletes_what_neither_this_push_nor_the_last_names_once_it_is_a_da
 
 
 @pytest.mark.parametrize(
-    ("remote", "step"), [(Bucket, "store"), (Bucket, "_replace_index"), (Hub, "store")], ids=lambda x: str(x)
+    ("remote", "step"),
+    [(Bucket, "store"), (Bucket, "_replace_index"), (Hub, "store")],
+    ids=lambda x: str(x),
 )
 def test_of_two_simultaneous_pushes_the_slower_one_gets_one_error_and_replaces_nothing(
     hub, dataset, arm, bucket, tmp_path, monkeypatch, capsys, remote, step
@@ -254,26 +280,40 @@ def test_of_two_simultaneous_pushes_the_slower_one_gets_one_error_and_replaces_n
     monkeypatch.setattr(remote, step, after_another_push)
     assert main(["push", str(dataset.path), place]) == 2
     said = capsys.readouterr().err.splitlines()
-    assert said[-1] == f"Remote: {place}: somebody else pushed at the same time, and nothing was replaced; push again"
+    assert (
+        said[-1]
+        == f"Remote: {place}: somebody else pushed at the same time, and nothing was replaced; push again"
+    )
     pull(place, tmp_path / "theirs")
     same(other, Dataset(tmp_path / "theirs"))
 
 
-def test_of_two_first_pushes_to_the_hub_the_slower_one_gets_the_error_too(hub, dataset, arm, tmp_path):
+def test_of_two_first_pushes_to_the_hub_the_slower_one_gets_the_error_too(
+    hub, dataset, arm, tmp_path
+):
     other = Dataset.create(tmp_path / "other", arm)
     add(other, arm, ["elsewhere"])
     remote = Hub("me/arm")
     assert remote.index("dataset") is None
     push(other.path, "me/arm")
     with pytest.raises(RemoteError, match="somebody else pushed at the same time"):
-        remote.store(tmp_path, Index(1, "dataset", "arm", ("a",), {"x": FileRecord(1, "0" * 64)}), ["x"], False)
+        remote.store(
+            tmp_path,
+            Index(1, "dataset", "arm", ("a",), {"x": FileRecord(1, "0" * 64)}),
+            ["x"],
+            False,
+        )
 
 
-def test_the_same_recording_under_another_name_is_the_one_that_is_there(dataset, arm, disk, tmp_path):
+def test_the_same_recording_under_another_name_is_the_one_that_is_there(
+    dataset, arm, disk, tmp_path
+):
     renamed = Dataset.create(tmp_path / "renamed", arm)
     for entry in dataset.entries:
         sequence = dataset.read(entry)
-        renamed.append(replace(sequence, meta=replace(sequence.meta, motion=f"my {entry.meta.motion}")))
+        renamed.append(
+            replace(sequence, meta=replace(sequence.meta, motion=f"my {entry.meta.motion}"))
+        )
     push(dataset.path, disk)
     pull(disk, tmp_path / "theirs")
     push(renamed.path, disk)
@@ -305,7 +345,10 @@ def test_an_address_of_nothing_is_one_line_without_keys(hub, tmp_path, capsys, a
 
 def test_no_error_shows_keys_or_the_signature_of_a_link():
     link = "https://KEY:SECRET@host/file?X-Amz-Signature=SECRET"
-    with pytest.raises(RemoteError, match=r"^me/arm: 403 for https://host/file\?…$"), network_errors("me/arm"):
+    with (
+        pytest.raises(RemoteError, match=r"^me/arm: 403 for https://host/file\?…$"),
+        network_errors("me/arm"),
+    ):
         raise OSError(f"403 for {link}")
 
 
@@ -342,7 +385,9 @@ def test_a_damaged_recording_is_not_pushed(dataset, bucket):
         push(dataset.path, f"file://{bucket}")
 
 
-def test_more_than_the_disk_holds_is_refused_before_anything_is_fetched(hub, dataset, tmp_path, monkeypatch):
+def test_more_than_the_disk_holds_is_refused_before_anything_is_fetched(
+    hub, dataset, tmp_path, monkeypatch
+):
     push(dataset.path, "me/arm")
     usage = shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
@@ -352,11 +397,26 @@ def test_more_than_the_disk_holds_is_refused_before_anything_is_fetched(hub, dat
 
 
 GOOD = {"size": 1, "sha256": "0" * 64}
-NAMES = ("../x", "/x", "a/../../x", "a//x", ".ssh/x", "a\\x", "C:x", "x\n", "a/" * 9 + "x", "gaponet.json", "a" * 401)
+NAMES = (
+    "../x",
+    "/x",
+    "a/../../x",
+    "a//x",
+    ".ssh/x",
+    "a\\x",
+    "C:x",
+    "x\n",
+    "a/" * 9 + "x",
+    "gaponet.json",
+    "a" * 401,
+)
 DIGESTS = ("../" * 19 + "etc/pwd", "A" * 64, "0" * 63 + " ", "0" * 65)
 HOSTILE = [
     *(({"files": {name: GOOD}}, "is not the name of a file inside a folder") for name in NAMES),
-    *(({"files": {"x": GOOD | {"sha256": text}}}, "should be the 64 lowercase hex digits") for text in DIGESTS),
+    *(
+        ({"files": {"x": GOOD | {"sha256": text}}}, "should be the 64 lowercase hex digits")
+        for text in DIGESTS
+    ),
     ({"files": {"arm/y": GOOD, "ARM/y": GOOD}}, "differ in capitals"),
     ({"files": {"arm": GOOD, "arm/y": GOOD}}, "'arm' is a file and a folder"),
     ({"files": {str(i): GOOD for i in range(20_001)}}, "files: "),
@@ -391,7 +451,9 @@ def test_a_hostile_index_is_refused_in_one_line(bucket, tmp_path, capsys, change
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")], ids=["pipe", "device"])
+@pytest.mark.parametrize(
+    "make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")], ids=["pipe", "device"]
+)
 def test_an_index_that_is_a_pipe_or_a_device_is_not_read(bucket, tmp_path, make):
     bucket.mkdir(parents=True)
     make(bucket / "gaponet.json")
@@ -400,10 +462,18 @@ def test_an_index_that_is_a_pipe_or_a_device_is_not_read(bucket, tmp_path, make)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/etc/hostname")], ids=["pipe", "link"])
+@pytest.mark.parametrize(
+    "make", [os.mkfifo, lambda path: path.symlink_to("/etc/hostname")], ids=["pipe", "link"]
+)
 def test_an_object_that_is_a_pipe_or_a_link_is_not_read(bucket, tmp_path, make):
     size = 0 if make is os.mkfifo else os.stat("/etc/hostname").st_size
-    index = {"format": 1, "kind": "dataset", "name": "arm", "contents": ["a"], "files": {"x": GOOD | {"size": size}}}
+    index = {
+        "format": 1,
+        "kind": "dataset",
+        "name": "arm",
+        "contents": ["a"],
+        "files": {"x": GOOD | {"size": size}},
+    }
     (bucket / "sha256").mkdir(parents=True)
     (bucket / "gaponet.json").write_text(json.dumps(index))
     make(bucket / "sha256" / GOOD["sha256"])
@@ -411,12 +481,19 @@ def test_an_object_that_is_a_pipe_or_a_link_is_not_read(bucket, tmp_path, make):
         pull(f"file://{bucket}", tmp_path / "back")
 
 
-def test_a_run_with_a_file_that_no_run_has_or_another_network_is_refused(run, bucket, forge, tmp_path):
+def test_a_run_with_a_file_that_no_run_has_or_another_network_is_refused(
+    run, bucket, forge, tmp_path
+):
     push(run, place := f"file://{bucket}")
     forge(lambda index, put, read: put("report.html", b"<script>"))
     with pytest.raises(RemoteError, match=r"report\.html: a run has no such file"):
         pull(place, tmp_path / "back")
-    forge(lambda index, put, read: (index["files"].pop("report.html"), put("model/model.onnx", b"no network")))
+    forge(
+        lambda index, put, read: (
+            index["files"].pop("report.html"),
+            put("model/model.onnx", b"no network"),
+        )
+    )
     with pytest.raises(RemoteError, match="not the network that was pushed"):
         pull(place, tmp_path / "back")
     assert not (tmp_path / "back").exists()

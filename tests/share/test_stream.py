@@ -55,7 +55,10 @@ def test_a_command_says_of_an_address_what_it_says_of_the_folder(dataset, addres
 
 def test_what_lies_in_a_bucket_is_not_changed_from_here(dataset, address):
     far, _ = gp.open_dataset(address)
-    for change in (lambda: far.append(dataset.read(dataset.entries[0])), lambda: far.set_provenance(licence="mine")):
+    for change in (
+        lambda: far.append(dataset.read(dataset.entries[0])),
+        lambda: far.set_provenance(licence="mine"),
+    ):
         with pytest.raises(DatasetError, match=r"arm: is only read; .* gaponet pull"):
             change()
 
@@ -67,7 +70,9 @@ def test_samples_that_were_changed_are_refused_when_they_are_read(address, forge
         table = pq.read_table(tmp_path / "x")
         column = table.schema.get_field_index("action")
         reversed_rows = table["action"].take(list(range(len(table)))[::-1])
-        pq.write_table(table.set_column(column, table.schema.field(column), reversed_rows), tmp_path / "x")
+        pq.write_table(
+            table.set_column(column, table.schema.field(column), reversed_rows), tmp_path / "x"
+        )
         put(name, (tmp_path / "x").read_bytes())
 
     forge(change)
@@ -80,8 +85,12 @@ def test_samples_that_were_changed_are_refused_when_they_are_read(address, forge
             far.read(entry)
 
 
-@pytest.mark.parametrize("what", ["contents", "shard", "robot", "no robot", "own", "cut", "kind", "half"])
-def test_a_place_with_other_content_than_its_index_says_is_one_line(address, bucket, forge, tmp_path, capsys, what):
+@pytest.mark.parametrize(
+    "what", ["contents", "shard", "robot", "no robot", "own", "cut", "kind", "half"]
+)
+def test_a_place_with_other_content_than_its_index_says_is_one_line(
+    address, bucket, forge, tmp_path, capsys, what
+):
     def change(index, put, read):
         data = next(name for name in index["files"] if "/data/" in name)
         if what == "contents":
@@ -93,7 +102,9 @@ def test_a_place_with_other_content_than_its_index_says_is_one_line(address, buc
         if what == "no robot":
             put("gaponet/robot/robot.xml", b"<mujoco>")
         if what == "own":
-            del index["files"][next(name for name in index["files"] if name.endswith("meta/gaponet.json"))]
+            del index["files"][
+                next(name for name in index["files"] if name.endswith("meta/gaponet.json"))
+            ]
         if what == "cut":
             put(data, read(data)[:-100])
         if what == "kind":

@@ -24,7 +24,9 @@ MODEL = (
     '<mujoco><compiler angle="radian"/><option integrator="implicitfast" timestep="0.0005"/>'
     "<worldbody>{}</worldbody></mujoco>"
 )
-JOINT = '<body><joint name="swing" axis="0 1 0" armature="0.002" damping="0.06" frictionloss="0.01"/>'
+JOINT = (
+    '<body><joint name="swing" axis="0 1 0" armature="0.002" damping="0.06" frictionloss="0.01"/>'
+)
 PLAY_HINGE = (
     f'{JOINT}<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/><body><joint name="play" axis="0 1 0" '
     f'limited="true" range="{-WIDTH / 2} {WIDTH / 2}" solreflimit="0.001 1"/>{LINK}</body></body>'
@@ -57,14 +59,18 @@ def test_joint_and_robot_move_as_a_play_hinge(pendulum):
     ctrl = command()
     real = play_hinge(ctrl)
     meta = SequenceMeta(pendulum.name, "a", "swing", 0.0, virtual=True)
-    recorded = Sequence(meta, pendulum.joint_names, 0.01, ctrl, real, np.gradient(real, 0.01, axis=0))
+    recorded = Sequence(
+        meta, pendulum.joint_names, 0.01, ctrl, real, np.gradient(real, 0.01, axis=0)
+    )
     rollouts, errors = JointRollouts([recorded], pendulum), []
     for width in (0.0, WIDTH):
         servo = SERVO | {"backlash": width}
         (whole,) = replay([recorded], pendulum.with_servos({"swing": servo}))
         values = {f: np.full((1, 1), v) for f, v in servo.items()}
         alone = rollouts.errors(values)[0, 0, 0]
-        np.testing.assert_allclose(rollouts._arrays(values)[0, 0, 0] * rollouts.counted[0], alone, atol=2e-4)
+        np.testing.assert_allclose(
+            rollouts._arrays(values)[0, 0, 0] * rollouts.counted[0], alone, atol=2e-4
+        )
         errors.append([np.abs(whole.qpos - real)[20:].mean(), np.abs(alone[20:]).mean()])
     assert min(errors[0]) > 4e-3  # rad: without the gap
     assert max(errors[1]) < 0.2 * min(errors[0])

@@ -96,7 +96,9 @@ def test_delayed_servos_need_past_targets(tmp_path):
 def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, delay):
     """Payloads, rates, laws, late servos, steps of some, forces: all that gaponet writes into a batch."""
     pytest.importorskip("mujoco.batch")
-    robot = replace(write_arm(tmp_path), delay=list(delay), stribeck=[0.1, 0.2], friction_motor=[0.1, 0.0])
+    robot = replace(
+        write_arm(tmp_path), delay=list(delay), stribeck=[0.1, 0.2], friction_motor=[0.1, 0.0]
+    )
     conditions = [(0.0, "both", 0.02), (0.3, "both", 0.02), (0.3, "both", 0.01)]
     rng = np.random.default_rng(3)
     past, targets, pushes = (rng.uniform(-1, 1, (k, 3, 2)) for k in (8, 20, 20))
@@ -111,12 +113,18 @@ def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, del
         for t, target in enumerate(targets):
             force[:] = pushes[t]
             sim.step(target, np.array([0, 2]) if t % 3 == 0 else None)
-            seen = [sim.qpos.copy(), sim.qvel.copy(), sim.torque[[0, 0, 2]]]  # always of those that moved
+            seen = [
+                sim.qpos.copy(),
+                sim.qvel.copy(),
+                sim.torque[[0, 0, 2]],
+            ]  # always of those that moved
             sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
             moved.append([*seen, bias.copy()])
         np.testing.assert_array_equal(sim.batch.get_data(1).qpos, sim.qpos[1])
         assert isinstance(sim.batch, OneByOne) == one_by_one
-        if one_by_one:  # a look at what follows from a state leaves each simulation the torque of its own step
+        if (
+            one_by_one
+        ):  # a look at what follows from a state leaves each simulation the torque of its own step
             sim.step(targets[0])
             torque = sim.torque.copy()
             sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
@@ -131,7 +139,9 @@ def test_a_speed_limited_servo_moves_as_another_under_ramped_commands(tmp_path, 
     slow = replace(robot, target_speed=[0.5, 0.0])
     jumps = np.repeat(np.random.default_rng(2).uniform(-1, 1, (3, 2, 2)), 30, axis=0)
     speed = np.array([0.5, np.inf])
-    ramps = np.stack([speed_limited(jumps[:, i], np.zeros(2), speed, dt) for i, dt in enumerate(rates)], 1)
+    ramps = np.stack(
+        [speed_limited(jumps[:, i], np.zeros(2), speed, dt) for i, dt in enumerate(rates)], 1
+    )
     sims = [BatchSim(r, [(0.0, "both", dt) for dt in rates]) for r in (slow, robot)]
     for sim in sims:
         sim.reset(slice(None), np.zeros(2), 0.0, past=jumps[0][:, None])
@@ -166,10 +176,14 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     robot = write_arm(tmp_path, xml=XML.replace('range="-1.5 1.5"', 'range="-1.5 1.5" ref="0.1"'))
     base = {"damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "kd": 0.3}
     base |= {"delay": 0.02} if field == "delay" else {}
-    base |= dict.fromkeys(SERVO_TERMS, 0.02) | {"no_load_speed": 9.0} if field in SERVO_TERMS else {}
+    base |= (
+        dict.fromkeys(SERVO_TERMS, 0.02) | {"no_load_speed": 9.0} if field in SERVO_TERMS else {}
+    )
     robot = robot.with_servos(dict.fromkeys(robot.joint_names, base))
     other, one = robot.with_servos({"elbow": {field: OTHER[field]}}), (0.0, "both", 0.02)
-    sims = {name: BatchSim(r, [one]) for name, r in (("own", robot), ("set", robot), ("made", other))}
+    sims = {
+        name: BatchSim(r, [one]) for name, r in (("own", robot), ("set", robot), ("made", other))
+    }
     given = {f: getattr(other, f)[1:][None] for f in (*base, "kp", "offset", field)}
     sims["set"].set_servos(("elbow",), given)
     targets = np.repeat(np.random.default_rng(5).uniform(-1, 1, (4, 1, 2)), 15, axis=0)
@@ -179,12 +193,17 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
         path[name] = np.array([sim.step(target) or sim.qpos.copy() for target in targets])
     assert np.abs(path["own"] - path["made"]).max() > 1e-3
     # Friction holds a little less firmly where MuJoCo computed a joint's mobility with another armature.
-    np.testing.assert_allclose(path["set"], path["made"], atol=1e-4 if field == "armature" else 1e-12)
+    np.testing.assert_allclose(
+        path["set"], path["made"], atol=1e-4 if field == "armature" else 1e-12
+    )
 
 
 @pytest.mark.parametrize("field", [*STOP_FIELDS, "delay", *SERVO_TERMS])
 def test_a_value_that_simulations_cannot_take_is_refused(tmp_path, field):
     robot = write_arm(tmp_path)
-    values = {f: np.full((1, 1), 0.1) for f in ("kp", "damping", "frictionloss", "armature", "offset", field)}
+    values = {
+        f: np.full((1, 1), 0.1)
+        for f in ("kp", "damping", "frictionloss", "armature", "offset", field)
+    }
     with pytest.raises(UsageError, match=f"{field} cannot differ between simulations of arm"):
         BatchSim(robot, [(0.0, "both", 0.02)]).set_servos(("elbow",), values)

@@ -75,4 +75,6 @@ def test_a_torque_speed_line_bounds_the_targets_of_a_moving_joint(tmp_path):
     at, speed = np.zeros((1, 2)), np.ones((1, 2))
     targets = inverse([Period(at, speed, at + 0.02, speed + 1.0, at)])
     assert inverse.high.max() == 0.4
-    np.testing.assert_allclose(inverse.kp * (targets - 0.01), 0.2, rtol=1e-3)  # 0.01 rad: the mean position
+    np.testing.assert_allclose(
+        inverse.kp * (targets - 0.01), 0.2, rtol=1e-3
+    )  # 0.01 rad: the mean position

@@ -10,7 +10,14 @@ from gaponet.sim.metrics import mean_reduction, metrics, runs, summary
 
 def sequence(robot, qpos, motion="m", payload=0.0):
     qpos = np.asarray(qpos, float)
-    return Sequence(SequenceMeta("arm", "a", motion, payload), robot.joint_names, 0.5, qpos, qpos, np.zeros_like(qpos))
+    return Sequence(
+        SequenceMeta("arm", "a", motion, payload),
+        robot.joint_names,
+        0.5,
+        qpos,
+        qpos,
+        np.zeros_like(qpos),
+    )
 
 
 @pytest.fixture
@@ -39,7 +46,10 @@ def test_the_common_start_is_no_error(robot):
 
 
 def test_a_motion_counts_once_whatever_its_length(robot):
-    short, long = sequence(robot, np.zeros((3, 2)), "short"), sequence(robot, np.zeros((30, 2)), "long", 1.0)
+    short, long = (
+        sequence(robot, np.zeros((3, 2)), "short"),
+        sequence(robot, np.zeros((30, 2)), "long", 1.0),
+    )
     result = summary(runs([short, long], [np.ones((3, 2)), np.zeros((30, 2))], robot), robot)
     assert result["mpjae"] == pytest.approx(0.5)
     assert result["by_motion"]["short"]["mpjae"] == pytest.approx(1.0)
@@ -73,6 +83,8 @@ def test_a_summary_of_an_iterator_is_that_of_a_list(robot):
     found = summary(iter(part), robot)
     assert found == summary(part, robot)
     assert found["mpjae"] == metrics(part)["mpjae"]
-    whole = {m: metrics([r for r in part if r.meta.motion == m]) for m in ("m0", "m1")}  # no joint here is a wrist
+    whole = {
+        m: metrics([r for r in part if r.meta.motion == m]) for m in ("m0", "m1")
+    }  # no joint here is a wrist
     assert found["by_motion"] == {m: w | {"mpjae_no_wrist": w["mpjae"]} for m, w in whole.items()}
     assert found["by_joint"] == {j: metrics(part, [i]) for i, j in enumerate(robot.operated)}

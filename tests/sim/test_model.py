@@ -33,13 +33,17 @@ def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.nd
 @pytest.mark.parametrize(("name", "mass"), [("so101", 0.0), ("so101", 0.3), ("h1_2", 3.0)])
 def test_a_loaded_joint_held_for_a_minute_does_not_creep(name, mass):
     robot = load_robot(name)
-    posture = np.clip(robot.qpos_home + 0.3, robot.qpos_range[:, 0] + 0.05, robot.qpos_range[:, 1] - 0.05)
+    posture = np.clip(
+        robot.qpos_home + 0.3, robot.qpos_range[:, 0] + 0.05, robot.qpos_range[:, 1] - 0.05
+    )
     early, late = hold(build_model(robot, mass), posture, 60.0)
     assert np.abs(late - early).max() < 0.5e-3
     assert np.abs(early - posture).max() > 2e-3  # and it does carry a load
 
 
-@pytest.mark.parametrize(("name", "armature"), [("so101", 0.0028), ("h1_2", 0.0028), ("h1_2", None)])
+@pytest.mark.parametrize(
+    ("name", "armature"), [("so101", 0.0028), ("h1_2", 0.0028), ("h1_2", None)]
+)
 def test_friction_holds_half_its_limit_for_two_minutes_with_the_smallest_armature(name, armature):
     robot = load_robot(name)
     if armature is not None:
@@ -47,14 +51,18 @@ def test_friction_holds_half_its_limit_for_two_minutes_with_the_smallest_armatur
     model = build_model(robot)
     model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
     data = mujoco.MjData(model)
-    data.qpos[:] = np.clip(robot.qpos_home + 0.3, robot.qpos_range[:, 0] + 0.05, robot.qpos_range[:, 1] - 0.05)
+    data.qpos[:] = np.clip(
+        robot.qpos_home + 0.3, robot.qpos_range[:, 0] + 0.05, robot.qpos_range[:, 1] - 0.05
+    )
     mujoco.mj_forward(model, data)
     load = data.qfrc_bias.copy()
     model.dof_frictionloss[:] = 2 * np.abs(load) + 0.02
     data.qfrc_applied[:] = -0.01 * np.sign(load)  # beside gravity: half of the limit
     mujoco.mj_step(model, data, round(1 / model.opt.timestep))
     early = data.qpos.copy()
-    mujoco.mj_step(model, data, round(20 / model.opt.timestep))  # a sixth of the time, a sixth of the way
+    mujoco.mj_step(
+        model, data, round(20 / model.opt.timestep)
+    )  # a sixth of the time, a sixth of the way
     assert np.abs(data.qpos - early).max() < 0.6e-3 / 6
 
 
@@ -87,16 +95,24 @@ def test_the_physics_step_is_nearly_the_same_at_any_rate(arm):
 
 
 def test_a_timestep_that_does_not_divide_the_control_period_is_refused(tmp_path):
-    with pytest.raises(RobotError, match="is not a whole number; choose a timestep that divides the control period"):
+    with pytest.raises(
+        RobotError, match="is not a whole number; choose a timestep that divides the control period"
+    ):
         write_arm(tmp_path / "arm", toml=TOML.replace("timestep = 0.005", "timestep = 0.007"))
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"payload_mass": -1.0}, r"payload_mass is -1\.0; give the mass in kg, 0 for an empty hand"),
+        (
+            {"payload_mass": -1.0},
+            r"payload_mass is -1\.0; give the mass in kg, 0 for an empty hand",
+        ),
         ({"payload_mass": float("nan")}, "payload_mass is nan"),
-        ({"payload_side": "foot"}, "payload side 'foot' is unknown to arm; use both or one of hand"),
+        (
+            {"payload_side": "foot"},
+            "payload side 'foot' is unknown to arm; use both or one of hand",
+        ),
         ({"dt": 50.0}, "dt is 50.0; the control period in seconds must be positive and at most 1"),
         ({"dt": 0.0}, "the control period in seconds must be positive"),
     ],
@@ -127,7 +143,10 @@ def test_a_broken_robot_folder_says_what_is_wrong(tmp_path, toml, xml, message):
 def test_a_robot_without_a_mount_carries_nothing(tmp_path):
     robot = write_arm(tmp_path / "arm", toml=TOML.split("[[payload_mount]]")[0])
     assert build_model(robot).nv == 2
-    with pytest.raises(RobotError, match=r"arm has no \[\[payload_mount\]\]; add one to robot.toml to attach 1.0 kg"):
+    with pytest.raises(
+        RobotError,
+        match=r"arm has no \[\[payload_mount\]\]; add one to robot.toml to attach 1.0 kg",
+    ):
         build_model(robot, 1.0)
 
 
@@ -169,19 +188,25 @@ def test_the_hash_changes_with_anything_that_changes_the_motion(tmp_path, change
     "xml",
     [
         FILES_XML.replace("<light", "<!-- a word --><light"),
-        FILES_XML.replace('<geom class="look"/>', '<geom class="look" pos="1 2 3"/><site name="s"/>'),
+        FILES_XML.replace(
+            '<geom class="look"/>', '<geom class="look" pos="1 2 3"/><site name="s"/>'
+        ),
         FILES_XML.replace('<geom class="look"/>', '<body name="cover"><geom class="look"/></body>'),
         FILES_XML.replace('rgba="0.5', 'rgba="0.1'),
         FILES_XML.replace('<light pos="0 0 1"/>', '<camera name="c"/>'),
         FILES_XML.replace("<sensor>", "<sensor><jointvel joint='elbow'/>"),
-        FILES_XML.replace('pos="0 0 0.21234567" euler="0 20 30"', 'euler="0 20 30" pos="0 0 0.21234567"'),
+        FILES_XML.replace(
+            'pos="0 0 0.21234567" euler="0 20 30"', 'euler="0 20 30" pos="0 0 0.21234567"'
+        ),
         FILES_XML.replace('quat="1 0.1 0.2 0.3"', 'quat="-2 -0.2 -0.4 -0.6"'),
         FILES_XML.replace('name="tool"', 'name="gripper"'),
     ],
 )
 def test_the_hash_ignores_looks_and_names(tmp_path, xml):
     assert xml != FILES_XML
-    assert vendor_hash(tmp_path / "arm", xml=xml) == vendor_hash(tmp_path / "elsewhere" / "with a space")
+    assert vendor_hash(tmp_path / "arm", xml=xml) == vendor_hash(
+        tmp_path / "elsewhere" / "with a space"
+    )
 
 
 def test_geoms_that_touch_count_where_contacts_are_on_and_only_there(tmp_path):
@@ -198,7 +223,9 @@ def test_geoms_that_touch_count_where_contacts_are_on_and_only_there(tmp_path):
 
 
 def test_a_model_in_degrees_moves_as_the_same_one_in_radians(tmp_path):
-    degrees = lambda m: 'range="' + " ".join(f"{np.degrees(float(x)):.12g}" for x in m[1].split()) + '"'  # noqa: E731
+    degrees = lambda m: (  # noqa: E731
+        'range="' + " ".join(f"{np.degrees(float(x)):.12g}" for x in m[1].split()) + '"'
+    )
     xml = re.sub(r'range="([^"]*)"', degrees, XML.replace('angle="radian"', 'angle="degree"'))
     assert xml != XML
     models = []
@@ -227,7 +254,11 @@ def test_h1_2_agrees_with_pinocchio(payload):
     rng = np.random.default_rng(0)
     model = build_model(robot, payload)
     low, high = robot.qpos_range.T
-    qpos, qvel, qacc = rng.uniform(low, high, (50, 27)), rng.normal(size=(50, 27)), 5 * rng.normal(size=(50, 27))
+    qpos, qvel, qacc = (
+        rng.uniform(low, high, (50, 27)),
+        rng.normal(size=(50, 27)),
+        5 * rng.normal(size=(50, 27)),
+    )
     ours = inverse_dynamics(model, qpos, qvel, qacc)
     theirs = np.empty_like(ours)
     data = other.createData()
@@ -250,7 +281,10 @@ def tipped(tmp_path):
 
 def test_nothing_touches_without_a_table(tipped):
     assert build_model(tipped).npair == 0
-    assert build_model(tipped).opt.disableflags == build_model(replace(tipped, tips=())).opt.disableflags
+    assert (
+        build_model(tipped).opt.disableflags
+        == build_model(replace(tipped, tips=())).opt.disableflags
+    )
 
 
 def test_the_tip_presses_into_the_table_by_force_over_stiffness(tipped):
@@ -261,7 +295,9 @@ def test_the_tip_presses_into_the_table_by_force_over_stiffness(tipped):
     mujoco.mj_step(model, data, 2000)
     force = np.zeros(6)
     mujoco.mj_contactForce(model, data, 0, force)
-    depth = -0.05 - (data.body("fore").xpos[2] + data.body("fore").xmat.reshape(3, 3)[2] @ [0.2, 0, 0] - 0.001)
+    depth = -0.05 - (
+        data.body("fore").xpos[2] + data.body("fore").xmat.reshape(3, 3)[2] @ [0.2, 0, 0] - 0.001
+    )
     assert force[0] > 5
     assert force[0] / depth == pytest.approx(3000.0, rel=0.1)
 
@@ -269,7 +305,9 @@ def test_the_tip_presses_into_the_table_by_force_over_stiffness(tipped):
 def test_a_batch_has_tables_of_its_own(tipped):
     sim = BatchSim(replace(tipped, table=Table(-0.05, 0.3, 3000.0)), [(0.0, "both", 0.02)] * 3, 1)
     heights = np.array([-0.05, -0.03, -9.0])
-    write_table(sim.batch, next(iter(sim.models.values())), heights, np.full(3, 0.3), np.full(3, 3000.0))
+    write_table(
+        sim.batch, next(iter(sim.models.values())), heights, np.full(3, 0.3), np.full(3, 3000.0)
+    )
     sim.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)))
     for _ in range(200):
         sim.step(np.full((3, 2), 0.3))
@@ -280,7 +318,10 @@ def test_a_batch_has_tables_of_its_own(tipped):
 
 
 def test_an_identified_table_is_saved_and_changes_the_simulator(tipped, tmp_path):
-    found = replace(tipped.with_servos({"elbow": {"stribeck": 0.1, "zero": 0.02}}), table=Table(-0.05, 0.3, 3000.0))
+    found = replace(
+        tipped.with_servos({"elbow": {"stribeck": 0.1, "zero": 0.02}}),
+        table=Table(-0.05, 0.3, 3000.0),
+    )
     save_robot(found, tmp_path / "found")
     again = load_robot(tmp_path / "found")
     assert again.table == found.table
@@ -293,7 +334,9 @@ def test_an_identified_table_is_saved_and_changes_the_simulator(tipped, tmp_path
 def test_a_table_that_nothing_may_touch_is_refused(tmp_path):
     with pytest.raises(RobotError, match=r"\[table\]: no \[\[tip\]\] can touch it"):
         write_arm(tmp_path / "arm", toml=TOML + "[table]\nheight = -0.05\n")
-    stranger = write_arm(tmp_path / "b", toml=TOML + TIP.replace("fore", "jaw") + "[table]\nheight = -0.05\n")
+    stranger = write_arm(
+        tmp_path / "b", toml=TOML + TIP.replace("fore", "jaw") + "[table]\nheight = -0.05\n"
+    )
     with pytest.raises(RobotError, match=r"a \[\[tip\]\] names body 'jaw', which is missing"):
         build_model(stranger)
 
@@ -302,11 +345,18 @@ def test_a_datasets_robot_has_the_gains_that_all_recordings_state(tmp_path):
     robot = write_arm(tmp_path / "arm")
     soft = robot.with_gains((15.0, 15.0), None)
     recorded = record(soft, commands(100, 1), "m")
-    recorded = replace(recorded, meta=replace(recorded.meta, kp=(15.0, 15.0), notes={"gains": "as recorded"}))
+    recorded = replace(
+        recorded, meta=replace(recorded.meta, kp=(15.0, 15.0), notes={"gains": "as recorded"})
+    )
     data = write_dataset(tmp_path / "data", robot, [recorded])
     assert dataset_robot(data).kp.tolist() == [15.0, 15.0]
-    for name, nominal, kp in (("with", soft, 15.0), ("before", robot, 20.0)):  # fitted with these gains, or without
+    for name, nominal, kp in (
+        ("with", soft, 15.0),
+        ("before", robot, 20.0),
+    ):  # fitted with these gains, or without
         save_robot(nominal.with_servos({"elbow": {"delay": 0.01}}), tmp_path / name)
         assert dataset_robot(data, tmp_path / name).kp.tolist() == [kp, kp]
-    data.append(replace(recorded.rows(slice(50)), meta=replace(recorded.meta, motion="n", kp=(9.0, 9.0))))
+    data.append(
+        replace(recorded.rows(slice(50)), meta=replace(recorded.meta, motion="n", kp=(9.0, 9.0)))
+    )
     assert dataset_robot(data).kp.tolist() == [20.0, 20.0]

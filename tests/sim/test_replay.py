@@ -17,7 +17,8 @@ def test_the_replay_of_the_nominal_robot_is_bit_identical(tmp_path):
     robot = write_arm(tmp_path)
     # Rows are stored as float32; a start that float32 holds exactly starts the replay exactly.
     sequences = [
-        record(robot, np.round(commands(rows, seed) * 256) / 256, f"m{seed}") for seed, rows in enumerate((60, 90))
+        record(robot, np.round(commands(rows, seed) * 256) / 256, f"m{seed}")
+        for seed, rows in enumerate((60, 90))
     ]
     for sequence, simulated in zip(sequences, replay(sequences, robot), strict=True):
         np.testing.assert_array_equal(sequence.qpos, simulated.qpos)
@@ -26,7 +27,10 @@ def test_the_replay_of_the_nominal_robot_is_bit_identical(tmp_path):
 
 def test_sequences_of_any_length_and_payload_run_side_by_side(tmp_path):
     robot = write_arm(tmp_path)
-    sequences = [record(robot, commands(rows, rows), f"m{rows}", payload=rows / 500) for rows in (40, 120, 80)]
+    sequences = [
+        record(robot, commands(rows, rows), f"m{rows}", payload=rows / 500)
+        for rows in (40, 120, 80)
+    ]
     together = replay(sequences, robot)
     for sequence, simulated in zip(sequences, together, strict=True):
         alone = replay([sequence], robot)[0]

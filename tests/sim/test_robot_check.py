@@ -11,7 +11,9 @@ from gaponet.robot.finding import Finding
 from gaponet.sim.robot_check import check_robot
 
 LIGHT = XML.replace('damping="0.5" armature="0.02" frictionloss="0.05"', "")
-STIFF = TOML.replace("kp = 20.0", "kp = 4000.0\nkd = 1.0").replace("effort_limit = 5.0", "effort_limit = 300.0")
+STIFF = TOML.replace("kp = 20.0", "kp = 4000.0\nkd = 1.0").replace(
+    "effort_limit = 5.0", "effort_limit = 300.0"
+)
 # The upper arm starts inside a pedestal that is fixed to the world, as links beside a base without its joint do.
 WELDED = XML.replace(' contype="0" conaffinity="0"', "").replace(
     '<body name="upper">', '<body name="base"><geom type="box" size="0.03 0.03 0.03" pos="0.02 0 0"/></body>'
@@ -36,7 +38,9 @@ def test_an_unstable_kp_is_an_error_and_each_suggested_cure_works(tmp_path):
     (text,) = said(findings, "step", "error")
     step = re.search(r"timestep = (\S+) in robot.toml", text)[1]
     armature = re.search(r"armature = (\S+) in robot.xml", text)[1]
-    shorter = write_arm(tmp_path / "shorter", STIFF.replace("timestep = 0.005", f"timestep = {step}"), LIGHT)
+    shorter = write_arm(
+        tmp_path / "shorter", STIFF.replace("timestep = 0.005", f"timestep = {step}"), LIGHT
+    )
     assert bad(check_robot(shorter)) == []
     heavier = LIGHT.replace("<joint name", f'<joint armature="{armature}" name')
     assert bad(check_robot(write_arm(tmp_path / "heavier", STIFF, heavier))) == []
@@ -57,13 +61,19 @@ def test_a_joint_too_weak_for_its_payload_is_a_warning_of_that_payload(arm):
 
 def test_links_inside_each_other_touch_by_choice_alone(tmp_path):
     off = write_arm(tmp_path / "off", TOML, WELDED)
-    assert said(check_robot(off), "contacts", "ok")[0].startswith("at home base and upper lie inside each other")
+    assert said(check_robot(off), "contacts", "ok")[0].startswith(
+        "at home base and upper lie inside each other"
+    )
     on = replace(off, contacts=True)
     (text,) = said(check_robot(on), "contacts", "warning")
     assert "contacts = false in robot.toml" in text
-    excluded = WELDED.replace("</mujoco>", '<contact><exclude body1="base" body2="upper"/></contact></mujoco>')
+    excluded = WELDED.replace(
+        "</mujoco>", '<contact><exclude body1="base" body2="upper"/></contact></mujoco>'
+    )
     assert not said(
-        check_robot(replace(write_arm(tmp_path / "x", TOML, excluded), contacts=True)), "contacts", "warning"
+        check_robot(replace(write_arm(tmp_path / "x", TOML, excluded), contacts=True)),
+        "contacts",
+        "warning",
     )
 
 

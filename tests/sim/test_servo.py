@@ -37,7 +37,9 @@ def test_friction_at_rest_exceeds_that_in_motion(arm):
 
 
 def test_a_loaded_motor_has_more_friction(tmp_path):
-    robot = servo_model(write_arm(tmp_path / "arm"), frictionloss=0.0, friction_motor=0.2, damping=3.0)
+    robot = servo_model(
+        write_arm(tmp_path / "arm"), frictionloss=0.0, friction_motor=0.2, damping=3.0
+    )
     sim = BatchSim(robot, [(0.0, "both", 0.02)] * 2, 1)
     home = np.zeros((2, 2))
     sim.reset(slice(None), home, home)
@@ -45,7 +47,9 @@ def test_a_loaded_motor_has_more_friction(tmp_path):
         sim.step(home)
     rest = sim.qpos[0].copy()
     held = -0.2 * 9.81 * 0.1  # N·m: the fore arm's weight
-    assert abs(sim.servo_model.torque[0, 1]) == pytest.approx(abs(held) / 1.2, rel=0.05)  # friction carries the rest
+    assert abs(sim.servo_model.torque[0, 1]) == pytest.approx(
+        abs(held) / 1.2, rel=0.05
+    )  # friction carries the rest
     # What friction may take there, it takes: a small push moves nothing.
     sim.batch.bind("qfrc_applied")[1] = [0.0, 0.2 * held]
     for _ in range(100):
@@ -77,7 +81,10 @@ def test_a_minimum_torque_overcomes_friction_at_small_errors(arm):
 
 
 def test_a_servo_model_of_zeros_is_bit_identical_to_none(arm):
-    sims = [BatchSim(arm, [(0.5, "both", 0.02)] * 3, 1, servo_model=with_model) for with_model in (False, True)]
+    sims = [
+        BatchSim(arm, [(0.5, "both", 0.02)] * 3, 1, servo_model=with_model)
+        for with_model in (False, True)
+    ]
     rng = np.random.default_rng(0)
     for sim in sims:
         sim.reset(slice(None), np.full((3, 2), 0.1), np.zeros((3, 2)))
@@ -89,7 +96,9 @@ def test_a_servo_model_of_zeros_is_bit_identical_to_none(arm):
 
 
 def test_a_restored_state_continues_identically(arm):
-    robot = servo_model(arm, stribeck=0.1, stribeck_speed=0.05, friction_motor=0.2, friction_external=0.1)
+    robot = servo_model(
+        arm, stribeck=0.1, stribeck_speed=0.05, friction_motor=0.2, friction_external=0.1
+    )
     sim = BatchSim(robot, [(0.5, "both", 0.02)] * 2, 1)
     sim.reset(slice(None), np.full((2, 2), 0.1), np.zeros((2, 2)))
     for _ in range(20):
@@ -106,8 +115,15 @@ def test_a_restored_state_continues_identically(arm):
 
 def test_compiled_and_array_servo_models_agree(arm):
     pytest.importorskip("numba")
-    terms = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "friction_external": 0.1}
-    robot = servo_model(arm, **terms, min_torque=0.03, encoder_step=0.002, no_load_speed=1.0, effort_limit=1.5)
+    terms = {
+        "stribeck": 0.1,
+        "stribeck_speed": 0.05,
+        "friction_motor": 0.2,
+        "friction_external": 0.1,
+    }
+    robot = servo_model(
+        arm, **terms, min_torque=0.03, encoder_step=0.002, no_load_speed=1.0, effort_limit=1.5
+    )
     sims = [BatchSim(robot, [(0.5, "both", 0.02)] * 3, 1) for _ in range(2)]
     for sim in sims:
         for x in sim.servo_model.values.values():
@@ -123,7 +139,13 @@ def test_compiled_and_array_servo_models_agree(arm):
 def test_a_torque_falls_with_speed_and_brakes_whole(arm):
     """Between ± effort_limit the motor is MuJoCo's own <dcmotor> behind a current controller."""
     kp, kd, limit, no_load, rows = 20.0, 0.5, 2.0, 2.0, 150
-    values = {"kp": kp, "effort_limit": limit, "no_load_speed": no_load, "damping": 0.1, "frictionloss": 0.0}
+    values = {
+        "kp": kp,
+        "effort_limit": limit,
+        "no_load_speed": no_load,
+        "damping": 0.1,
+        "frictionloss": 0.0,
+    }
     robot = replace(servo_model(arm, **values), kd=np.full(2, kd), timestep=0.0005)
     sim = BatchSim(robot, [(0.0, "both", 0.02)], 1)
     targets = np.repeat(np.random.default_rng(0).uniform(-1, 1, (rows // 30, 2)), 30, axis=0)
@@ -133,7 +155,9 @@ def test_a_torque_falls_with_speed_and_brakes_whole(arm):
     resistance = constant * volts / limit
     for servo in spec.actuators:
         gains = [kp, 0, kd, 0, 0, volts]
-        servo.set_to_dcmotor(motorconst=[constant, 0], resistance=resistance, controller=gains, ctrlspec=1)
+        servo.set_to_dcmotor(
+            motorconst=[constant, 0], resistance=resistance, controller=gains, ctrlspec=1
+        )
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[:], qpos, torque, qvel = targets[0], [], [], []
@@ -144,7 +168,9 @@ def test_a_torque_falls_with_speed_and_brakes_whole(arm):
         qpos.append(sim.qpos[0] - data.qpos)
         torque.append(sim.torque[0].copy())
         qvel.append(sim.qvel[0].copy())
-    assert np.abs(qpos).mean() < 2e-3  # rad; both step by half a millisecond, MuJoCo's back-EMF implicitly
+    assert (
+        np.abs(qpos).mean() < 2e-3
+    )  # rad; both step by half a millisecond, MuJoCo's back-EMF implicitly
     driving = np.sign(torque) * np.array(qvel) / no_load
     assert driving.max() > 0.3  # it is a matter of speed
     assert (np.abs(torque) <= limit * np.minimum(1, 1 - driving) + 0.05).all()

@@ -17,7 +17,14 @@ from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
-SERVO = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.2, "armature": 0.02, "offset": 0.0, "delay": 0.0}
+SERVO = {
+    "kp": 20.0,
+    "damping": 0.5,
+    "frictionloss": 0.2,
+    "armature": 0.02,
+    "offset": 0.0,
+    "delay": 0.0,
+}
 WARM = {"friction_per_kelvin": -0.02, "damping_per_kelvin": -0.005, "friction_temperature": 30.0}
 
 
@@ -31,7 +38,10 @@ def test_every_simulation_has_the_friction_of_the_recorded_temperature(tmp_path,
     robot = write_arm(tmp_path / "arm")
     (real,) = recordings(robot, 1, rows=150)
     both = dict.fromkeys(robot.joint_names, SERVO | WARM)
-    now = {"frictionloss": 0.2 * (1 - 0.02 * (celsius - 30)), "damping": 0.5 - 0.005 * (celsius - 30)}
+    now = {
+        "frictionloss": 0.2 * (1 - 0.02 * (celsius - 30)),
+        "damping": 0.5 - 0.005 * (celsius - 30),
+    }
     expected = replay([real], robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | now)))
     warm = at(real, celsius)
     (moved,) = replay([warm], robot.with_servos(both))
@@ -47,7 +57,9 @@ def test_every_simulation_has_the_friction_of_the_recorded_temperature(tmp_path,
 def test_a_simulation_without_temperature_is_at_the_reference(tmp_path):
     robot = write_arm(tmp_path / "arm")
     (real,) = recordings(robot, 1, rows=100)
-    made = [robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | more)) for more in (WARM, {})]
+    made = [
+        robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | more)) for more in (WARM, {})
+    ]
     (one,), (other,) = (replay([real], r) for r in made)
     np.testing.assert_array_equal(one.qpos, other.qpos)
     assert model_hash(made[0]) != model_hash(made[1])  # stored replays of one are not the other's
@@ -69,8 +81,14 @@ def test_the_term_is_in_the_robot_folder(tmp_path):
 def test_the_term_is_tried_where_the_temperature_varies_and_no_gain_with_it(tmp_path):
     robot = write_arm(tmp_path / "arm")
     cold, hot = recordings(robot, 1, rows=60), (25.0, 28.0, 36.0, 39.0)
-    mixed = [at(cold[0], t, kp=(k, k), kd=(0.0, 0.0)) for t, k in zip(hot, (5.0, 9.0, 5.0, 9.0), strict=True)]
-    rising = [at(cold[0], t, kp=(k, k), kd=(0.0, 0.0)) for t, k in zip(hot, (5.0, 5.0, 9.0, 9.0), strict=True)]
+    mixed = [
+        at(cold[0], t, kp=(k, k), kd=(0.0, 0.0))
+        for t, k in zip(hot, (5.0, 9.0, 5.0, 9.0), strict=True)
+    ]
+    rising = [
+        at(cold[0], t, kp=(k, k), kd=(0.0, 0.0))
+        for t, k in zip(hot, (5.0, 5.0, 9.0, 9.0), strict=True)
+    ]
     assert temperature_varies(mixed, robot).all()
     assert "temperature" in default_terms(mixed, robot)
     for recorded in (rising, [at(cold[0], 25.0), at(cold[0], 26.0)], [at(cold[0], 25.0), cold[0]]):
@@ -78,7 +96,9 @@ def test_the_term_is_tried_where_the_temperature_varies_and_no_gain_with_it(tmp_
     assert "temperature" not in default_terms(rising, robot)
     std = {joint: {"friction_per_kelvin": 0.002} for joint in robot.operated}
     assert temperature_findings(mixed, robot, std) == ()
-    assert all("varies with gains or payload" in s for s in temperature_findings(rising, robot, std))
+    assert all(
+        "varies with gains or payload" in s for s in temperature_findings(rising, robot, std)
+    )
     warm = robot.with_servos({robot.operated[0]: SERVO | WARM})
     (sentence,) = temperature_findings(mixed, warm, std)
     assert "friction falls by 2.00 ± 0.20 % per K, recorded at 25 to 39 °C" in sentence

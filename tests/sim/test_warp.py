@@ -115,13 +115,18 @@ def test_some_simulations_step_alone_and_a_state_is_restored(tmp_path, rates):
 def test_the_servo_model_agrees_with_mujoco(tmp_path, rates, delay):
     law = {"stribeck": 0.05, "stribeck_speed": 0.2, "friction_motor": 0.1, "friction_external": 0.1}
     law["no_load_speed"] = 1.0
-    robot = replace(write_arm(tmp_path), delay=[delay, 0.0], encoder_step=1e-3, min_torque=0.02, **law)
+    robot = replace(
+        write_arm(tmp_path), delay=[delay, 0.0], encoder_step=1e-3, min_torque=0.02, **law
+    )
     robot = robot.with_servos({"elbow": {"offset": 0.1}})
     ours = BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1)
     for x in ours.servo_model.values.values():
         x *= np.array([[1.0], [0.5], [2.0]])
     theirs, apart, still = WarpSim(ours, DEVICE), 0.0, 0.0
-    plain = BatchSim(replace(robot, encoder_step=0.0, min_torque=0.0, **dict.fromkeys(law, 0.0)), [(0.0, "both", 0.02)])
+    plain = BatchSim(
+        replace(robot, encoder_step=0.0, min_torque=0.0, **dict.fromkeys(law, 0.0)),
+        [(0.0, "both", 0.02)],
+    )
     at = np.full((3, 2), 0.3)
 
     def put(ids):
@@ -145,7 +150,9 @@ def test_the_servo_model_agrees_with_mujoco(tmp_path, rates, delay):
         assert theirs.state()[name].shape == x.shape
 
 
-@pytest.mark.parametrize("parts", [("stribeck", "stribeck_speed"), ("encoder_step",), ("no_load_speed",), SERVO_TERMS])
+@pytest.mark.parametrize(
+    "parts", [("stribeck", "stribeck_speed"), ("encoder_step",), ("no_load_speed",), SERVO_TERMS]
+)
 def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp_path, parts):
     law = dict(zip(SERVO_TERMS, (0.05, 0.2, 0.1, 0.2, 0.02, 1e-3, 1.0, 0.0), strict=True))
     robot = replace(write_arm(tmp_path), timestep=0.02, **{name: law[name] for name in parts})
@@ -168,5 +175,7 @@ def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp
         ours.servo_model.before()
         theirs.step(target)
         for name in ("actuator_biasprm", "dof_frictionloss", "actuator_forcerange"):
-            np.testing.assert_allclose(getattr(model, name).numpy(), ours.batch.expanded(name), rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(
+                getattr(model, name).numpy(), ours.batch.expanded(name), rtol=1e-5, atol=1e-5
+            )
         ours.set_state({name: x.cpu().numpy() for name, x in theirs.state().items()})

@@ -14,7 +14,14 @@ from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.problem import JointFit
 
 WIDTH = 0.008
-SERVO = {"kp": 3.0, "damping": 0.08, "frictionloss": 0.015, "armature": 2e-3, "offset": 0.0, "delay": 0.0}
+SERVO = {
+    "kp": 3.0,
+    "damping": 0.08,
+    "frictionloss": 0.015,
+    "armature": 2e-3,
+    "offset": 0.0,
+    "delay": 0.0,
+}
 TOML = 'name = "disc"\ndt = 0.01\ntimestep = 0.0025\n[[joint]]\nname = "turn"\nkp = 3.0\neffort_limit = 50.0\n'
 XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="turn" axis="0 0 1" armature="0.002"
   damping="0.08" frictionloss="0.015"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.01" mass="0.15"
@@ -27,15 +34,23 @@ def fitted(folder, width):
     meta, rng = SequenceMeta(robot.name, "a", "m", 0.0, virtual=True), np.random.default_rng(0)
     parts = []
     for number in range(3):
-        ctrl = sum(0.12 * np.sin(2 * np.pi * f * t + p) for f, p in rng.uniform((0.3, 0), (2.0, 6), (3, 2)))
-        asked = Sequence(replace(meta, motion=f"m{number}"), robot.joint_names, 0.01, ctrl, ctrl, 0.0 * ctrl)
+        ctrl = sum(
+            0.12 * np.sin(2 * np.pi * f * t + p) for f, p in rng.uniform((0.3, 0), (2.0, 6), (3, 2))
+        )
+        asked = Sequence(
+            replace(meta, motion=f"m{number}"), robot.joint_names, 0.01, ctrl, ctrl, 0.0 * ctrl
+        )
         (moved,) = replay([asked], robot.with_servos({"turn": SERVO | {"backlash": width}}))
         noisy = moved.qpos + 2e-4 * rng.standard_normal(moved.qpos.shape)
         parts.append(replace(asked, qpos=noisy, qvel=moved.qvel))
     fit = JointFit(JointRollouts(parts, robot, nthread=1), robot, Bounds(robot, parts))
     without = fit.search((), {f: np.full(1, v) for f, v in SERVO.items()})
     fit.prior.update_correlation_time(fit.rollouts, without)
-    return fit, without, fit.search(("backlash",), without | {"backlash": fit.bounds.guess["backlash"]})
+    return (
+        fit,
+        without,
+        fit.search(("backlash",), without | {"backlash": fit.bounds.guess["backlash"]}),
+    )
 
 
 def test_a_gap_is_found_and_probable(tmp_path):
@@ -44,7 +59,9 @@ def test_a_gap_is_found_and_probable(tmp_path):
     assert values["backlash"] == pytest.approx(WIDTH, rel=0.2)
     chance = backlash.probability(fit, without, values)
     assert chance > 0.99
-    (sentence,) = backlash.findings(("turn",), values["backlash"], chance, {"turn": {"backlash": 5e-4}})
+    (sentence,) = backlash.findings(
+        ("turn",), values["backlash"], chance, {"turn": {"backlash": 5e-4}}
+    )
     assert sentence.startswith("turn: backlash ")
     assert sentence.endswith("mrad (probability above 0.99)")
 

@@ -22,7 +22,9 @@ from gaponet.sysid.robot_rollouts import cut
 def found(tmp_path_factory):
     """A file that claims twice the damping that the servo has, as kd."""
     sequences = recordings(write_arm(tmp_path_factory.mktemp("real")), 4, rows=160, kp=0.6, delay=2)
-    robot = write_arm(tmp_path_factory.mktemp("arm"), TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.5"))
+    robot = write_arm(
+        tmp_path_factory.mktemp("arm"), TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.5")
+    )
     return robot, identify(sequences, robot, windows=4)
 
 
@@ -59,15 +61,22 @@ def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
 def test_terms_of_the_robot_are_part_of_the_start(tmp_path):
     robot = write_arm(tmp_path)
     logs = recordings(robot, 3, rows=100)
-    begun = robot.with_servos({j: {"stribeck": 0.05, "stribeck_speed": 0.1} for j in robot.operated})
+    begun = robot.with_servos(
+        {j: {"stribeck": 0.05, "stribeck_speed": 0.1} for j in robot.operated}
+    )
     warm = robot.with_servos({j: {"friction_per_kelvin": -0.01} for j in robot.operated})
     for start in (begun, warm):
-        assert identify(logs, start, windows=2, terms=(), budget=1e-6).robot.joint_names == robot.joint_names
+        assert (
+            identify(logs, start, windows=2, terms=(), budget=1e-6).robot.joint_names
+            == robot.joint_names
+        )
 
 
 def test_no_term_is_tried_after_the_time_limit(tmp_path):
     robot = write_arm(tmp_path)
-    fit = identify(recordings(robot, 3, rows=100), robot, windows=2, terms=("stribeck", "load"), budget=1e-6)
+    fit = identify(
+        recordings(robot, 3, rows=100), robot, windows=2, terms=("stribeck", "load"), budget=1e-6
+    )
     assert fit.comparisons == ()
     assert any("the time was over before stribeck, load" in w for w in fit.warnings)
 
@@ -102,11 +111,16 @@ def test_a_soft_joint_that_sticks_has_no_stop(tmp_path):
     ctrl = np.zeros_like(s.ctrl)
     ctrl[:, 0] = 0.9 * np.sin(np.linspace(0, 6 * np.pi, len(ctrl)))
     qpos = np.zeros_like(ctrl)
-    for t in range(1, len(ctrl)):  # a spring to the command that is as soft as friction is strong: 0.4 rad of play
+    for t in range(
+        1, len(ctrl)
+    ):  # a spring to the command that is as soft as friction is strong: 0.4 rad of play
         qpos[t, 0] = np.clip(qpos[t - 1, 0], ctrl[t, 0] - 0.4, ctrl[t, 0] + 0.4)
     pressed = (ctrl[:, 0] > qpos[:, 0].max() + 0.1) & (qpos[:, 0] > qpos[:, 0].max() - 0.005)
     assert pressed.sum() >= 50  # as long as against a stop
-    assert with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))]).qpos_range[0, 1] == 1.5
+    assert (
+        with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))]).qpos_range[0, 1]
+        == 1.5
+    )
 
 
 def test_packing_by_kinematic_chain_is_undone():
@@ -120,9 +134,13 @@ def test_packing_by_kinematic_chain_is_undone():
 
 def test_cross_validation_ignores_one_short_motion_without_information(tmp_path):
     robot = write_arm(tmp_path)
-    logs, still = recordings(robot, 4, rows=150, kp=0.6), [record(robot, commands(10, 4), "still", kp=1.0)]
+    logs, still = (
+        recordings(robot, 4, rows=150, kp=0.6),
+        [record(robot, commands(10, 4), "still", kp=1.0)],
+    )
     alone, folds = (
-        identify(logs, robot, still, windows=4, terms=(), table=False, folds=count).chosen for count in (1, 3)
+        identify(logs, robot, still, windows=4, terms=(), table=False, folds=count).chosen
+        for count in (1, 3)
     )
     assert (alone, folds) == ("given", "limbs")
 
@@ -131,11 +149,15 @@ def test_folds_share_no_motion_and_a_set_of_joints_with_one_motion_is_always_fit
     logs = recordings(arm, 5)
     logs[4] = replace(logs[4], meta=replace(logs[4].meta, notes={"held_at_home": ("elbow",)}))
     folds = cross_validation(logs[:3], logs[3:], 3)
-    assert sorted(s.meta.motion for _, out in folds for s in out) == sorted(s.meta.motion for s in logs[:4])
+    assert sorted(s.meta.motion for _, out in folds for s in out) == sorted(
+        s.meta.motion for s in logs[:4]
+    )
     for train, out in folds:
         assert not {s.meta.motion for s in train} & {s.meta.motion for s in out}
         assert logs[4] in train
-    assert cross_validation(logs[:1], logs[1:4], 3) == [(logs[:1], logs[1:4])]  # three motions validate
+    assert cross_validation(logs[:1], logs[1:4], 3) == [
+        (logs[:1], logs[1:4])
+    ]  # three motions validate
 
 
 @pytest.mark.parametrize(
@@ -167,7 +189,12 @@ def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
 
 def test_pieces_of_one_recording_are_one_motion(arm):
     logs = [
-        replace(s, meta=replace(s.meta, motion=f"m{i // 2}@{4 * (i % 2)}s", notes={"from_s": 4.0 * (i % 2)}))
+        replace(
+            s,
+            meta=replace(
+                s.meta, motion=f"m{i // 2}@{4 * (i % 2)}s", notes={"from_s": 4.0 * (i % 2)}
+            ),
+        )
         for i, s in enumerate(recordings(arm, 10, rows=40))
     ]
     for train, held_out in cross_validation(logs[:8], logs[8:], 3):
@@ -177,7 +204,10 @@ def test_pieces_of_one_recording_are_one_motion(arm):
 
 def test_a_joint_takes_a_fit_only_if_its_own_motions_accept_it():
     """Payloads of one motion are one vote: the first joint follows one motion of three better, with both payloads."""
-    errors = {1.0: np.full((4, 2), 10.0), 2.0: np.array([[4.0, 8.0], [4.0, 8.1], [11.0, 7.9], [11.5, 8.2]])}
+    errors = {
+        1.0: np.full((4, 2), 10.0),
+        2.0: np.array([[4.0, 8.0], [4.0, 8.1], [11.0, 7.9], [11.5, 8.2]]),
+    }
 
     class Payloads(Judge):
         names = np.array(["a", "a", "b", "c"])

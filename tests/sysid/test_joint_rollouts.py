@@ -16,7 +16,14 @@ from gaponet.sysid import joint_rollouts
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
 
-FIRST = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.0}
+FIRST = {
+    "kp": 20.0,
+    "damping": 0.5,
+    "frictionloss": 0.05,
+    "armature": 0.02,
+    "offset": 0.0,
+    "delay": 0.0,
+}
 
 
 @pytest.mark.parametrize(
@@ -48,14 +55,19 @@ def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
     assert np.abs(alone - company).mean() < 0.1 * np.abs(company).mean()
     assert set(changed) <= {*FIRST, *SERVO_TERMS, "effort_limit"}
     if joint_rollouts.advance is not None:
-        np.testing.assert_allclose(runs._arrays(values)[0, :, 0].T * runs.counted[0][:, None], alone, atol=2e-4)
+        np.testing.assert_allclose(
+            runs._arrays(values)[0, :, 0].T * runs.counted[0][:, None], alone, atol=2e-4
+        )
 
 
 def test_candidates_do_not_affect_each_other(tmp_path):
     robot = write_arm(tmp_path)
     runs = JointRollouts(recordings(robot, 2, rows=60, kp=0.7), robot)
     law = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "min_torque": 0.1}
-    values = {f: v * np.linspace(0.5, 1.5, 6).reshape(3, 2) for f, v in (FIRST | {"delay": 0.013} | law).items()}
+    values = {
+        f: v * np.linspace(0.5, 1.5, 6).reshape(3, 2)
+        for f, v in (FIRST | {"delay": 0.013} | law).items()
+    }
     alone = [runs.errors({f: v[i : i + 1] for f, v in values.items()})[0] for i in range(3)]
     np.testing.assert_array_equal(runs.errors(values), alone)
 
@@ -65,7 +77,10 @@ def test_recordings_at_several_gains_have_one_servo(tmp_path):
     told = []
     for kp in (8.0, 40.0):  # of a motor that makes 0.8 of what its gains say
         set_to = robot.with_gains((kp, kp), None)
-        motor = {joint: {"kp": v} for joint, v in zip(robot.joint_names, (0.8 * kp, 0.8 * kp), strict=True)}
+        motor = {
+            joint: {"kp": v}
+            for joint, v in zip(robot.joint_names, (0.8 * kp, 0.8 * kp), strict=True)
+        }
         made = recordings(set_to.with_servos(motor), 1, rows=200)[0]
         told.append(replace(made, meta=replace(made.meta, kp=(kp, kp), kd=(0.0, 0.0))))
     values = {f: np.full((1, 2), v) for f, v in (FIRST | {"kp": 0.8 * 20.0}).items()}
@@ -83,7 +98,9 @@ def test_unrecorded_joints_stand_still_and_are_not_counted(tmp_path):
         qpos[:, 0], ctrl[:, 0], qvel[:, 0] = 0.4, 0.4, 0.0
         meta = replace(real.meta, notes=real.meta.notes | {"posture": {robot.joint_names[0]: 0.4}})
         whole = replace(real, meta=meta, qpos=qpos, ctrl=ctrl, qvel=qvel)
-        (moved,) = replay([whole], robot.with_servos({robot.joint_names[1]: {"kp": 0.7 * robot.kp[1]}}))
+        (moved,) = replay(
+            [whole], robot.with_servos({robot.joint_names[1]: {"kp": 0.7 * robot.kp[1]}})
+        )
         assert np.array_equal(moved.qpos[:, 0], np.full(250, np.float32(0.4)))
         seen = replace(whole, qpos=moved.qpos, qvel=moved.qvel)
         windows += [seen.rows(slice(a, a + 50)) for a in range(0, 250, 50)]
@@ -94,7 +111,9 @@ def test_unrecorded_joints_stand_still_and_are_not_counted(tmp_path):
     total = summary(runs(windows, [t.qpos for t in replay(windows, robot)], robot), robot)
     assert total["mpjae"] == total["by_joint"][robot.joint_names[1]]["mpjae"]
     assert list(total["by_joint"]) == [robot.joint_names[1]]
-    assert verdict({"nominal": total})[0].endswith(f"most at {robot.joint_names[1]} ({1e3 * total['mpjae']:.2f}).")
+    assert verdict({"nominal": total})[0].endswith(
+        f"most at {robot.joint_names[1]} ({1e3 * total['mpjae']:.2f})."
+    )
 
 
 def test_a_single_joint_rollout_stays_within_the_joints_range():
@@ -117,18 +136,26 @@ def test_a_single_joint_rollout_stays_within_the_joints_range():
 def test_windows_of_several_control_rates_are_fitted_together(tmp_path):
     """Two seconds of one servo, recorded at 50, at 100 and at 400 Hz: its numbers explain all of them."""
     robot = write_arm(tmp_path)
-    acting = robot.with_servos({j: FIRST | {"kp": 14.0, "delay": 0.03, "damping": 0.8} for j in robot.joint_names})
+    acting = robot.with_servos(
+        {j: FIRST | {"kp": 14.0, "delay": 0.03, "damping": 0.8} for j in robot.joint_names}
+    )
     template, parts = recordings(robot, 1)[0], []
     for motion, dt in enumerate([0.02, 0.01, 0.01, 0.0025]):
         rows = round(2 / dt)
         ctrl = commands(rows, motion, dt)
-        asked = Sequence(template.meta, robot.joint_names, dt, ctrl, np.tile(ctrl[0], (rows, 1)), 0 * ctrl)
+        asked = Sequence(
+            template.meta, robot.joint_names, dt, ctrl, np.tile(ctrl[0], (rows, 1)), 0 * ctrl
+        )
         (simulated,) = replay([asked], acting)
         parts.append(replace(asked, qpos=simulated.qpos, qvel=simulated.qvel))
     runs = JointRollouts(parts, robot)
     values = {f: np.array([getattr(acting, f)]) for f in FIRST}
-    first = np.abs(runs.errors({f: np.full((1, 2), v) for f, v in FIRST.items()})).mean(axis=(0, 1, 3))
+    first = np.abs(runs.errors({f: np.full((1, 2), v) for f, v in FIRST.items()})).mean(
+        axis=(0, 1, 3)
+    )
     assert (np.abs(runs.errors(values)).mean(axis=(0, 1, 3)) < 0.1 * first).all()
     np.testing.assert_allclose(runs._arrays(values) * runs.counted, runs.errors(values), atol=2e-4)
-    np.testing.assert_allclose(runs.counted.sum(axis=1), [95, 190, 190, 190], atol=5)  # no row in less than 10 ms
+    np.testing.assert_allclose(
+        runs.counted.sum(axis=1), [95, 190, 190, 190], atol=5
+    )  # no row in less than 10 ms
     np.testing.assert_allclose(runs.regressed()["kp"], 14.0, rtol=0.35)  # where a search starts

@@ -39,7 +39,9 @@ def test_several_starts_find_the_deeper_minimum():
 
 def test_a_bounded_step_solves_the_free_parameters_again():
     normal = np.array([[2.0, 1.0], [1.0, 2.0]])
-    found = step(normal, np.array([-4.0, 0.0]), np.array([-9.0, -9.0]), np.array([1.0, 9.0]), np.array(0.0))
+    found = step(
+        normal, np.array([-4.0, 0.0]), np.array([-9.0, -9.0]), np.array([1.0, 9.0]), np.array(0.0)
+    )
     assert found == pytest.approx([1.0, -0.5], abs=1e-6)
 
 

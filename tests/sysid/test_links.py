@@ -39,7 +39,9 @@ def heavy(robot, factor):
     return replace(robot, links=axes.links(x), nominal=robot)
 
 
-def test_links_are_physical_whatever_their_coordinates_and_bodies_that_are_welded_move_as_one(robot):
+def test_links_are_physical_whatever_their_coordinates_and_bodies_that_are_welded_move_as_one(
+    robot,
+):
     axes, rng = LinkAxes(robot), np.random.default_rng(0)
     assert axes.names == ["upper", "fore"]
     assert axes.links(np.zeros(2 * COORDINATES)) == {}
@@ -50,7 +52,9 @@ def test_links_are_physical_whatever_their_coordinates_and_bodies_that_are_welde
         assert (a + b >= c).all()
     x = np.r_[np.zeros(COORDINATES), rng.normal(0, 2, COORDINATES)]
     before, now = (build_model(replace(robot, links=axes.links(one))) for one in (0 * x, x))
-    np.testing.assert_allclose(now.body_mass[2:4] / before.body_mass[2:4], np.exp(2 * x[10] * axes.scale[1, 0]))
+    np.testing.assert_allclose(
+        now.body_mass[2:4] / before.body_mass[2:4], np.exp(2 * x[10] * axes.scale[1, 0])
+    )
     assert axes.moments(x)[1, 0] == pytest.approx(now.body_mass[2:4].sum())
 
 
@@ -62,7 +66,9 @@ def test_a_compiled_model_with_other_links_is_the_model_that_is_compiled_with_th
         for field in sorted(MODEL_FIELDS - {"body_iquat"}):
             value = getattr(two, field, None)
             if isinstance(value, np.ndarray):
-                np.testing.assert_allclose(getattr(one, field), value, rtol=1e-6, atol=1e-9, err_msg=field)
+                np.testing.assert_allclose(
+                    getattr(one, field), value, rtol=1e-6, atol=1e-9, err_msg=field
+                )
 
 
 def test_a_robot_folder_has_its_links_and_the_robot_before_them(robot, tmp_path):
@@ -71,15 +77,25 @@ def test_a_robot_folder_has_its_links_and_the_robot_before_them(robot, tmp_path)
     loaded = load_robot(tmp_path / "out")
     assert loaded.links == other.links
     assert set(loaded.links) == {"fore", "plate"}
-    assert model_hash(loaded) == model_hash(other) != model_hash(robot) == model_hash(loaded.before_identification)
-    with pytest.raises(RobotError, match=r"an \[identified_link\] names body 'hand', which is missing"):
+    assert (
+        model_hash(loaded)
+        == model_hash(other)
+        != model_hash(robot)
+        == model_hash(loaded.before_identification)
+    )
+    with pytest.raises(
+        RobotError, match=r"an \[identified_link\] names body 'hand', which is missing"
+    ):
         build_model(replace(robot, links={"hand": Link(1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))}))
 
 
 def recorded(robot, count, rows=100, payloads=(0.0, 0.2), first=0):
     """Motions of a robot whose servos are a tenth stiffer."""
     payload = [payloads[i % len(payloads)] for i in range(count)]
-    return [record(robot, commands(rows, first + i), f"m{first + i}", p, kp=1.1) for i, p in enumerate(payload)]
+    return [
+        record(robot, commands(rows, first + i), f"m{first + i}", p, kp=1.1)
+        for i, p in enumerate(payload)
+    ]
 
 
 def link_fit(robot, train, torque_kp=None, residual=0.01):
@@ -97,7 +113,9 @@ def test_recordings_show_a_heavy_link_by_its_moment_and_the_error_falls(robot):
     assert 1 <= fit.directions.shape[1] <= 6  # of 20: a planar arm shows few
     result = fit.descend(lambda cost: None)
     errors = [
-        np.abs(fit.whole.rollouts.flat_errors({f: v[None] for f, v in result.values.items()}, [one])).mean()
+        np.abs(
+            fit.whole.rollouts.flat_errors({f: v[None] for f, v in result.values.items()}, [one])
+        ).mean()
         for one in ({}, fit.axes.links(result.x))
     ]
     assert errors[1] < 0.3 * errors[0]
@@ -112,7 +130,10 @@ def test_a_gain_from_torque_separates_masses_from_gains_without_a_second_payload
     train, all_masses = recorded(robot, 3, payloads=(0.0,)), np.zeros(2 * COORDINATES)
     all_masses[[0, COORDINATES]] = np.sqrt(0.5)
     torque = dict.fromkeys(robot.operated, (22.0, 0.1))
-    shares = [np.linalg.norm(all_masses @ link_fit(robot, train, kp, 1e-4).directions) for kp in ({}, torque)]
+    shares = [
+        np.linalg.norm(all_masses @ link_fit(robot, train, kp, 1e-4).directions)
+        for kp in ({}, torque)
+    ]
     assert shares[0] < 0.4
     assert shares[1] > 0.8
 
@@ -129,12 +150,16 @@ def test_a_centre_of_mass_is_no_surer_than_the_zeros_of_the_encoders(robot, monk
 
 @pytest.mark.parametrize("factor", [1.0, 1.6])
 def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monkeypatch, factor):
-    servos = lambda self, *args, **options: self.bounds.first | {"kp": 1.1 * self.bounds.first["kp"]}  # noqa: E731
+    servos = lambda self, *args, **options: (  # noqa: E731
+        self.bounds.first | {"kp": 1.1 * self.bounds.first["kp"]}
+    )
     monkeypatch.setattr(JointFit, "search", servos)
     monkeypatch.setattr("gaponet.sysid.problem.CHAIN_ITERATIONS", 1)
     true = heavy(robot, factor) if factor != 1 else robot
     train, judges = recorded(true, 4, 200), recorded(true, 3, 200, first=50)
-    fitted = identify(train, robot, judges, windows=4, terms=(), table=False, nthread=1, masses=True)
+    fitted = identify(
+        train, robot, judges, windows=4, terms=(), table=False, nthread=1, masses=True
+    )
     comparison = fitted.comparisons[-1]
     assert comparison.name == "masses"
     assert comparison.accepted == (factor > 1) == bool(fitted.robot.links)
@@ -151,4 +176,6 @@ def test_where_masses_and_gains_are_known_together_gains_follow_masses(robot):
     slopes = fit.servo_slopes(replace(result, x=0 * result.x))
     np.testing.assert_allclose(slopes["kp"] @ masses.ravel(), np.log(1.2), rtol=0.15)
     kd_over_kp = robot.kd / result.values["kp"]
-    np.testing.assert_allclose(slopes["damping"] @ masses.ravel(), kd_over_kp * np.log(1.2), rtol=0.5, atol=2e-3)
+    np.testing.assert_allclose(
+        slopes["damping"] @ masses.ravel(), kd_over_kp * np.log(1.2), rtol=0.5, atol=2e-3
+    )

@@ -21,7 +21,16 @@ def recorded(robot, count=6, rows=400):
         ctrl = 1.5 * commands(rows, i)
         ctrl[: rows // 2] = np.repeat(rng.uniform(-1, 1, (4, 2)), rows // 8, axis=0)
         start = np.tile(ctrl[0], (rows, 1))
-        made.append(Sequence(SequenceMeta("arm", "a", f"m{i}", 0.0), robot.joint_names, 0.02, ctrl, start, 0 * start))
+        made.append(
+            Sequence(
+                SequenceMeta("arm", "a", f"m{i}", 0.0),
+                robot.joint_names,
+                0.02,
+                ctrl,
+                start,
+                0 * start,
+            )
+        )
     return [
         replace(s, qpos=t.qpos + rng.normal(0, 1e-4, t.qpos.shape).astype(np.float32), qvel=t.qvel)
         for s, t in zip(made, replay(made, robot), strict=True)
@@ -30,13 +39,18 @@ def recorded(robot, count=6, rows=400):
 
 @pytest.fixture
 def servos():
-    return {j: {"kp": 14.0, "delay": 0.02, "damping": 0.8, "armature": 0.02} for j in ("shoulder", "elbow")}
+    return {
+        j: {"kp": 14.0, "delay": 0.02, "damping": 0.8, "armature": 0.02}
+        for j in ("shoulder", "elbow")
+    }
 
 
 def test_the_speed_of_a_ramp_is_estimated_from_recordings(tmp_path, servos):
     robot = write_arm(tmp_path)
     servos["elbow"]["target_speed"] = 0.7
-    assert target_speeds(recorded(robot.with_servos(servos)), robot) == pytest.approx([0.0, 0.7], rel=0.04)
+    assert target_speeds(recorded(robot.with_servos(servos)), robot) == pytest.approx(
+        [0.0, 0.7], rel=0.04
+    )
 
 
 @pytest.mark.parametrize("wrong", [{"damping": 4.0}, {"frictionloss": 0.6}])
@@ -50,7 +64,9 @@ def test_identification_finds_a_ramp_and_warns(tmp_path, servos):
     robot = write_arm(tmp_path)
     servos["shoulder"]["target_speed"] = 0.6
     logs = recorded(robot.with_servos(servos), 5, rows=240)
-    found = identify(logs[:3], robot, logs[3:], windows=3, terms=(), table=False, nthread=1, folds=1)
+    found = identify(
+        logs[:3], robot, logs[3:], windows=3, terms=(), table=False, nthread=1, folds=1
+    )
     assert found.robot.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
     assert found.after < 0.1 * found.before
     assert found.comparisons[-1].name == "ramp"
@@ -58,7 +74,9 @@ def test_identification_finds_a_ramp_and_warns(tmp_path, servos):
     assert found.robot.before_identification.target_speed.max() == 0
 
 
-@pytest.mark.parametrize(("limit", "terms"), [(3.0, ("limit", "speed", *DEFAULT_TERMS)), (50.0, DEFAULT_TERMS)])
+@pytest.mark.parametrize(
+    ("limit", "terms"), [(3.0, ("limit", "speed", *DEFAULT_TERMS)), (50.0, DEFAULT_TERMS)]
+)
 def test_a_torque_limit_is_fitted_where_recordings_reach_it(tmp_path, servos, limit, terms):
     logs = recorded(write_arm(tmp_path).with_servos(servos), 3, rows=240)
     limits = {j: {"effort_limit": limit} for j in servos}
@@ -69,6 +87,11 @@ def test_single_joint_rollouts_follow_ramps(tmp_path, servos):
     servos["shoulder"]["target_speed"] = 0.6
     robot = write_arm(tmp_path).with_servos(servos)
     runs = JointRollouts(recorded(robot), robot, nthread=1)
-    values = {f: np.array([[s[f] for s in servos.values()]]) for f in ("kp", "delay", "damping", "armature")}
-    errors = runs.errors(values | {"offset": np.zeros((1, 2)), "frictionloss": np.full((1, 2), 0.05)})
+    values = {
+        f: np.array([[s[f] for s in servos.values()]])
+        for f in ("kp", "delay", "damping", "armature")
+    }
+    errors = runs.errors(
+        values | {"offset": np.zeros((1, 2)), "frictionloss": np.full((1, 2), 0.05)}
+    )
     assert np.abs(errors).mean() < 1e-3

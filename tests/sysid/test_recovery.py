@@ -16,7 +16,14 @@ from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms
 from gaponet.sysid.problem import JointFit, standard_errors
 
-SERVO = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.06, "offset": 0.0, "delay": 0.0}
+SERVO = {
+    "kp": 20.0,
+    "damping": 0.5,
+    "frictionloss": 0.05,
+    "armature": 0.06,
+    "offset": 0.0,
+    "delay": 0.0,
+}
 
 
 def played(robot, acting, count, rows):
@@ -39,7 +46,9 @@ def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
     robot = write_arm(tmp_path / "arm")
     parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
     fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
-    start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.bounds.guess[f] for f in SERVO_TERMS if f in law}
+    start = {f: np.full(2, v) for f, v in SERVO.items()} | {
+        f: fit.bounds.guess[f] for f in SERVO_TERMS if f in law
+    }
     found = fit.search(tuple(law), start)
     assert set(CLASSIC) < set(found)
     std = standard_errors(fit, found).std
@@ -59,17 +68,28 @@ def test_a_torque_speed_line_is_recovered_and_none_is_seen_where_none_is(tmp_pat
     parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replays, strict=True)]
     assert "speed" in default_terms(parts, robot)
     fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
-    start = {f: np.full(2, v) for f, v in SERVO.items()} | {"no_load_speed": fit.bounds.guess["no_load_speed"]}
+    start = {f: np.full(2, v) for f, v in SERVO.items()} | {
+        "no_load_speed": fit.bounds.guess["no_load_speed"]
+    }
     found = fit.search(("no_load_speed",), start)
     np.testing.assert_allclose(fit.bounds.visible("no_load_speed", found), no_load, rtol=0.1)
 
 
 def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):
-    robot, template = write_arm(tmp_path / "arm"), recordings(write_arm(tmp_path / "arm"), 1, rows=80)[0]
+    robot, template = (
+        write_arm(tmp_path / "arm"),
+        recordings(write_arm(tmp_path / "arm"), 1, rows=80)[0],
+    )
     jumps = np.random.default_rng(0).uniform(-1, 1, (5, 4, 2)).repeat(20, axis=1)
-    asked = [replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}")) for i, c in enumerate(jumps)]
+    asked = [
+        replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}"))
+        for i, c in enumerate(jumps)
+    ]
     weak = robot.with_servos({joint: {"effort_limit": 2.5} for joint in robot.joint_names})
-    parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replay(asked, weak), strict=True)]
+    parts = [
+        replace(s, qpos=t.qpos, qvel=t.qvel)
+        for s, t in zip(asked, replay(asked, weak), strict=True)
+    ]
     found = identify(parts[:4], robot, parts[4:], windows=4, terms=("limit",), table=False, folds=1)
     assert [c.name for c in found.comparisons if c.accepted] == ["limit"]
     np.testing.assert_allclose(found.robot.effort_limit, 2.5, rtol=0.05)
@@ -81,7 +101,10 @@ def test_damping_of_an_unmoved_joint_is_recovered_from_the_motion_of_another(tmp
     robot = write_arm(tmp_path / "arm")
     swung = [replace(s, ctrl=s.ctrl * [0, 1]) for s in played(robot, robot, 3, 200)]
     true, told = (robot.with_servos({"shoulder": {"damping": d, "kp": 20.0}}) for d in (0.2, 2.0))
-    parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(swung, replay(swung, true), strict=True)]
+    parts = [
+        replace(s, qpos=t.qpos, qvel=t.qvel)
+        for s, t in zip(swung, replay(swung, true), strict=True)
+    ]
     found = identify(parts[:2], told, parts[2:], windows=2, terms=(), table=False, folds=1)
     assert found.improved
     assert found.after < 0.1 * found.before
@@ -95,7 +118,9 @@ def test_a_table_is_recovered(tmp_path):
     robot = write_arm(tmp_path / "arm", toml=TOML + TIP)
     parts = played(robot, replace(robot, table=Table(-0.02, 0.3, 2000.0)), 3, 100)
     heights = table_contact.tip_heights(parts, robot)
-    found = table_contact.fit_table(parts, robot, min(h.min() for h in heights), 1, lambda error: None)
+    found = table_contact.fit_table(
+        parts, robot, min(h.min() for h in heights), 1, lambda error: None
+    )
     assert found.accepted
     assert found.after.mean() < 0.2 * found.before.mean()
     assert found.robot.table.height == pytest.approx(-0.02, abs=0.004)
@@ -109,4 +134,7 @@ def test_half_of_the_rows_remain_for_motions_close_to_the_table(tmp_path):
     heights = [np.linspace(0.30, 0.33, 50), np.full(40, 0.32)]
     below = table_contact.contact_height(robot, heights)
     assert np.mean(np.concatenate(heights) >= below) >= 0.5
-    assert table_contact.contact_height(robot, [np.r_[0.0, np.full(50, 0.4)]]) == table_contact.CONTACT_CLEARANCE_M
+    assert (
+        table_contact.contact_height(robot, [np.r_[0.0, np.full(50, 0.4)]])
+        == table_contact.CONTACT_CLEARANCE_M
+    )

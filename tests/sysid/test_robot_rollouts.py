@@ -38,7 +38,9 @@ def test_robot_rollouts_agree_with_replays(robot, parts):
 def test_a_joints_error_depends_mostly_on_its_own_parameters(robot, parts):
     runs, values = RobotRollouts(parts, robot), own(robot, parts)
     stiffer = np.array([[1.0, 1.0], [1.02, 1.02], [1.02, 1.0], [1.0, 1.02]])
-    errors = runs.flat_errors({f: x * stiffer if f == "kp" else np.repeat(x, 4, axis=0) for f, x in values.items()})
+    errors = runs.flat_errors(
+        {f: x * stiffer if f == "kp" else np.repeat(x, 4, axis=0) for f, x in values.items()}
+    )
     together = errors[1] - errors[0]
     for joint in range(2):
         alone = errors[2 + joint, joint] - errors[0, joint]
@@ -48,11 +50,17 @@ def test_a_joints_error_depends_mostly_on_its_own_parameters(robot, parts):
 def test_a_rollout_restarts_from_the_recording_after_a_possible_contact(robot, parts):
     touch = np.zeros((2, 60), bool)
     touch[0, 30] = True
-    free, held, values = RobotRollouts(parts, robot), RobotRollouts(parts, robot, touch=touch), own(robot, parts)
+    free, held, values = (
+        RobotRollouts(parts, robot),
+        RobotRollouts(parts, robot, touch=touch),
+        own(robot, parts),
+    )
     assert free.counted[29, 0]
     assert not held.counted[29, 0]
     assert held.counted[29, 1]
-    one, other = ([runs.flat_errors(values)[0][:, runs.window == w] for w in (0, 1)] for runs in (free, held))
+    one, other = (
+        [runs.flat_errors(values)[0][:, runs.window == w] for w in (0, 1)] for runs in (free, held)
+    )
     np.testing.assert_array_equal(one[1], other[1])
     late = RobotRollouts([parts[0].rows(slice(30, 60))], robot)
     afresh = late.flat_errors(values)[0][:, 1:]  # the first rows after it do not count

@@ -26,7 +26,9 @@ def test_a_value_an_order_of_magnitude_off_is_named(tmp_path):
     robot = write_arm(tmp_path, TWO)
     assert far_from_servo_type(robot) == []
     odd = robot.with_servos({"elbow": {"armature": 0.25, "damping": 0.4}})
-    assert far_from_servo_type(odd) == ["elbow: armature 0.25 is 12 times the 0.02 of the S1 (a bench)"]
+    assert far_from_servo_type(odd) == [
+        "elbow: armature 0.25 is 12 times the 0.02 of the S1 (a bench)"
+    ]
 
 
 def test_every_type_of_the_table_has_source_licence_and_ordered_values():
@@ -42,11 +44,16 @@ def test_every_type_of_the_table_has_source_licence_and_ordered_values():
         Spread(3.0, 1.0, 2.0)
 
 
-def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loads(tmp_path, capsys):
+def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loads(
+    tmp_path, capsys
+):
     robot = write_arm(tmp_path / "nominal", TWO)
     values = {"shoulder": (0.8, 0.1, 0.03), "elbow": (1.2, 0.3, 0.05)}
     fields = ("damping", "frictionloss", "armature")
-    save_robot(robot.with_servos({j: dict(zip(fields, v, strict=True)) for j, v in values.items()}), tmp_path / "id")
+    save_robot(
+        robot.with_servos({j: dict(zip(fields, v, strict=True)) for j, v in values.items()}),
+        tmp_path / "id",
+    )
     command = ["robot", "servos", "--from", str(tmp_path / "id")]
     assert main(command) == 2  # without a licence
     capsys.readouterr()
@@ -54,11 +61,23 @@ def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loa
     assert main(command) == 0
     entry = capsys.readouterr().out
     (servo, _) = write_arm(tmp_path / "used", TWO.replace(SERVO, entry)).servos
-    assert (servo.name, servo.source, servo.licence, servo.joints, servo.robots) == ("S1", "my logs", "CC0-1.0", 2, 1)
+    assert (servo.name, servo.source, servo.licence, servo.joints, servo.robots) == (
+        "S1",
+        "my logs",
+        "CC0-1.0",
+        2,
+        1,
+    )
     for field, low, high in zip(fields, *values.values(), strict=True):
-        assert vars(servo.measured[field]) == pytest.approx({"value": (low + high) / 2, "low": low, "high": high})
+        assert vars(servo.measured[field]) == pytest.approx(
+            {"value": (low + high) / 2, "low": low, "high": high}
+        )
     assert main([*command, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["servos"][0]["damping"] == {"value": 1.0, "low": 0.8, "high": 1.2}
+    assert json.loads(capsys.readouterr().out)["servos"][0]["damping"] == {
+        "value": 1.0,
+        "low": 0.8,
+        "high": 1.2,
+    }
 
 
 def test_the_interval_of_a_single_joint_is_that_of_its_standard_error(tmp_path):
@@ -77,7 +96,9 @@ def test_the_interval_of_a_single_joint_is_that_of_its_standard_error(tmp_path):
 
 def test_a_robot_s_own_servo_type_comes_before_the_table_s(tmp_path):
     used = TWO.replace('"S1"', '"STS3215"')
-    own, packaged = (write_arm(tmp_path, toml).servos[0] for toml in (used, used.split("[[servo]]")[0]))
+    own, packaged = (
+        write_arm(tmp_path, toml).servos[0] for toml in (used, used.split("[[servo]]")[0])
+    )
     assert (own.source, own.measured["armature"].value) == ("a bench", 0.02)
     assert packaged == load_robot("so101").servos[0]
 
@@ -98,9 +119,13 @@ def test_a_mirrored_joint_has_the_other_side_in_its_name(joint, other):
     assert (mirrored(joint), mirrored(other)) == (other, joint)
 
 
-def test_a_joint_starts_from_the_identified_servo_of_its_type_or_mirror_image_and_keeps_its_mounting(tmp_path):
+def test_a_joint_starts_from_the_identified_servo_of_its_type_or_mirror_image_and_keeps_its_mounting(
+    tmp_path,
+):
     robot = write_arm(tmp_path / "a", TWO)
-    identified = robot.with_servos({"elbow": {"kp": 15.0, "frictionloss": 0.2, "offset": 0.03, "delay": 0.01}})
+    identified = robot.with_servos(
+        {"elbow": {"kp": 15.0, "frictionloss": 0.2, "offset": 0.03, "delay": 0.01}}
+    )
     stiff = write_arm(tmp_path / "b", TWO.replace("kp = 20.0", "kp = 40.0"))
     started, sources = servos_like(stiff, identified)
     assert sources == {"shoulder": "elbow", "elbow": "elbow"}  # the shoulder was not identified

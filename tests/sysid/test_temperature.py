@@ -13,7 +13,14 @@ from gaponet.sysid.axes import WARM, Bounds, identified_joints
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.problem import JointFit, standard_errors
 
-SERVO = {"kp": 3.0, "damping": 0.08, "frictionloss": 0.03, "armature": 2e-3, "offset": 0.0, "delay": 0.0}
+SERVO = {
+    "kp": 3.0,
+    "damping": 0.08,
+    "frictionloss": 0.03,
+    "armature": 2e-3,
+    "offset": 0.0,
+    "delay": 0.0,
+}
 TRUE = {"friction_per_kelvin": -0.02, "damping_per_kelvin": -1e-3, "friction_temperature": 30.0}
 TOML = 'name = "disc"\ndt = 0.01\ntimestep = 0.005\n[[joint]]\nname = "turn"\nkp = 3.0\neffort_limit = 50.0\n'
 XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="turn" axis="0 0 1" armature="0.002"
@@ -25,9 +32,13 @@ def recorded(robot, celsius):
     """Recordings of a VIRTUAL joint whose grease thins, one at each temperature."""
     rng, t, parts = np.random.default_rng(0), np.arange(200)[:, None] * 0.01, []
     for number, warm in enumerate(celsius):
-        ctrl = sum(0.2 * np.sin(2 * np.pi * f * t + p) for f, p in rng.uniform((0.3, 0), (1.5, 6), (3, 2)))
+        ctrl = sum(
+            0.2 * np.sin(2 * np.pi * f * t + p) for f, p in rng.uniform((0.3, 0), (1.5, 6), (3, 2))
+        )
         meta = SequenceMeta(robot.name, "a", f"m{number}", 0.0, virtual=True)
-        command = Sequence(meta, robot.joint_names, 0.01, ctrl, 0 * ctrl, 0 * ctrl, temperature=0 * ctrl + warm)
+        command = Sequence(
+            meta, robot.joint_names, 0.01, ctrl, 0 * ctrl, 0 * ctrl, temperature=0 * ctrl + warm
+        )
         (moved,) = replay([command], robot.with_servos({"turn": SERVO | TRUE}))
         noisy = moved.qpos + 2e-4 * rng.standard_normal(moved.qpos.shape)
         parts.append(replace(command, qpos=noisy, qvel=moved.qvel))
@@ -58,12 +69,16 @@ def test_recordings_at_one_temperature_leave_the_term_at_zero(tmp_path):
     bounds = Bounds(robot, parts)
     assert [bounds.limits[f][1][0] for f in WARM[:2]] == [0.0, 0.0]
     assert bounds.guess["friction_per_kelvin"][0] == 0
-    low, high, _ = Bounds(robot.with_servos({"turn": SERVO | TRUE}), parts).limits["friction_per_kelvin"]
+    low, high, _ = Bounds(robot.with_servos({"turn": SERVO | TRUE}), parts).limits[
+        "friction_per_kelvin"
+    ]
     assert low == high == -0.02  # a robot that has the term keeps it
 
 
 def test_the_temperature_is_the_last_cause_of_the_joint_itself(tmp_path):
-    robot = write_arm(tmp_path / "disc", TOML, XML).with_servos({"turn": SERVO | {"frictionloss": 0.04} | TRUE})
+    robot = write_arm(tmp_path / "disc", TOML, XML).with_servos(
+        {"turn": SERVO | {"frictionloss": 0.04} | TRUE}
+    )
     steps = cause_steps(robot)
     assert [name for name, _ in steps] == ["friction", "creep", "temperature"]
     assert steps[1][1].friction_per_kelvin[0] == 0

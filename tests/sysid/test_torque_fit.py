@@ -20,7 +20,9 @@ from gaponet.sysid.torque import TorqueFit
 
 def moved(robot, metres, hand):
     """The robot with its payload hung elsewhere, and a hand."""
-    mounts = (replace(m, pos=(m.pos[0] + metres, *m.pos[1:]), mass=hand) for m in robot.payload_mounts)
+    mounts = (
+        replace(m, pos=(m.pos[0] + metres, *m.pos[1:]), mass=hand) for m in robot.payload_mounts
+    )
     return replace(robot, payload_mounts=tuple(mounts))
 
 
@@ -29,7 +31,9 @@ FIRST_MOUNT = '[[payload_mount]]\nside = "post"\nbody = "post"\npos = [0.2, 0.0,
 
 
 @pytest.mark.parametrize("second", [False, True])
-def test_torque_determines_the_payloads_place_and_the_hands_mass_at_the_mount_that_a_joint_carries(tmp_path, second):
+def test_torque_determines_the_payloads_place_and_the_hands_mass_at_the_mount_that_a_joint_carries(
+    tmp_path, second
+):
     toml, xml = TOML, XML
     if second:
         toml = toml.replace('[[payload_mount]]\nside = "hand"', FIRST_MOUNT)
@@ -74,7 +78,10 @@ def test_measurement_noise_does_not_lower_the_estimated_gains(arm):
         ctrl = wave(120, 2, hertz=0.5 + 0.1 * seed)
         s = arm_sequence(arm, ctrl, late(ctrl, 4), f"m{seed}")
         error = np.concatenate([np.zeros((1, 2)), s.ctrl[:-1] - s.qpos[1:]])
-        noisy = [x + spread * rng.standard_normal(x.shape) for x, spread in ((s.qpos, 0.01), (s.qvel, 0.3))]
+        noisy = [
+            x + spread * rng.standard_normal(x.shape)
+            for x, spread in ((s.qpos, 0.01), (s.qvel, 0.3))
+        ]
         made.append(replace(s, tau=48.0 * error - 1.0 * s.qvel, qpos=noisy[0], qvel=noisy[1]))
     for kp, _, kd, _ in TorqueFit(made, arm).gains().values():
         assert (kp, kd) == (pytest.approx(48.0, rel=0.03), pytest.approx(1.0, rel=0.1))
@@ -82,14 +89,19 @@ def test_measurement_noise_does_not_lower_the_estimated_gains(arm):
 
 def loaded(robot):
     """Six motions with three payloads each, of an arm with softer servos, a hand, and a payload hung elsewhere."""
-    true, windows = moved(robot, -0.06, 0.3).with_servos({j: {"kp": 12.0, "kd": 0.4} for j in robot.operated}), []
+    true, windows = (
+        moved(robot, -0.06, 0.3).with_servos({j: {"kp": 12.0, "kd": 0.4} for j in robot.operated}),
+        [],
+    )
     for motion in range(6):
         for mass in (0.0, 0.2, 0.4):
             ctrl = commands(60, motion)
             one = arm_sequence(robot, ctrl, ctrl, f"m{motion}")
             one = replace(one, meta=replace(one.meta, payload_mass=mass))
             (simulated,) = replay([one], true)
-            windows.append(replace(one, qpos=simulated.qpos, qvel=simulated.qvel, tau=simulated.tau))
+            windows.append(
+                replace(one, qpos=simulated.qpos, qvel=simulated.qvel, tau=simulated.tau)
+            )
     return windows
 
 
@@ -98,21 +110,34 @@ def test_the_fit_from_torque_is_used_if_validation_motions_accept_it(tmp_path):
     windows = loaded(robot)
     found = identify(windows[:12], robot, windows[12:], terms=())
     (tried,) = found.comparisons
-    assert (found.chosen, tried.name, tried.accepted, len(tried.before)) == ("torque", "torque", True, 6)
+    assert (found.chosen, tried.name, tried.accepted, len(tried.before)) == (
+        "torque",
+        "torque",
+        True,
+        6,
+    )
     assert found.robot.kp == pytest.approx([12.0, 12.0], rel=0.03)
     assert found.robot.payload_mounts[0].mass == pytest.approx(0.3, abs=0.05)
-    assert not (found.held_out[0].robot.kp == found.robot.kp).all()  # fitted once more, to the motions that judged it
+    assert not (
+        found.held_out[0].robot.kp == found.robot.kp
+    ).all()  # fitted once more, to the motions that judged it
     assert found.after == pytest.approx(tried.after.mean())
     assert tried.after.mean() < tried.before.mean()
 
 
-def test_a_refit_with_the_validation_motions_is_dropped_if_it_follows_them_worse(tmp_path, monkeypatch):
+def test_a_refit_with_the_validation_motions_is_dropped_if_it_follows_them_worse(
+    tmp_path, monkeypatch
+):
     robot, own = write_arm(tmp_path / "arm"), TorqueFit.fit
     windows = loaded(robot)
 
     def astray(self, how):
         found = own(self, how)
-        return found.with_servos({"elbow": {"offset": 0.1}}) if len(self.sequences) == len(windows) else found
+        return (
+            found.with_servos({"elbow": {"offset": 0.1}})
+            if len(self.sequences) == len(windows)
+            else found
+        )
 
     monkeypatch.setattr(TorqueFit, "fit", astray)
     found = identify(windows[:12], robot, windows[12:], terms=(), folds=1)
@@ -129,7 +154,11 @@ def test_identified_payload_mounts_are_stored_in_the_folder(tmp_path):
     assert again.payload_mounts == true.payload_mounts
     assert again.before_identification.payload_mounts == robot.payload_mounts
     assert model_hash(again) == model_hash(true) != model_hash(robot)
-    text = (tmp_path / "kept" / "robot.toml").read_text().replace('identified_mount."hand"', "identified_mount.foot")
+    text = (
+        (tmp_path / "kept" / "robot.toml")
+        .read_text()
+        .replace('identified_mount."hand"', "identified_mount.foot")
+    )
     (tmp_path / "kept" / "robot.toml").write_text(text)
     with pytest.raises(RobotError, match=r"names no \[\[payload_mount\]\]"):
         load_robot(tmp_path / "kept")

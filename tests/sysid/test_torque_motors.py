@@ -28,7 +28,11 @@ def drive(robot, seed, unit=1.0, rows=1200):
     for name, values in TRUE.items():
         getattr(model, f"dof_{name}").reshape(model.nv, -1)[:, 0] = values
     model.opt.timestep = DT / 2
-    data, wanted, rng = mujoco.MjData(model), 1.6 * commands(rows, seed, DT), np.random.default_rng(seed)
+    data, wanted, rng = (
+        mujoco.MjData(model),
+        1.6 * commands(rows, seed, DT),
+        np.random.default_rng(seed),
+    )
     data.qpos[:], pitch = wanted[0], rng.uniform(2.5, 3.5)
     told, seen = [], []
     for t in range(rows):
@@ -45,9 +49,22 @@ def imported(folder, robot, logs, torque=True):
     head = "time,q_shoulder,q_elbow" + ",tau_shoulder,tau_elbow" * torque
     for name, table in logs.items():
         columns = table if torque else table[:, :3]
-        np.savetxt(folder / "logs" / f"{name}.csv", columns, delimiter=",", header=head, comments="")
-    (folder / "logs" / "logs.toml").write_text(LOGS_TOML if torque else LOGS_TOML.replace('tau = "tau_{joint}"\n', ""))
-    words = ["--robot", str(robot.folder), "--unit-id", "a", "--payload-mass", "0", "--out", str(folder / "data")]
+        np.savetxt(
+            folder / "logs" / f"{name}.csv", columns, delimiter=",", header=head, comments=""
+        )
+    (folder / "logs" / "logs.toml").write_text(
+        LOGS_TOML if torque else LOGS_TOML.replace('tau = "tau_{joint}"\n', "")
+    )
+    words = [
+        "--robot",
+        str(robot.folder),
+        "--unit-id",
+        "a",
+        "--payload-mass",
+        "0",
+        "--out",
+        str(folder / "data"),
+    ]
     assert main(["import", str(folder / "logs"), *words]) == 0
     return str(folder / "data")
 
@@ -72,7 +89,9 @@ def test_a_torque_driven_arm_is_identified(robot, tmp_path, capsys, unit, words)
     assert np.mean(after) < 0.05 * np.mean(before)
     again = load_robot(tmp_path / "found")
     assert again.damping[0] == said["joints"]["shoulder"]["damping"]
-    assert main(["export", str(tmp_path / "found"), "--to", "json"]) == 0  # judged by what the robot itself answers
+    assert (
+        main(["export", str(tmp_path / "found"), "--to", "json"]) == 0
+    )  # judged by what the robot itself answers
 
 
 def test_a_push_by_hand_is_not_taken_for_friction(robot, tmp_path, capsys):

@@ -20,7 +20,14 @@ from gaponet.sysid.evidence.drift import drift
 from gaponet.sysid.evidence.evidence import estimate_uncertainty
 from gaponet.sysid.uncertainty import OLD_KEYS, JointSummary, ParameterUncertainty, from_axes
 
-TRUE = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
+TRUE = {
+    "kp": 16.0,
+    "damping": 0.5,
+    "frictionloss": 0.05,
+    "armature": 0.02,
+    "offset": 0.0,
+    "delay": 0.02,
+}
 
 
 def played(robot, first=0, count=6, seconds=8, noise=4e-4, **how):
@@ -29,7 +36,12 @@ def played(robot, first=0, count=6, seconds=8, noise=4e-4, **how):
     for seed in range(first, first + count):
         rows = round(seconds / robot.dt)
         one = record(robot, commands(rows, seed), f"m{seed}", **({"kp": 0.8, "delay": 1} | how))
-        found.append(replace(one, qpos=one.qpos + noise * np.random.default_rng(seed).standard_normal(one.qpos.shape)))
+        found.append(
+            replace(
+                one,
+                qpos=one.qpos + noise * np.random.default_rng(seed).standard_normal(one.qpos.shape),
+            )
+        )
     return found
 
 
@@ -71,7 +83,9 @@ def test_uncertainty_has_sources_values_and_a_consistent_covariance(arm, folder)
     assert source["seconds"] == pytest.approx(48.0)
     for joint in arm.operated:
         values, covariance = mine.si(joint)
-        np.testing.assert_allclose([values[f] for f in mine.fields], [TRUE[f] for f in mine.fields], atol=1e-5)
+        np.testing.assert_allclose(
+            [values[f] for f in mine.fields], [TRUE[f] for f in mine.fields], atol=1e-5
+        )
         drawn = np.random.default_rng(0).multivariate_normal(
             mine.array(joint, "values"), mine.array(joint, "covariance"), 20_000
         )
@@ -91,7 +105,9 @@ def test_a_value_is_shown_without_its_error_where_no_log_shows_it():
 
 def test_a_parameter_without_information_keeps_its_prior_std(arm):
     """A joint that nothing loads and that hardly moves shows no gain: kp is believed to a factor, not to the moon."""
-    still = [replace(s, ctrl=s.ctrl * [0.02, 1], qpos=s.qpos * [0.02, 1]) for s in played(arm, 0, 3)]
+    still = [
+        replace(s, ctrl=s.ctrl * [0.02, 1], qpos=s.qpos * [0.02, 1]) for s in played(arm, 0, 3)
+    ]
     mine = estimate_uncertainty(arm, still, [], nthread=1)
     assert np.sqrt(np.diag(mine.array("shoulder", "covariance"))[0]) <= 0.5
 
@@ -100,15 +116,21 @@ def test_residuals_use_recordings_that_hold_the_joint_and_the_robot_that_was_jud
     robot, judges = load_robot(folder), played(arm, 20, 2)
     alone = [replace(s, meta=replace(s.meta, notes={"held_at_home": ["elbow"]})) for s in judges]
     both, one, none = (
-        estimate_uncertainty(robot, judges, some, nthread=1).joints for some in (judges, [judges[0], alone[1]], alone)
+        estimate_uncertainty(robot, judges, some, nthread=1).joints
+        for some in (judges, [judges[0], alone[1]], alone)
     )
     assert one["elbow"].residual_rms == pytest.approx(
-        estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"].residual_rms, rel=0.2
+        estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"].residual_rms,
+        rel=0.2,
     )
-    assert one["elbow"].residual_rms > 0.5 * both["elbow"].residual_rms  # rows that do not hold it are no zeros
+    assert (
+        one["elbow"].residual_rms > 0.5 * both["elbow"].residual_rms
+    )  # rows that do not hold it are no zeros
     assert none["elbow"].residual_p90 == none["shoulder"].residual_p90 > 0.0
     off = robot.with_servos({"elbow": {"offset": 0.05}})
-    judged = estimate_uncertainty(robot, judges, judges, held_out=[HeldOut(judges, off)], nthread=1).joints["elbow"]
+    judged = estimate_uncertainty(
+        robot, judges, judges, held_out=[HeldOut(judges, off)], nthread=1
+    ).joints["elbow"]
     assert judged.residual_rms > 10 * both["elbow"].residual_rms
     assert judged.values == both["elbow"].values
 
@@ -118,7 +140,9 @@ def test_the_error_bound_is_wider_if_few_motions_differ(arm, folder):
     alike = estimate_uncertainty(robot, judges, judges, nthread=1).joints["elbow"]
     apart = [replace(s, qpos=s.qpos + np.float32(0.05 * (i == 0))) for i, s in enumerate(judges)]
     replays = replay(apart, robot, nthread=1, lock_idle=True)
-    pooled = np.concatenate([np.abs(t.qpos - s.qpos)[1:] for s, t in zip(apart, replays, strict=True)])
+    pooled = np.concatenate(
+        [np.abs(t.qpos - s.qpos)[1:] for s, t in zip(apart, replays, strict=True)]
+    )
     wide = estimate_uncertainty(robot, judges, apart, nthread=1).joints["elbow"].residual_p90
     assert wide > 1.5 * np.quantile(pooled[:, robot.index(["elbow"])], 0.9) > alike.residual_p90
     one = estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"].residual_p90
@@ -141,7 +165,11 @@ def test_a_change_by_adaptation_increases_the_variance(arm, folder):
     for by in (0.0, -0.05):
         there = robot.with_servos({"elbow": {"offset": by}})
         seen = [replace(s, qpos=s.qpos + np.array([0.0, by])) for s in played(arm, 40, 2)]
-        found.append(estimate_uncertainty(there, seen, [], before=mine, nthread=1).array("elbow", "covariance"))
+        found.append(
+            estimate_uncertainty(there, seen, [], before=mine, nthread=1).array(
+                "elbow", "covariance"
+            )
+        )
     same, moved = (np.diag(covariance)[mine.fields.index("offset")] for covariance in found)
     assert moved > 1.1 * same
 
@@ -149,7 +177,9 @@ def test_a_change_by_adaptation_increases_the_variance(arm, folder):
 def test_an_edited_folder_is_refused(folder, tmp_path):
     robot = load_robot(folder)
     save_robot(robot.with_servos({"elbow": {"kp": 30.0}}), tmp_path / "edited")
-    with pytest.raises(RobotError, match=r"other values than robot\.toml's, at elbow; identify or adapt again"):
+    with pytest.raises(
+        RobotError, match=r"other values than robot\.toml's, at elbow; identify or adapt again"
+    ):
         ParameterUncertainty.load(load_robot(tmp_path / "edited"))
 
 
@@ -161,7 +191,9 @@ def test_a_folder_of_an_older_version_loads(folder, tmp_path):
         text = text.replace(f'"{key}"', f'"{old}"')
     (tmp_path / "old" / "known.json").write_text(text)
     new.unlink()
-    assert ParameterUncertainty.load(load_robot(tmp_path / "old")) == ParameterUncertainty.load(load_robot(folder))
+    assert ParameterUncertainty.load(load_robot(tmp_path / "old")) == ParameterUncertainty.load(
+        load_robot(folder)
+    )
 
 
 def test_a_folder_without_uncertainty_loads_and_show_refuses_it(arm, capsys):
@@ -200,7 +232,9 @@ def test_show_prints_and_draws(folder, tmp_path, capsys):
 
 
 def test_check_reports_a_changed_kp(arm, folder, tmp_path, capsys):
-    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", played(arm, 70, 6, kp=0.7)))
+    code, said = checked(
+        capsys, folder, dataset(arm, tmp_path / "data", played(arm, 70, 6, kp=0.7))
+    )
     assert (code, said["verdict"]) == (1, "drifted")
     assert "kp" in {m["field"] for m in said["moved"]}
 
@@ -247,7 +281,9 @@ def test_another_arm_that_no_parameter_explains_has_drifted(arm, folder, monkeyp
     assert set(found.far) <= set(arm.operated)
 
 
-def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(arm, folder, tmp_path):
+def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(
+    arm, folder, tmp_path
+):
     """A robot that stands 4 mrad elsewhere each time it plays a command: 3 mrad today are nothing."""
     robot, rng = load_robot(folder), np.random.default_rng(0)
     today = [replace(s, qpos=s.qpos + np.float32([0.003, 0.0])) for s in played(arm, 50, 6)]
@@ -267,7 +303,12 @@ def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(ar
 
 def test_recordings_of_joints_that_were_never_identified_are_not_called_the_same(arm, folder):
     robot = load_robot(folder)
-    half = replace(robot, **{f: np.where([True, False], getattr(robot, f), getattr(arm, f)) for f in TRUE})
-    logs = [replace(s, meta=replace(s.meta, notes={"held_at_home": ("shoulder",)})) for s in played(arm, 70, 2)]
+    half = replace(
+        robot, **{f: np.where([True, False], getattr(robot, f), getattr(arm, f)) for f in TRUE}
+    )
+    logs = [
+        replace(s, meta=replace(s.meta, notes={"held_at_home": ("shoulder",)}))
+        for s in played(arm, 70, 2)
+    ]
     with pytest.raises(UsageError, match="never identified: elbow"):
         drift(half, ParameterUncertainty.load(robot), logs, 1)

@@ -8,7 +8,17 @@ from gaponet.sim.batch import OneByOne
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.virtual_robot import VirtualRobot
 
-MECHANICAL = ["gain", "torque_constant", "friction", "load_friction", "damping", "cable", "mass", "tilt", "cogging"]
+MECHANICAL = [
+    "gain",
+    "torque_constant",
+    "friction",
+    "load_friction",
+    "damping",
+    "cable",
+    "mass",
+    "tilt",
+    "cogging",
+]
 
 
 @pytest.fixture
@@ -29,14 +39,24 @@ def moving(arm):
         robots.step(row[None])
         data = robots.batch.get_data(0)
         mujoco.mj_forward(model, data)
-        rows.append((data.energy.sum(), data.qpos.copy(), data.qvel.copy(), force[0].copy(), friction[0].copy()))
+        rows.append(
+            (
+                data.energy.sum(),
+                data.qpos.copy(),
+                data.qvel.copy(),
+                force[0].copy(),
+                friction[0].copy(),
+            )
+        )
     return robots, model, [np.array(x) for x in zip(*rows, strict=True)]
 
 
 def test_work_becomes_energy_and_heat_and_torques_add_up_to_what_moves_the_links(moving):
     robots, model, (energy, qpos, qvel, force, friction) = moving
     h = 0.001
-    cogging = robots.physics.cogging * np.sin(robots.physics.cogging_count * qpos + robots.physics.cogging_phase)
+    cogging = robots.physics.cogging * np.sin(
+        robots.physics.cogging_count * qpos + robots.physics.cogging_phase
+    )
     middle = lambda x: (x[1:] + x[:-1]) / 2  # noqa: E731
     work = (middle(force + friction + cogging) * middle(qvel)).sum() * h
     heat = (model.dof_damping * middle(qvel) ** 2).sum() * h

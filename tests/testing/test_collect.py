@@ -62,19 +62,34 @@ def test_every_take_is_there_once_and_says_virtual(whole, spec):
     dataset = Dataset(out)
     assert done.written == len(dataset) == 2 * 2 * 2 * 2
     assert done.hours == pytest.approx(dataset.hours())
-    keys = {(m.motion, m.unit_id, m.payload_mass, e.dt, m.repetition) for e in dataset.entries for m in [e.meta]}
+    keys = {
+        (m.motion, m.unit_id, m.payload_mass, e.dt, m.repetition)
+        for e in dataset.entries
+        for m in [e.meta]
+    }
     assert len(keys) == 16
     assert all(
-        e.meta.virtual and e.meta.unit_id.startswith("virtual-") and "virtual" in e.meta.source for e in dataset.entries
+        e.meta.virtual and e.meta.unit_id.startswith("virtual-") and "virtual" in e.meta.source
+        for e in dataset.entries
     )
-    assert set(dataset.entries[0].channels) == {"ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature"}
+    assert set(dataset.entries[0].channels) == {
+        "ctrl",
+        "qpos",
+        "qvel",
+        "qacc",
+        "tau",
+        "tau_eq",
+        "temperature",
+    }
     assert json.loads((out / "collect.json").read_text())["virtual"] is True
 
 
 def test_hidden_numbers_stay_out_of_the_dataset(whole):
     out, _ = whole
     text = (out / "sequences.jsonl").read_text() + (out / "collect.json").read_text()
-    names = {f.name for f in fields(Physics)} - {"delay"}  # the importer writes its own estimate of a delay
+    names = {f.name for f in fields(Physics)} - {
+        "delay"
+    }  # the importer writes its own estimate of a delay
     assert not [name for name in names if f'"{name}"' in text]
 
 
@@ -84,7 +99,9 @@ def test_a_row_is_the_state_before_its_command(whole, spec):
     entry = next(e for e in dataset.entries if e.meta.motion == "steps-elbow" and e.dt == 0.02)
     s = dataset.read(entry)
     column = spec.index(["elbow"])[0]
-    assert np.array_equal(s.ctrl, Library(spec, 5, 0.2).make("steps-elbow").sample(0.02).astype(np.float32))
+    assert np.array_equal(
+        s.ctrl, Library(spec, 5, 0.2).make("steps-elbow").sample(0.02).astype(np.float32)
+    )
     told = int(np.argmax(np.abs(s.ctrl[:, column] - s.ctrl[0, column]) > 1e-3))
     moved = int(np.argmax(np.abs(s.qpos[:, column] - s.qpos[0, column]) > 5e-3))
     assert np.abs(s.qvel[:5, column]).max() < 0.06  # noise
@@ -93,7 +110,11 @@ def test_a_row_is_the_state_before_its_command(whole, spec):
 
 def test_repetitions_differ_a_little(whole):
     dataset = Dataset(whole[0])
-    same = [e for e in dataset.entries if e.meta.motion == "tour-all-0" and e.dt == 0.02 and e.meta.payload_mass == 0.2]
+    same = [
+        e
+        for e in dataset.entries
+        if e.meta.motion == "tour-all-0" and e.dt == 0.02 and e.meta.payload_mass == 0.2
+    ]
     first, second = (dataset.read(e) for e in same)
     assert np.array_equal(first.ctrl, second.ctrl)
     assert not np.array_equal(first.qpos, second.qpos)
@@ -158,7 +179,10 @@ def _wait_for_orphans(session):
 
 
 def test_a_dataset_keeps_the_robot_with_the_gains_that_its_fleet_sets(spec, fleet, tmp_path):
-    firm, less = replace(fleet, gain_scale=3.0), replace(RECIPE, motions=("steps-elbow",), rates=(50.0,), repetitions=1)
+    firm, less = (
+        replace(fleet, gain_scale=3.0),
+        replace(RECIPE, motions=("steps-elbow",), rates=(50.0,), repetitions=1),
+    )
     collect(spec, firm, less, tmp_path, seed=5, nproc=1)
     kept = load_robot(tmp_path / "robot")
     assert kept.kp.tolist() == list(Dataset(tmp_path).entries[0].meta.kp) == [60.0, 60.0]
@@ -167,14 +191,19 @@ def test_a_dataset_keeps_the_robot_with_the_gains_that_its_fleet_sets(spec, flee
 
 def test_what_something_else_collected_is_not_mixed(whole, spec):
     out, _ = whole
-    with pytest.raises(DatasetError, match=r"was collected with seed 5, not 6 \(collect.json\); choose another folder"):
+    with pytest.raises(
+        DatasetError,
+        match=r"was collected with seed 5, not 6 \(collect.json\); choose another folder",
+    ):
         collect(spec, load_fleet("easy", spec), RECIPE, out, seed=6, nproc=1)
     with pytest.raises(DatasetError, match="was collected with fleet 'easy', not 'shifted'"):
         collect(spec, load_fleet("shifted", spec), RECIPE, out, seed=5, nproc=1)
 
 
 def test_mistakes_in_a_recipe_are_named(spec, fleet, tmp_path):
-    with pytest.raises(UsageError, match="no recipe 'big': in the package are arm, demo, simlifter, small"):
+    with pytest.raises(
+        UsageError, match="no recipe 'big': in the package are arm, demo, simlifter, small"
+    ):
         load_recipe("big")
     with pytest.raises(UsageError, match="recipe 'test': no motion of this robot matches 'reach"):
         collect(spec, fleet, replace(RECIPE, motions=("reach-*",)), tmp_path / "a", nproc=1)
@@ -185,16 +214,24 @@ def test_mistakes_in_a_recipe_are_named(spec, fleet, tmp_path):
             collect(spec, fleet, replace(RECIPE, **wrong), tmp_path / "a", nproc=1)
     file = tmp_path / "mine.toml"
     file.write_text('motions = ["*"]\npayloads = [0]\nunit = ["virtual-1"]\n')
-    with pytest.raises(UsageError, match=r"mine.toml: units: is missing .*; fields are name, payloads, units"):
+    with pytest.raises(
+        UsageError, match=r"mine.toml: units: is missing .*; fields are name, payloads, units"
+    ):
         load_recipe(file)
     file.write_text('motions = ["*"]\nunits = ["virtual-1"]\n')
-    with pytest.raises(UsageError, match=r"mine.toml: payloads: is missing; fields are name, payloads"):
+    with pytest.raises(
+        UsageError, match=r"mine.toml: payloads: is missing; fields are name, payloads"
+    ):
         load_recipe(file)
 
 
 def test_a_recipe_may_play_motion_files(spec, fleet, tmp_path):
-    (tmp_path / "swing.txt").write_text("shoulder,elbow\n" + "".join(f"{0.001 * t},{-0.001 * t}\n" for t in range(100)))
-    (tmp_path / "mine.toml").write_text('files = ["swing.txt"]\npayloads = [0.1]\nunits = ["virtual-1"]\n')
+    (tmp_path / "swing.txt").write_text(
+        "shoulder,elbow\n" + "".join(f"{0.001 * t},{-0.001 * t}\n" for t in range(100))
+    )
+    (tmp_path / "mine.toml").write_text(
+        'files = ["swing.txt"]\npayloads = [0.1]\nunits = ["virtual-1"]\n'
+    )
     collect(spec, fleet, load_recipe(tmp_path / "mine.toml"), tmp_path / "out", nproc=1)
     (entry,) = Dataset(tmp_path / "out").entries
     assert entry.meta.motion == "swing"

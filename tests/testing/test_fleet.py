@@ -11,7 +11,12 @@ from gaponet.testing.fleet import FLEETS, load_fleet
 from gaponet.testing.physics import Physics, neutral
 from gaponet.testing.virtual_robot import VirtualRobot
 
-DIGESTS = {"easy": "470699a7d760", "hard": "1d49d40c608d", "shifted": "d2cc972792f1", "unnamed": "6e07b3021441"}
+DIGESTS = {
+    "easy": "470699a7d760",
+    "hard": "1d49d40c608d",
+    "shifted": "d2cc972792f1",
+    "unnamed": "6e07b3021441",
+}
 
 
 @pytest.mark.parametrize("name", DIGESTS)
@@ -37,7 +42,9 @@ def test_a_raw_hand_of_the_firm_fleet_sags_about_2_cm_under_3_kg():
     plans = planner.plans(3)
     held = np.repeat([plan.ctrl[-1] for plan in plans], len(fleet.units), axis=0)
     units = [*fleet.units.values()] * len(plans)
-    robots = VirtualRobot(robot.with_gain_scale(fleet.gain_scale), units, [(3.0, "both")] * len(units))
+    robots = VirtualRobot(
+        robot.with_gain_scale(fleet.gain_scale), units, [(3.0, "both")] * len(units)
+    )
     robots.reset(held, list(range(len(units))))
     sag = (planner.hand_positions(held) - planner.hand_positions(robots.true_qpos()))[..., 2]
     assert 0.015 < sag.mean() < 0.025
@@ -64,13 +71,20 @@ def test_errors_say_what_there_is(arm, tmp_path):
         match=r"no fleet 'lab': in the package are easy, firm, hard, shifted, unnamed; or give a \.toml file",
     ):
         load_fleet("lab", arm)
-    with pytest.raises(UsageError, match="fleet 'easy' has no unit 'robot-7'; it has virtual-1, virtual-2"):
+    with pytest.raises(
+        UsageError, match="fleet 'easy' has no unit 'robot-7'; it has virtual-1, virtual-2"
+    ):
         load_fleet("easy", arm).unit("robot-7")
-    with pytest.raises(UsageError, match="effect 'magic' is unknown; effects are gain, torque_constant"):
+    with pytest.raises(
+        UsageError, match="effect 'magic' is unknown; effects are gain, torque_constant"
+    ):
         neutral(2).only(["magic"])
     file = tmp_path / "bad.toml"
     file.write_text('seed = 1\n[[distribution]]\nname = "charm"\nmean = 1\nsource = "none"\n')
-    with pytest.raises(UsageError, match=r"bad.toml: \[\[distribution\]\] names 'charm' twice, or not one of kp_scale"):
+    with pytest.raises(
+        UsageError,
+        match=r"bad.toml: \[\[distribution\]\] names 'charm' twice, or not one of kp_scale",
+    ):
         load_fleet(file, arm)
 
 
@@ -82,13 +96,25 @@ def test_errors_say_what_there_is(arm, tmp_path):
         ("type_spread = 0.03", "type_spread = nan", r"distribution\[0\]\.type_spread: should be"),
         ("low = 0.6", "lov = 0.6", r"distribution\[0\]\.lov: is not a known field"),
         ('name = "kd_scale"', 'name = "kp_scale"', "names 'kp_scale' twice"),
-        ("mean = 0.01\nunit_spread = 0.002\nlow = 0.002", "mean = 3600.0", "unit 'virtual-1': delay is "),
-        ("mean = 0.01\nunit_spread = 0.002\nlow = 0.002", "mean = -0.1", "unit 'virtual-1': delay is "),
+        (
+            "mean = 0.01\nunit_spread = 0.002\nlow = 0.002",
+            "mean = 3600.0",
+            "unit 'virtual-1': delay is ",
+        ),
+        (
+            "mean = 0.01\nunit_spread = 0.002\nlow = 0.002",
+            "mean = -0.1",
+            "unit 'virtual-1': delay is ",
+        ),
         ("mean = 0.002\nunit_spread = 0.0005", "mean = 2.0", "unit 'virtual-1': drop is "),
     ],
 )
-def test_a_fleet_of_numbers_that_no_robot_has_is_refused_with_file_and_field(arm, tmp_path, old, new, said):
+def test_a_fleet_of_numbers_that_no_robot_has_is_refused_with_file_and_field(
+    arm, tmp_path, old, new, said
+):
     file = tmp_path / "mine.toml"
-    file.write_text((FLEETS / "easy.toml").read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8")
+    file.write_text(
+        (FLEETS / "easy.toml").read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8"
+    )
     with pytest.raises(UsageError, match=rf"mine\.toml: .*{said}"):
         load_fleet(file, arm)

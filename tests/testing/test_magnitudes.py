@@ -15,7 +15,9 @@ def test_four_numbers_leave_of_the_hard_fleet_what_real_arms_leave():
     """Gap and rest are of the size of a real SO-101's (19 and 4.4 mrad) and of the paper's H1-2 (12 to 15 left)."""
     robot = load_robot("h1_2")
     recipe = Recipe("test", (0.0, 3.0), ("virtual-4",), MOTIONS)
-    recorded = play(Job(robot, load_fleet("hard", robot), recipe, (), 0, tuple(takes(recipe, list(MOTIONS)))))
+    recorded = play(
+        Job(robot, load_fleet("hard", robot), recipe, (), 0, tuple(takes(recipe, list(MOTIONS))))
+    )
     recorded = [s.rows(slice(0, 250)) for s in recorded]
     fitted = {"frictionloss": 1.74, "damping": 1.007, "delay": 0.011}
     gains = zip(robot.operated, robot.kp[robot.operated_index], strict=True)

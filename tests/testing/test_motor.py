@@ -26,7 +26,9 @@ def one(**values: float) -> Physics:
 
 
 def limit(physics, qvel=0.0, torque=0.0, push=0.0, nominal=0.2):
-    value = friction_limit(physics, np.array([nominal]), *(np.array([[x]]) for x in (qvel, torque, push)))
+    value = friction_limit(
+        physics, np.array([nominal]), *(np.array([[x]]) for x in (qvel, torque, push))
+    )
     return float(value[0, 0])
 
 
@@ -56,11 +58,15 @@ def test_a_gear_loses_less_when_driving_than_when_driven():
 
 def test_warmth_takes_from_dry_friction_and_not_from_the_gears_part():
     p = one(friction=1.0, efficiency=0.8)
-    value = friction_limit(p, np.array([0.2]), *(np.array([[x]]) for x in (1.0, 10.0, 0.0)), np.array([[0.5]]))
+    value = friction_limit(
+        p, np.array([0.2]), *(np.array([[x]]) for x in (1.0, 10.0, 0.0)), np.array([[0.5]])
+    )
     assert float(value[0, 0]) == pytest.approx(0.5 * 1.2 + 2.0)
     thermal = Thermal(one(thinning=0.01))
     thermal.reset(np.array([[45.0]]))
-    assert float(thermal.thinning_factor()[0, 0]) == pytest.approx(np.exp(-0.2))  # 20 K: 82 % is left
+    assert float(thermal.thinning_factor()[0, 0]) == pytest.approx(
+        np.exp(-0.2)
+    )  # 20 K: 82 % is left
 
 
 def slide(bristles, path, g=1.2, h=1e-3):
@@ -92,7 +98,9 @@ def test_bristles_keep_their_torque_at_rest_and_start_with_what_they_are_given()
 def test_torque_falls_from_the_corner_to_the_no_load_speed():
     p = one(no_load_speed=10.0, corner=0.6)
     share = lambda v: float(speed_factor(p, np.array([[v]]))[0, 0])  # noqa: E731
-    assert [share(v) for v in (-20.0, 0.0, 6.0, 10.0, 12.0)] == pytest.approx([1.0, 1.0, 1.0, 0.0, 0.0])
+    assert [share(v) for v in (-20.0, 0.0, 6.0, 10.0, 12.0)] == pytest.approx(
+        [1.0, 1.0, 1.0, 0.0, 0.0]
+    )
     assert share(8.0) == pytest.approx(0.5)
     assert float(speed_factor(one(), np.array([[1e3]]))[0, 0]) == 1.0
 
@@ -116,7 +124,13 @@ def test_backlash_opens_only_when_the_torque_turns():
 
 def test_heating_curve_has_the_winding_time_constant():
     # 4 N·m at 2 N·m/√W: 4 W through 3 K/W, 12 K at last, 63.2 % of it after one time constant
-    p = one(motor_constant=2.0, winding_resistance=3.0, winding_time=20.0, housing_resistance=1.0, housing_time=1e9)
+    p = one(
+        motor_constant=2.0,
+        winding_resistance=3.0,
+        winding_time=20.0,
+        housing_resistance=1.0,
+        housing_time=1e9,
+    )
     thermal = Thermal(p)
     thermal.reset(np.array([[25.0]]))
     for _ in range(1000):
@@ -129,14 +143,22 @@ def test_heating_curve_has_the_winding_time_constant():
 
 
 def test_the_housing_settles_where_its_resistance_says():
-    p = one(motor_constant=2.0, winding_resistance=3.0, winding_time=5.0, housing_resistance=2.0, housing_time=20.0)
+    p = one(
+        motor_constant=2.0,
+        winding_resistance=3.0,
+        winding_time=5.0,
+        housing_resistance=2.0,
+        housing_time=20.0,
+    )
     thermal = Thermal(p)
     thermal.reset(np.array([[25.0]]))
     for _ in range(20000):
         thermal.step(np.array([[4.0]]), 0.02)
     heat = float(thermal.heat(np.array([[4.0]]))[0, 0])  # 1 W and what warm copper adds
     assert float(thermal.housing[0, 0]) - 25.0 == pytest.approx(2.0 * heat, rel=1e-3)
-    assert float(thermal.winding[0, 0] - thermal.housing[0, 0]) == pytest.approx(3.0 * heat, rel=1e-3)
+    assert float(thermal.winding[0, 0] - thermal.housing[0, 0]) == pytest.approx(
+        3.0 * heat, rel=1e-3
+    )
 
 
 def test_torque_constant_falls_with_temperature():

@@ -22,7 +22,12 @@ BLIND = [p for p in PACKAGE.iterdir() if p.name not in OPEN]
 @pytest.fixture(scope="module")
 def trees():
     """Nodes of every module that must not see the hidden physics, by file."""
-    files = [f for place in BLIND for f in ([place] if place.is_file() else place.rglob("*.py")) if f.suffix == ".py"]
+    files = [
+        f
+        for place in BLIND
+        for f in ([place] if place.is_file() else place.rglob("*.py"))
+        if f.suffix == ".py"
+    ]
     return {file: list(ast.walk(ast.parse(file.read_text(encoding="utf-8")))) for file in files}
 
 
@@ -44,6 +49,10 @@ def test_no_blind_module_imports_the_virtual_robots(trees):
 def test_no_blind_module_names_the_fleet_files(trees):
     for file, nodes in trees.items():
         for node in nodes:
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and "\n" not in node.value:
+            if (
+                isinstance(node, ast.Constant)
+                and isinstance(node.value, str)
+                and "\n" not in node.value
+            ):
                 assert "fleets" not in node.value, file
                 assert "gaponet.testing" not in node.value, file

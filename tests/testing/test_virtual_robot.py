@@ -27,7 +27,9 @@ def run(robot, units, ctrl, payload=0.0, dt=0.02, start=None, **how):
     """Play (T, n) targets on every unit; true positions after each period (T, N, n) and the robots."""
     robots = VirtualRobot(robot, units, [(payload, "both")] * len(units), dt, **how)
     every = lambda row: np.repeat(row[None], len(units), axis=0)  # noqa: E731
-    robots.reset(every(ctrl[0]), list(range(len(units))), start=None if start is None else every(start))
+    robots.reset(
+        every(ctrl[0]), list(range(len(units))), start=None if start is None else every(start)
+    )
     path = []
     for row in ctrl:
         robots.step(every(row))
@@ -61,7 +63,9 @@ def test_standing_legs_change_nothing_for_the_arms():
     arms = robot.index([n for n in robot.joint_names if n not in locked])
     time = np.arange(100)[:, None] * robot.dt
     ctrl = np.zeros((100, 27))
-    ctrl[:, robot.operated_index] = 0.3 * np.sin(2 * time + np.arange(10)) - 0.3 * np.sin(np.arange(10))
+    ctrl[:, robot.operated_index] = 0.3 * np.sin(2 * time + np.arange(10)) - 0.3 * np.sin(
+        np.arange(10)
+    )
     physics = load_fleet("easy", robot).unit("virtual-1")
     whole, _ = run(robot, [physics], ctrl, 3.0)
     upper, _ = run(robot, [physics], ctrl, 3.0, locked=locked)
@@ -84,25 +88,35 @@ def test_a_weak_drive_sags_by_the_torque_over_what_it_delivers(arm):
     for i, share in enumerate((0.8, 0.8, 1.0)):
         q = path[-1, i]
         torque = static_torque(model, q[None])[0]
-        assert (0.0 - q) * KP * share == pytest.approx(torque, abs=0.06)  # the nominal friction band, 0.05 N·m
+        assert (0.0 - q) * KP * share == pytest.approx(
+            torque, abs=0.06
+        )  # the nominal friction band, 0.05 N·m
 
 
 def test_friction_opens_a_hysteresis_loop_of_twice_its_torque(arm):
     time = np.arange(0, 12, 0.02)
-    slow = 1.2 + 0.2 * np.abs((time / 6 + 1) % 2 - 1)  # up and down at 33 mrad/s, the arm nearly hanging
+    slow = 1.2 + 0.2 * np.abs(
+        (time / 6 + 1) % 2 - 1
+    )  # up and down at 33 mrad/s, the arm nearly hanging
     ctrl = np.stack([slow, np.zeros_like(slow)], axis=1)
     width = {}
     for friction in (0.0, 0.3):
         path, _ = run(arm, [unit(friction=friction)], ctrl)
         q = path[:, 0, 0]
-        width[friction] = q[len(q) * 3 // 4] - q[len(q) // 4]  # same command, coming down and going up
-    assert width[0.0] == pytest.approx(2 * 0.05 / KP + 2 * 0.5 * 0.033 / KP, abs=1e-3)  # nominal friction and damping
+        width[friction] = (
+            q[len(q) * 3 // 4] - q[len(q) // 4]
+        )  # same command, coming down and going up
+    assert width[0.0] == pytest.approx(
+        2 * 0.05 / KP + 2 * 0.5 * 0.033 / KP, abs=1e-3
+    )  # nominal friction and damping
     assert width[0.3] - width[0.0] == pytest.approx(2 * 0.3 / KP, rel=0.1)
 
 
 def test_a_stuck_joint_does_not_creep(arm):
     path, _ = run(arm, [unit(friction=0.5)], hold(0.4, seconds=5.0), start=np.array([0.42, 0.01]))
-    assert np.abs(path[-1] - path[50]).max() < 1.2e-4  # friction is a stiff constraint, not a rigid one: 20 µrad/s
+    assert (
+        np.abs(path[-1] - path[50]).max() < 1.2e-4
+    )  # friction is a stiff constraint, not a rigid one: 20 µrad/s
 
 
 HANGING = np.array([1.4, np.pi / 2 - 1.4])  # no weight on the elbow
@@ -115,7 +129,9 @@ def pushed(elbow, seconds=0.4, dt=0.02):
 def test_bristles_give_way_like_a_spring_and_come_back(arm):
     slowly = np.concatenate([np.linspace(0, 0.02, 50), np.linspace(0.02, 0, 50)])
     ctrl = HANGING + np.stack([0 * slowly, slowly], axis=1)
-    path, _ = run(arm, [unit(friction=1.0, presliding=0.02), unit(friction=1.0)], ctrl, start=HANGING)
+    path, _ = run(
+        arm, [unit(friction=1.0, presliding=0.02), unit(friction=1.0)], ctrl, start=HANGING
+    )
     q = path[:, :, 1] - HANGING[1]
     # 20 (0.02 − x) = 1.05 (1 − exp(−x / 0.02)) at 6.15 mrad; back, −20 x = −1.05 + 1.33 exp(−(6.15 mrad − x) / 0.02)
     assert q[49, 0] == pytest.approx(6.15e-3, rel=0.03)
@@ -135,9 +151,13 @@ def test_a_compliant_joint_hangs_below_what_its_encoder_says(arm):
     twist = seen[:, 0] - path[-1, :, 0]
     load = static_torque(build_model(arm), path[-1, :1])[0, 0]
     assert abs(load) == pytest.approx(0.883, rel=0.05)
-    assert twist[0] == pytest.approx(0.1 * load / 5.0, abs=0.05 * 0.1 / 5.0)  # less what friction carries
+    assert twist[0] == pytest.approx(
+        0.1 * load / 5.0, abs=0.05 * 0.1 / 5.0
+    )  # less what friction carries
     assert twist[1] == 0.0
-    assert seen[0, 0] == pytest.approx(seen[1, 0], abs=0.006)  # the drive holds its own side as well as ever
+    assert seen[0, 0] == pytest.approx(
+        seen[1, 0], abs=0.006
+    )  # the drive holds its own side as well as ever
 
 
 def test_the_current_loop_delays_by_its_time_constant(arm):
@@ -155,7 +175,10 @@ def test_delay_holds_the_joint_still_until_it_has_passed(arm):
     ctrl = np.concatenate([hold(1.0, seconds=0.2), hold(1.2, seconds=0.3)])
     path, _ = run(arm, [unit(), unit(delay=0.06)], ctrl)
     begun = np.abs(path - path[0]) > 1e-4
-    assert [int(begun[:, i, 0].argmax()) for i in range(2)] == [10, 13]  # three periods of 20 ms later
+    assert [int(begun[:, i, 0].argmax()) for i in range(2)] == [
+        10,
+        13,
+    ]  # three periods of 20 ms later
 
 
 def test_a_cable_pulls_towards_its_angle(arm):
@@ -241,7 +264,9 @@ def test_readings_are_quantised_shifted_and_noisy_but_the_robot_is_not(arm):
     path, robots = run(arm, [physics], hold(1.0, seconds=2.0))
     reading = robots.read()
     assert np.allclose(reading.qpos / step, np.round(reading.qpos / step))
-    assert path[-1, 0] == pytest.approx(plain[-1, 0] - offset, abs=6e-3)  # it believes to be where it was told
+    assert path[-1, 0] == pytest.approx(
+        plain[-1, 0] - offset, abs=6e-3
+    )  # it believes to be where it was told
     assert reading.qpos[0] == pytest.approx(path[-1, 0] + offset, abs=step / 2 + 1e-9)
     taus = []
     for _ in range(200):
@@ -267,7 +292,13 @@ def test_current_tells_the_torque_that_the_motor_was_asked_for(arm):
 def test_every_effect_has_a_switch_that_matters(arm, effect):
     """With one effect switched on, something that is seen differs from the robot without any."""
     physics = load_fleet("shifted", arm).unit("virtual-1").only([effect])
-    if effect in ("presliding", "thinning", "compliance", "current_loop", "torque_speed"):  # not in that fleet
+    if effect in (
+        "presliding",
+        "thinning",
+        "compliance",
+        "current_loop",
+        "torque_speed",
+    ):  # not in that fleet
         physics = load_fleet("hard", arm).unit("virtual-1").only([effect])
         physics = replace(physics, no_load_speed=physics.no_load_speed / 10)
     if effect in ("drag", "churning", "limb_current", "derating", "smoothing", "flex", "grip"):

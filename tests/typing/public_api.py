@@ -17,7 +17,9 @@ data = gp.Dataset("data")
 assert_type(gp.open_dataset("s3://bucket/data"), tuple[gp.Dataset, gp.RobotSpec])
 
 with gp.progress_bar("importing") as update:
-    imported = gp.import_logs(Path("logs"), robot="so101", out="data", unit_id="a", payload_mass=0.0, progress=update)
+    imported = gp.import_logs(
+        Path("logs"), robot="so101", out="data", unit_id="a", payload_mass=0.0, progress=update
+    )
 assert_type(imported, gp.ImportResult)
 assert_type(imported.dataset, gp.Dataset)
 assert_type(gp.doctor(data), gp.DoctorResult)

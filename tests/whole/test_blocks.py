@@ -62,7 +62,9 @@ OTHERS = {
 }  # fmt: skip
 SO101_IN_SAGE = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
-MENTION = re.compile(r"\bgaponet ([a-z]+)(?: ([a-z]+))?((?:(?!gaponet )[^;`\n)])*)")  # command, action, what follows
+MENTION = re.compile(
+    r"\bgaponet ([a-z]+)(?: ([a-z]+))?((?:(?!gaponet )[^;`\n)])*)"
+)  # command, action, what follows
 
 
 class Understood(Exception):  # noqa: N818
@@ -74,15 +76,22 @@ def understood() -> None:
 
 
 def blocks(page: Path, *languages: str) -> list[str]:
-    return re.findall(rf"```(?:{'|'.join(languages)})\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    return re.findall(
+        rf"```(?:{'|'.join(languages)})\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
+    )
 
 
 def lines(page: Path) -> list[str]:
     """Lines of a page's console blocks, and its indented lines that call gaponet."""
     text = page.read_text(encoding="utf-8")
-    found = "\n".join(blocks(page, "console", "sh", "bash", "shell")).replace("\\\n", " ").splitlines()
+    found = (
+        "\n".join(blocks(page, "console", "sh", "bash", "shell")).replace("\\\n", " ").splitlines()
+    )
     outside = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
-    return [*filter(str.strip, found), *re.findall(r"^ {4,}((?:.* \| )?gaponet .*)$", outside, re.MULTILINE)]
+    return [
+        *filter(str.strip, found),
+        *re.findall(r"^ {4,}((?:.* \| )?gaponet .*)$", outside, re.MULTILINE),
+    ]
 
 
 def words(line: str) -> list[str]:
@@ -149,7 +158,13 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for seed, name in enumerate(["LOGS"] * 4 + ["NEW_LOGS"] * 3):
         pace = 0.3 + 0.1 * seed
         ctrl = robot.qpos_home + wave(200, 6, robot.dt, 0.2, pace) * [1, 1, 1, 1, 1, 0.5]
-        s = record(robot, np.clip(ctrl, *robot.qpos_range.T), name, kp=0.8 if name == "LOGS" else 0.6, delay=1)
+        s = record(
+            robot,
+            np.clip(ctrl, *robot.qpos_range.T),
+            name,
+            kp=0.8 if name == "LOGS" else 0.6,
+            delay=1,
+        )
         logged = [values.copy() for values in (s.ctrl, s.qpos)]
         for values in logged:  # SAGE has the gripper as a fraction of its range
             values[:, 5] = (values[:, 5] - low) / (high - low)
@@ -165,7 +180,9 @@ def quick(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def identify(dataset: str, *, out: str, **others: object) -> None:
         if not (place / "identified").exists():
-            original(dataset, out=place / "identified", windows=4, terms=(), table=False, budget="1s")
+            original(
+                dataset, out=place / "identified", windows=4, terms=(), table=False, budget="1s"
+            )
         shutil.copytree(place / "identified", out)
 
     def train(dataset: str, *, out: str, budget: str, progress: object) -> SimpleNamespace:
@@ -212,7 +229,15 @@ def test_the_python_blocks_of_a_page_run(page, place, quick, tmp_path, monkeypat
 
 
 QUICK = {  # Page → commands of it that take seconds; the others are parsed
-    "README.md": ("import", "doctor", "gap", "robot show", "export my_so101 --to randomization", "replay", "adapt"),
+    "README.md": (
+        "import",
+        "doctor",
+        "gap",
+        "robot show",
+        "export my_so101 --to randomization",
+        "replay",
+        "adapt",
+    ),
     "logs.md": ("import --formats",),
     "tutorial.md": ("robot", "import bags", "doctor", "gap data"),
     "install.md": ("--version", "--tyro-print-completion"),
@@ -230,20 +255,35 @@ def test_quick_commands_of_a_page_run_in_its_order(page, place, quick, tmp_path,
     for argv in filter(None, map(words, lines(PATHS[page]))):
         if argv[0] == "identify" and page == "README.md":
             gaponet.api.identify(argv[1], out=argv[3])
-        elif " ".join(argv).startswith(QUICK[page]) and "run" not in argv and "./my_arm_identified" not in argv:
+        elif (
+            " ".join(argv).startswith(QUICK[page])
+            and "run" not in argv
+            and "./my_arm_identified" not in argv
+        ):
             argv = [{"ROLLOUTS": "LOGS"}.get(word, word) for word in argv]
-            with redirect_stdout(told), suppress(SystemExit) if argv[0].startswith("--tyro") else nullcontext():
+            with (
+                redirect_stdout(told),
+                suppress(SystemExit) if argv[0].startswith("--tyro") else nullcontext(),
+            ):
                 assert main(argv) == 0, argv
     if page == "tutorial.md":
         said = " ".join(told.getvalue().split())
-        for part in ("ok: arm compiles, holds its home and is stable", "2 recordings", "mean |error|, mrad"):
+        for part in (
+            "ok: arm compiles, holds its home and is stable",
+            "2 recordings",
+            "mean |error|, mrad",
+        ):
             assert part in said
 
 
 def write_arm_and_bags(folder: Path) -> None:
     """A vendor's model and ROS bags."""
-    servos = "".join(f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow"))
-    (folder / "arm.xml").write_text(XML.replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>"))
+    servos = "".join(
+        f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow")
+    )
+    (folder / "arm.xml").write_text(
+        XML.replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>")
+    )
     for name, rows in (("wave", 400), ("sway", 300)):
         write_bag(folder / "bags" / name, rows=rows)
 
@@ -267,8 +307,12 @@ def literals(file: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.JoinedStr):
             inner |= {id(value) for value in node.values}
-            yield "".join(value.value if isinstance(value, ast.Constant) else "X" for value in node.values)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner:
+            yield "".join(
+                value.value if isinstance(value, ast.Constant) else "X" for value in node.values
+            )
+        elif (
+            isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner
+        ):
             yield node.value
 
 
@@ -284,12 +328,18 @@ def absent(text: str, options: dict[tuple[str, ...], set[str]]) -> Iterator[str]
         there = there or [have for path, have in options.items() if path[0] == command]
         wanted = set(OPTION.findall(rest)) - FOREIGN.keys()
         seen |= wanted if there else set()
-        yield from (f"gaponet {command}: {option}" for option in wanted if there and option not in set().union(*there))
+        yield from (
+            f"gaponet {command}: {option}"
+            for option in wanted
+            if there and option not in set().union(*there)
+        )
     yield from set(OPTION.findall(text)) - every - seen
 
 
 def test_every_option_that_a_message_names_is_there(options):
-    files = (f for part in sorted((ROOT / "src").glob("gaponet*")) for f in sorted(part.rglob("*.py")))
+    files = (
+        f for part in sorted((ROOT / "src").glob("gaponet*")) for f in sorted(part.rglob("*.py"))
+    )
     wrong = {
         f"{file.relative_to(ROOT)}: {problem}"
         for file in files
@@ -317,4 +367,7 @@ def test_a_wrong_command_option_or_value_is_found(parse, options):
     ):
         with pytest.raises(SystemExit, match="2"):
             parse(wrong.split())
-    assert [*absent("take `gaponet gap DATA --fix`, or --fixx", options)] == ["gaponet gap: --fix", "--fixx"]
+    assert [*absent("take `gaponet gap DATA --fix`, or --fixx", options)] == [
+        "gaponet gap: --fix",
+        "--fixx",
+    ]

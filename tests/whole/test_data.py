@@ -37,7 +37,18 @@ def test_the_card_says_virtual_first_asks_for_the_licence_and_keeps_it(place, ca
         .read_text(encoding="utf-8")
         .startswith("# set: 6 sequences, 0.00 h of arm, all on V")
     )
-    out = run(place, capsys, "data", "card", "{}/set", "--licence", "CC-BY-4.0", "--source", "test", "--json").out
+    out = run(
+        place,
+        capsys,
+        "data",
+        "card",
+        "{}/set",
+        "--licence",
+        "CC-BY-4.0",
+        "--source",
+        "test",
+        "--json",
+    ).out
     card = json.loads(out)
     assert (card["licence"], card["source"], card["total"]["frames"]) == ("CC-BY-4.0", "test", 360)
     assert json.loads((place / "set" / "dataset.json").read_text())["licence"] == "CC-BY-4.0"
@@ -45,7 +56,18 @@ def test_the_card_says_virtual_first_asks_for_the_licence_and_keeps_it(place, ca
 
 def test_a_split_is_printed_and_written(place, capsys):
     result = json.loads(
-        run(place, capsys, "data", "split", "{}/set", "--by", "payload", "--holdout", "0.2", "--json").out
+        run(
+            place,
+            capsys,
+            "data",
+            "split",
+            "{}/set",
+            "--by",
+            "payload",
+            "--holdout",
+            "0.2",
+            "--json",
+        ).out
     )
     assert result["split"].endswith("splits/payload-0.2.json")
     assert result["parts"]["test"]["payloads_kg"] == ["0.2"]

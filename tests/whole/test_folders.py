@@ -74,7 +74,10 @@ def test_a_dataset_that_may_only_be_read_has_a_gap_a_card_and_can_be_pushed(arm,
     if os.geteuid() == 0:  # to whom every folder is open: a disk that is mounted to be read
         mounted = f"mount --bind {disk} {disk} && mount -o remount,ro,bind {disk} && exec"
         words = ["unshare", "-m", "sh", "-c", f'{mounted} "$@"', "-", *words]
-        if not shutil.which("unshare") or subprocess.run([*words[:-3], "pass"], capture_output=True).returncode:
+        if (
+            not shutil.which("unshare")
+            or subprocess.run([*words[:-3], "pass"], capture_output=True).returncode
+        ):
             pytest.skip("root here may not mount")
     before = sorted(disk.rglob("*"))
     done = subprocess.run(words, capture_output=True, text=True)

@@ -14,14 +14,18 @@ from gaponet.cli.main import main
 from gaponet.robot.spec import load_robot
 
 DOCS = Path(__file__).parents[2] / "docs"
-SERVOS = "".join(f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow"))
+SERVOS = "".join(
+    f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow")
+)
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     """A model file, logs of an arm with weaker and later servos, logs of another day, and a rollout of a simulator."""
     folder = tmp_path_factory.mktemp("pages")
-    (folder / "arm.xml").write_text(XML.replace("</mujoco>", f"<actuator>{SERVOS}</actuator></mujoco>"))
+    (folder / "arm.xml").write_text(
+        XML.replace("</mujoco>", f"<actuator>{SERVOS}</actuator></mujoco>")
+    )
     robot = write_arm(folder / "nominal")
     for name, seeds, how in (("logs", range(5), {"kp": 0.7, "delay": 2}), ("new_logs", [11], {"kp": 0.65, "delay": 2}),
                              ("rollouts", [12], {})):  # fmt: skip
@@ -31,13 +35,22 @@ def place(tmp_path_factory):
             s = record(robot, commands(rows, seed), f"m{seed}", **how)
             table = np.concatenate([s.dt * np.arange(rows)[:, None], s.ctrl, s.qpos], axis=1)
             head = "time,ctrl.shoulder,ctrl.elbow,qpos.shoulder,qpos.elbow"
-            np.savetxt(folder / name / f"m{seed}.csv", table, delimiter=",", header=head, comments="", fmt="%.6f")
+            np.savetxt(
+                folder / name / f"m{seed}.csv",
+                table,
+                delimiter=",",
+                header=head,
+                comments="",
+                fmt="%.6f",
+            )
     return folder
 
 
 def blocks(page, heading):
     """(language, text) of the blocks of a page's section."""
-    section = (DOCS / page).read_text(encoding="utf-8").split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    section = (
+        (DOCS / page).read_text(encoding="utf-8").split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    )
     return re.findall(r"```(console|python)\n(.*?)```", section, re.DOTALL)
 
 
@@ -51,7 +64,11 @@ def play(page, heading, capsys):
         for line in text.splitlines():
             words = shlex.split(line)
             if words[0] == "python":
-                print(subprocess.run([sys.executable, words[1]], capture_output=True, text=True, check=True).stdout)
+                print(
+                    subprocess.run(
+                        [sys.executable, words[1]], capture_output=True, text=True, check=True
+                    ).stdout
+                )
             else:  # the pages' fits take a minute; here they take seconds
                 quick = ["--budget", "3s"] if words[1] == "start" else []
                 assert main([*words[1:], *quick]) == 0, line
@@ -75,7 +92,9 @@ def test_a_section_does_what_it_says(place, monkeypatch, capsys, page):
         found = load_robot(place / "started/identified")
         assert found.kp[found.operated_index] == pytest.approx([14.0, 14.0], rel=0.1)
         assert found.delay[found.operated_index] == pytest.approx([0.04, 0.04], abs=0.008)
-        here, there = map(float, re.search(r"the MJCF alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups())
+        here, there = map(
+            float, re.search(r"the MJCF alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups()
+        )
         assert abs(here - there) <= 0.02 * there + 0.01
     if page == "export.md":
         assert "The robot would not do what the simulator did: " in said
@@ -83,6 +102,7 @@ def test_a_section_does_what_it_says(place, monkeypatch, capsys, page):
         assert len(np.load(place / "answer.npz")["joints"]) == 2
     if page == "benchmark.md":
         nominal, mine, found = (
-            float(re.search(rf"{n}: ([\d.]+) mrad", said)[1]) for n in ("nominal", "mine", "identified")
+            float(re.search(rf"{n}: ([\d.]+) mrad", said)[1])
+            for n in ("nominal", "mine", "identified")
         )
         assert found < mine < nominal

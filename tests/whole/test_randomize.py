@@ -32,7 +32,9 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
     logs(robot, tmp_path / "new_logs", 20, 4, kp=0.7, delay=1)
     logs(robot, tmp_path / "logs" / "a", 40, 4, kp=0.8, delay=1)
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```(console|python)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    blocks = re.findall(
+        r"```(console|python)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+    )
     assert [kind for kind, _ in blocks] == ["console", "python", "console", "console", "console"]
     assert main(["identify", "data", "--out", "my_arm"]) == 0
     codes = {}

@@ -62,11 +62,28 @@ def test_an_adapted_unit_is_evaluated_with_and_without_and_run_by_its_name(place
     assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet", "adapted"]
     assert (result["adapted_units"], result["unseen"]) == ([adapted["unit_id"]], True)
     motion = place / "sway.npz"
-    np.savez(motion, joint_names=["shoulder", "elbow"], ctrl=np.linspace([0.0, 0.0], [0.2, 0.3], 40), dt=0.02)
-    words = ["run", "--motion", str(motion), "--model", "{}/gaponet", "--fast", "--yes", "--blend", "0.2"]
+    np.savez(
+        motion,
+        joint_names=["shoulder", "elbow"],
+        ctrl=np.linspace([0.0, 0.0], [0.2, 0.3], 40),
+        dt=0.02,
+    )
+    words = [
+        "run",
+        "--motion",
+        str(motion),
+        "--model",
+        "{}/gaponet",
+        "--fast",
+        "--yes",
+        "--blend",
+        "0.2",
+    ]
     played, err = run(place, capsys, *words, "--payload-mass", "0")
     assert played["adapted"] is None
-    assert f"adaptations of {adapted['unit_id']}, none of which is used: --unit-id says which" in err
+    assert (
+        f"adaptations of {adapted['unit_id']}, none of which is used: --unit-id says which" in err
+    )
     played, err = run(place, capsys, *words, "--payload-mass", "0", "--unit-id", adapted["unit_id"])
     assert played["adapted"] == adapted["unit_id"]
     words = [word.format(place) for word in words]

@@ -83,7 +83,10 @@ def test_a_missing_extra_is_one_line_with_the_command(missing, monkeypatch, caps
         return
     assert main(["doctor"]) == 2
     extra = {"torch": "train", "matplotlib": "report", "serial": "so101"}[missing]
-    assert capsys.readouterr().err == f"Missing: {missing} is not installed; run: pip install 'gaponet[{extra}]'\n"
+    assert (
+        capsys.readouterr().err
+        == f"Missing: {missing} is not installed; run: pip install 'gaponet[{extra}]'\n"
+    )
 
 
 def test_completion_knows_every_command_where_no_extra_is_installed():
@@ -111,8 +114,14 @@ sys.exit(code)
 
 @pytest.mark.parametrize("words", [["doctor"], ["doctor", "--json"], ["--help"]])
 def test_a_closed_pipe_is_no_traceback(place, words):
-    words = [words[0], f"{place}/set", "--robot", f"{place}/arm", *words[1:]] if words[0] == "doctor" else words
-    run = subprocess.Popen([sys.executable, "-m", "gaponet", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    words = (
+        [words[0], f"{place}/set", "--robot", f"{place}/arm", *words[1:]]
+        if words[0] == "doctor"
+        else words
+    )
+    run = subprocess.Popen(
+        [sys.executable, "-m", "gaponet", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     run.stdout.close()
     said = run.stderr.read().decode()
     assert run.wait() in (141, 0)

@@ -84,7 +84,9 @@ def test_the_way_from_logs_to_a_report_needs_nothing_that_windows_has_not(tmp_pa
     for i in range(5):
         ctrl = wave(80, 6, hertz=0.3 + 0.2 * i)
         ctrl[:, 5] = 0.5 + ctrl[:, 5]
-        write_sage(tmp_path / "logs" / "real" / "so101" / "custom" / f"wave_{i}", ctrl, late(ctrl, 2))
+        write_sage(
+            tmp_path / "logs" / "real" / "so101" / "custom" / f"wave_{i}", ctrl, late(ctrl, 2)
+        )
     assert "all the way" in without_posix(WAY, tmp_path)
 
 
@@ -96,7 +98,9 @@ def test_what_windows_has_not_is_imported_nowhere_at_the_top():
     """But by the virtual servo bus, which is a pseudo-terminal."""
     for file in SOURCE.rglob("*.py"):
         top = [
-            n for n in ast.parse(file.read_text(encoding="utf-8")).body if isinstance(n, ast.Import | ast.ImportFrom)
+            n
+            for n in ast.parse(file.read_text(encoding="utf-8")).body
+            if isinstance(n, ast.Import | ast.ImportFrom)
         ]
         names = {a.name for n in top if isinstance(n, ast.Import) for a in n.names}
         names |= {n.module for n in top if isinstance(n, ast.ImportFrom)}

@@ -52,7 +52,10 @@ def export_robot(
 
     holder = Path(robot)
     spec, source = load_robot(simulator_folder(holder)), None if into is None else Path(into)
-    recordings, folder = read_recordings(simulator_folder(holder), data, spec), Path(out) if out else holder / to
+    recordings, folder = (
+        read_recordings(simulator_folder(holder), data, spec),
+        Path(out) if out else holder / to,
+    )
     made = files.export_robot(spec, to, folder, recordings, source, prefix, payload_mass, progress)
     return _exported(made, folder, to, spec.name)
 
@@ -129,7 +132,9 @@ def randomization(
 
     spec = load_robot(simulator_folder(Path(robot)))
     made = sample_units(spec, scope, tuple(map(Path, units)), engine=engine)
-    made = judge_units(made, spec, read_recordings(spec.folder, data, spec), progress, ENGINE_TERMS.get(engine, ()))
+    made = judge_units(
+        made, spec, read_recordings(spec.folder, data, spec), progress, ENGINE_TERMS.get(engine, ())
+    )
     return write_randomization(made, engine, Path(out)), made
 
 
@@ -157,5 +162,7 @@ def _export_onnx(run: Path, out: Path | None) -> ExportResult:
     net = trained_network(run, config, len(card["joint_names"]))
     parity = write(net, path, card, sample_inputs(net))
     if path != run / "model" and has_stored_robot(run):
-        save_robot(load_stored_robot(run, card["robot"]), path / STORED_ROBOT)  # commands can then be transferred
+        save_robot(
+            load_stored_robot(run, card["robot"]), path / STORED_ROBOT
+        )  # commands can then be transferred
     return ExportResult(path=path, to="onnx", robot=card["robot"], parity=parity)

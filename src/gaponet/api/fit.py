@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from gaponet.api.logs import unit_recordings
-from gaponet.api.opening import Place, as_dataset, as_robot, as_run, entries_of_unit, require_commands
+from gaponet.api.opening import (
+    Place,
+    as_dataset,
+    as_robot,
+    as_run,
+    entries_of_unit,
+    require_commands,
+)
 from gaponet.api.results import AdaptResult, IdentifyResult, TorqueResult, TrainResult
 from gaponet.base.errors import NoGainError, UsageError
 from gaponet.base.files import write_json, write_text
@@ -120,9 +127,23 @@ def identify(
             raise NoGainError(fitted.no_gain_message(spec, given, after))
         save_robot(fitted.robot, folder)
         errors = {"nominal": nominal, "identified": after}
-        _save_origin(folder, data, split, {name: float(e.mean()) for name, e in errors.items()}, fitted.findings)
+        _save_origin(
+            folder,
+            data,
+            split,
+            {name: float(e.mean()) for name, e in errors.items()},
+            fitted.findings,
+        )
         judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
-        _save_uncertainty(folder, data.sequences(split["train"]), val, fitted.covariance, None, judges, fitted.links)
+        _save_uncertainty(
+            folder,
+            data.sequences(split["train"]),
+            val,
+            fitted.covariance,
+            None,
+            judges,
+            fitted.links,
+        )
     return IdentifyResult(
         robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began,
         taken_from=taken,
@@ -130,7 +151,11 @@ def identify(
 
 
 def identify_torque(
-    dataset: Dataset | Place, *, out: Place, current: bool = False, robot: RobotSpec | Place | None = None
+    dataset: Dataset | Place,
+    *,
+    out: Place,
+    current: bool = False,
+    robot: RobotSpec | Place | None = None,
 ) -> TorqueResult:
     """Fit friction, inertia and delay of a robot that is driven by torque.
 
@@ -156,10 +181,14 @@ def identify_torque(
     data, spec = as_dataset(dataset, robot)
     data.require_robot(spec)
     few = len({e.meta.motion for e in data.entries}) < MIN_MOTIONS_TO_SPLIT
-    split = {"train": data.entries, "val": data.entries, "test": []} if few else split_entries(data, ())
+    split = (
+        {"train": data.entries, "val": data.entries, "test": []} if few else split_entries(data, ())
+    )
     folder, train_set = Path(out), data.sequences(split["train"])
     with lock_folder(folder, "robot"):
-        fitted = fit_torque_driven(train_set, train_set if few else data.sequences(split["val"]), spec, current)
+        fitted = fit_torque_driven(
+            train_set, train_set if few else data.sequences(split["val"]), spec, current
+        )
         before, after = (float(np.mean(x)) for x in fitted.angle[0.5])
         if not after < before:
             raise NoGainError(
@@ -199,7 +228,9 @@ def _save_uncertainty(
         (folder / name).unlink(missing_ok=True)
     robot = load_robot(folder)
     made = estimate_uncertainty(robot, sequences, validation, covariance, before, held_out)
-    replace(made, links=before.links if before else LinkUncertainty.of(links, robot, made.fields)).save(folder)
+    replace(
+        made, links=before.links if before else LinkUncertainty.of(links, robot, made.fields)
+    ).save(folder)
 
 
 def train(
@@ -311,7 +342,9 @@ def adapt_model(
         entries = [e for e in entries if e.meta.motion in model.card["motions"]["train"]] or entries
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
-    fitted = Adaptation.fit(model, simulator, data.sequences(entries), seconds, _window_rms(progress))
+    fitted = Adaptation.fit(
+        model, simulator, data.sequences(entries), seconds, _window_rms(progress)
+    )
     fitted.save(folder)
     return AdaptResult(
         unit_id=fitted.unit_id, servos={j: {str(f): v for f, v in s.items()} for j, s in fitted.servos.items()},
@@ -355,9 +388,15 @@ def adapt_robot(
     from gaponet.sysid.adapt import FIELDS, adapt
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
-    folder, spec = Path(out), as_robot(Path(robot) if isinstance(robot, str) and "/" in robot else robot)
+    folder, spec = (
+        Path(out),
+        as_robot(Path(robot) if isinstance(robot, str) and "/" in robot else robot),
+    )
     uncertainty = ParameterUncertainty.load(spec)
-    with lock_folder(folder, "robot"), unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences):
+    with (
+        lock_folder(folder, "robot"),
+        unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
+    ):
         fitted = adapt(sequences, spec, seconds, None, _window_rms(progress), judge=True)
         if not fitted.accepted:
             before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
@@ -376,10 +415,18 @@ def adapt_robot(
                 f"the fit and {1e3 * before:.2f} mrad with {spec.name}; give longer logs (--seconds), or keep the robot"
             )
         save_robot(fitted.robot, folder)
-        if (spec.folder / PROVENANCE_FILE).is_file():  # identification's training motions stay on record
-            write_text(folder / PROVENANCE_FILE, (spec.folder / PROVENANCE_FILE).read_text(encoding="utf-8"))
+        if (
+            spec.folder / PROVENANCE_FILE
+        ).is_file():  # identification's training motions stay on record
+            write_text(
+                folder / PROVENANCE_FILE,
+                (spec.folder / PROVENANCE_FILE).read_text(encoding="utf-8"),
+            )
         _save_uncertainty(folder, sequences, [], {}, uncertainty)
-    robot, joints = fitted.robot, zip(fitted.robot.operated, fitted.robot.operated_index, strict=True)
+    robot, joints = (
+        fitted.robot,
+        zip(fitted.robot.operated, fitted.robot.operated_index, strict=True),
+    )
     return AdaptResult(
         unit_id=unit, servos={j: {f: float(getattr(robot, f)[i]) for f in FIELDS} for j, i in joints},
         before=before, after=after, robot=robot, folder=folder, recordings=len(sequences),

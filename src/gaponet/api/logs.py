@@ -27,7 +27,10 @@ if TYPE_CHECKING:
     from gaponet.sysid.uncertainty import ParameterUncertainty
     from gaponet.testing.collect import CollectResult
 
-DEFAULT_MINUTES, DEFAULT_FURTHER_MINUTES = 10.0, 0.5  # of motions for a new robot, and for an identified one
+DEFAULT_MINUTES, DEFAULT_FURTHER_MINUTES = (
+    10.0,
+    0.5,
+)  # of motions for a new robot, and for an identified one
 
 
 def import_logs(
@@ -118,7 +121,9 @@ def doctor(
     from gaponet.sim.dynamics import gravity_of
 
     data, spec = as_dataset(dataset, robot)
-    return DoctorResult.of(data, spec, gravity_model=gravity_of(spec), progress=progress, executor=executor)
+    return DoctorResult.of(
+        data, spec, gravity_model=gravity_of(spec), progress=progress, executor=executor
+    )
 
 
 def pair(
@@ -186,7 +191,9 @@ def collect(
 
     spec, plan = as_robot(robot), recording.load_recipe(recipe)
     plan = replace(plan, payloads=payloads or plan.payloads, units=units or plan.units)
-    return recording.collect(spec, load_fleet(fleet, spec), plan, out, seed, nproc, progress, executor=executor)
+    return recording.collect(
+        spec, load_fleet(fleet, spec), plan, out, seed, nproc, progress, executor=executor
+    )
 
 
 def excite(
@@ -229,10 +236,15 @@ def excite(
             plan, prediction = _further_motions(spec, seconds, masses, seed, progress)
         else:
             plan = make_plan(spec, DEFAULT_MINUTES if minutes is None else minutes, masses, seed)
-        files = {motion.name: f"{i:02d}_{motion.name}.{format}" for i, motion in enumerate(plan.motions, 1)}
+        files = {
+            motion.name: f"{i:02d}_{motion.name}.{format}"
+            for i, motion in enumerate(plan.motions, 1)
+        }
         for motion in plan.motions:
             write_motion(folder / files[motion.name], motion, spec, rate)
-        write_text(folder / "sheet.md", sheet(spec, plan, files, rate, spec.folder if further else None))
+        write_text(
+            folder / "sheet.md", sheet(spec, plan, files, rate, spec.folder if further else None)
+        )
     return ExciteResult(
         folder=folder, motions=tuple(files.values()), minutes=plan.minutes, payloads=tuple(plan.payloads),
         sheet=folder / "sheet.md", prediction=prediction,
@@ -255,15 +267,21 @@ def _further_motions(
 
     uncertainty = ParameterUncertainty.require(spec)
     if payloads[0] < 0 or (payloads[-1] > 0 and not spec.payload_mounts):
-        raise UsageError(f"--payloads {payloads}: give kg ≥ 0; {spec.name} has {len(spec.payload_mounts)} mounts")
+        raise UsageError(
+            f"--payloads {payloads}: give kg ≥ 0; {spec.name} has {len(spec.payload_mounts)} mounts"
+        )
     motions = candidate_motions(Library(spec, seed, payloads[-1]), progress)
     pairs = [(mass, motion) for mass in payloads for motion in motions]
     design = ExperimentDesign.from_recordings(
-        spec, uncertainty, [s for mass in payloads for s in simulated_recordings(spec, motions, mass)]
+        spec,
+        uncertainty,
+        [s for mass in payloads for s in simulated_recordings(spec, motions, mass)],
     )
     picks = sorted(design.choose(seconds), key=lambda i: pairs[i][0])
     if not picks:
-        raise UsageError(f"--minutes {seconds / 60:g}: no motion is so short; give {design.seconds.min() / 60:.2f}")
+        raise UsageError(
+            f"--minutes {seconds / 60:g}: no motion is so short; give {design.seconds.min() / 60:.2f}"
+        )
     before, after = (_standard_errors(uncertainty, design.after(chosen)) for chosen in ([], picks))
     chosen = tuple(pairs[i] for i in picks)
     return Plan(chosen), Prediction(
@@ -273,11 +291,17 @@ def _further_motions(
     )  # fmt: skip
 
 
-def _standard_errors(uncertainty: ParameterUncertainty, covariance: np.ndarray) -> dict[str, dict[str, float]]:
+def _standard_errors(
+    uncertainty: ParameterUncertainty, covariance: np.ndarray
+) -> dict[str, dict[str, float]]:
     """Return joint → field → standard error, SI."""
     return {
         joint: dict(
-            zip(uncertainty.fields, np.sqrt(np.diag(uncertainty.si(joint, covariance[i])[1])).tolist(), strict=True)
+            zip(
+                uncertainty.fields,
+                np.sqrt(np.diag(uncertainty.si(joint, covariance[i])[1])).tolist(),
+                strict=True,
+            )
         )
         for i, joint in enumerate(uncertainty.joints)
     }
@@ -299,14 +323,25 @@ def unit_recordings(
         UsageError: The unit is not there, or there are several and none is named.
     """
     with tempfile.TemporaryDirectory() as place:
-        if isinstance(source, (str, Path)) and Path(source).exists() and not (Path(source) / "dataset.json").is_file():
+        if (
+            isinstance(source, (str, Path))
+            and Path(source).exists()
+            and not (Path(source) / "dataset.json").is_file()
+        ):
             target = Path(place) / "data"
-            data = import_logs(source, robot=robot, out=target, unit_id=unit or None, payload_mass=payload_mass).dataset
+            data = import_logs(
+                source, robot=robot, out=target, unit_id=unit or None, payload_mass=payload_mass
+            ).dataset
         else:
             data, _ = as_dataset(source, robot)
         data.require_robot(robot)
         unit, entries = entries_of_unit(data, unit, motions)
-        stated = max((e.meta.payload_mass for e in entries if e.meta.payload_mass != payload_mass), default=None)
+        stated = max(
+            (e.meta.payload_mass for e in entries if e.meta.payload_mass != payload_mass),
+            default=None,
+        )
         if payload_mass is not None and stated is not None:
-            raise UsageError(f"--payload-mass {payload_mass:g}: {source} states {stated:g} kg; leave it out")
+            raise UsageError(
+                f"--payload-mass {payload_mass:g}: {source} states {stated:g} kg; leave it out"
+            )
         yield unit, data.sequences(entries)

@@ -67,14 +67,20 @@ def gap(
 
 
 def _gap_by_cause(
-    dataset: Dataset | Place, robot: RobotSpec | None, folder: Path | None, motions: tuple[str, ...], progress: Progress
+    dataset: Dataset | Place,
+    robot: RobotSpec | None,
+    folder: Path | None,
+    motions: tuple[str, ...],
+    progress: Progress,
 ) -> GapResult:
     from gaponet.report.candidate import Candidate
     from gaponet.report.figures.evaluation import write_gap
     from gaponet.report.gap import gap_by_step
 
     data, spec = as_dataset(dataset, robot, folder)
-    candidate = Candidate(spec.folder, spec, None) if folder is None else Candidate.load(folder, spec)
+    candidate = (
+        Candidate(spec.folder, spec, None) if folder is None else Candidate.load(folder, spec)
+    )
     table = gap_by_step(candidate, data, motions, progress)
     if (
         folder is not None or (candidate.folder / FOLDER_MARKER).is_file()
@@ -120,7 +126,9 @@ def evaluate(
         own = load_robot(folder) if is_robot(folder) else load_stored_robot(folder, spec.name)
     if model_hash(own) != model_hash(spec):
         target, spec = spec, own.nominal or own
-    evaluation = measuring.evaluate([folder, *map(Path, also)], data, spec, motions, progress, target, units)
+    evaluation = measuring.evaluate(
+        [folder, *map(Path, also)], data, spec, motions, progress, target, units
+    )
     evaluation.save(folder)
     return EvalResult(
         methods=evaluation.result["methods"], unseen=evaluation.result["unseen"], evaluation=evaluation
@@ -157,7 +165,9 @@ def check(
     uncertainty = ParameterUncertainty.require(spec)
     with unit_recordings(logs, spec, unit, motions, payload_mass) as (_, sequences):
         drifted = drift(spec, uncertainty, sequences, threads)
-    return CheckResult(verdict=drifted.verdict, advice=drifted.advice, recordings=len(sequences), drift=drifted)
+    return CheckResult(
+        verdict=drifted.verdict, advice=drifted.advice, recordings=len(sequences), drift=drifted
+    )
 
 
 def replay(
@@ -190,7 +200,10 @@ def replay(
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
     spec = as_robot(Path(robot) if isinstance(robot, str) else robot)
-    uncertainty, recordings = ParameterUncertainty.load(spec), read_recordings(spec.folder, data, spec)
+    uncertainty, recordings = (
+        ParameterUncertainty.load(spec),
+        read_recordings(spec.folder, data, spec),
+    )
     drawn = sample_robots(spec) if uncertainty is not None else []
     errors: Array
     if recordings is not None:
@@ -213,7 +226,10 @@ def replay(
         rollouts = report.dataset.sequences(list(report.added))
     prediction = predict(spec, rollouts, errors, drawn)
     joints = summary(prediction, spec.operated)
-    differ = sorted((j for j, s in joints.items() if s["inside"] < BAND_SHARE), key=lambda j: joints[j]["inside"])
+    differ = sorted(
+        (j for j, s in joints.items() if s["inside"] < BAND_SHARE),
+        key=lambda j: joints[j]["inside"],
+    )
     return ReplayResult(
         robot=spec, joints=joints, differ=tuple(differ), rollouts=tuple(prediction), share=BAND_SHARE, drawn=len(drawn),
         band_from_recordings=recordings is not None,

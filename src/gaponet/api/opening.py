@@ -46,7 +46,9 @@ def entries_of_unit(data: Dataset, unit: str, motions: tuple[str, ...]) -> tuple
     """
     units = sorted({e.meta.unit_id for e in data.entries})
     if unit not in units and (unit or len(units) != 1):
-        raise UsageError(f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one")
+        raise UsageError(
+            f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one"
+        )
     unit = unit or units[0]
     return unit, [e for e in data.select(motions) if e.meta.unit_id == unit]
 

@@ -30,7 +30,9 @@ __all__ = [
     "AdaptResult", "CheckResult", "EvalResult", "ExciteResult", "ExportResult", "GapResult", "IdentifyResult",
     "PairResult", "ReplayResult", "TorqueResult", "TrainResult",
 ]  # fmt: skip
-Metrics = dict[str, Any]  # mpjae rad, q_dis rad·s, …, and by_joint, by_payload, by_unit, by_motion, by_horizon
+Metrics = dict[
+    str, Any
+]  # mpjae rad, q_dis rad·s, …, and by_joint, by_payload, by_unit, by_motion, by_horizon
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +65,11 @@ class PairResult:
     present: int
 
     def to_dict(self) -> dict[str, Any]:
-        return {"dataset": str(self.dataset.path), "simulated": self.simulated, "present": self.present}
+        return {
+            "dataset": str(self.dataset.path),
+            "simulated": self.simulated,
+            "present": self.present,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +141,8 @@ class IdentifyResult:
             joint: {
                 f: float(getattr(robot, f)[i])
                 for f in SERVO_FIELDS
-                if np.isfinite(getattr(robot, f)[i]) and (f != "effort_limit" or f in self.fit.std[joint])
+                if np.isfinite(getattr(robot, f)[i])
+                and (f != "effort_limit" or f in self.fit.std[joint])
             }
             for joint, i in zip(robot.operated, robot.operated_index, strict=True)
         }
@@ -211,9 +218,21 @@ class TrainResult:
         return {name: float(self.card["val_mpjae"][name]) for name in ("nominal", "start", "model")}
 
     def to_dict(self) -> dict[str, Any]:
-        keys = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
+        keys = (
+            "val_mpjae",
+            "steps",
+            "seconds",
+            "sensor_r2",
+            "stages",
+            "interrupted",
+            "parity_rad",
+            "seed",
+        )
         kind = self.card["model"]["kind"]
-        return {key: self.card[key] for key in keys} | {"kind": kind, "candidates": dict(self.candidates)}
+        return {key: self.card[key] for key in keys} | {
+            "kind": kind,
+            "candidates": dict(self.candidates),
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,7 +321,11 @@ class ReplayResult:
         }  # fmt: skip
         for k, a in enumerate(self.rollouts):
             series = {"target": a.target, "rollout": a.rollout, "robot": a.robot}
-            series |= {"low": a.robot - a.half_width, "high": a.robot + a.half_width, "dt": np.array(a.dt)}
+            series |= {
+                "low": a.robot - a.half_width,
+                "high": a.robot + a.half_width,
+                "dt": np.array(a.dt),
+            }
             arrays |= {f"{name}_{k}": values for name, values in series.items()}
         with atomic_write(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)

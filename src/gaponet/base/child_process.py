@@ -30,8 +30,13 @@ def exclude_current_folder() -> None:
 
 def _module_path() -> list[str]:
     """Return sys.path without relative entries and the current folder, unless gaponet itself is installed there."""
-    current, home = _real("."), os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    return [p for p in sys.path if os.path.isabs(p) and (_real(p) != current or current == _real(home))]
+    current, home = (
+        _real("."),
+        os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))),
+    )
+    return [
+        p for p in sys.path if os.path.isabs(p) and (_real(p) != current or current == _real(home))
+    ]
 
 
 def _real(path: str) -> str:

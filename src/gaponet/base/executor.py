@@ -93,7 +93,9 @@ class Pool:
                         submit(job, deaths + 1)
                     else:
                         reason = str(death).strip() or type(death).__name__
-                        message = f"{deaths + 1} workers died of it, out of memory? The last: {reason}"
+                        message = (
+                            f"{deaths + 1} workers died of it, out of memory? The last: {reason}"
+                        )
                         yield _Outcome(job, None, WorkerError(message))
                 on_poll()
         finally:
@@ -194,11 +196,15 @@ def _call(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     return fn(*args, **kwargs)
 
 
-def _connect_ray(stack: ExitStack, address: str, workers: int, threads: int) -> tuple[Executor, int]:
+def _connect_ray(
+    stack: ExitStack, address: str, workers: int, threads: int
+) -> tuple[Executor, int]:
     """Connect to the cluster at an address or $RAY_ADDRESS, or start Ray here, closed to other machines."""
     address = address or os.environ.get("RAY_ADDRESS") or LOCAL
     if address == LOCAL:
-        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # binds to the loopback interface on every system
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
+            "0"  # binds to the loopback interface on every system
+        )
     import ray
 
     if not ray.is_initialized():

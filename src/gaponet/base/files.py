@@ -25,12 +25,16 @@ from gaponet.base.errors import FolderError
 WINDOWS = os.name == "nt"
 FOLDER_MARKER = ".gaponet"
 LOCK_RETRY_S = 0.05
-LOCKED_BYTE = 1 << 30  # Windows: a locked byte cannot be read, so it lies far behind the end of the file
+LOCKED_BYTE = (
+    1 << 30
+)  # Windows: a locked byte cannot be read, so it lies far behind the end of the file
 # Files by which a folder without a marker is recognised: older versions wrote none.
 UNMARKED_FOLDERS = {
     "dataset": ("dataset.json",),
     "run": ("split.json",),
-    "experiments": tuple(f"{place}cells/*/setup.json" for place in ("", "rehearsal/", "without-*/")),
+    "experiments": tuple(
+        f"{place}cells/*/setup.json" for place in ("", "rehearsal/", "without-*/")
+    ),
     "model": ("card.json",),
 }
 
@@ -68,7 +72,10 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically, with the conversions of `json_compatible`."""
-    write_text(path, json.dumps(json_compatible(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(
+        path,
+        json.dumps(json_compatible(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
+    )
 
 
 def json_compatible(value: Any) -> Any:
@@ -111,10 +118,16 @@ def require_own_folder(folder: Path, kind: str) -> None:
         return
     marked = _marker_lines(folder)[:1]
     if marked and marked[0] != kind:
-        raise FolderError(f"{folder}: holds gaponet's {marked[0]}, not {kind}; choose another folder")
-    if marked or any(any(folder.glob(sign)) for sign in UNMARKED_FOLDERS.get(kind, (FOLDER_MARKER,))):
+        raise FolderError(
+            f"{folder}: holds gaponet's {marked[0]}, not {kind}; choose another folder"
+        )
+    if marked or any(
+        any(folder.glob(sign)) for sign in UNMARKED_FOLDERS.get(kind, (FOLDER_MARKER,))
+    ):
         return
-    others = sorted(child.name for child in folder.iterdir() if not child.name.startswith(FOLDER_MARKER))
+    others = sorted(
+        child.name for child in folder.iterdir() if not child.name.startswith(FOLDER_MARKER)
+    )
     if others:
         more = f" and {len(others) - 3} more" if len(others) > 3 else ""
         raise FolderError(
@@ -153,7 +166,9 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
     try:
         if not os.fstat(descriptor).st_size:
             _write_at(descriptor, 0, kind_line)
-        elif os.fstat(descriptor).st_size > len(kind_line):  # a second line names a writer that was killed
+        elif os.fstat(descriptor).st_size > len(
+            kind_line
+        ):  # a second line names a writer that was killed
             _remove_unfinished(folder)
         _write_at(descriptor, len(kind_line), f"{os.getpid()}\n".encode())
         yield
@@ -186,7 +201,9 @@ def _lock_marker(folder: Path, kind: str, wait: float) -> int:
             return descriptor
         if time.monotonic() >= deadline:
             writer = "".join(f" (process {process})" for process in _marker_lines(folder)[1:2])
-            raise FolderError(f"{folder}: another gaponet{writer} is writing here; wait for it or stop it")
+            raise FolderError(
+                f"{folder}: another gaponet{writer} is writing here; wait for it or stop it"
+            )
         time.sleep(LOCK_RETRY_S)
 
 
@@ -242,7 +259,9 @@ def _process_runs(process: int) -> bool:
         import ctypes
 
         kernel = ctypes.windll.kernel32  # type: ignore[attr-defined]
-        handle = kernel.OpenProcess(0x100000, False, process)  # SYNCHRONIZE: the right to wait for its end
+        handle = kernel.OpenProcess(
+            0x100000, False, process
+        )  # SYNCHRONIZE: the right to wait for its end
         try:
             return bool(handle) and kernel.WaitForSingleObject(handle, 0) == 0x102  # WAIT_TIMEOUT
         finally:

@@ -8,7 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, ProgressColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.progress import Progress as Bars
 
 from gaponet.base.text import escape
@@ -47,7 +54,10 @@ def progress_bars(title: str, total: int) -> Iterator[Callable[[Running, int], N
     """Show a bar for the whole and one per running task; yields show(running, done)."""
     with _progress(title) as show:
         yield lambda running, done: show(
-            running, done + sum(fraction for fraction, _ in running.values()), total, f"{done} of {total} done"
+            running,
+            done + sum(fraction for fraction, _ in running.values()),
+            total,
+            f"{done} of {total} done",
         )
 
 
@@ -74,7 +84,9 @@ def _progress(title: str) -> Iterator[_Show]:
                 if name not in shown:
                     shown[name] = progress.add_task(f"  {escape(name)}", total=1.0, note="")
                 progress.update(shown[name], completed=fraction, note=escape(task_note))
-            progress.update(whole, completed=min(done, MAX_UNFINISHED * total), total=total, note=escape(note))
+            progress.update(
+                whole, completed=min(done, MAX_UNFINISHED * total), total=total, note=escape(note)
+            )
 
         yield show
         if (task := progress.tasks[0]).percentage >= 100 * MAX_UNFINISHED:
@@ -92,7 +104,10 @@ def _lines(title: str, console: Console) -> Iterator[_Show]:
         nonlocal last, fraction, newest
         tasks = [
             note,
-            *(f"{name} {100 * part:.0f} % {progress_text}".rstrip() for name, (part, progress_text) in running.items()),
+            *(
+                f"{name} {100 * part:.0f} % {progress_text}".rstrip()
+                for name, (part, progress_text) in running.items()
+            ),
         ]
         fraction, newest = done / total if total else 0.0, "; ".join(task for task in tasks if task)
         if time.monotonic() - last >= interval and (fraction < 1 or last >= start):

@@ -49,7 +49,9 @@ class ResultTable:
     def __post_init__(self) -> None:
         for row in self.rows:
             if len(row) != len(self.columns):
-                raise ValueError(f"table '{self.name}': {len(row)} cells under {len(self.columns)} columns: {row}")
+                raise ValueError(
+                    f"table '{self.name}': {len(row)} cells under {len(self.columns)} columns: {row}"
+                )
 
     def texts(self) -> list[list[str]]:
         """Return the rows as formatted cells."""
@@ -64,24 +66,43 @@ class ResultTable:
     def markdown(self) -> str:
         """Return the table in Markdown, with the caption below."""
         ruler = ["---", *["---:"] * (len(self.columns) - 1)]
-        lines = [map(escape_markdown, self.columns), ruler, *(map(escape_markdown, row) for row in self.texts())]
+        lines = [
+            map(escape_markdown, self.columns),
+            ruler,
+            *(map(escape_markdown, row) for row in self.texts()),
+        ]
         table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
         return f"{table}\n\n{escape_markdown(self.caption)}" if self.caption else table
 
     def csv(self) -> str:
         """Return the table as CSV at full precision; a column with MeanStd is followed by its std and count."""
-        with_std = [any(isinstance(cell, MeanStd) for cell in column) for column in zip(*self.rows, strict=True)]
+        with_std = [
+            any(isinstance(cell, MeanStd) for cell in column)
+            for column in zip(*self.rows, strict=True)
+        ]
         with_std = with_std or [False] * len(self.columns)
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        names = ((c, f"{c}: std", f"{c}: n") if wide else (c,) for c, wide in zip(self.columns, with_std, strict=True))
+        names = (
+            (c, f"{c}: std", f"{c}: n") if wide else (c,)
+            for c, wide in zip(self.columns, with_std, strict=True)
+        )
         writer.writerow([name for group in names for name in group])
         for row in self.rows:
             line: list[Any] = []
             for cell, wide in zip(row, with_std, strict=True):
-                values = [cell.mean, cell.std, cell.count] if isinstance(cell, MeanStd) else [cell, None, None]
+                values = (
+                    [cell.mean, cell.std, cell.count]
+                    if isinstance(cell, MeanStd)
+                    else [cell, None, None]
+                )
                 line += values if wide else values[:1]
-            writer.writerow(["" if v is None or (isinstance(v, float) and not math.isfinite(v)) else v for v in line])
+            writer.writerow(
+                [
+                    "" if v is None or (isinstance(v, float) and not math.isfinite(v)) else v
+                    for v in line
+                ]
+            )
         return out.getvalue()
 
 

@@ -42,7 +42,17 @@ MAX_FILES_BESIDE_MODEL = 5000  # whose sizes count
 IDLE_S = 20.0
 IDLE = "the child was idle and ended"
 # One thread and the system's allocator: what other allocators reserve counts as memory in use.
-INHERITED_VARIABLES = ("PATH", "HOME", "LANG", "LC_ALL", "SYSTEMROOT", "TEMP", "TMP", "TMPDIR", "LD_LIBRARY_PATH")
+INHERITED_VARIABLES = (
+    "PATH",
+    "HOME",
+    "LANG",
+    "LC_ALL",
+    "SYSTEMROOT",
+    "TEMP",
+    "TMP",
+    "TMPDIR",
+    "LD_LIBRARY_PATH",
+)
 CHILD_VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -68,7 +78,14 @@ def sandboxed(
         @functools.wraps(function)
         def call(file: Path, *arguments: Any) -> T:
             path = Path(os.path.abspath(file))
-            return _run(function, error, PROCESSOR_S + 1e-6 * seconds_per_mb * _size(path), path, file, arguments)
+            return _run(
+                function,
+                error,
+                PROCESSOR_S + 1e-6 * seconds_per_mb * _size(path),
+                path,
+                file,
+                arguments,
+            )
 
         call.sandboxed = function, library  # type: ignore[attr-defined]
         return call
@@ -82,7 +99,12 @@ def in_sandbox() -> bool:
 
 
 def _run(
-    function: Callable[..., T], error: type[GAPONetError], seconds: float, path: Path, file: Path, arguments: Any
+    function: Callable[..., T],
+    error: type[GAPONetError],
+    seconds: float,
+    path: Path,
+    file: Path,
+    arguments: Any,
 ) -> T:
     if _Child.is_this_process:
         return function(file, *arguments)
@@ -92,9 +114,13 @@ def _run(
         if failure == IDLE:
             answer, failure = _Child.current_or_new().request(request, seconds)
     if failure == "memory":
-        raise error(f"{file}: takes more than {MEMORY_BYTES >> 20} MiB to be read, more than a file may; cut it")
+        raise error(
+            f"{file}: takes more than {MEMORY_BYTES >> 20} MiB to be read, more than a file may; cut it"
+        )
     if failure == "time":
-        raise error(f"{file}: is not read after {seconds:.0f} s, longer than a file of its size may take; cut it")
+        raise error(
+            f"{file}: is not read after {seconds:.0f} s, longer than a file of its size may take; cut it"
+        )
     if failure:
         raise error(f"{file}: is not readable ({failure}); copy or make it again")
     if isinstance(answer, Exception):
@@ -107,7 +133,11 @@ def _size(path: Path) -> int:
     with suppress(OSError):
         if path.is_dir() or path.suffix in (".xml", ".urdf"):
             folder = path if path.is_dir() else path.parent
-            return sum(f.stat().st_size for f in islice(folder.rglob("*"), MAX_FILES_BESIDE_MODEL) if f.is_file())
+            return sum(
+                f.stat().st_size
+                for f in islice(folder.rglob("*"), MAX_FILES_BESIDE_MODEL)
+                if f.is_file()
+            )
         return path.stat().st_size
     return 0
 
@@ -142,12 +172,21 @@ class _Child:
         try:
             _write(self.process.stdin, request)
             return pickle.load(self.process.stdout)
-        except (EOFError, BrokenPipeError, pickle.UnpicklingError):  # the last: the child ended within its answer
+        except (
+            EOFError,
+            BrokenPipeError,
+            pickle.UnpicklingError,
+        ):  # the last: the child ended within its answer
             code = self.process.wait()
             if code == 0:
                 return None, IDLE
             timed_out = code == -getattr(signal, "SIGXCPU", 0) or not timeout.is_alive()
-            return None, "time" if timed_out else f"its parser ended with code {code}: damaged, or too large"
+            return (
+                None,
+                "time"
+                if timed_out
+                else f"its parser ended with code {code}: damaged, or too large",
+            )
         except BaseException:  # an unread answer would be taken for the next one
             self.close()
             raise
@@ -196,7 +235,9 @@ def _serve() -> None:
             _write(out, (None, "memory"))
 
 
-def _answer(function: Callable[..., Any], path: Path, file: Path, arguments: tuple[Any, ...]) -> tuple[Any, str]:
+def _answer(
+    function: Callable[..., Any], path: Path, file: Path, arguments: tuple[Any, ...]
+) -> tuple[Any, str]:
     try:
         return function(path, *arguments), ""
     except (MemoryError, ImportError):
@@ -217,7 +258,9 @@ def _set_limits(seconds: float) -> None:
     _set_limit(resource.RLIMIT_FSIZE, MEMORY_BYTES)
     _set_limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
     with suppress(OSError):  # /proc exists on Linux only
-        status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+        status = dict(
+            line.split(":") for line in Path("/proc/self/status").read_text().splitlines()
+        )
         resident, private = (int(status[name].split()[0]) << 10 for name in ("VmRSS", "VmData"))
         _set_limit(resource.RLIMIT_DATA, private + max(MEMORY_BYTES - resident, 0))
 
@@ -228,4 +271,6 @@ def _set_limit(kind: int, soft: int) -> None:
 
 
 if __name__ == "__main__":
-    import_module("gaponet.base.sandbox")._serve()  # not as __main__: functions know this module by its name
+    import_module(
+        "gaponet.base.sandbox"
+    )._serve()  # not as __main__: functions know this module by its name

@@ -31,15 +31,25 @@ MAX_ARRAYS_BYTES = 512 << 20  # of the arrays in one file
 
 
 def _name(text: str) -> str:
-    if not 0 < len(text) <= 200 or "/" in text or "\\" in text or text in (".", "..") or min(text) < " ":
-        raise ValueError("should be 1 to 200 letters, none of them a slash, a backslash or a control character")
+    if (
+        not 0 < len(text) <= 200
+        or "/" in text
+        or "\\" in text
+        or text in (".", "..")
+        or min(text) < " "
+    ):
+        raise ValueError(
+            "should be 1 to 200 letters, none of them a slash, a backslash or a control character"
+        )
     return text
 
 
 def _all_finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError("holds a number that is not finite")
-    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+    for part in (
+        value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    ):
         _all_finite(part)
     return value
 
@@ -58,14 +68,24 @@ Name = Annotated[str, AfterValidator(_name)]  # may become the name of a file
 Sha256 = Annotated[str, AfterValidator(_hex)]
 Count = Annotated[int, Interval(ge=0, le=10**15)]
 Angle = Annotated[float, Interval(ge=-1e3, le=1e3)]  # rad
-Extended = Annotated[float, AllowInfNan(True), Interval(ge=-math.inf, le=math.inf)]  # infinity too, but no NaN
+Extended = Annotated[
+    float, AllowInfNan(True), Interval(ge=-math.inf, le=math.inf)
+]  # infinity too, but no NaN
 # A measured number; in a file, None stands for a missing one.
-Number = Annotated[Annotated[float, AllowInfNan(True)] | None, AfterValidator(lambda x: math.nan if x is None else x)]
+Number = Annotated[
+    Annotated[float, AllowInfNan(True)] | None,
+    AfterValidator(lambda x: math.nan if x is None else x),
+]
 Json = Annotated[Any, AfterValidator(_all_finite)]  # any JSON value with finite numbers
 
 
 def validated(
-    kind: type[T], data: Any, where: str | Path, error: type[GAPONetError], hint: str = "", allow_extra: bool = False
+    kind: type[T],
+    data: Any,
+    where: str | Path,
+    error: type[GAPONetError],
+    hint: str = "",
+    allow_extra: bool = False,
 ) -> T:
     """Convert plain data (dict, list, text, numbers) to a value of type `kind`.
 
@@ -81,7 +101,10 @@ def validated(
     """
     try:
         text = to_json(data, inf_nan_mode="constants")
-    except (PydanticSerializationError, ValueError) as invalid:  # unpaired surrogates, recursive lists
+    except (
+        PydanticSerializationError,
+        ValueError,
+    ) as invalid:  # unpaired surrogates, recursive lists
         raise error(_message(where, str(invalid), hint)) from None
     return parse_json(kind, text, where, error, hint, allow_extra)
 
@@ -96,7 +119,9 @@ def parse_json(
 ) -> T:
     """Convert JSON text to a value of type `kind`; arguments and error as for `validated`."""
     try:
-        value = _type_adapter(cast("Any", kind)).validate_json(text, extra="allow" if allow_extra else "forbid")
+        value = _type_adapter(cast("Any", kind)).validate_json(
+            text, extra="allow" if allow_extra else "forbid"
+        )
     except ValidationError as invalid:
         raise error(_message(where, _first_error(invalid), hint)) from None
     except GAPONetError as invalid:  # raised by __post_init__
@@ -106,16 +131,22 @@ def parse_json(
     return value
 
 
-def read_json(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", allow_extra: bool = False) -> T:
+def read_json(
+    kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", allow_extra: bool = False
+) -> T:
     """Read a JSON file as a value of type `kind`; arguments and error as for `validated`."""
     return parse_json(kind, read_limited(path, error, hint), path, error, hint, allow_extra)
 
 
-def read_format(kind: type[T], path: Path, newest: int, error: type[GAPONetError], hint: str = "") -> T:
+def read_format(
+    kind: type[T], path: Path, newest: int, error: type[GAPONetError], hint: str = ""
+) -> T:
     """Read a JSON file with a "format" of at most `newest`; fields that `kind` does not name are kept."""
     table = read_json(_Format, path, error, hint, allow_extra=True)
     if table["format"] > newest:
-        raise error(f"{path}: format {table['format']} is newer than this gaponet reads ({newest}); upgrade gaponet")
+        raise error(
+            f"{path}: format {table['format']} is newer than this gaponet reads ({newest}); upgrade gaponet"
+        )
     return validated(kind, table, path, error, hint, allow_extra=True)
 
 
@@ -142,7 +173,9 @@ def load_toml(kind: str, folder: Path, name_or_path: str | Path) -> tuple[Path, 
         path = Path(name_or_path)
     if not path.is_file():
         names = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-        raise UsageError(f"no {kind} '{name_or_path}': in the package are {names}; or give a .toml file")
+        raise UsageError(
+            f"no {kind} '{name_or_path}': in the package are {names}; or give a .toml file"
+        )
     return path, read_toml(dict[str, Any], path, UsageError)
 
 
@@ -167,7 +200,9 @@ def read_npz(
         raise error(_message(path, f"not readable ({reason})", hint)) from None
 
 
-def read_limited(path: Path, error: type[GAPONetError], hint: str = "", max_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
+def read_limited(
+    path: Path, error: type[GAPONetError], hint: str = "", max_bytes: int = MAX_DOCUMENT_BYTES
+) -> bytes:
     """Read a file; refuses folders, pipes and files of more than `max_bytes`."""
     if not path.is_file():
         raise error(_message(path, "is missing, or not a file", hint))
@@ -186,7 +221,9 @@ def _first_error(invalid: ValidationError) -> str:
     """Describe the first error (field, reason, value) and count the others."""
     errors = invalid.errors(include_url=False)
     kind, given = errors[0]["type"], errors[0]["input"]
-    field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in errors[0]["loc"]).lstrip(".")
+    field = "".join(
+        f"[{part}]" if isinstance(part, int) else f".{part}" for part in errors[0]["loc"]
+    ).lstrip(".")
     reason = errors[0]["msg"].removeprefix("Input ").removeprefix("Value error, ").rstrip(".")
     if kind == "missing":
         reason = "is missing"

@@ -17,11 +17,16 @@ from gaponet.report.tables import mrad
 from gaponet.robot.spec import robot_argument
 
 Known = Annotated[
-    Folder, tyro.conf.arg(help="Robot folder (with --out), or run folder of gaponet train.", metavar="ROBOT|RUN")
+    Folder,
+    tyro.conf.arg(
+        help="Robot folder (with --out), or run folder of gaponet train.", metavar="ROBOT|RUN"
+    ),
 ]
 Logs = Annotated[
     tyro.conf.Positional[str],
-    tyro.conf.arg(help="Dataset folder or address; for a robot folder logs as well.", metavar="LOGS"),
+    tyro.conf.arg(
+        help="Dataset folder or address; for a robot folder logs as well.", metavar="LOGS"
+    ),
 ]
 
 
@@ -60,16 +65,22 @@ def adapt(
         screen.result(made.to_dict())
         return
     if out is not None:
-        raise UsageError(f"{run}: is no robot folder (no robot.toml); --out is for those, a run keeps its adaptations")
+        raise UsageError(
+            f"{run}: is no robot folder (no robot.toml); --out is for those, a run keeps its adaptations"
+        )
     if payload_mass is not None:
-        raise UsageError("--payload-mass is for the logs of a robot folder; the dataset of a run states its payload")
+        raise UsageError(
+            "--payload-mass is for the logs of a robot folder; the dataset of a run states its payload"
+        )
     with progress_bar("adapting") as update:
         made = api.adapt_model(
             run, dataset, unit=unit, motions=motions, seconds=seconds, robot=robot, mixed_gains=mixed_gains,
             progress=update,
         )  # fmt: skip
     _show(screen, made)
-    screen.say(f"window RMS {mrad(made.before)} → {mrad(made.after)} mrad of the fitted windows; stored in {run}")
+    screen.say(
+        f"window RMS {mrad(made.before)} → {mrad(made.after)} mrad of the fitted windows; stored in {run}"
+    )
     screen.next(f"gaponet eval {run} {dataset}")
     screen.result(made.to_dict())
 

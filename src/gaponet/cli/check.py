@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 Robot = Annotated[
     Folder,
-    tyro.conf.arg(help="Robot folder of gaponet identify or adapt; with --fleet a folder of those.", metavar="ROBOT"),
+    tyro.conf.arg(
+        help="Robot folder of gaponet identify or adapt; with --fleet a folder of those.",
+        metavar="ROBOT",
+    ),
 ]
 Logs = Annotated[
     tyro.conf.Positional[str],
@@ -59,9 +62,14 @@ def check(
             raise UsageError("--fleet: give a folder for the page and the results, --out FOLDER")
         _check_fleet(screen, robot, logs, out, night, adapt, payload_mass, executor, workers)
         return
-    made = api.check(robot, logs, unit=unit, motions=motions, payload_mass=payload_mass, threads=threads)
+    made = api.check(
+        robot, logs, unit=unit, motions=motions, payload_mass=payload_mass, threads=threads
+    )
     drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
-    named, count = {m.joint for m in drift.moved}, f"{made.recordings} recording{'s' * (made.recordings != 1)}"
+    named, count = (
+        {m.joint for m in drift.moved},
+        f"{made.recordings} recording{'s' * (made.recordings != 1)}",
+    )
     screen.table(
         f"Largest change of each joint ({count}, {drift.seconds:.0f} s)",
         ["joint", "parameter", "change", "standard errors", "effect, mrad", "verdict"],
@@ -73,7 +81,9 @@ def check(
     for a in drift.against:
         what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} standard errors"
         screen.say(f"  {what}", "warning", "yellow")
-    screen.say(f"{made.verdict}: {made.advice.replace('ROBOT', robot.as_posix()).replace('LOGS', logs)}")
+    screen.say(
+        f"{made.verdict}: {made.advice.replace('ROBOT', robot.as_posix()).replace('LOGS', logs)}"
+    )
     screen.result(made.to_dict())
     if made.verdict != "same":
         sys.stdout.flush()
@@ -89,11 +99,15 @@ def _check_fleet(
 
     when, results = night or date.today().isoformat(), dict[str, fleet.Night]()
     with progress_bar("checking") as update:
-        checked = fleet.check_fleet(robots, Path(logs), out, when, adapt, payload_mass, executor, workers)
+        checked = fleet.check_fleet(
+            robots, Path(logs), out, when, adapt, payload_mass, executor, workers
+        )
         for name, result, count in checked:
             results[name] = result
             update(len(results), count, f"{name}: {result['verdict']}")
-    changed = {name: result for name, result in sorted(results.items()) if result["verdict"] != fleet.SAME}
+    changed = {
+        name: result for name, result in sorted(results.items()) if result["verdict"] != fleet.SAME
+    }
     if changed:
         screen.table(f"Changed robots, {when}", ["robot", "since", "parameters that changed, or the problem"], [
             [name, fleet.changed_since(fleet.load_nights(out / f"{name}.json")), "; ".join(n["moved"]) or n["advice"]]
@@ -101,7 +115,9 @@ def _check_fleet(
         ])  # fmt: skip
     took, page = sum(n["took"] for n in results.values()), out / "fleet.html"
     unchanged = len(results) - len(changed)
-    screen.say(f"{unchanged} of {len(results)} are the same; {took:.0f} s of processor time; {page}")
+    screen.say(
+        f"{unchanged} of {len(results)} are the same; {took:.0f} s of processor time; {page}"
+    )
     screen.result({"night": when, "robots": results, "page": str(page)})
     if changed:
         sys.stdout.flush()
@@ -112,4 +128,11 @@ def _row(m: ParameterChange, uncertainty: ParameterUncertainty, counts: bool) ->
     from gaponet.sysid.uncertainty import format_change
 
     by = format_change(m.field, m.by, uncertainty, m.joint)
-    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", "changed" if counts else "same"]
+    return [
+        m.joint,
+        m.field,
+        by,
+        f"{m.sigmas:+.1f}",
+        f"{1e3 * m.moves:.2f}",
+        "changed" if counts else "same",
+    ]

@@ -15,7 +15,9 @@ from gaponet.robot.finding import abbreviate
 from gaponet.share.reading import open_dataset
 
 
-def _card(dataset: Data, licence: str | None = None, source: str | None = None, json: Json = False) -> None:
+def _card(
+    dataset: Data, licence: str | None = None, source: str | None = None, json: Json = False
+) -> None:
     """Count and measure what a dataset holds; writes card.json and CARD.md into it.
 
     Args:
@@ -97,7 +99,9 @@ def _figures(dataset: Source, out: Path, robot: Robot = None, json: Json = False
     screen.result({"figures": [str(path) for path in written], "left_out": left_out})
 
 
-def _export(dataset: Source, out: Path, to: str = "lerobot", robot: Robot = None, json: Json = False) -> None:
+def _export(
+    dataset: Source, out: Path, to: str = "lerobot", robot: Robot = None, json: Json = False
+) -> None:
     """Write a dataset in another format; gaponet import reads it back as far as the format can hold it.
 
     Args:
@@ -118,7 +122,9 @@ def _export(dataset: Source, out: Path, to: str = "lerobot", robot: Robot = None
         screen.say(f"… and {len(sets) - len(shown)} more")
     pickled = " --allow-pickle" if to == "asap" else ""
     screen.say(f"Back: gaponet import {out!s} --robot {data.robot_name}{pickled} --out NEW")
-    screen.result({"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]})
+    screen.result(
+        {"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]}
+    )
 
 
 def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Json = False) -> None:
@@ -129,7 +135,9 @@ def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Jso
     """
     out, data = Out(json), Dataset(dataset)
     gone = data.remove(ids)
-    out.say(f"removed {len(gone)}: {abbreviate([e.id for e in gone])}; {data.path!s} now holds {len(data)}")
+    out.say(
+        f"removed {len(gone)}: {abbreviate([e.id for e in gone])}; {data.path!s} now holds {len(data)}"
+    )
     out.result({"removed": [e.id for e in gone], "sequences": len(data)})
 
 
@@ -155,7 +163,15 @@ def _labels(
     gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
     labels = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
     write(labels, out, rate)
-    columns = ["joint", "to, rad", "recordings", "N·m a kg", "bands apart", "units, N·m", "payload determined"]
+    columns = [
+        "joint",
+        "to, rad",
+        "recordings",
+        "N·m a kg",
+        "bands apart",
+        "units, N·m",
+        "payload determined",
+    ]
     screen.table("Held torque at equal commands", columns, [
         [c.joint, f"{c.command:+.2f}", str(c.count), f"{c.slope:+.2f}", f"{c.band_distance:.1f}",
          ", ".join(f"{u:+.2f}" for u in c.units), "yes" if c.determined else "no"]
@@ -165,7 +181,9 @@ def _labels(
         screen.say(line)
     screen.say(f"written: {out / 'labels.csv'!s}")
     screen.next(f"gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}")
-    screen.result({"cells": labels.groups, "agreement": labels.agreement, "recordings": labels.recordings})
+    screen.result(
+        {"cells": labels.groups, "agreement": labels.agreement, "recordings": labels.recordings}
+    )
 
 
 @actions(card=_card, split=_split, figures=_figures, export=_export, remove=_remove, labels=_labels)
@@ -182,7 +200,9 @@ def _show_card(out: Out, made: dict[str, Any]) -> None:
         out.show("", count_table(made, name))
     repeated = made["repeatability"]
     if repeated["channels"]:
-        spread = ", ".join(f"{name} {c['mean']:.3g} {c['unit']}" for name, c in repeated["channels"].items())
+        spread = ", ".join(
+            f"{name} {c['mean']:.3g} {c['unit']}" for name, c in repeated["channels"].items()
+        )
         out.say(
             f"repeatability (std over {repeated['sequences']} repetitions in {repeated['groups']} groups): {spread}"
         )

@@ -37,7 +37,10 @@ def demo(
         budget: Time of the searches of identification.
         network: Training time of a network on top of the identified robot.
     """
-    if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")):
+    if any(
+        find_spec(module) is None
+        for module in ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")
+    ):
         raise UsageError("the demo trains and draws: pip install 'gaponet[train,report]'")
     prepare()  # before mujoco is imported
     from gaponet.cli.identify import identify
@@ -46,15 +49,22 @@ def demo(
 
     screen, began = Out(json), time.monotonic()
     dataset, identified, run = out / "dataset", out / "robot", out / "network"
-    with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
-        screen.say(f": how far is the simulator from the robot?  (gaponet gap {dataset})", "1 Measure")
+    with contextlib.redirect_stdout(
+        sys.stderr if json else sys.stdout
+    ):  # stdout is the evaluation's
+        screen.say(
+            f": how far is the simulator from the robot?  (gaponet gap {dataset})", "1 Measure"
+        )
         holdout = _make_dataset(dataset, data, robot, screen)
         with progress_bar("gap") as update:
             gap = api.gap(str(dataset), robot=robot, progress=update)
         show_methods(screen, gap.to_dict(), ("joint",))
         for sentence in verdict(gap.methods):
             screen.say(sentence)
-        screen.say(f": which causes explain that?  (gaponet identify {dataset} --out {identified})", "2 Identify")
+        screen.say(
+            f": which causes explain that?  (gaponet identify {dataset} --out {identified})",
+            "2 Identify",
+        )
         if not (identified / "robot.toml").is_file():
             identify(str(dataset), identified, budget=budget, robot=robot, holdout_units=holdout)
         words = f"gaponet train {dataset} --model gaponet --robot {robot_argument(identified)} --out {run}"
@@ -67,7 +77,9 @@ def demo(
                 )  # fmt: skip
         except ModelError:  # a machine with much other work
             screen.say(
-                f"{network} were over before a network learned anything; --network 5m gives it more", "", "yellow"
+                f"{network} were over before a network learned anything; --network 5m gives it more",
+                "",
+                "yellow",
             )
             run = identified
         with progress_bar("evaluating") as update:
@@ -92,7 +104,11 @@ def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tup
         import_logs(data, robot, unit_id="lab", payload_mass=0.0, out=path)
         return ()
     if load_robot(robot).name != "h1_2":
-        raise UsageError(f"the embedded virtual robots are H1-2; for {robot} give logs with --data DIR")
-    screen.say("No --data given: collecting from VIRTUAL H1-2 robots; nothing below says anything about real ones.")
+        raise UsageError(
+            f"the embedded virtual robots are H1-2; for {robot} give logs with --data DIR"
+        )
+    screen.say(
+        "No --data given: collecting from VIRTUAL H1-2 robots; nothing below says anything about real ones."
+    )
     collect(robot=robot, fleet="easy", recipe="demo", out=path)
     return ("virtual-4",)

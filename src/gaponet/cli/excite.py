@@ -41,7 +41,9 @@ def excite(
     """
     screen = Out(json)
     if bool(robot) == (known is not None):
-        raise UsageError("give --robot NAME where there is no data yet, or --for FOLDER of a robot that was identified")
+        raise UsageError(
+            "give --robot NAME where there is no data yet, or --for FOLDER of a robot that was identified"
+        )
     spec = load_robot(known or robot)
     with progress_bar("choosing motions") as update:
         made = api.excite(
@@ -51,8 +53,12 @@ def excite(
     if made.prediction is not None:
         _show_prediction(screen, spec.name, made.prediction)
     masses = ", ".join(f"{p:g}" for p in made.payloads)
-    screen.say(f"{len(made.motions)} motions, {made.minutes:.1f} min at {masses} kg for {spec.name}: {out!s}")
-    screen.next(f"print {made.sheet}; play them (gaponet run or record --motion FILE, or your own player)")
+    screen.say(
+        f"{len(made.motions)} motions, {made.minutes:.1f} min at {masses} kg for {spec.name}: {out!s}"
+    )
+    screen.next(
+        f"print {made.sheet}; play them (gaponet run or record --motion FILE, or your own player)"
+    )
     screen.result(made.to_dict())
 
 

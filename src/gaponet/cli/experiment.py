@@ -38,9 +38,13 @@ EXPERIMENTS = (Compare, Paper, Tracking, Delivery)
 DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
 
 
-def _compare(experiment: Compare, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
+def _compare(
+    experiment: Compare, data: Dataset, robot: RobotSpec, out: Path, options: Options
+) -> None:
     """Train, and show the result."""
-    study = Study.from_options(data, robot, out, options, holdout_units=experiment.holdout_units, one_rate=False)
+    study = Study.from_options(
+        data, robot, out, options, holdout_units=experiment.holdout_units, one_rate=False
+    )
     if experiment.identify:
         study = _identified(experiment, study)
     screen, cells = Out(options.json), experiment.cells(study)
@@ -48,20 +52,26 @@ def _compare(experiment: Compare, data: Dataset, robot: RobotSpec, out: Path, op
         result = experiment.run(study, show)
     _show_result(result, study.out, screen)
     if failed := sum(not c.done for c in cells):
-        raise ModelError(f"{failed} trainings failed; the tables are of the others. Run it again to retry")
+        raise ModelError(
+            f"{failed} trainings failed; the tables are of the others. Run it again to retry"
+        )
 
 
 def _identified(experiment: Compare, study: Study) -> Study:
     """Check the models, then identify the simulator."""
     if study.robot.nominal is not None:
-        raise UsageError(f"--identify: robot {study.robot.folder} is an identified one; all models start from it")
+        raise UsageError(
+            f"--identify: robot {study.robot.folder} is an identified one; all models start from it"
+        )
     for word in experiment.models:
         parse_variant(word, study.config)
     with progress_bar("identifying") as update:
         return with_identified(study, update)
 
 
-def _on_unit(experiment: UnitExperiment, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
+def _on_unit(
+    experiment: UnitExperiment, data: Dataset, robot: RobotSpec, out: Path, options: Options
+) -> None:
     """Train GAPONet and an MLP if no runs are given, run the experiment, and show the result."""
     data.require_robot(robot)
     experiment.require(data)
@@ -77,7 +87,9 @@ def _on_unit(experiment: UnitExperiment, data: Dataset, robot: RobotSpec, out: P
             raise UsageError(f"{failed[0]}; run it again to retry")
         runs = experiment.evaluated(cells)
     trained_on, nominal = data if study is None else study.data, robot.nominal or robot
-    session = Session(experiment, trained_on, nominal, load_trained(runs, nominal), study, tuple(cells))
+    session = Session(
+        experiment, trained_on, nominal, load_trained(runs, nominal), study, tuple(cells)
+    )
     with progress_bar("playing") as update:
         result = experiment.run(session, lambda step, share: update(share, 1.0, step))
     _show_result(result, out if study is None else study.out, screen)
@@ -99,12 +111,19 @@ def _command(kind: type[Any]) -> Any:
         import gaponet.experiments.result_files  # noqa: F401  # needs an extra; without it nothing is trained
 
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, signal.default_int_handler)  # options are understood (__main__.py)
+            signal.signal(
+                signal.SIGINT, signal.default_int_handler
+            )  # options are understood (__main__.py)
         data, robot = open_dataset(dataset, options.robot)
         (_compare if kind is Compare else _on_unit)(experiment, data, robot, out, options)
 
     place = tyro.conf.Positional[str]
-    run.__annotations__ = {"dataset": place, "out": Path, "experiment": Annotated[kind, FLAT], "options": Shared}
+    run.__annotations__ = {
+        "dataset": place,
+        "out": Path,
+        "experiment": Annotated[kind, FLAT],
+        "options": Shared,
+    }
     trained_on = "" if kind is Compare else " that the models were trained on"
     run.__doc__ = "\n    ".join((
         f"{inspect.getdoc(kind)}\n\nArgs:",
@@ -158,7 +177,9 @@ def real(
     methods = METHODS | {name: (name, function) for name, function in map(load_method, method)}
     methods |= network_methods(networks) if networks else {}
     result = Bench(read_cards(), data_folder(data), out, methods, screen.say).run(sets, questions)
-    screen.show("Real robots, recordings that no method was fitted to", result_table(result["rows"]))
+    screen.show(
+        "Real robots, recordings that no method was fitted to", result_table(result["rows"])
+    )
     for name, remarks in result["labels"].items():
         screen.say(f" of {name}: {'; '.join(remarks)}", "labels")
     for path in write_page(result, out):

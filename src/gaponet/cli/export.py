@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 POLICY_FILE, POLICY_STEP = "policy_postprocessor.json", "gaponet_correct"  # of a LeRobot policy
 CHECKED_IN = {"mjcf": "MuJoCo", "actuator-net": "mjlab"}
-Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.", metavar="ROBOT|RUN")]
+Holder = Annotated[
+    Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.", metavar="ROBOT|RUN")
+]
 
 
 @like(api.export_robot)
@@ -53,7 +55,10 @@ def export(
     """
     screen = Out(json)
     for words, unused in (
-        ("--engine, --scope, --units", to != "randomization" and (engine != "json" or scope != "today" or units)),
+        (
+            "--engine, --scope, --units",
+            to != "randomization" and (engine != "json" or scope != "today" or units),
+        ),
         ("--payload-mass", to == "randomization" and payload_mass),
         ("--out", to == "lerobot" and out),
         ("--into and --prefix", to not in ("mjcf", "urdf", "lerobot") and (into or prefix)),
@@ -82,7 +87,9 @@ def export(
     if made.parity is not None:
         screen.say(f"{made.path}: differs by {made.parity:.1e} rad from what was trained")
     else:
-        motions = ("VIRTUAL" if made.virtual else "validation") + " motion" + "s" * (made.motions != 1)
+        motions = (
+            ("VIRTUAL" if made.virtual else "validation") + " motion" + "s" * (made.motions != 1)
+        )
         rows = [[form, mrad(error)] for form, error in made.errors.items()]
         screen.table(f"Mean |error| on {made.motions} {motions}", ["form", "mrad"], rows)
         for line in made.notes:
@@ -94,7 +101,13 @@ def export(
 
 
 def _show_ranges(
-    screen: Out, robot: Path, out: Path, engine: Engine, scope: Scope, units: tuple[Path, ...], data: str | None
+    screen: Out,
+    robot: Path,
+    out: Path,
+    engine: Engine,
+    scope: Scope,
+    units: tuple[Path, ...],
+    data: str | None,
 ) -> None:
     from gaponet.export.randomization import FILE, table_rows
 
@@ -117,13 +130,19 @@ def _show_ranges(
         screen.say(f"  {note}", "note", "cyan")
     if made.unknown:
         names = "; ".join(made.unknown)
-        screen.say(f"  no log determines these, drawn from the prior range: {names}", "warning", "yellow")
+        screen.say(
+            f"  no log determines these, drawn from the prior range: {names}", "warning", "yellow"
+        )
     use = "" if engine == "json" else f"; {file.name} applies them in {engine}"
     screen.say(f"{file.parent / FILE}: {len(next(iter(made.units.values())))} units{use}")
-    screen.result({"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown})
+    screen.result(
+        {"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown}
+    )
 
 
-def _attach(screen: Out, policy: Path, holder: Path | None, payload_mass: float, dynamics: bool) -> None:
+def _attach(
+    screen: Out, policy: Path, holder: Path | None, payload_mass: float, dynamics: bool
+) -> None:
     """Put the correction of a robot or a run behind a LeRobot policy, in place of an earlier one; None removes it."""
     file = policy / POLICY_FILE
     if not file.is_file():
@@ -141,7 +160,9 @@ def _attach(screen: Out, policy: Path, holder: Path | None, payload_mass: float,
         if is_robot:
             load_robot(holder)
         elif not (holder / "model").is_dir():
-            raise UsageError(f"{holder}: is neither a robot folder of gaponet identify nor a run of gaponet train")
+            raise UsageError(
+                f"{holder}: is neither a robot folder of gaponet identify nor a run of gaponet train"
+            )
         config = {
             "known" if is_robot else "model": str(holder.resolve()),
             "payload_mass": payload_mass,

@@ -29,7 +29,9 @@ def gap(
     out = Out(json)
     data, spec = open_dataset(dataset, robot, run)
     with progress_bar("gap") as update:
-        result = api.gap(data, robot=spec, motions=motions, run=run, executor=executor, progress=update)
+        result = api.gap(
+            data, robot=spec, motions=motions, run=run, executor=executor, progress=update
+        )
     folder = run or (spec.folder if robot is None else Path(robot))
     if not result.by_cause:
         show_methods(out, result.to_dict())

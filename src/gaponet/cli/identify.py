@@ -65,7 +65,9 @@ def identify(
         )  # fmt: skip
     _show(screen, made, details)
     if "backlash" in (terms or ()) and "backlash" not in [c.name for c in made.fit.comparisons]:
-        screen.say("backlash: no gap makes a joint's rollouts better. Only a load that changes its sign shows one")
+        screen.say(
+            "backlash: no gap makes a joint's rollouts better. Only a load that changes its sign shows one"
+        )
     screen.say(f"robot folder: {out}, after {made.seconds:.0f} s")
     screen.next(f"gaponet gap {dataset} --robot {robot_argument(out)}")
     screen.result(made.to_dict())
@@ -75,7 +77,11 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     """Print the verdict, the servos as a table, and what each term gave."""
     fit, errors, values = made.fit, made.errors, made.values()
     nominal, left = (mrad_with_error(e.mean(), standard_error(e)) for e in errors.values())
-    ratio, count, folds = errors["identified"].mean() / errors["nominal"].mean(), len(errors["nominal"]), fit.held_out
+    ratio, count, folds = (
+        errors["identified"].mean() / errors["nominal"].mean(),
+        len(errors["nominal"]),
+        fit.held_out,
+    )
     judges = f"{count} independent motions judge."
     if count == 1:
         judges = "A single motion judges: the error of other motions is not known. Record three motions or more."
@@ -90,8 +96,13 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         end = "" if fit.improved else " No fit was better, so these servos are written as they are."
         screen.say(f"Start and prior: {taken}.{end}")
     shown = [f for f in SERVO_FIELDS if any(v.get(f) for v in values.values())]
-    rows, sources = [[j, *(_cell(v, fit.std[j], f) for f in shown)] for j, v in values.items()], list[str]()
-    for servo in dict.fromkeys(filter(None, (fit.robot.servos[i] for i in fit.robot.operated_index))):
+    rows, sources = (
+        [[j, *(_cell(v, fit.std[j], f) for f in shown)] for j, v in values.items()],
+        list[str](),
+    )
+    for servo in dict.fromkeys(
+        filter(None, (fit.robot.servos[i] for i in fit.robot.operated_index))
+    ):
         if any(cells := [servo.text(f) if f in MEASURED_FIELDS else "" for f in shown]):
             rows.append([f"servo {servo.name}", *cells])
             sources.append(f"servo {servo.name}: {servo.source}")
@@ -128,7 +139,9 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
             screen.say(f"  {warning}", "warning", "yellow")
     if unknown and not details:
         joints = abbreviate([w.partition(":")[0] for w in unknown])
-        screen.say(f"some parameters of {joints} are not determined (--details). Use all values of a joint together")
+        screen.say(
+            f"some parameters of {joints} are not determined (--details). Use all values of a joint together"
+        )
 
 
 def _cell(joint: dict[str, float], errors: dict[str, float], field: str) -> str:
@@ -147,15 +160,28 @@ def _show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
         i = spec.operated_index[j]
         values = {f: float(getattr(fit.robot, f)[i]) for f in PASSIVE_FIELDS}
         cells = [
-            format_uncertainty(SERVO_FIELDS[f].factor * v, SERVO_FIELDS[f].factor * fit.std[name][f]) if v else "0"
+            format_uncertainty(
+                SERVO_FIELDS[f].factor * v, SERVO_FIELDS[f].factor * fit.std[name][f]
+            )
+            if v
+            else "0"
             for f, v in values.items()
         ]
         rows.append([name, *cells, f"{1e3 * fit.robot.delay[i]:.0f}", f"{fit.bias[j]:+.2g}",
                      *([format_uncertainty(float(fit.constant[j]), fit.std[name]["constant"])] if current else []),
                      *(f"{x[j]:.3g}" for x in fit.torque)])  # fmt: skip
-    columns = ["joint", *(SERVO_FIELDS[f].heading for f in PASSIVE_FIELDS), "delay, ms", "bias, N·m"]
+    columns = [
+        "joint",
+        *(SERVO_FIELDS[f].heading for f in PASSIVE_FIELDS),
+        "delay, ms",
+        "bias, N·m",
+    ]
     columns += ["N·m per unit"] * current + ["torque apart before, N·m", "after"]
-    screen.table("Torque-driven joints, ± standard error; medians on recordings that were not fitted", columns, rows)
+    screen.table(
+        "Torque-driven joints, ± standard error; medians on recordings that were not fitted",
+        columns,
+        rows,
+    )
     ahead = f"Angle apart from the {virtual}robot, so long after its state, mrad: before → after, {fit.windows} starts"
     screen.table(ahead, ["joint", *(f"{h:g} s" for h in fit.angle)], [
         [name, *(f"{mrad(a[j])} → {mrad(b[j])}" for a, b in fit.angle.values())]

@@ -56,7 +56,9 @@ def import_logs(
         _show_formats(Out(json))
         return
     if src is None or not robot:
-        raise UsageError("give a folder of logs and --robot ROBOT (or --formats, to see which formats are read)")
+        raise UsageError(
+            "give a folder of logs and --robot ROBOT (or --formats, to see which formats are read)"
+        )
     spec = load_robot(robot)
     if guess:
         from gaponet.data.describe.guess import guess_logs
@@ -66,7 +68,9 @@ def import_logs(
         print(guess_logs(recordings, spec, kind, dict(facts)), end="")
         return
     if out is None:
-        raise UsageError("say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)")
+        raise UsageError(
+            "say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)"
+        )
     with progress_bar("importing") as update:
         made = api.import_logs(
             src, robot=spec, out=out, unit_id=unit_id, payload_mass=payload_mass, payload_side=payload_side,
@@ -78,7 +82,11 @@ def import_logs(
 
 
 def doctor(
-    dataset: Source, robot: str | None = None, fix: Flag = False, figures: Path | None = None, json: Json = False
+    dataset: Source,
+    robot: str | None = None,
+    fix: Flag = False,
+    figures: Path | None = None,
+    json: Json = False,
 ) -> None:
     """Check a dataset: order, signs, units, rates, gaps, lag, payload.
 
@@ -107,7 +115,11 @@ def doctor(
             drawn = draw_findings(data, spec, list(diagnosis.findings), figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")
     if diagnosis.count("error"):
-        out.next("correct the logs, import them into a new folder" if fix else f"gaponet doctor {dataset} --fix")
+        out.next(
+            "correct the logs, import them into a new folder"
+            if fix
+            else f"gaponet doctor {dataset} --fix"
+        )
     else:
         out.next(f"gaponet gap {dataset}")
     out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": proposal,
@@ -121,19 +133,26 @@ def _show_formats(out: Out) -> None:
     out.table("Formats that gaponet import reads", ["format", "what it is", "needs"], [
         [fmt, what, f"gaponet[{extra}]" if extra else ""] for fmt, (what, extra) in rows.items()
     ])  # fmt: skip
-    out.say("Other columns: gaponet import LOGS --robot ROBOT --guess > LOGS/logs.toml; then check that file.")
+    out.say(
+        "Other columns: gaponet import LOGS --robot ROBOT --guess > LOGS/logs.toml; then check that file."
+    )
     out.result({fmt: {"about": what, "extra": extra} for fmt, (what, extra) in rows.items()})
 
 
 def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
     """Return lines about recordings that were cut, implausible rows, and operated joints that the logs lack."""
-    cuts, implausible = defaultdict[str, list[str]](list), defaultdict[str, list[tuple[str, dict[str, Any]]]](list)
+    cuts, implausible = (
+        defaultdict[str, list[str]](list),
+        defaultdict[str, list[tuple[str, dict[str, Any]]]](list),
+    )
     for entry in entries:
         if cut := entry.meta.notes.get("cut"):
             cuts[cut].append(entry.meta.motion)
         for channel, rows in entry.meta.notes.get("nonsense", {}).items():
             implausible[channel].append((entry.meta.motion, rows))
-    lines = [f"{', '.join(motions)}: {cut}; what follows was left out" for cut, motions in cuts.items()]
+    lines = [
+        f"{', '.join(motions)}: {cut}; what follows was left out" for cut, motions in cuts.items()
+    ]
     lines += [
         f"{channel} is implausible in {sum(rows['rows'] for _, rows in counts)} rows of {len(counts)} recordings "
         f"(first {counts[0][1]['worst']:.4g} of {counts[0][1]['joints'][0]} in {counts[0][0]}): "
@@ -143,7 +162,9 @@ def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
     if uneven := [e.meta for e in entries if "why_resampled" in e.meta.notes]:
         why = f"{uneven[0].notes['rows']}; {uneven[0].notes['why_resampled']}"
         lines.append(f"{abbreviate([meta.motion for meta in uneven])}: {why}")
-    lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
+    lacking = [
+        j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)
+    ]
     where = "missing in some recordings, assumed at the home position there; [posture] in logs.toml sets another"
     return [*lines, f"{abbreviate(lacking)}: {where}"] if lacking else lines
 
@@ -181,7 +202,9 @@ def _show_import(out: Out, made: ImportResult) -> None:
     offsets = made.offsets or {}
     _show_offsets(out, table["fast_lag_s"], offsets)
     if offsets:
-        out.say(f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data.")
+        out.say(
+            f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data."
+        )
     out.next(f"gaponet doctor {data.path!s}")
     out.result(table)
 
@@ -194,9 +217,13 @@ def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, Joi
         joint = offsets.get(name)
         at_rest = _signed_mrad(joint.static_error, joint.stiction_band) if joint else "–"
         rows.append([name, median, at_rest, _signed_mrad(joint.tracking_offset) if joint else "–"])
-    out.table("Lag and errors at rest", ["joint", "lag, ms", "error at rest, mrad", "offset, mrad"], rows)
+    out.table(
+        "Lag and errors at rest", ["joint", "lag, ms", "error at rest, mrad", "offset, mrad"], rows
+    )
     if offsets:
-        out.say("error at rest: state − command ± stiction, both directions. offset: without the sag that kp explains")
+        out.say(
+            "error at rest: state − command ± stiction, both directions. offset: without the sag that kp explains"
+        )
 
 
 def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:
@@ -223,7 +250,9 @@ def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:
 
 def _lag(values: dict[str, float] | None) -> str:
     """Median and range, "104 (81–120)"."""
-    return f"{values['median'] * 1e3:.0f} ({_span([values['min'], values['max']])})" if values else "–"
+    return (
+        f"{values['median'] * 1e3:.0f} ({_span([values['min'], values['max']])})" if values else "–"
+    )
 
 
 def _span(seconds: list[float]) -> str:

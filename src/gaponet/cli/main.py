@@ -36,14 +36,20 @@ ELSEWHERE = {
     "pull": "share:pull",
 }  # fmt: skip
 # Command → module:function. A module is imported when its command runs.
-COMMANDS = {name: f"gaponet.cli.{ELSEWHERE.get(name, f'{name}:{name}')}" for names in TASKS.values() for name in names}
+COMMANDS = {
+    name: f"gaponet.cli.{ELSEWHERE.get(name, f'{name}:{name}')}"
+    for names in TASKS.values()
+    for name in names
+}
 ABOUT = "Close the gap between simulated and real motors from joint logs."
 
 
 def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda: None) -> int:
     """Run a command; returns its exit code. `begin` is called once all options are understood, just before it."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack our letters, and a file's name may be no text
+        if isinstance(
+            stream, io.TextIOWrapper
+        ):  # a terminal may lack our letters, and a file's name may be no text
             stream.reconfigure(errors="backslashreplace")
     try:
         _run(list(sys.argv[1:] if argv is None else argv), begin)
@@ -59,9 +65,15 @@ def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + 13  # SIGPIPE, which Windows has not
     except OSError as error:  # a full disk, a missing permission: the user's to mend, not a bug
-        return _say(": ".join(str(part) for part in ("File", error.filename, error.strerror or error) if part))
+        return _say(
+            ": ".join(
+                str(part) for part in ("File", error.filename, error.strerror or error) if part
+            )
+        )
     except MemoryError:
-        return _say("Memory: there is not enough of it for this; give less at once, or close other programs")
+        return _say(
+            "Memory: there is not enough of it for this; give less at once, or close other programs"
+        )
     except KeyboardInterrupt as stop:
         print(f"interrupted; {str(stop) or 'what was written so far is complete'}", file=sys.stderr)
         return 128 + signal.SIGINT

@@ -20,17 +20,25 @@ Data = Annotated[Folder, tyro.conf.arg(help="Dataset folder.", metavar="DATASET"
 Source = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
-        help="Dataset folder, or the address (s3://, gs://, file://, hf://) of one that was pushed.", metavar="DATASET"
+        help="Dataset folder, or the address (s3://, gs://, file://, hf://) of one that was pushed.",
+        metavar="DATASET",
     ),
 ]
 Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.", metavar="RUN")]
 Known = Annotated[
-    Folder, tyro.conf.arg(help="Robot folder of gaponet identify, or run folder of gaponet train.", metavar="ROBOT|RUN")
+    Folder,
+    tyro.conf.arg(
+        help="Robot folder of gaponet identify, or run folder of gaponet train.",
+        metavar="ROBOT|RUN",
+    ),
 ]
 Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these motions.")]
 Robot = Annotated[
     str | None,
-    tyro.conf.arg(help="Robot name or folder, if not the one that the dataset or the run stores.", metavar="ROBOT"),
+    tyro.conf.arg(
+        help="Robot name or folder, if not the one that the dataset or the run stores.",
+        metavar="ROBOT",
+    ),
 ]
 Unit = Annotated[str, tyro.conf.arg(aliases=["--unit-id"])]  # gaponet import calls it --unit-id
 Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
@@ -63,7 +71,9 @@ def actions(**functions: Callable[..., Any]) -> Callable[[Command], Command]:
     """
     for f in functions.values():
         join_lines(f)
-    kinds = [Annotated[None, tyro.conf.subcommand(name, constructor=f)] for name, f in functions.items()]
+    kinds = [
+        Annotated[None, tyro.conf.subcommand(name, constructor=f)] for name, f in functions.items()
+    ]
 
     def decorate(command: Command) -> Command:
         union: Any = Union[tuple(kinds)]  # noqa: UP007

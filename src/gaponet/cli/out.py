@@ -66,12 +66,19 @@ class Out:
         least = [_least_width(head, column) for head, column in zip(heads, cells, strict=True)]
         while start < max(len(columns), 2):
             stop = start + 1
-            while stop < len(columns) and sum(least[start : stop + 1], least[0] + 1) <= self.console.width:
+            while (
+                stop < len(columns)
+                and sum(least[start : stop + 1], least[0] + 1) <= self.console.width
+            ):
                 stop += 1
             part = [0, *range(start, min(stop, len(columns)))]
-            fits = 1 + sum(BORDER + max(len(heads[i]), longest[i]) for i in part) <= self.console.width
+            fits = (
+                1 + sum(BORDER + max(len(heads[i]), longest[i]) for i in part) <= self.console.width
+            )
             more = ", continued" * (start > 1)
-            table = Table(title=Text(escape(title) + more), title_justify="left", title_style="bold")
+            table = Table(
+                title=Text(escape(title) + more), title_justify="left", title_style="bold"
+            )
             for i in part:
                 text = i == 0 or longest[i] > NUMBER
                 table.add_column(
@@ -91,7 +98,11 @@ class Out:
     def findings(self, findings: Iterable[Finding]) -> None:
         """A line each."""
         for finding in findings:
-            self.say(f"  {finding.check}: {finding.message}", f"{finding.level:>7}", COLOURS[finding.level])
+            self.say(
+                f"  {finding.check}: {finding.message}",
+                f"{finding.level:>7}",
+                COLOURS[finding.level],
+            )
 
     def result(self, value: dict[str, Any]) -> None:
         """The command's result as one JSON object; nothing without --json."""
@@ -104,7 +115,9 @@ def _least_width(head: str, cells: list[str]) -> int:
     """Letters that a column and its border need: cells are wrapped only where they are long, heads at any space."""
     whole = [cell for cell in cells if len(cell) <= NUMBER]
     words = [word for text in (head, *cells) for word in text.split()]
-    return BORDER + max(max(map(len, whole), default=1), min(max(map(len, words), default=1), NUMBER))
+    return BORDER + max(
+        max(map(len, whole), default=1), min(max(map(len, words), default=1), NUMBER)
+    )
 
 
 def writes(kind: str) -> Callable[[Command], Command]:

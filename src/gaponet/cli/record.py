@@ -49,7 +49,9 @@ def record(
         raise UsageError(f"--repetitions {repetitions}: give 1 or more, or nothing is recorded")
     if args.driver == "virtual":
         if unit_id not in ("", args.connection.unit, args.connection.unit_name):
-            raise UsageError(f"--unit-id {unit_id}: a virtual robot is chosen by --unit {args.connection.unit}")
+            raise UsageError(
+                f"--unit-id {unit_id}: a virtual robot is chosen by --unit {args.connection.unit}"
+            )
         unit_id = args.connection.unit_name
     request = RunArgs(**vars(args), payload_mass=payload_mass)
     spec = resolve_robot(request)

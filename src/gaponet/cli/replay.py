@@ -33,15 +33,30 @@ def replay(
             logs, robot=robot, data=data, described=described, payload_mass=payload_mass, progress=update
         )  # fmt: skip
     if not made.band_from_recordings:
-        screen.say("  its recordings are gone: the band is from the robot folder; or give --data", "note", "cyan")
+        screen.say(
+            "  its recordings are gone: the band is from the robot folder; or give --data",
+            "note",
+            "cyan",
+        )
     _tell(screen, robot, len(made.rollouts), made.joints, list(made.differ))
     if out is not None:
         made.save(out)
     screen.result(made.to_dict())
 
 
-def _tell(screen: Out, robot: Path, count: int, joints: Mapping[str, Mapping[str, Any]], differ: list[str]) -> None:
-    columns = ["joint", "behind target", "robot behind", "apart", "in the first s", "band ±", "in band", "worst"]
+def _tell(
+    screen: Out, robot: Path, count: int, joints: Mapping[str, Mapping[str, Any]], differ: list[str]
+) -> None:
+    columns = [
+        "joint",
+        "behind target",
+        "robot behind",
+        "apart",
+        "in the first s",
+        "band ±",
+        "in band",
+        "worst",
+    ]
     screen.table(f"Simulator and robot under the targets of {count} rollout(s), mrad", columns, [
         [j, mrad(s["rollout_behind"]), mrad(s["robot_behind"]), mrad(s["apart"]), mrad(s["apart_first_second"]),
          mrad(s["band"]), f"{s['inside']:.0%}", f"{mrad(s['worst'])} at {s['worst_at']:.1f} s"]
@@ -53,4 +68,6 @@ def _tell(screen: Out, robot: Path, count: int, joints: Mapping[str, Mapping[str
             f"(gaponet export {robot} --to …), or compensate on the robot (gaponet run --compensate)"
         )
     else:
-        screen.say("The robot would do what the simulator did, as far as it is known: every joint stays in its band")
+        screen.say(
+            "The robot would do what the simulator did, as far as it is known: every joint stays in its band"
+        )

@@ -49,10 +49,14 @@ def report(
 def _show_runs(screen: Out, folder: Path) -> None:
     """List the training runs in a folder and below it, best first."""
     runs = [
-        _facts(p.parent, folder) for p in sorted(folder.rglob("config.json")) if (p.parent / "split.json").is_file()
+        _facts(p.parent, folder)
+        for p in sorted(folder.rglob("config.json"))
+        if (p.parent / "split.json").is_file()
     ]
     if not runs:
-        raise UsageError(f"{folder}: no run here or below (a run has config.json and split.json); train one first")
+        raise UsageError(
+            f"{folder}: no run here or below (a run has config.json and split.json); train one first"
+        )
     runs.sort(key=lambda r: r["val_ratio"] if r["val_ratio"] is not None else float("inf"))
     screen.table(
         f"Runs in {folder}: mean |error| of validation and test motions, mrad (of nominal)",

@@ -33,7 +33,13 @@ def list_robots(json: Json = False) -> None:
          ", ".join(m.side for m in s.payload_mounts) or "–", s.description] for s in specs
     ])  # fmt: skip
     out.say("Your own: a folder with robot.toml and robot.xml; gaponet robot check FOLDER")
-    out.result({"robots": [{"name": s.name, "joints": s.joint_names, "operated": s.operated} for s in specs]})
+    out.result(
+        {
+            "robots": [
+                {"name": s.name, "joints": s.joint_names, "operated": s.operated} for s in specs
+            ]
+        }
+    )
 
 
 def link(
@@ -54,7 +60,11 @@ def link(
     from gaponet.hw.drivers.open import open_driver
 
     out, name = Out(json), robot or ("h1_2" if driver == "unitree" else "so101")
-    options = {"domain": domain, "interface": interface, "silent": True} if driver == "unitree" else {"port": port}
+    options = (
+        {"domain": domain, "interface": interface, "silent": True}
+        if driver == "unitree"
+        else {"port": port}
+    )
     bus = open_driver(driver, name, **options)
     try:
         bus.connect()
@@ -87,7 +97,9 @@ def check(
         payloads: kg in every mount; each is held for a minute. Default: those of the data, or 0.
     """
     if not robot:
-        raise UsageError(f"gaponet robot check needs a robot name ({', '.join(packaged_robots())}) or a folder")
+        raise UsageError(
+            f"gaponet robot check needs a robot name ({', '.join(packaged_robots())}) or a folder"
+        )
     out = Out(json)
     out.result(check_robot(out, load_robot(robot), data, payloads))
 
@@ -122,13 +134,24 @@ def new(
     from gaponet.robot.new import RobotOptions, new_robot
 
     screen = Out(json)
-    options = RobotOptions(joints, kp, kd, effort_limit, servo, packages, rate, keyframe, contacts, name)
+    options = RobotOptions(
+        joints, kp, kd, effort_limit, servo, packages, rate, keyframe, contacts, name
+    )
     made = new_robot(model, out, options)
     for note in made.notes:
         screen.say(f"  {note}", "   note", "cyan")
     passive = ("damping, friction, armature", "passive_source")
-    for what, field in (("kp", "kp_source"), ("kd", "kd_source"), ("effort_limit", "limit_source"), passive):
-        screen.say(f"  {what}: {', '.join(dict.fromkeys(getattr(d, field) for d in made.drives))}", "   from", "cyan")
+    for what, field in (
+        ("kp", "kp_source"),
+        ("kd", "kd_source"),
+        ("effort_limit", "limit_source"),
+        passive,
+    ):
+        screen.say(
+            f"  {what}: {', '.join(dict.fromkeys(getattr(d, field) for d in made.drives))}",
+            "   from",
+            "cyan",
+        )
     picture = None
     try:
         from gaponet.report.view.picture import still
@@ -138,8 +161,12 @@ def new(
         screen.say(f"  no picture: {error}", "   note", "cyan")
     result = check_robot(screen, made.robot, None, ())
     screen.say(f"written: {out}/robot.toml, robot.xml{', picture.png' if picture else ''}")
-    screen.next(f"look at robot.toml and the picture; gaponet import LOGS --robot {robot_argument(out)} --out data")
-    screen.result(result | {"folder": str(out), "notes": made.notes, "picture": picture and str(picture)})
+    screen.next(
+        f"look at robot.toml and the picture; gaponet import LOGS --robot {robot_argument(out)} --out data"
+    )
+    screen.result(
+        result | {"folder": str(out), "notes": made.notes, "picture": picture and str(picture)}
+    )
 
 
 def _picture(made: NewRobot, label: str, still: Callable[..., bytes]) -> Path:
@@ -147,13 +174,20 @@ def _picture(made: NewRobot, label: str, still: Callable[..., bytes]) -> Path:
     from gaponet.sim.model import build_model
 
     path = made.robot.folder / "picture.png"
-    png = still([(label, made.vendor, made.pose), ("robot.xml", build_model(made.robot), made.robot.qpos_home)])
+    png = still(
+        [
+            (label, made.vendor, made.pose),
+            ("robot.xml", build_model(made.robot), made.robot.qpos_home),
+        ]
+    )
     with atomic_write(path) as temporary:
         temporary.write_bytes(png)
     return path
 
 
-def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple[float, ...]) -> dict[str, Any]:
+def check_robot(
+    out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple[float, ...]
+) -> dict[str, Any]:
     """Step the robot; a broken one raises RobotError, a doubtful one gets warnings."""
     from gaponet.sim import robot_check as check
     from gaponet.sim.model import model_hash
@@ -182,7 +216,11 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple
     out.findings(findings)
     bad = {level: sum(f.level == level for f in findings) for level in ("error", "warning")}
     if bad["error"]:
-        out.say(f": {spec.name} is no simulator of it yet; mend the {bad['error']} error(s)", "not ok", "bold red")
+        out.say(
+            f": {spec.name} is no simulator of it yet; mend the {bad['error']} error(s)",
+            "not ok",
+            "bold red",
+        )
     elif bad["warning"]:
         out.say(f"{spec.name} compiles and holds; see the {bad['warning']} warning(s)")
     else:
@@ -202,7 +240,10 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple
 
 
 def show(
-    robot: Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify or gaponet adapt.", metavar="ROBOT")],
+    robot: Annotated[
+        Folder,
+        tyro.conf.arg(help="Robot folder of gaponet identify or gaponet adapt.", metavar="ROBOT"),
+    ],
     out: Path | None = None,
     json: Json = False,
 ) -> None:
@@ -267,8 +308,14 @@ def servos(
 
     out, table = Out(json), servo_table()
     if measured and not (source and licence):
-        raise UsageError("--from: name the recordings' data set with --source, and its licence with --licence")
-    types = measured_types(list(map(load_robot, measured)), source, licence) if measured else table.servo
+        raise UsageError(
+            "--from: name the recordings' data set with --source, and its licence with --licence"
+        )
+    types = (
+        measured_types(list(map(load_robot, measured)), source, licence)
+        if measured
+        else table.servo
+    )
     types = [servo for servo in types if name.lower() in servo.name.lower()]
     if not types:
         raise UsageError(f"no servo type has '{name}' in its name; gaponet robot servos lists them")
@@ -276,13 +323,24 @@ def servos(
         for line in "\n".join(map(toml_entry, types)).splitlines():
             out.say(line)
     else:
-        stated = {"effort_limit": "torque limit, N·m", "speed_limit": "speed limit, rad/s", "gain": "kp of 1, N·m/rad"}
+        stated = {
+            "effort_limit": "torque limit, N·m",
+            "speed_limit": "speed limit, rad/s",
+            "gain": "kp of 1, N·m/rad",
+        }
         fields = (*MEASURED_FIELDS[:3], *stated, *MEASURED_FIELDS[3:])
         headings = [stated.get(f) or SERVO_FIELDS[f].heading for f in fields]
         title = f"Servo types, version {table.version}; measured values: median (5…95 % of joints)"
-        out.table(title, ["servo type", *headings], [[s.name, *(s.text(f) for f in fields)] for s in types])
+        out.table(
+            title,
+            ["servo type", *headings],
+            [[s.name, *(s.text(f) for f in fields)] for s in types],
+        )
         for servo in types:
-            counts = servo.gaponet and f"joints: {servo.joints}, robots: {servo.robots}; gaponet {servo.gaponet}"
+            counts = (
+                servo.gaponet
+                and f"joints: {servo.joints}, robots: {servo.robots}; gaponet {servo.gaponet}"
+            )
             limits = servo.limit_source and f"limits: {servo.limit_source}"
             sources = filter(None, (servo.variant, servo.source, servo.licence, counts, limits))
             out.say(f"{servo.name}: {'; '.join(sources)}")

@@ -163,7 +163,9 @@ def run(
         raise UsageError("a dry run moves nothing, so there is nothing to record; leave out --out")
     recording, played, _ = perform(screen, motion, args, folder=out)
     if out:
-        screen.say(f"written: {recording.save(out, played.name if played else 'live').with_suffix('.*')}")
+        screen.say(
+            f"written: {recording.save(out, played.name if played else 'live').with_suffix('.*')}"
+        )
     screen.result(recording.summary() | tracking(recording))
     if recording.fault or (out and recording.rows.error):
         sys.exit(3)
@@ -175,14 +177,23 @@ def perform(
     """Prepare, ask for consent, run and report. Live targets are no motion. The seed is for a virtual robot."""
     from gaponet.hw.control.clock import MonotonicClock, SimulatedClock
     from gaponet.hw.control.controller import Controller
-    from gaponet.hw.control.hardware import hardware_robot, reference_robot, require_plausible, robot_hash
+    from gaponet.hw.control.hardware import (
+        hardware_robot,
+        reference_robot,
+        require_plausible,
+        robot_hash,
+    )
     from gaponet.hw.control.plan import Planner
     from gaponet.hw.drivers.dry import DryRun
 
     if (motion_name is None) == (args.targets is None):
-        raise UsageError("give either --motion, what to play, or --targets, where targets come from while it moves")
+        raise UsageError(
+            "give either --motion, what to play, or --targets, where targets come from while it moves"
+        )
     if args.compensation != CompensatorConfig() and not (args.compensate or args.model):
-        raise UsageError("settings of the compensation are given, and it is off; add --compensate or --model")
+        raise UsageError(
+            "settings of the compensation are given, and it is off; add --compensate or --model"
+        )
     if args.live != Live() and args.targets is None:
         raise UsageError("settings of live targets are given, and this is a motion; leave them out")
     spec = identified = resolve_robot(args)
@@ -204,7 +215,9 @@ def perform(
     planner = Planner(spec, driver.commanded, args.control, args.safety, limits)
     if args.dry_run:
         driver = DryRun(driver)
-    compensator, adapted = _compensator(screen, args, identified, args.unit_id or facts.get("unit_id", ""))
+    compensator, adapted = _compensator(
+        screen, args, identified, args.unit_id or facts.get("unit_id", "")
+    )
     if compensator and args.driver != "virtual":
         require_plausible(compensator.robot)
     live = None if motion else listen(screen, args, spec, driver, clock)
@@ -223,7 +236,9 @@ def perform(
             _show(screen, plan, spec, robot, limits.max_payload)
         if needs_consent:
             how = f"as {args.targets} says" if motion is None else "as planned"
-            require_consent(f"{robot.address} will move {how}; {len(robot.commanded)} joints are commanded.")
+            require_consent(
+                f"{robot.address} will move {how}; {len(robot.commanded)} joints are commanded."
+            )
 
     controller = Controller(
         driver, spec, config=args.control, safety=args.safety, compensator=compensator, clock=clock,
@@ -249,7 +264,9 @@ def perform(
     return recording, controller.plan.motion if controller.plan else None, identified
 
 
-def listen(screen: Out, args: RunArgs, robot: RobotSpec, driver: Driver, clock: Clock) -> LiveTargets:
+def listen(
+    screen: Out, args: RunArgs, robot: RobotSpec, driver: Driver, clock: Clock
+) -> LiveTargets:
     """Open the transport of live targets."""
     from gaponet.hw.targets.live import LiveTargets
 
@@ -262,13 +279,17 @@ def listen(screen: Out, args: RunArgs, robot: RobotSpec, driver: Driver, clock: 
     elif args.targets == "dds":
         from gaponet.hw.targets.ros2 import ROS2Transport
 
-        transport = ROS2Transport(args.connection.domain, args.connection.interface, live.topic, live.states)
+        transport = ROS2Transport(
+            args.connection.domain, args.connection.interface, live.topic, live.states
+        )
     else:
         from gaponet.hw.targets.pipe import PipeTransport
 
         transport = PipeTransport()
     screen.say(f"targets are expected on {transport.address}")
-    return LiveTargets(transport, robot, driver.commanded, clock, 1.0 / args.control.rate, args.safety.speed, live)
+    return LiveTargets(
+        transport, robot, driver.commanded, clock, 1.0 / args.control.rate, args.safety.speed, live
+    )
 
 
 def resolve_robot(args: RunArgs) -> RobotSpec:
@@ -279,7 +300,13 @@ def resolve_robot(args: RunArgs) -> RobotSpec:
     from gaponet.robot.spec import load_robot
     from gaponet.sim.model import require_stored_robot
 
-    place = None if args.model is None else args.model.parent if args.model.name == "model" else args.model
+    place = (
+        None
+        if args.model is None
+        else args.model.parent
+        if args.model.name == "model"
+        else args.model
+    )
     if place is not None and args.robot is not None:
         return require_stored_robot(place, load_robot(args.robot), ModelError, "leave --robot out")
     if place is not None and has_stored_robot(place):
@@ -313,17 +340,30 @@ def _require_shapes(screen: Out, args: RunArgs, robot: RobotSpec) -> None:
 
 def _require_hung(args: RunArgs) -> None:
     """Refuse lowcmd unless the user states that the robot hangs."""
-    if args.driver != "unitree" or args.connection.topic != "lowcmd" or args.connection.hangs or args.dry_run:
+    if (
+        args.driver != "unitree"
+        or args.connection.topic != "lowcmd"
+        or args.connection.hangs
+        or args.dry_run
+    ):
         return
-    words = {"arms": "legs and torso", "upper_body": "the legs", "all": "at the end of the run all motors"}
+    words = {
+        "arms": "legs and torso",
+        "upper_body": "the legs",
+        "all": "at the end of the run all motors",
+    }
     off = words[args.connection.joints]
     if args.yes:
-        raise UsageError(f"with --topic lowcmd {off} go off, and a robot that stands falls; say --hangs if it hangs")
+        raise UsageError(
+            f"with --topic lowcmd {off} go off, and a robot that stands falls; say --hangs if it hangs"
+        )
     text = f"With --topic lowcmd {off} go off: a robot that stands falls."
     require_consent(text, "Does it hang?", "it hangs", "--hangs")
 
 
-def find_motion(name: str | None, args: RunArgs, robot: RobotSpec) -> tuple[Motion | None, Feasibility]:
+def find_motion(
+    name: str | None, args: RunArgs, robot: RobotSpec
+) -> tuple[Motion | None, Feasibility]:
     """Return a motion from a file or the library, or None for live targets; and the limits that it must keep."""
     from gaponet.sysid.motion.files import SUFFIXES, read_motion
     from gaponet.sysid.motion.library import Library
@@ -335,10 +375,14 @@ def find_motion(name: str | None, args: RunArgs, robot: RobotSpec) -> tuple[Moti
     library = Library(robot, max_payload=heaviest, height=args.plane, unchecked=args.unchecked)
     if name is None:
         return None, library.limits
-    return read_motion(name, robot) if name.endswith(SUFFIXES) else library.make(name), library.limits
+    return read_motion(name, robot) if name.endswith(SUFFIXES) else library.make(
+        name
+    ), library.limits
 
 
-def make_driver(args: RunArgs, robot: RobotSpec, clock: Any, seed: int) -> tuple[Driver, dict[str, Any]]:
+def make_driver(
+    args: RunArgs, robot: RobotSpec, clock: Any, seed: int
+) -> tuple[Driver, dict[str, Any]]:
     """Return the driver, and facts about a virtual robot for the recording."""
     from gaponet.hw.drivers.open import open_driver, supported_options
 
@@ -355,7 +399,10 @@ def make_driver(args: RunArgs, robot: RobotSpec, clock: Any, seed: int) -> tuple
     name, side = connection.unit_name, args.payload_side
     physics = load_fleet(connection.fleet, robot).unit(name)
     payload = (args.payload_mass or 0.0, side)
-    return VirtualDriver(robot, physics, clock, payload, name, seed=seed), {"unit_id": name, "fleet": connection.fleet}
+    return VirtualDriver(robot, physics, clock, payload, name, seed=seed), {
+        "unit_id": name,
+        "fleet": connection.fleet,
+    }
 
 
 def tracking(recording: Recording) -> dict[str, Any]:
@@ -367,8 +414,15 @@ def tracking(recording: Recording) -> dict[str, Any]:
     target, qpos = rows["target"][:, at], rows["qpos"][:, at]
     error = np.abs(qpos[1:] - target[:-1])
     moved = np.ptp(target, axis=0) > 1e-6
-    joints = {n: float(e) for n, e, m in zip(recording.commanded, error.mean(axis=0), moved, strict=True) if m}
-    return {"tracking_error_rad": {"mean": float(np.mean(list(joints.values()))) if joints else None} | joints}
+    joints = {
+        n: float(e)
+        for n, e, m in zip(recording.commanded, error.mean(axis=0), moved, strict=True)
+        if m
+    }
+    return {
+        "tracking_error_rad": {"mean": float(np.mean(list(joints.values()))) if joints else None}
+        | joints
+    }
 
 
 def _compensator(screen: Out, args: RunArgs, robot: RobotSpec, unit: str) -> tuple[Any, str | None]:
@@ -380,7 +434,9 @@ def _compensator(screen: Out, args: RunArgs, robot: RobotSpec, unit: str) -> tup
     config, dt = args.compensation, 1.0 / args.control.rate
     if args.model is None:
         config = replace(config, dynamics=config.dynamics or args.targets is None)
-        made = Compensator(robot, None, config, dt, None, args.payload_side, extrapolate=args.extrapolate)
+        made = Compensator(
+            robot, None, config, dt, None, args.payload_side, extrapolate=args.extrapolate
+        )
         if args.payload_mass is not None:
             made.require_payload(args.payload_mass)  # before anything is opened
         if robot.nominal is None:
@@ -396,7 +452,9 @@ def _compensator(screen: Out, args: RunArgs, robot: RobotSpec, unit: str) -> tup
         screen.say(f"commands are found with the adaptation of unit {unit}")
     elif known:
         units = ", ".join(known)
-        screen.say(f"the run holds adaptations of {units}, none of which is used: --unit-id says which unit this is")
+        screen.say(
+            f"the run holds adaptations of {units}, none of which is used: --unit-id says which unit this is"
+        )
     compensator = Compensator(
         robot, model, config, dt, payload_side=args.payload_side,
         extrapolate=args.extrapolate, adaptation=known.get(unit),
@@ -411,7 +469,11 @@ def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: f
     from gaponet.hw.control.plan import NO_MOVEMENT
 
     rows = plan.rows
-    moves = [n for n, span in zip(robot.joint_names, np.ptp(rows, axis=0), strict=True) if span > NO_MOVEMENT]
+    moves = [
+        n
+        for n, span in zip(robot.joint_names, np.ptp(rows, axis=0), strict=True)
+        if span > NO_MOVEMENT
+    ]
     held = [n for n in driver.commanded if n not in moves]
     assert plan.motion
     title = f"Plan: {plan.motion.name}, {plan.duration:.1f} s, of which {plan.approach.duration:.1f} to where it begins"
@@ -421,8 +483,16 @@ def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: f
         for joint, j in zip(moves, robot.index(moves), strict=True)
     ])  # fmt: skip
     around = len(plan.approach.points) - 2
-    how = {"hand_over": "handed over to the robot's own controller", "hold": "held", "damp": "damped, then let go"}
-    load = f"with up to {heaviest:g} kg in each hand" if heaviest else "with nothing in the hands (--payload-mass)"
+    how = {
+        "hand_over": "handed over to the robot's own controller",
+        "hold": "held",
+        "damp": "damped, then let go",
+    }
+    load = (
+        f"with up to {heaviest:g} kg in each hand"
+        if heaviest
+        else "with nothing in the hands (--payload-mass)"
+    )
     back = "goes back to where it was found and is " if plan.retreat else "is "
     for text in (
         f"held where found: {', '.join(held)}" if held else "",

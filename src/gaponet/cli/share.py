@@ -21,8 +21,13 @@ def push(
 ) -> None:  # fmt: skip
     """Put a dataset or a run onto the Hugging Face Hub or a bucket."""
     screen = Out(json)
-    result, shown = push_pull.push(path, address, private, replace, prune), remove_credentials(address)
-    screen.say(f" of {result.files} files, {result.size / 1e6:,.1f} MB, is now at {shown}", result.kind)
+    result, shown = (
+        push_pull.push(path, address, private, replace, prune),
+        remove_credentials(address),
+    )
+    screen.say(
+        f" of {result.files} files, {result.size / 1e6:,.1f} MB, is now at {shown}", result.kind
+    )
     if prune:
         screen.say(f"{result.pruned} files of earlier pushes were deleted")
     screen.say(f"Back: gaponet pull {shown} {path.name}")
@@ -36,7 +41,12 @@ def pull(address: Address, out: Folder, json: Json = False) -> None:
     screen = Out(json)
     result = push_pull.pull(address, out)
     if result.files:
-        screen.say(f" of {result.files} files, {result.size / 1e6:,.1f} MB; all hashes are right: {out}", result.kind)
+        screen.say(
+            f" of {result.files} files, {result.size / 1e6:,.1f} MB; all hashes are right: {out}",
+            result.kind,
+        )
     else:
         screen.say(f"nothing is there that {out} lacks")
-    screen.result({"kind": result.kind, "path": str(out), "files": result.files, "bytes": result.size})
+    screen.result(
+        {"kind": result.kind, "path": str(out), "files": result.files, "bytes": result.size}
+    )

@@ -25,9 +25,15 @@ def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path |
 def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GROUPS) -> None:
     """The tables of gap and eval: totals by method, then by each group."""
     methods, kind = result["methods"], "VIRTUAL robot" if result["virtual"] else "real robot"
-    out.say(f", {kind}, {result['sequences']} recordings, open-loop rollouts of whole motions", result["robot"])
+    out.say(
+        f", {kind}, {result['sequences']} recordings, open-loop rollouts of whole motions",
+        result["robot"],
+    )
     whole = totals(methods)
-    out.show("Error of each method", ResultTable("", whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
+    out.show(
+        "Error of each method",
+        ResultTable("", whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)),
+    )
     for group in groups:
         if group not in ("payload", "unit") or len(methods["nominal"][f"by_{group}"]) > 1:
             out.show(f"Mean |error| by {group}{UNITS.get(group, '')}", by_group(methods, group))

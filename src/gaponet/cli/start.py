@@ -35,7 +35,10 @@ if TYPE_CHECKING:
     from gaponet.robot.new import RobotOptions
 
 COMMANDS_FILE = "commands.sh"  # the commands that have finished, one per line
-RECORD_FILE, MODEL_INPUT = "start.json", "the model"  # MODEL_INPUT: what the robot's command depends on
+RECORD_FILE, MODEL_INPUT = (
+    "start.json",
+    "the model",
+)  # MODEL_INPUT: what the robot's command depends on
 MIN_RECORDINGS = 3  # fewer are cut into pieces, so that some can validate
 PIECE_S, MIN_PIECE_S = 8.0, 4.0
 MAX_RELATIVE_ROUNDING = 0.01  # of the measured rate to a whole number of Hz
@@ -63,7 +66,9 @@ class Inspection:
     def rate(self) -> float:
         """Rate of the commands, Hz, rounded to a whole number that is near."""
         rate = 1 / float(np.median(np.diff(self.log.channels["ctrl"].time)))
-        return float(round(rate)) if abs(rate - round(rate)) < MAX_RELATIVE_ROUNDING * rate else rate
+        return (
+            float(round(rate)) if abs(rate - round(rate)) < MAX_RELATIVE_ROUNDING * rate else rate
+        )
 
 
 def start(
@@ -111,8 +116,20 @@ def start(
     from gaponet.robot.new import RobotOptions
 
     screen, logs_toml = Out(json), out / "logs.toml"
-    values = {"format": format, "position_unit": position_unit, "time_unit": time_unit, "rate": rate, "cut": cut}
-    import_options = ["--unit-id", unit_id, "--payload-mass", f"{payload_mass:g}", *(f"--map={pair}" for pair in map)]
+    values = {
+        "format": format,
+        "position_unit": position_unit,
+        "time_unit": time_unit,
+        "rate": rate,
+        "cut": cut,
+    }
+    import_options = [
+        "--unit-id",
+        unit_id,
+        "--payload-mass",
+        f"{payload_mass:g}",
+        *(f"--map={pair}" for pair in map),
+    ]
     import_options += [f"--{k.replace('_', '-')}={v}" for k, v in values.items() if v is not None]
     import_options += ["--skip-bad"] * skip_bad + ["--allow-pickle"] * allow_pickle
     read_options: dict[str, Any] = {
@@ -123,7 +140,9 @@ def start(
     robot_options = RobotOptions(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
         try:
-            inspection = inspect_inputs(model, logs, logs_toml, robot_options, read_options, guess_joints=dry_run)
+            inspection = inspect_inputs(
+                model, logs, logs_toml, robot_options, read_options, guess_joints=dry_run
+            )
         except DescriptionNeededError as error:
             for line in error.text.splitlines():
                 screen.say(f"  {line}")
@@ -133,9 +152,13 @@ def start(
                 then = f"they are in {logs_toml}: check those with a ?, then give the same command again"
                 with lock_folder(out, "started"):
                     write_text(logs_toml, error.text)
-            raise UsageError(f"{error}. The lines above are a guess from these logs; {then}") from None
+            raise UsageError(
+                f"{error}. The lines above are a guess from these logs; {then}"
+            ) from None
         _print_inspection(screen, inspection, model, logs, unit_id, payload_mass)
-        commands = make_commands(inspection, model, logs, out, robot_options, import_options, cut is None)
+        commands = make_commands(
+            inspection, model, logs, out, robot_options, import_options, cut is None
+        )
         for words in commands:
             words += ["--to", to] if words[0] == "export" else []
             words += ["--budget", budget] if words[0] == "identify" and budget else []
@@ -147,7 +170,9 @@ def start(
             with lock_folder(out, "started"):
                 if inspection.logs_toml:
                     write_text(logs_toml, inspection.logs_toml)
-                record.begin(shlex.join(next(words for words in commands if words[0] == "import")[2:]))
+                record.begin(
+                    shlex.join(next(words for words in commands if words[0] == "import")[2:])
+                )
                 _run(screen, commands, lines, record, anyway)
             screen.say(f"commands that ran: {out / COMMANDS_FILE}")
             screen.next(f"look at {out / 'identified' / 'report.html'}")
@@ -185,7 +210,11 @@ def inspect_inputs(
         else:
             robot, packaged = new_robot(model, Path(place) / "robot", robot_options).robot, ""
         checked = logs_toml if logs_toml.is_file() else None
-        return Inspection(robot, packaged, *read_first_recording(logs, robot, checked, guess_joints, **read_options))
+        return Inspection(
+            robot,
+            packaged,
+            *read_first_recording(logs, robot, checked, guess_joints, **read_options),
+        )
 
 
 def make_commands(
@@ -200,12 +229,23 @@ def make_commands(
     """
     data, identified, commands = str(out / "data"), out / "identified", list[list[str]]()
     if not inspection.packaged:
-        options = {name: getattr(robot_options, name) for name in ("joints", "kp", "kd", "effort_limit")}
-        if not options["joints"] and len(inspection.log.joint_names) < len(inspection.robot.joint_names):
+        options = {
+            name: getattr(robot_options, name) for name in ("joints", "kp", "kd", "effort_limit")
+        }
+        if not options["joints"] and len(inspection.log.joint_names) < len(
+            inspection.robot.joint_names
+        ):
             options["joints"] = inspection.log.joint_names
-        words = [x for name, value in options.items() if value for x in (f"--{name.replace('_', '-')}", *value)]
+        words = [
+            x
+            for name, value in options.items()
+            if value
+            for x in (f"--{name.replace('_', '-')}", *value)
+        ]
         rate = f"{inspection.rate:g}"
-        commands.append(["robot", "new", str(model), "--out", str(out / "robot"), "--rate", rate, *words])
+        commands.append(
+            ["robot", "new", str(model), "--out", str(out / "robot"), "--rate", rate, *words]
+        )
     robot, logs_toml = inspection.packaged or robot_argument(out / "robot"), out / "logs.toml"
     described = ["--logs", str(logs_toml)] if inspection.logs_toml or logs_toml.is_file() else []
     time = inspection.log.channels["ctrl"].time
@@ -228,7 +268,10 @@ def _print_inspection(
     screen: Out, inspection: Inspection, model: Path, logs: Path, unit_id: str, payload_mass: float
 ) -> None:
     log, robot = inspection.log, inspection.robot
-    time, absent = log.channels["ctrl"].time, [j for j in robot.joint_names if j not in log.joint_names]
+    time, absent = (
+        log.channels["ctrl"].time,
+        [j for j in robot.joint_names if j not in log.joint_names],
+    )
     first = f"{time[-1] - time[0]:.1f} s at {inspection.rate:g} Hz, {', '.join(log.channels)}"
     gains = ", ".join(f"{x:g}" for x in robot.kp)
     rows = {
@@ -242,7 +285,9 @@ def _print_inspection(
         if text:
             screen.say(f": {text}", label)
     for line in inspection.logs_toml.splitlines():
-        screen.say(f"  {line}", "logs.toml, guessed" if line.startswith("# Lines") else "", "yellow")
+        screen.say(
+            f"  {line}", "logs.toml, guessed" if line.startswith("# Lines") else "", "yellow"
+        )
 
 
 class _RecordFields(TypedDict):
@@ -264,7 +309,10 @@ class StartRecord:
             UsageError: The folder holds data of other logs.
         """
         self.out, self.data, path = out, out / "data", out / RECORD_FILE
-        known, source = _RecordFields(logs="", files={}, options="", done={}), "logs that no file names"
+        known, source = (
+            _RecordFields(logs="", files={}, options="", done={}),
+            "logs that no file names",
+        )
         if path.is_file():
             known = read_json(_RecordFields, path, UsageError, f"delete it and {self.data}")
             source = known["logs"]
@@ -273,7 +321,11 @@ class StartRecord:
             done = {line: inputs for line, inputs in known["done"].items() if inputs == MODEL_INPUT}
             self.fields |= {"options": "", "done": done}
             return
-        other = [name for name, digest in known["files"].items() if self.fields["files"].get(name) != digest]
+        other = [
+            name
+            for name, digest in known["files"].items()
+            if self.fields["files"].get(name) != digest
+        ]
         if known["logs"] and not other:
             return
         if other:
@@ -320,13 +372,25 @@ class StartRecord:
 def hash_logs(logs: Path, out: Path) -> dict[str, str]:
     """Return file → SHA-256 of all logs, and of the logs.toml in `out`, which may lie among the logs."""
     paths, root = (logs.rglob("*"), logs) if logs.is_dir() else ([logs], logs.parent)
-    files = {file.relative_to(root).as_posix(): file for file in paths if out.resolve() not in file.resolve().parents}
-    files = {name: file for name, file in files.items() if not any(part.startswith(".") for part in name.split("/"))}
+    files = {
+        file.relative_to(root).as_posix(): file
+        for file in paths
+        if out.resolve() not in file.resolve().parents
+    }
+    files = {
+        name: file
+        for name, file in files.items()
+        if not any(part.startswith(".") for part in name.split("/"))
+    }
     files[f"{out.name}/logs.toml"] = out / "logs.toml"
-    return {name: FileRecord.of(file).sha256 for name, file in sorted(files.items()) if file.is_file()}
+    return {
+        name: FileRecord.of(file).sha256 for name, file in sorted(files.items()) if file.is_file()
+    }
 
 
-def _run(screen: Out, commands: list[list[str]], lines: list[str], record: StartRecord, anyway: bool) -> None:
+def _run(
+    screen: Out, commands: list[list[str]], lines: list[str], record: StartRecord, anyway: bool
+) -> None:
     """Run the commands that have not finished on the present inputs; none of them names the next one."""
     Out.names_next = False
     try:

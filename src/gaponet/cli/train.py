@@ -62,23 +62,30 @@ def train(
     card, kind = trained.card, title(trained.card["model"]["kind"])
     val = card["val_mpjae"]
     if trained.candidates:
-        rows = {"without a network": val["start"]} | {title(name): e for name, e in trained.candidates.items()}
+        rows = {"without a network": val["start"]} | {
+            title(name): e for name, e in trained.candidates.items()
+        }
         rows[f"{kind}, at the end"] = val["model"]
         columns = ["each with a fifth of the budget", "mrad"]
-        screen.table("Validation error", columns, [[name, mrad(error)] for name, error in rows.items()])
+        screen.table(
+            "Validation error", columns, [[name, mrad(error)] for name, error in rows.items()]
+        )
         if "trees" not in trained.candidates:
             screen.say("boosted trees were not tried: pip install 'gaponet[trees]'")
     screen.say(
         f"best on validation: {mrad(val['model'])} mrad, without the network {mrad(val['start'])}, nominal "
         f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "
-        f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
+        f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}"
+        + (" (interrupted)" if card["interrupted"] else "")
     )
     gain = NetworkGain("identified", val["added"], val.get("error", math.nan), val["start"])
     screen.say(f"with {kind} the error of validation motions falls by {gain.text}")
     step = f"gaponet eval {out} {quote(dataset)}"
     if not gain.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"
-        screen.say("that is within what motions scatter, or less than 2 %: the identified robot is as good without it")
+        screen.say(
+            "that is within what motions scatter, or less than 2 %: the identified robot is as good without it"
+        )
     screen.say(f"{kind} in {trained.model.path}")
     screen.next(step)
     screen.result(trained.to_dict())
@@ -97,10 +104,16 @@ def evaluate(
         )  # fmt: skip
     table = result.to_dict()
     if not result.unseen:
-        out.say("", "a model was trained or chosen on some of these motions: the errors are no test errors", "yellow")
+        out.say(
+            "",
+            "a model was trained or chosen on some of these motions: the errors are no test errors",
+            "yellow",
+        )
     for name, delta in table["delta"].items():
         if delta["at_limit"]:
-            out.say(f"{title(name)}: {delta['at_limit']:.2%} of the corrections are at the limit (--model.delta-max)")
+            out.say(
+                f"{title(name)}: {delta['at_limit']:.2%} of the corrections are at the limit (--model.delta-max)"
+            )
     show_methods(out, table)
     show_verdict(out, result.methods, dataset, run)
     out.result(table)

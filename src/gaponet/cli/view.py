@@ -53,15 +53,26 @@ def view(
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot, model[0] if model else None)
-    entry = select_entry(data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass)
+    entry = select_entry(
+        data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass
+    )
     with progress_bar("replaying") as update:
         shown = side_by_side(data, entry, spec, model, update)
-    shown = shown.only(tuple(n for n in show if n != "aligned" or model or spec.nominal is not None))
+    shown = shown.only(
+        tuple(n for n in show if n != "aligned" or model or spec.nominal is not None)
+    )
     clip = Clip.from_start(shown, start, duration, speed, fps)
     errors = {m.method: m.mpjae for m in shown.motions if m.method != "recorded"}
-    _introduce(out, entry.meta, {title(m.method): m.mpjae for m in shown.motions if m.method in errors}, shown.seen)
+    _introduce(
+        out,
+        entry.meta,
+        {title(m.method): m.mpjae for m in shown.motions if m.method in errors},
+        shown.seen,
+    )
     rows = slice(round(clip.start / shown.real.dt), round(clip.stop / shown.real.dt) + 1)
-    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), rows, render is not None, closeup)
+    scene = Scene(
+        shown.magnified(magnify), View(azimuth, elevation), rows, render is not None, closeup
+    )
     if render is not None:
         _film(scene, clip, render, width, magnify, out)
     else:
@@ -93,7 +104,11 @@ def _introduce(out: Out, meta: SequenceMeta, errors: dict[str, float], seen: boo
     kind = "VIRTUAL " if meta.virtual else ""
     out.say(f", {kind}unit {meta.unit_id}, {meta.payload_mass:g} kg; {errors_text}", meta.motion)
     if seen:
-        out.say("", "a model was trained or chosen on this recording: its error is no test error", "yellow")
+        out.say(
+            "",
+            "a model was trained or chosen on this recording: its error is no test error",
+            "yellow",
+        )
 
 
 def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, out: Out) -> None:

@@ -70,8 +70,15 @@ def virtual(
         with closing(arm):
             _live(arm, limit, out, f"{label}: servo bus on {arm.port}")
         return
-    humanoid = VirtualH12(spec, physics, (payload_mass, payload_side), domain, interface, rate, fault, fault_at)
-    _live(humanoid, limit, out, f"{label}: rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}")
+    humanoid = VirtualH12(
+        spec, physics, (payload_mass, payload_side), domain, interface, rate, fault, fault_at
+    )
+    _live(
+        humanoid,
+        limit,
+        out,
+        f"{label}: rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}",
+    )
     summary = f"heard {len(humanoid.heard)} commands, refused {humanoid.refused}, late {humanoid.missed} periods"
     out.say(f"{label}: {summary}")
 

@@ -22,7 +22,9 @@ from gaponet.data.sequence import ARRAYS
 from gaponet.data.statistics import Statistics, pool, statistics
 from gaponet.data.store import Dataset, Entry, dataset_hash
 
-PERCENTILE_ROWS = 100_000  # about so many rows, evenly taken from the dataset, give the 1 % and 99 % percentiles
+PERCENTILE_ROWS = (
+    100_000  # about so many rows, evenly taken from the dataset, give the 1 % and 99 % percentiles
+)
 NOT_STATED = "not stated"
 # Property → its heading and its value; the card counts sequences by each.
 PROPERTIES: dict[str, tuple[str, Callable[[Entry], str]]] = {
@@ -67,7 +69,9 @@ def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, A
             name: {
                 "unit": UNITS[name],
                 "sequences": len(stats[name]),
-                "joints": _by_joint(pool(stats[name]), np.concatenate(samples[name]), dataset.joint_names),
+                "joints": _by_joint(
+                    pool(stats[name]), np.concatenate(samples[name]), dataset.joint_names
+                ),
             }
             for name in ARRAYS
             if stats[name]
@@ -85,7 +89,9 @@ def _counted(dataset: Dataset) -> dict[str, Any]:
         groups: dict[str, list[Entry]] = defaultdict(list)
         for entry in dataset.entries:
             groups[value_of(entry)].append(entry)
-        by_property[name] = {value: count_entries(groups[value]) for value in sorted(groups, key=_number_or_name)}
+        by_property[name] = {
+            value: count_entries(groups[value]) for value in sorted(groups, key=_number_or_name)
+        }
     return {
         "name": dataset.path.resolve().name,
         "robot": dataset.robot_name,
@@ -116,7 +122,9 @@ def count_entries(entries: list[Entry]) -> dict[str, float]:
     }
 
 
-def _by_joint(pooled: Statistics, samples: Array, names: tuple[str, ...]) -> dict[str, dict[str, float]]:
+def _by_joint(
+    pooled: Statistics, samples: Array, names: tuple[str, ...]
+) -> dict[str, dict[str, float]]:
     p1, p99 = np.percentile(samples, [1, 99], axis=0)
     columns = {"min": pooled["min"], "p1": p1, "mean": pooled["mean"], "p99": p99, "max": pooled["max"],
                "std": pooled["std"]}  # fmt: skip
@@ -149,14 +157,24 @@ def headline(card: dict[str, Any]) -> str:
 def count_table(card: dict[str, Any], by: str) -> ResultTable:
     """Return sequences, hours, frames and motions by one of PROPERTIES."""
     counts = card["shares"][by]
-    rows = tuple((value, c["sequences"], c["hours"], c["frames"], c["motions"]) for value, c in counts.items())
+    rows = tuple(
+        (value, c["sequences"], c["hours"], c["frames"], c["motions"])
+        for value, c in counts.items()
+    )
     return ResultTable(by, (PROPERTIES[by][0], "sequences", "hours", "frames", "motions"), rows)
 
 
 def card_markdown(card: dict[str, Any]) -> str:
     """Return the card as Markdown; the first line says if robots were virtual."""
     tables = [line for by in PROPERTIES for line in (count_table(card, by).markdown(), "")]
-    lines = [f"# {escape_markdown(headline(card))}", "", *_facts(card), *tables, *_repeatability(card), *_signals(card)]
+    lines = [
+        f"# {escape_markdown(headline(card))}",
+        "",
+        *_facts(card),
+        *tables,
+        *_repeatability(card),
+        *_signals(card),
+    ]
     return "\n".join(lines)
 
 
@@ -189,7 +207,9 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
         yield f"{excluded:,} sequences of these groups had another command and were left out."
     channels = repeated["channels"]
     joints = dict.fromkeys(j for c in channels.values() for j in c["joints"])
-    rows = [(joint, *(_digits(c["joints"].get(joint)) for c in channels.values())) for joint in joints]
+    rows = [
+        (joint, *(_digits(c["joints"].get(joint)) for c in channels.values())) for joint in joints
+    ]
     mean = ("mean", *(_digits(c["mean"]) for c in channels.values()))
     headings = ("joint", *(f"{name}, {c['unit']}" for name, c in channels.items()))
     yield "\n" + ResultTable("repeatability", headings, (*rows, mean)).markdown() + "\n"
@@ -199,8 +219,15 @@ def _signals(card: dict[str, Any]) -> Iterator[str]:
     yield "## Signals\n"
     for name, signal in card["signals"].items():
         yield f"### {name}, {signal['unit']} ({signal['sequences']:,} sequences)\n"
-        rows = tuple((joint, *map(_digits, values.values())) for joint, values in signal["joints"].items())
-        yield ResultTable(name, ("joint", "min", "1 %", "mean", "99 %", "max", "std"), rows).markdown() + "\n"
+        rows = tuple(
+            (joint, *map(_digits, values.values())) for joint, values in signal["joints"].items()
+        )
+        yield (
+            ResultTable(
+                name, ("joint", "min", "1 %", "mean", "99 %", "max", "std"), rows
+            ).markdown()
+            + "\n"
+        )
 
 
 def _digits(value: float | None) -> str:

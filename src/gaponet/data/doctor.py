@@ -21,7 +21,11 @@ from gaponet.data.store import Dataset
 from gaponet.robot.finding import LEVELS, Finding
 from gaponet.robot.spec import RobotSpec
 
-CONSEQUENCES = ("blocked", "stuck", "sag")  # findings that an exchanged, mirrored or mis-scaled joint causes
+CONSEQUENCES = (
+    "blocked",
+    "stuck",
+    "sag",
+)  # findings that an exchanged, mirrored or mis-scaled joint causes
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,11 @@ class DoctorResult:
         texts = [f"{n} {level}{'s' * (n > 1)}" for level, n in count.items() if n]
         if count["error"]:
             return f"Do not train on this yet: {' and '.join(texts)}."
-        return f"Usable. Read the {texts[0].removeprefix('1 ')} first." if texts else "Good: no error and no warning."
+        return (
+            f"Usable. Read the {texts[0].removeprefix('1 ')} first."
+            if texts
+            else "Good: no error and no warning."
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
@@ -72,8 +80,17 @@ class DoctorResult:
         dataset.require_sequences()
         surveys = survey_all(dataset, robot, progress, executor)
         findings = [f for check in CHECKS for f in check.run(surveys, robot)]
-        wrong = {j for f in findings if f.level == "error" and f.check in ("order", "sign", "unit") for j in f.joints}
-        findings = [f for f in findings if f.check not in CONSEQUENCES or not f.joints or not wrong >= set(f.joints)]
+        wrong = {
+            j
+            for f in findings
+            if f.level == "error" and f.check in ("order", "sign", "unit")
+            for j in f.joints
+        }
+        findings = [
+            f
+            for f in findings
+            if f.check not in CONSEQUENCES or not f.joints or not wrong >= set(f.joints)
+        ]
         if gravity_model is not None:
             findings += _examine_loads(findings, surveys, robot, gravity_model)
         findings.sort(key=lambda f: -LEVELS.index(f.level))
@@ -94,7 +111,9 @@ class DoctorResult:
         )
 
 
-def _examine_loads(findings: list[Finding], surveys: list[Survey], robot: RobotSpec, model: Gravity) -> list[Finding]:
+def _examine_loads(
+    findings: list[Finding], surveys: list[Survey], robot: RobotSpec, model: Gravity
+) -> list[Finding]:
     """Compare torques and static poses with gravity, unless another error would cause these findings too."""
     errors = [f.check for f in findings if f.level == "error" or "slope" in f.values]
     if errors:

@@ -18,8 +18,14 @@ from gaponet.base.arrays import Array
 
 SAMPLED_ROWS, OUTLINE_POINTS = 32, 24
 ROW_RESOLUTION_RAD = 1e-5  # rows that differ by less are equal
-MIN_SHARED_ROWS, MIN_SHARED_SHARE = 2, 0.3  # of the sampled rows; one common resting place is not enough
-MAX_OUTLINE_DIFFERENCE, MAX_DURATION_DIFFERENCE = 0.004, 0.01  # shares of the outline's range and of the duration
+MIN_SHARED_ROWS, MIN_SHARED_SHARE = (
+    2,
+    0.3,
+)  # of the sampled rows; one common resting place is not enough
+MAX_OUTLINE_DIFFERENCE, MAX_DURATION_DIFFERENCE = (
+    0.004,
+    0.01,
+)  # shares of the outline's range and of the duration
 MAX_START_SHIFT = 0.1  # outline points by which one command may begin later
 OUTLIERS = 2  # outline points that may differ by more: a step is a row early or late
 
@@ -33,7 +39,9 @@ class CommandFingerprint(TypedDict):
 
     rows: Annotated[list[Annotated[int, Interval(ge=0, lt=2**32)]], Len(1, SAMPLED_ROWS)]
     seconds: Annotated[float, Interval(ge=0, le=1e8)]
-    outline: Annotated[list[Annotated[float, Interval(ge=-1e6, le=1e6)]], Len(OUTLINE_POINTS, OUTLINE_POINTS)]
+    outline: Annotated[
+        list[Annotated[float, Interval(ge=-1e6, le=1e6)]], Len(OUTLINE_POINTS, OUTLINE_POINTS)
+    ]
 
 
 def fingerprint(ctrl: Array, dt: float) -> CommandFingerprint:
@@ -41,7 +49,9 @@ def fingerprint(ctrl: Array, dt: float) -> CommandFingerprint:
     steps = np.round(np.asarray(ctrl, float) / ROW_RESOLUTION_RAD).astype(np.int64)
     rng = np.random.default_rng(0)
     weights = rng.integers(1, 2**62, ctrl.shape[1], dtype=np.int64) | 1
-    hashes = ((steps * weights).sum(axis=1).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
+    hashes = (
+        (steps * weights).sum(axis=1).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    ) >> np.uint64(32)
     distinct = hashes[hashes != hashes[0]]
     changed = np.flatnonzero((steps[1:] != steps[:-1]).any(axis=1))
     first, last = (int(changed[0]), int(changed[-1]) + 1) if len(changed) else (0, len(ctrl) - 1)
@@ -61,9 +71,17 @@ def equal_commands(fingerprints: Sequence[CommandFingerprint]) -> list[tuple[int
     seconds = np.array([f["seconds"] for f in fingerprints])
     slopes, ranges = np.gradient(outlines, axis=1), np.ptp(outlines, axis=1)
     for i in np.flatnonzero(ranges > 0):
-        others = i + 1 + np.flatnonzero(np.abs(seconds[i + 1 :] - seconds[i]) <= MAX_DURATION_DIFFERENCE * seconds[i])
+        others = (
+            i
+            + 1
+            + np.flatnonzero(
+                np.abs(seconds[i + 1 :] - seconds[i]) <= MAX_DURATION_DIFFERENCE * seconds[i]
+            )
+        )
         difference, slope = outlines[others] - outlines[i], slopes[i]
-        shift = np.clip(difference @ slope / max(slope @ slope, 1e-12), -MAX_START_SHIFT, MAX_START_SHIFT)
+        shift = np.clip(
+            difference @ slope / max(slope @ slope, 1e-12), -MAX_START_SHIFT, MAX_START_SHIFT
+        )
         residual = np.abs(difference - shift[:, None] * slope)
         worst = np.partition(residual, -1 - OUTLIERS, axis=1)[:, -1 - OUTLIERS]
         pairs |= {(int(i), int(j)) for j in others[worst <= MAX_OUTLINE_DIFFERENCE * ranges[i]]}
@@ -77,7 +95,8 @@ def _pairs_with_shared_rows(samples: list[set[int]]) -> Iterator[tuple[int, int]
     index = {row: k for k, row in enumerate(sorted(set().union(*samples)))}
     places = [(i, index[row]) for i, sample in enumerate(samples) for row in sample]
     contains = csr_matrix(
-        (np.ones(len(places), np.int32), tuple(zip(*places, strict=True))), (len(samples), len(index))
+        (np.ones(len(places), np.int32), tuple(zip(*places, strict=True))),
+        (len(samples), len(index)),
     )
     common = (contains @ contains.T).tocoo()
     for i, j, n in zip(common.row.tolist(), common.col.tolist(), common.data.tolist(), strict=True):

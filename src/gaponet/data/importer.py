@@ -28,7 +28,9 @@ from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import KIND, Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
-MAX_HELD_BYTES = 1 << 26  # of samples that are held between checking and writing; a larger source is read twice
+MAX_HELD_BYTES = (
+    1 << 26
+)  # of samples that are held between checking and writing; a larger source is read twice
 MIN_PIECE_S = 0.8
 UNSTATED_REPETITION = -1
 
@@ -59,7 +61,9 @@ class ImportResult:
     def fast_lags(self, joint: str) -> list[float]:
         """Lags of a joint in the sequences that command it fast, s."""
         measured = [{name: x.get(joint) for name, x in e.findings.items()} for e in self.entries]
-        lags = [x.get("delay_s") for x in measured if (x.get("fast_speed") or 0) >= FAST_COMMAND_RAD_S]
+        lags = [
+            x.get("delay_s") for x in measured if (x.get("fast_speed") or 0) >= FAST_COMMAND_RAD_S
+        ]
         return [lag for lag in lags if lag is not None]
 
     def to_dict(self) -> dict[str, Any]:
@@ -120,11 +124,17 @@ def import_logs(
             poses: dict[str, StaticPoses] = {}
             added, present = source.write(dataset, poses if gravity else None)
         units = dict.fromkeys(e.meta.unit_id for e in (*present, *added)) if gravity else {}
-        offsets = {unit: unit_offsets(dataset, robot, unit, gravity, poses) for unit in units} if gravity else {}
+        offsets = (
+            {unit: unit_offsets(dataset, robot, unit, gravity, poses) for unit in units}
+            if gravity
+            else {}
+        )
         for unit, of_unit in offsets.items():
             record_offsets(dataset, unit, of_unit, simulator)
     only = next(iter(offsets.values())) if len(offsets) == 1 else None
-    return ImportResult(dataset, robot, tuple(added), tuple(present), only, tuple(dict.fromkeys(skipped or ())))
+    return ImportResult(
+        dataset, robot, tuple(added), tuple(present), only, tuple(dict.fromkeys(skipped or ()))
+    )
 
 
 @dataclass
@@ -175,7 +185,9 @@ class _Source:
                 f"payload): {duplicates[0][0]} is {duplicates[0][1]}. Nothing was imported; leave one of them out"
             )
 
-    def write(self, dataset: Dataset, poses: dict[str, StaticPoses] | None) -> tuple[list[Entry], list[Entry]]:
+    def write(
+        self, dataset: Dataset, poses: dict[str, StaticPoses] | None
+    ) -> tuple[list[Entry], list[Entry]]:
         """Append what is new; return the added and the present entries.
 
         Args:
@@ -195,7 +207,9 @@ class _Source:
                     continue
                 key = sequence.meta.repetition_key
                 if sequence.meta.repetition == UNSTATED_REPETITION:
-                    sequence = replace(sequence, meta=replace(sequence.meta, repetition=repetitions[key]))
+                    sequence = replace(
+                        sequence, meta=replace(sequence.meta, repetition=repetitions[key])
+                    )
                 added.append(dataset.append(sequence, measure_delays(sequence), content_hash))
                 repetitions[key] += 1
         return added, present
@@ -210,7 +224,9 @@ class _Source:
             meta = self._meta(log, motion, file_hashes[files])
             _require_side(self.robot, meta.payload_side)
             sequence = to_sequence(log, self.robot, meta)
-            if "notes" in log.meta.get("stated", {}):  # an export of ours: notes of the first import
+            if "notes" in log.meta.get(
+                "stated", {}
+            ):  # an export of ours: notes of the first import
                 sequence = replace(sequence, meta=meta)
             for piece in _pieces(sequence, self.cut):
                 yield piece, log
@@ -222,15 +238,26 @@ class _Source:
         for name, value in self.labels.items():
             if name in stated and stated[name] != value:
                 flag = "--" + name.replace("_", "-")
-                raise UsageError(f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out")
-        needed = {"unit_id": "--unit-id NAME", "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)"}
+                raise UsageError(
+                    f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out"
+                )
+        needed = {
+            "unit_id": "--unit-id NAME",
+            "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)",
+        }
         missing = [flag for name, flag in needed.items() if name not in self.labels | stated]
         if missing:
-            raise UsageError(f"{log.source}: this format does not state unit or payload: give {' and '.join(missing)}")
+            raise UsageError(
+                f"{log.source}: this format does not state unit or payload: give {' and '.join(missing)}"
+            )
         # A relative path: no home folder gets into a dataset.
-        source = Path(os.path.relpath(log.source, Path(os.path.abspath(self.src)).parent)).as_posix()
+        source = Path(
+            os.path.relpath(log.source, Path(os.path.abspath(self.src)).parent)
+        ).as_posix()
         origin = {"source": source, "source_sha256": sha256, "repetition": UNSTATED_REPETITION}
-        fields: dict[str, Any] = origin | self.labels | {"robot": self.robot.name, "motion": motion} | stated
+        fields: dict[str, Any] = (
+            origin | self.labels | {"robot": self.robot.name, "motion": motion} | stated
+        )
         return SequenceMeta(**fields)
 
 
@@ -259,7 +286,9 @@ def _parse_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[f
         except ValueError:
             value = np.nan
         if not (np.isfinite(value) and value >= 0) or (not equals and len(words) > 1):
-            raise UsageError(f"--{name} {word}: give one number ≥ 0 for all joints, or JOINT=NUMBER for some")
+            raise UsageError(
+                f"--{name} {word}: give one number ≥ 0 for all joints, or JOINT=NUMBER for some"
+            )
         gains[robot.index([joint]) if equals else slice(None)] = value
     if len({word.rpartition("=")[0] for word in words}) < len(words):
         raise UsageError(f"--{name} {' '.join(words)}: names a joint twice")
@@ -268,9 +297,13 @@ def _parse_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[f
 
 def measure_delays(sequence: Sequence) -> Findings:
     """Return by joint: delay_s, lag of the state (None if the motion does not show it), and fast_speed."""
-    delay, speed = estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt), fast_speed(sequence.ctrl, sequence.dt)
+    delay, speed = (
+        estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt),
+        fast_speed(sequence.ctrl, sequence.dt),
+    )
     by_joint = lambda x: {  # noqa: E731
-        j: round(float(v), 4) if np.isfinite(v) else None for j, v in zip(sequence.joint_names, x, strict=True)
+        j: round(float(v), 4) if np.isfinite(v) else None
+        for j, v in zip(sequence.joint_names, x, strict=True)
     }
     return {"delay_s": by_joint(delay), "fast_speed": by_joint(speed)}
 
@@ -281,7 +314,11 @@ def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:
     for unit, mass, side in {(m.unit_id, m.payload_mass, m.payload_side) for m in same_length}:
         other = replace(meta, unit_id=unit, payload_mass=mass, payload_side=side)
         entry = existing.find(replace(sequence, meta=other).content_hash())
-        if entry is not None and (unit, mass, side) != (meta.unit_id, meta.payload_mass, meta.payload_side):
+        if entry is not None and (unit, mass, side) != (
+            meta.unit_id,
+            meta.payload_mass,
+            meta.payload_side,
+        ):
             raise DatasetError(
                 f"{meta.source}: known samples under new labels: {existing.path} holds them as unit {unit}, {mass:g} "
                 f"kg ({side}), not unit {meta.unit_id}, {meta.payload_mass:g} kg ({meta.payload_side}). Nothing was "
@@ -292,7 +329,9 @@ def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:
 def _require_side(robot: RobotSpec, side: str) -> None:
     sides = ("both", *(mount.side for mount in robot.payload_mounts))
     if side not in sides:
-        raise UsageError(f"payload side '{side}' is unknown to {robot.name}; use one of {', '.join(sides)}")
+        raise UsageError(
+            f"payload side '{side}' is unknown to {robot.name}; use one of {', '.join(sides)}"
+        )
 
 
 def _sha256(files: tuple[str, ...]) -> str:

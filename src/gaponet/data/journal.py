@@ -26,7 +26,9 @@ from gaponet.data.sequence import ARRAYS, SequenceMeta
 FILE = "sequences.jsonl"
 HINT = "delete the line and import that log again"
 FLUSH_INTERVAL_S = 1.0
-Findings = dict[str, dict[str, float | None]]  # measured at import: delay_s, fast_speed → joint → value
+Findings = dict[
+    str, dict[str, float | None]
+]  # measured at import: delay_s, fast_speed → joint → value
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,9 @@ class EntryHeader:
 
     def __post_init__(self) -> None:
         if not {"ctrl", "qpos", "qvel"} <= set(self.channels) <= set(ARRAYS):
-            raise DatasetError(f"channels: {self.channels!r:.80} lack ctrl, qpos or qvel, or hold an unknown one")
+            raise DatasetError(
+                f"channels: {self.channels!r:.80} lack ctrl, qpos or qvel, or hold an unknown one"
+            )
 
 
 @dataclass(frozen=True)
@@ -60,11 +64,17 @@ class Entry(EntryHeader):
 
     @classmethod
     def create(
-        cls, header: EntryHeader, meta: SequenceMeta, findings: Findings, command: CommandFingerprint | None = None
+        cls,
+        header: EntryHeader,
+        meta: SequenceMeta,
+        findings: Findings,
+        command: CommandFingerprint | None = None,
     ) -> Entry:
         """Return the entry of a new sequence; `command` is the fingerprint of its commands."""
         content = asdict(header) | {"meta": asdict(meta), "findings": findings, "command": command}
-        return cls(**vars(header), line=json.dumps(content, ensure_ascii=False, allow_nan=False).encode())
+        return cls(
+            **vars(header), line=json.dumps(content, ensure_ascii=False, allow_nan=False).encode()
+        )
 
     @classmethod
     def parse(cls, line: bytes, where: str) -> Entry:
@@ -126,7 +136,9 @@ class Journal:
         for number, line in enumerate(content[: self._size].split(b"\n")[:-1], 1):
             entry = Entry.parse(line, f"{self.path}:{number}")
             if id_of_hash.setdefault(entry.hash, entry.id) != entry.id or len(id_of_hash) < number:
-                raise DatasetError(f"{entry.where}: '{id_of_hash[entry.hash]}' is listed already; delete this line")
+                raise DatasetError(
+                    f"{entry.where}: '{id_of_hash[entry.hash]}' is listed already; delete this line"
+                )
             yield entry
 
     @property
@@ -145,7 +157,9 @@ class Journal:
         if not self._pending:
             return
         lines = b"".join(entry.line + b"\n" for entry in self._pending)
-        flush_to_disk(self.path.parent / "sequences")  # the names of the listed files are on the disk first
+        flush_to_disk(
+            self.path.parent / "sequences"
+        )  # the names of the listed files are on the disk first
         with self.path.open("ab") as file:
             file.truncate(self._size)  # removes a line that a crash or a full disk cut short
             file.write(lines)

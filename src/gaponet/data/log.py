@@ -16,7 +16,14 @@ from gaponet.base.errors import LogError
 FEEDFORWARD = "feedforward_torque"  # that a controller adds to its PD torque; data.sequence makes it a position
 COMMANDS = ("ctrl", FEEDFORWARD)  # channels that are held between their rows
 # Channel names and their SI units. ctrl is the commanded joint position.
-CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C", FEEDFORWARD: "N·m"}
+CHANNELS = {
+    "ctrl": "rad",
+    "qpos": "rad",
+    "qvel": "rad/s",
+    "tau": "N·m",
+    "temperature": "°C",
+    FEEDFORWARD: "N·m",
+}
 # What others computed from these; kept where a format states it (an exported dataset), never looked for elsewhere.
 DERIVED = {"qacc": "rad/s²", "tau_eq": "N·m"}
 UNITS = {"time": "s"} | CHANNELS | DERIVED
@@ -81,7 +88,9 @@ class Log:
         for name, (clock, _) in self.channels.items():
             if name in channels:
                 continue
-            same = [n for n, c in self.channels.items() if np.array_equal(c.time, clock, equal_nan=True)]
+            same = [
+                n for n, c in self.channels.items() if np.array_equal(c.time, clock, equal_nan=True)
+            ]
             good = np.isfinite(clock)
             for other in same:
                 good &= np.isfinite(self.channels[other].values).all(axis=1)
@@ -96,17 +105,25 @@ class Log:
 
     def _check(self, name: str, time: Array, values: Array) -> None:
         if name not in UNITS:
-            raise LogError(f"{self.source}: unknown channel '{name}'; known are {', '.join(CHANNELS | DERIVED)}")
+            raise LogError(
+                f"{self.source}: unknown channel '{name}'; known are {', '.join(CHANNELS | DERIVED)}"
+            )
         if values.shape != (len(time), len(self.joint_names)):
             raise LogError(
                 f"{self.source}: channel {name} has shape {values.shape}, expected "
                 f"({len(time)}, {len(self.joint_names)}) for joints {', '.join(self.joint_names)}"
             )
         if len(time) < 2:
-            raise LogError(f"{self.source}: channel {name} has {len(time)} rows; nothing to learn from")
+            raise LogError(
+                f"{self.source}: channel {name} has {len(time)} rows; nothing to learn from"
+            )
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(time))
         if bad.size:
-            joint = int(np.flatnonzero(~np.isfinite(values[bad[0]]))[0]) if np.isfinite(time[bad[0]]) else 0
+            joint = (
+                int(np.flatnonzero(~np.isfinite(values[bad[0]]))[0])
+                if np.isfinite(time[bad[0]])
+                else 0
+            )
             raise LogError(
                 f"{self.row(name, int(bad[0]))}: {name} of {self.joint_names[joint]} is not finite; "
                 "repair or cut the row"

@@ -35,7 +35,9 @@ class JointOffset:
     rests_up: int  # static poses approached from below
     rests_down: int  # and from above
     static_error: float | None  # qpos − ctrl, mean of both approaches
-    stiction_band: float | None  # half the distance between both approaches, without nominal sag; times kp a torque
+    stiction_band: (
+        float | None
+    )  # half the distance between both approaches, without nominal sag; times kp a torque
     nominal_sag: float | None  # static error of the nominal model in the same poses
     tracking_offset: float | None  # static_error − nominal_sag
 
@@ -46,7 +48,11 @@ class _OffsetsFile(TypedDict):
 
 
 def unit_offsets(
-    dataset: Dataset, robot: RobotSpec, unit_id: str, gravity: Gravity, known: dict[str, StaticPoses]
+    dataset: Dataset,
+    robot: RobotSpec,
+    unit_id: str,
+    gravity: Gravity,
+    known: dict[str, StaticPoses],
 ) -> dict[str, JointOffset]:
     """Measure the offsets of the operated joints of one unit from all its sequences.
 
@@ -67,11 +73,15 @@ def unit_offsets(
     for name, j in zip(robot.operated, robot.operated_index, strict=True):
         error, beyond = joined.static_error(j), joined.static_error(j, sag[:, j])
         values = (error.middle, beyond.half_band, error.middle - beyond.middle, beyond.middle)
-        offsets[name] = JointOffset(error.up, error.down, *(round(x, 6) if math.isfinite(x) else None for x in values))
+        offsets[name] = JointOffset(
+            error.up, error.down, *(round(x, 6) if math.isfinite(x) else None for x in values)
+        )
     return offsets
 
 
-def record_offsets(dataset: Dataset, unit_id: str, offsets: dict[str, JointOffset], simulator: str) -> Path:
+def record_offsets(
+    dataset: Dataset, unit_id: str, offsets: dict[str, JointOffset], simulator: str
+) -> Path:
     """Write a unit's offsets into offsets.json; those of other units stay.
 
     Args:

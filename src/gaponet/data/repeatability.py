@@ -14,7 +14,9 @@ from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 
 MAX_COMMAND_DIFFERENCE_RAD = 1e-3  # repetitions whose commands differ by more have another command
-MAX_COMMAND_DIFFERENCE_SHARE = 0.02  # the same, of the command's range, on average: of commands computed twice
+MAX_COMMAND_DIFFERENCE_SHARE = (
+    0.02  # the same, of the command's range, on average: of commands computed twice
+)
 MAX_SHIFT_ROWS, MAX_PAIRS = 5, 100  # by which clocks differ; of recordings that are compared
 MIN_PERIOD_S = 0.5  # of a periodic motion
 MIN_MOTION_RAD = 0.02  # joints that are commanded to move by less are left out
@@ -33,10 +35,16 @@ def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> A
     """
     marks = [fingerprint(s.ctrl, s.dt) for s in sequences]
     pairs = [(sequences[i], sequences[j]) for i, j in equal_commands(marks)]
-    pairs = [(a, b) for a, b in pairs if a.meta.repetition_key[1:] == b.meta.repetition_key[1:] and a.dt == b.dt]
+    pairs = [
+        (a, b)
+        for a, b in pairs
+        if a.meta.repetition_key[1:] == b.meta.repetition_key[1:] and a.dt == b.dt
+    ]
     total, count = np.zeros((2, len(joints)))
     for a, b in pairs[:: max(1, len(pairs) // MAX_PAIRS)]:
-        columns = [i for i, j in enumerate(joints) if j not in (*a.meta.unrecorded, *b.meta.unrecorded)]
+        columns = [
+            i for i, j in enumerate(joints) if j not in (*a.meta.unrecorded, *b.meta.unrecorded)
+        ]
         places = [a.joint_names.index(joints[i]) for i in columns]
         if columns and (difference := _tracking_difference(a, b, places)) is not None:
             total[columns] += difference
@@ -46,12 +54,17 @@ def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> A
 
 def _tracking_difference(a: Sequence, b: Sequence, columns: list[int]) -> Array | None:
     """Return the mean squared difference of the tracking errors of two recordings, (n) rad²; None for two commands."""
-    one, other = (np.concatenate([s.ctrl[:, columns], s.qpos[:, columns]], axis=1).astype(float) for s in (a, b))
+    one, other = (
+        np.concatenate([s.ctrl[:, columns], s.qpos[:, columns]], axis=1).astype(float)
+        for s in (a, b)
+    )
     rows = np.arange(MAX_SHIFT_ROWS, min(len(a), len(b)) - MAX_SHIFT_ROWS)
     if not len(rows):
         return None
     each = [one[rows] - other[rows + shift] for shift in range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1)]
-    command, position = np.split(min(each, key=lambda x: np.abs(x[:, : len(columns)]).mean()), 2, axis=1)
+    command, position = np.split(
+        min(each, key=lambda x: np.abs(x[:, : len(columns)]).mean()), 2, axis=1
+    )
     limit = MAX_COMMAND_DIFFERENCE_SHARE * float(np.ptp(a.ctrl[:, columns], axis=0).max())
     if np.abs(command).mean() > max(MAX_COMMAND_DIFFERENCE_RAD, limit):
         return None
@@ -103,7 +116,9 @@ class Repetitions:
 
     def result(self) -> RepetitionResult:
         """Return the result of two or more repetitions."""
-        variance = {c: squares.mean(axis=0) / (self.count - 1) for c, squares in self._squares.items()}
+        variance = {
+            c: squares.mean(axis=0) / (self.count - 1) for c, squares in self._squares.items()
+        }
         moved = np.ptp(self._ctrl, axis=0) > MIN_MOTION_RAD
         return RepetitionResult(self.count, self.other_commands, moved, variance)
 
@@ -114,12 +129,18 @@ class Repetitions:
         rows = len(ctrl)
         for period in range(max(1, round(MIN_PERIOD_S / sequence.dt)), rows // 3 + 1):
             before, after = ctrl[:-period], ctrl[period:]
-            differences = (np.abs(after[::every] - before[::every]).max() for every in (97, 1))  # a few rows first
+            differences = (
+                np.abs(after[::every] - before[::every]).max() for every in (97, 1)
+            )  # a few rows first
             if all(difference <= MAX_COMMAND_DIFFERENCE_RAD for difference in differences):
                 break
         else:
             return []
-        starts = range(period, rows - period + 1, period) if np.ptp(ctrl, axis=0).max() > MIN_MOTION_RAD else ()
+        starts = (
+            range(period, rows - period + 1, period)
+            if np.ptp(ctrl, axis=0).max() > MIN_MOTION_RAD
+            else ()
+        )
         return [sequence.rows(slice(a, a + period)) for a in starts]
 
     @staticmethod
@@ -136,14 +157,20 @@ class Repetitions:
         """
         channels = {}
         for name in CHANNELS:
-            variances = [np.where(r.moved, r.variance[name], np.nan) for r in results if name in r.variance]
+            variances = [
+                np.where(r.moved, r.variance[name], np.nan) for r in results if name in r.variance
+            ]
             values = {}
             for j, joint in enumerate(joint_names):
                 column = np.array([v[j] for v in variances])
                 if np.isfinite(column).any():
                     values[joint] = float(f"{np.sqrt(np.nanmean(column)):.6g}")
             if values:
-                channels[name] = {"unit": UNITS[name], "mean": float(np.mean(list(values.values()))), "joints": values}
+                channels[name] = {
+                    "unit": UNITS[name],
+                    "mean": float(np.mean(list(values.values()))),
+                    "joints": values,
+                }
         return {
             "groups": len(results),
             "sequences": sum(r.count for r in results),

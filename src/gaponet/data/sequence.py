@@ -58,7 +58,9 @@ class SequenceMeta:
             if (gains := getattr(self, name)) is not None:
                 object.__setattr__(self, name, _gains(name, gains, self.source or self.motion))
         if not (np.isfinite(self.payload_mass) and 0 <= self.payload_mass <= 100):
-            raise LogError(f"{self.source or self.motion}: payload_mass is {self.payload_mass}; give kg, 0 when empty")
+            raise LogError(
+                f"{self.source or self.motion}: payload_mass is {self.payload_mass}; give kg, 0 when empty"
+            )
         if not self.unit_id or not self.motion:
             raise LogError(f"{self.source}: unit_id and motion must be named")
         if self.level not in LEVELS:
@@ -113,7 +115,9 @@ class Sequence:
 
     def __post_init__(self) -> None:
         if not MIN_PERIOD_S <= self.dt <= MAX_PERIOD_S:
-            raise LogError(f"{self.meta.source}: dt is {self.dt} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}")
+            raise LogError(
+                f"{self.meta.source}: dt is {self.dt} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}"
+            )
         shape = (len(self.ctrl), len(self.joint_names))
         for name in ARRAYS:
             value = getattr(self, name)
@@ -121,12 +125,16 @@ class Sequence:
                 continue
             value = np.ascontiguousarray(value, np.float32)
             if value.shape != shape or not np.isfinite(value).all():
-                raise LogError(f"{self.meta.source}: {name} has shape {value.shape} or holds NaN; expected {shape}")
+                raise LogError(
+                    f"{self.meta.source}: {name} has shape {value.shape} or holds NaN; expected {shape}"
+                )
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         for name in ("kp", "kd"):
             if len(getattr(self.meta, name) or self.joint_names) != shape[1]:
-                raise LogError(f"{self.meta.source}: {name} must hold one number for each of the {shape[1]} joints")
+                raise LogError(
+                    f"{self.meta.source}: {name} must hold one number for each of the {shape[1]} joints"
+                )
 
     def __len__(self) -> int:
         return len(self.ctrl)
@@ -144,7 +152,11 @@ class Sequence:
     @property
     def temperatures(self) -> tuple[float, ...] | None:
         """Mean temperature of each joint, (n) °C; None if it was not recorded."""
-        return None if self.temperature is None else tuple(self.temperature.mean(axis=0, dtype=float).round(1).tolist())
+        return (
+            None
+            if self.temperature is None
+            else tuple(self.temperature.mean(axis=0, dtype=float).round(1).tolist())
+        )
 
     def rows(self, part: slice) -> Sequence:
         """The same recording, only these rows."""
@@ -179,7 +191,9 @@ def _gains(name: str, values: Any, where: str) -> tuple[float, ...]:
     return gains
 
 
-def require_same_gains(metas: Iterable[SequenceMeta], joint_names: tuple[str, ...], joints: tuple[str, ...]) -> None:
+def require_same_gains(
+    metas: Iterable[SequenceMeta], joint_names: tuple[str, ...], joints: tuple[str, ...]
+) -> None:
     """Refuse recordings made with different gains: what one robot does with two stiffnesses is not one gap.
 
     Args:
@@ -222,7 +236,9 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     _require_both_ends(log)
     period = np.diff(time)
     median = _median_period(log)
-    shared = all(len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values())
+    shared = all(
+        len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values()
+    )
     even = shared and bool((np.abs(period - median) <= 0.1 * median).all())
     mean = round(float(period.mean()), 7)
     exact = (mean,) if np.abs(period - mean).max() < 2e-6 else ()  # a clock that does not waver
@@ -237,13 +253,19 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
         arrays = _resample(log, dt, begin)
     arrays = {name: _to_robot(name, values, log, robot) for name, values in arrays.items()}
     converted = log.meta.get("converted_from", {})
-    odd = [j for j, name in enumerate(robot.joint_names) if "qvel" not in arrays or converted.get(name) == "fraction"]
+    odd = [
+        j
+        for j, name in enumerate(robot.joint_names)
+        if "qvel" not in arrays or converted.get(name) == "fraction"
+    ]
     if odd:  # a joint logged as a fraction of its range has its velocity in any unit at all
         qvel = differentiate(arrays["qpos"], dt)
         arrays.setdefault("qvel", qvel)[:, odd] = qvel[:, odd]
     notes = meta.notes | log.meta.get("notes", {})
     notes |= {
-        "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated",
+        "rows": "as recorded"
+        if regular
+        else f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated",
         "rate_hz": round(1 / median, 3),
         "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
         "uneven_ms": round(float(np.percentile(np.abs(period - median), 95)) * 1e3, 3),
@@ -253,24 +275,43 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     if not regular:
         span = f"{1e3 * period.min():.1f} to {1e3 * period.max():.1f} ms"
         uneven = (
-            "no even period fits its rows" if even else f"its rows lie {span} apart, and shorter delays are not known"
+            "no even period fits its rows"
+            if even
+            else f"its rows lie {span} apart, and shorter delays are not known"
         )
         notes["why_resampled"] = uneven if shared else "its channels have clocks of their own"
     posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
-    absent = [name for name in robot.joint_names if name not in log.joint_names and name not in posture]
-    notes |= ({"posture": posture} if posture else {}) | ({"held_at_home": absent} if absent else {})
+    absent = [
+        name for name in robot.joint_names if name not in log.joint_names and name not in posture
+    ]
+    notes |= ({"posture": posture} if posture else {}) | (
+        {"held_at_home": absent} if absent else {}
+    )
     if converted:
         notes["converted_from"] = converted
     gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
-    origins = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
+    origins = [
+        "as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED
+        for n in gains
+    ]
     notes["gains"] = origins[0] if origins[0] == origins[1] else f"kp {origins[0]}, kd {origins[1]}"
     if FEEDFORWARD in arrays:
         assumed = origins[0] == ASSUMED
-        further = _feedforward_position(arrays.pop(FEEDFORWARD), np.array(gains["kp"]), assumed, log, robot)
+        further = _feedforward_position(
+            arrays.pop(FEEDFORWARD), np.array(gains["kp"]), assumed, log, robot
+        )
         arrays["ctrl"] = arrays["ctrl"] + further
-        largest = {j: round(float(x), 4) for j, x in zip(robot.joint_names, abs(further).max(axis=0), strict=True) if x}
-        notes |= {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}} if largest else {}
-    return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
+        largest = {
+            j: round(float(x), 4)
+            for j, x in zip(robot.joint_names, abs(further).max(axis=0), strict=True)
+            if x
+        }
+        notes |= (
+            {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}} if largest else {}
+        )
+    return Sequence(
+        SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays
+    )
 
 
 def _require_both_ends(log: Log) -> None:
@@ -334,7 +375,10 @@ def _loop(time: Array, median: float, usual: float) -> tuple[float | None, float
             break
         rows *= 2
     number = (time - begin) / period
-    if not abs(period - median) < 0.1 * median or np.median(np.abs(number - np.round(number))) > 0.2:
+    if (
+        not abs(period - median) < 0.1 * median
+        or np.median(np.abs(number - np.round(number))) > 0.2
+    ):
         return None, round(median, 5)
     short = (usual, round(float(period), 5), float(period))
     return begin, next(p for p in short if abs(p - period) * number[-1] <= 0.1 * period)
@@ -360,7 +404,9 @@ def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
     }  # fmt: skip
 
 
-def _feedforward_position(torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec) -> Array:
+def _feedforward_position(
+    torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec
+) -> Array:
     """Return the distance of the command, (T, n) rad, that has the effect of a torque on a PD controller: torque / kp,
     as kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇. `assumed`: nobody stated kp."""
     without = torque.any(axis=0) & (assumed | (kp == 0))

@@ -9,7 +9,9 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 SAME_INSTANT = 0.1  # of a period by which stamps of one instant may differ
-FAST_COMMAND_RAD_S = 0.3  # fast_speed from which a lag is mostly delay; below, it is mostly stiction
+FAST_COMMAND_RAD_S = (
+    0.3  # fast_speed from which a lag is mostly delay; below, it is mostly stiction
+)
 # Of a Response: least step; span of the command before and after the state; parts of a recording; shifts of a part.
 MIN_STEP_S, BEFORE_S, AFTER_S, SPLITS = 0.01, 0.12, 0.6, 3
 SHIFTS_S = np.arange(-0.12, 0.1201, 0.002)
@@ -86,13 +88,20 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
         tried, which happens in slow motions with stiction.
     """
     kernel = np.hanning(7)[1:-1] / np.hanning(7).sum()
-    u, v = (np.stack([np.convolve(c, kernel, "same") for c in np.diff(x, axis=0).T]) for x in (ctrl, qpos))
+    u, v = (
+        np.stack([np.convolve(c, kernel, "same") for c in np.diff(x, axis=0).T])
+        for x in (ctrl, qpos)
+    )
     shifts = range(min(int(max_delay / dt), u.shape[1] // 2) + 1)
     score = np.stack([correlation(u[:, : u.shape[1] - s], v[:, s:]) for s in shifts])  # (S, n)
     best = score.argmax(axis=0)
     delay = np.full(ctrl.shape[1], np.nan)
     for j, s in enumerate(best):
-        if np.ptp(ctrl[:, j]) < MIN_COMMAND_RAD or not score[s, j] > MIN_CORRELATION or s == len(score) - 1:
+        if (
+            np.ptp(ctrl[:, j]) < MIN_COMMAND_RAD
+            or not score[s, j] > MIN_CORRELATION
+            or s == len(score) - 1
+        ):
             continue
         offset = 0.0
         if s > 0:
@@ -106,7 +115,10 @@ def range_before(values: Array, rows: int) -> Array:
     """Return the greatest less the least value of each row and those before it, `rows` in all, (T, n)."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-    most, least = (f(values, rows, axis=0, origin=(rows - 1) // 2) for f in (maximum_filter1d, minimum_filter1d))
+    most, least = (
+        f(values, rows, axis=0, origin=(rows - 1) // 2)
+        for f in (maximum_filter1d, minimum_filter1d)
+    )
     return np.asarray(most - least)
 
 
@@ -203,10 +215,17 @@ class Response:
         step, n, lags = responses[0].step, *responses[0].own.shape[1:]
         at = (np.arange(lags) - round(BEFORE_S / step)) * step
         mask = np.ones(len(responses), bool) if used is None else np.array(used)
-        parts = [np.stack([getattr(r, f) for r in responses]).astype(float) for f in ("own", "cross", "power")]
+        parts = [
+            np.stack([getattr(r, f) for r in responses]).astype(float)
+            for f in ("own", "cross", "power")
+        ]
         own, cross, power = (x[mask].sum(axis=(0, 1)) for x in parts)
         quick = Response.sharp(responses)
-        onset, early, fits = np.full(n, np.nan), np.full(n, np.nan), np.zeros((len(responses), SPLITS, len(SHIFTS_S)))
+        onset, early, fits = (
+            np.full(n, np.nan),
+            np.full(n, np.nan),
+            np.zeros((len(responses), SPLITS, len(SHIFTS_S))),
+        )
         for j in range(n):
             if own[j, 0] <= 0 or power[j] <= 0:
                 continue
@@ -215,17 +234,27 @@ class Response:
             if residual > MAX_UNEXPLAINED * power[j] or weights.sum() < 0.3:
                 continue
             past_only = toeplitz(own[j, :-now]) + RIDGE * own[j, 0] * np.eye(lags - now)
-            early[j] = (power[j] - cross[j, now:] @ np.linalg.solve(past_only, cross[j, now:])) / residual
+            early[j] = (
+                power[j] - cross[j, now:] @ np.linalg.solve(past_only, cross[j, now:])
+            ) / residual
             progress = np.cumsum(weights) / weights.sum()
             first = int(np.argmax(progress > ONSET_SHARE))
-            if quick[j] and first:  # the earliest lag also stands for still earlier ones, or for chance
+            if (
+                quick[j] and first
+            ):  # the earliest lag also stands for still earlier ones, or for chance
                 before = progress[first - 1]
                 onset[j] = (
-                    at[first] + step - step * (progress[first] - ONSET_SHARE) / max(progress[first] - before, 1e-9)
+                    at[first]
+                    + step
+                    - step * (progress[first] - ONSET_SHARE) / max(progress[first] - before, 1e-9)
                 )
-            shifted = np.stack([np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS_S])
+            shifted = np.stack(
+                [np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS_S]
+            )
             spectrum = np.fft.rfft(shifted, 2 * lags, axis=1)
-            square = np.fft.irfft(np.abs(spectrum) ** 2, 2 * lags, axis=1)[:, :lags]  # of the weights with themselves
+            square = np.fft.irfft(np.abs(spectrum) ** 2, 2 * lags, axis=1)[
+                :, :lags
+            ]  # of the weights with themselves
             square[:, 1:] *= 2
             fits += (parts[1][:, :, j] @ shifted.T - 0.5 * parts[0][:, :, j] @ square.T) / residual
         return CommonResponse(onset, early, _best_shifts(fits), _best_shifts(fits.sum(axis=1)))

@@ -99,22 +99,39 @@ def split_entries(
     """
     _require_present(dataset, holdout_units, holdout_payloads, rates)
     if not 0 < train_share <= 1:
-        raise UsageError(f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1")
+        raise UsageError(
+            f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1"
+        )
     held_out = lambda e: e.meta.unit_id in holdout_units or e.meta.payload_mass in holdout_payloads  # noqa: E731
     canonical = canonical_motions(dataset)
-    repetitions = Counter((canonical[e.meta.motion], *e.meta.repetition_key[1:]) for e in dataset.entries)
+    repetitions = Counter(
+        (canonical[e.meta.motion], *e.meta.repetition_key[1:]) for e in dataset.entries
+    )
     if len(set(canonical.values())) < MIN_MOTIONS <= max(repetitions.values(), default=0):
         splits = split_by_order(dataset, "repetition")
         return splits | {s: [e for e in splits[s] if not held_out(e)] for s in ("train", "val")}
-    motions = _split_by_joints({canonical[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries})
+    motions = _split_by_joints(
+        {canonical[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries}
+    )
     motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
-    entries = [e for e in dataset.entries if not rates or any(abs(r - 1 / e.dt) < RATE_TOLERANCE * r for r in rates)]
+    entries = [
+        e
+        for e in dataset.entries
+        if not rates or any(abs(r - 1 / e.dt) < RATE_TOLERANCE * r for r in rates)
+    ]
     splits = {
-        s: [e for e in entries if canonical[e.meta.motion] in motions[s] and (s == "test" or not held_out(e))]
+        s: [
+            e
+            for e in entries
+            if canonical[e.meta.motion] in motions[s] and (s == "test" or not held_out(e))
+        ]
         for s in SPLITS
     }
     if empty := [s for s in SPLITS if not splits[s]]:
-        reason = ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)]) or "all other rates"
+        reason = (
+            ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)])
+            or "all other rates"
+        )
         raise UsageError(f"{dataset.path}: nothing left for {empty[0]} after holding out {reason}")
     return splits
 
@@ -124,14 +141,18 @@ def _require_present(
 ) -> None:
     known_units = sorted({e.meta.unit_id for e in dataset.entries})
     if missing_units := [u for u in units if u not in known_units]:
-        raise UsageError(f"unit '{missing_units[0]}' is not in {dataset.path}; it holds {', '.join(known_units)}")
+        raise UsageError(
+            f"unit '{missing_units[0]}' is not in {dataset.path}; it holds {', '.join(known_units)}"
+        )
     for wanted, known, text, tolerance in (
         (payloads, {e.meta.payload_mass for e in dataset.entries}, "with {:g} kg", 0.0),
         (rates, {round(1 / e.dt, 2) for e in dataset.entries}, "at {:g} Hz", RATE_TOLERANCE),
     ):
         if missing := [x for x in wanted if not any(abs(x - k) <= tolerance * x for k in known)]:
             present, unit = ", ".join(f"{k:g}" for k in sorted(known)), text[-2:]
-            raise UsageError(f"no recording {text.format(missing[0])} in {dataset.path}; it holds {present} {unit}")
+            raise UsageError(
+                f"no recording {text.format(missing[0])} in {dataset.path}; it holds {present} {unit}"
+            )
 
 
 def split_by_order(dataset: Dataset, by: str) -> Splits:
@@ -146,7 +167,9 @@ def split_by_order(dataset: Dataset, by: str) -> Splits:
     canonical = canonical_motions(dataset) if by == "repetition" else {}
     groups: dict[tuple[Any, ...], list[Entry]] = {}
     for e in dataset.entries:
-        groups.setdefault((*e.meta.repetition_key[1:], canonical.get(e.meta.motion, e.meta.source)), []).append(e)
+        groups.setdefault(
+            (*e.meta.repetition_key[1:], canonical.get(e.meta.motion, e.meta.source)), []
+        ).append(e)
     splits: Splits = {s: [] for s in SPLITS}
     for group in groups.values():
         place = {e.id: (e.meta.motion, e.meta.repetition) if canonical else (e.meta.notes.get("from_s", 0.0),)
@@ -157,7 +180,11 @@ def split_by_order(dataset: Dataset, by: str) -> Splits:
             rank = places.index(place[e.id])
             splits["test" if rank < test else "val" if test and rank == test else "train"].append(e)
     if not splits["test"]:
-        kind = "repetitions" if by == "repetition" else "pieces of one recording (gaponet import --cut 8)"
+        kind = (
+            "repetitions"
+            if by == "repetition"
+            else "pieces of one recording (gaponet import --cut 8)"
+        )
         raise UsageError(f"a split by {by} needs {MIN_MOTIONS} {kind} or more")
     return splits
 
@@ -199,7 +226,9 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
     return splits
 
 
-def _held_out_values(dataset: Dataset, by: str, holdout: tuple[str, ...], key: Callable[[Entry], str]) -> set[str]:
+def _held_out_values(
+    dataset: Dataset, by: str, holdout: tuple[str, ...], key: Callable[[Entry], str]
+) -> set[str]:
     """Return the keys that are held out; a motion takes those with equal commands with it."""
     values = hash_order(map(PROPERTIES[by], dataset.entries))
     if by == "payload":
@@ -209,9 +238,13 @@ def _held_out_values(dataset: Dataset, by: str, holdout: tuple[str, ...], key: C
             raise UsageError(f"--holdout {' '.join(holdout)}: payloads are numbers, kg") from None
     for value in holdout:
         if value not in values:
-            raise UsageError(f"{dataset.path}: no {by} '{value}' to hold out; it holds {', '.join(sorted(values))}")
+            raise UsageError(
+                f"{dataset.path}: no {by} '{value}' to hold out; it holds {', '.join(sorted(values))}"
+            )
     if len(values) < 2:
-        raise UsageError(f"{dataset.path}: one {by} only ({', '.join(values)}); split it by another property")
+        raise UsageError(
+            f"{dataset.path}: one {by} only ({', '.join(values)}); split it by another property"
+        )
     keys = hash_order(map(key, dataset.entries))
     if len(keys) < 2:
         raise UsageError(
@@ -228,7 +261,9 @@ def canonical_motions(dataset: Dataset) -> dict[str, str]:
     for entry in dataset.entries:
         of_motion = fingerprints.setdefault(entry.meta.motion, [])
         command = entry.command
-        if command is None and not of_motion:  # an old journal: one recording is enough for its motion
+        if (
+            command is None and not of_motion
+        ):  # an old journal: one recording is enough for its motion
             command = fingerprint(dataset.channels(entry, ("ctrl",))["ctrl"], entry.dt)
         if command is not None and command not in of_motion:
             of_motion.append(command)
@@ -269,7 +304,9 @@ def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[st
     Args:
         unrecorded: Motion → joints that it does not hold.
     """
-    groups = [[m for m in unrecorded if unrecorded[m] == joints] for joints in set(unrecorded.values())]
+    groups = [
+        [m for m in unrecorded if unrecorded[m] == joints] for joints in set(unrecorded.values())
+    ]
     if len(groups) == 1 or max(map(len, groups)) < MIN_MOTIONS:
         return split_motions(unrecorded)
     splits: dict[str, list[str]] = {s: [] for s in SPLITS}
@@ -285,13 +322,19 @@ def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
     groups: dict[tuple[object, ...], list[Entry]] = {}
     for entry in entries:
         m = entry.meta
-        groups.setdefault((m.payload_mass, m.payload_side, m.unit_id, round(1 / entry.dt, 1)), []).append(entry)
+        groups.setdefault(
+            (m.payload_mass, m.payload_side, m.unit_id, round(1 / entry.dt, 1)), []
+        ).append(entry)
     rotated = [g[i % len(g) :] + g[: i % len(g)] for i, g in enumerate(groups.values())]
-    chosen = [e.id for turn in itertools.zip_longest(*rotated) for e in turn if e is not None][:count]
+    chosen = [e.id for turn in itertools.zip_longest(*rotated) for e in turn if e is not None][
+        :count
+    ]
     return [e for e in entries if e.id in chosen]
 
 
-def require_distinct_samples(dataset: Dataset, splits: Splits, progress: Progress = no_progress) -> None:
+def require_distinct_samples(
+    dataset: Dataset, splits: Splits, progress: Progress = no_progress
+) -> None:
     """Refuse splits that share samples under different units or payloads, which content hashes do not show.
 
     Raises:
@@ -338,15 +381,21 @@ def read_split(path: str | Path, dataset: Dataset) -> Splits:
     Raises:
         DatasetError: It is no split file, a sequence is not in the dataset, or two splits share one.
     """
-    file = read_json(_SplitFile, Path(path), DatasetError, "make one with gaponet data split", allow_extra=True)
+    file = read_json(
+        _SplitFile, Path(path), DatasetError, "make one with gaponet data split", allow_extra=True
+    )
     splits: Splits = {s: [] for s in SPLITS}
     split_of_hash: dict[str, str] = {}
     for s in SPLITS:
         for name, digest in file["parts"][s].items():  # type: ignore[literal-required]
             entry = dataset.find(digest)
             if entry is None:
-                raise DatasetError(f"{path}: '{name}' is not in {dataset.path}; split that dataset anew")
+                raise DatasetError(
+                    f"{path}: '{name}' is not in {dataset.path}; split that dataset anew"
+                )
             if split_of_hash.setdefault(digest, s) != s:
-                raise DatasetError(f"{path}: '{name}' is in {split_of_hash[digest]} and in {s}; split the dataset anew")
+                raise DatasetError(
+                    f"{path}: '{name}' is in {split_of_hash[digest]} and in {s}; split the dataset anew"
+                )
             splits[s].append(entry)
     return splits

@@ -45,7 +45,9 @@ class StaticPoses:
         qpos, ctrl = np.zeros((len(ends), n)), np.zeros((len(ends), n))
         approach, distinct = np.zeros((len(ends), n), int), np.ones((len(ends), n), bool)
         w, starts = _window_rows(sequence), np.arange(0, len(sequence), BLOCK_ROWS)
-        extremes = np.stack([f.reduceat(sequence.qpos, starts) for f in (np.minimum, np.maximum)])  # (2, blocks, n)
+        extremes = np.stack(
+            [f.reduceat(sequence.qpos, starts) for f in (np.minimum, np.maximum)]
+        )  # (2, blocks, n)
         for i, end in enumerate(ends):
             qpos[i], ctrl[i] = sequence.qpos[end + 1 - w : end + 1].mean(axis=0), sequence.ctrl[end]
             approach[i] = -_last_side(sequence.qpos[: end + 1], extremes, qpos[i])
@@ -57,7 +59,9 @@ class StaticPoses:
     @classmethod
     def joined(cls, parts: list[StaticPoses], n: int) -> StaticPoses:
         """Return the static poses of several sequences of n joints as one."""
-        empty = cls(np.zeros((0, n)), np.zeros((0, n)), np.zeros((0, n), int), np.zeros((0, n), bool))
+        empty = cls(
+            np.zeros((0, n)), np.zeros((0, n)), np.zeros((0, n), int), np.zeros((0, n), bool)
+        )
         return cls(*(np.concatenate([getattr(p, f) for p in (empty, *parts)]) for f in vars(empty)))
 
     def static_error(self, joint: int, expected: Array | float = 0.0) -> StaticError:
@@ -70,7 +74,9 @@ class StaticPoses:
         distinct, side = self.distinct[:, joint], self.approach[:, joint]
         up, down, both = error[distinct & (side > 0)], error[distinct & (side < 0)], error[distinct]
         if min(len(up), len(down)) < MIN_POSES_PER_SIDE:
-            return StaticError(float(np.median(both)) if len(both) else np.nan, np.nan, len(up), len(down))
+            return StaticError(
+                float(np.median(both)) if len(both) else np.nan, np.nan, len(up), len(down)
+            )
         high, low = float(np.median(down)), float(np.median(up))
         return StaticError((high + low) / 2, max(high - low, 0.0) / 2, len(up), len(down))
 
@@ -93,7 +99,9 @@ class StaticError:
 def _last_side(qpos: Array, extremes: Array, rest: Array) -> Array:
     """Return on which side of `rest` (n) the joints of qpos (T, n) were last, (n): +1, −1, or 0 if never away."""
     full, side = len(qpos) // BLOCK_ROWS, np.zeros(len(rest), int)
-    blocks = (np.abs(extremes[:, :full] - rest) > MIN_MOTION_RAD).any(axis=0)  # complete blocks, (full, n)
+    blocks = (np.abs(extremes[:, :full] - rest) > MIN_MOTION_RAD).any(
+        axis=0
+    )  # complete blocks, (full, n)
     for j, x in enumerate(rest):
         for start in (full * BLOCK_ROWS, *BLOCK_ROWS * np.flatnonzero(blocks[:, j])[:-2:-1]):
             offset = qpos[start : start + BLOCK_ROWS, j] - x

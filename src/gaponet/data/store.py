@@ -98,10 +98,14 @@ class Dataset:
 
     def _read_entries(self) -> Iterator[Entry]:
         folder = self.path / "sequences"
-        files = set(os.listdir(folder)) if folder.is_dir() else set()  # one system call, not one per sequence
+        files = (
+            set(os.listdir(folder)) if folder.is_dir() else set()
+        )  # one system call, not one per sequence
         for entry in self.journal.read():
             if f"{entry.id}.parquet" not in files:
-                raise DatasetError(f"{entry.where}: {self._file(entry)} is missing; restore it or delete the line")
+                raise DatasetError(
+                    f"{entry.where}: {self._file(entry)} is missing; restore it or delete the line"
+                )
             yield entry
 
     @classmethod
@@ -119,7 +123,12 @@ class Dataset:
         with lock_folder(path, KIND):
             if not (path / "dataset.json").is_file():
                 units = {channel: UNITS[channel] for channel in ("time", *ARRAYS)}
-                header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": units}
+                header = {
+                    "format": FORMAT,
+                    "robot": robot.name,
+                    "joint_names": list(robot.joint_names),
+                    "units": units,
+                }
                 write_json(path / "dataset.json", header)
             if not has_stored_robot(path):
                 save_robot(robot.nominal or robot, path / STORED_ROBOT)
@@ -240,7 +249,9 @@ class Dataset:
             self.header = {k: v for k, v in (self.header | fields).items() if v != ""}
             write_json(self.path / "dataset.json", self.header)
 
-    def append(self, sequence: Sequence, findings: Findings | None = None, content_hash: str | None = None) -> Entry:
+    def append(
+        self, sequence: Sequence, findings: Findings | None = None, content_hash: str | None = None
+    ) -> Entry:
         """Add a sequence. Its content hash is computed if it is not given.
 
         Raises:
@@ -257,7 +268,9 @@ class Dataset:
                 "(same samples, unit and payload); nothing to add"
             )
         channels = tuple(c for c in ARRAYS if getattr(sequence, c) is not None)
-        header = EntryHeader(entry_id(meta, content_hash), content_hash, sequence.dt, len(sequence), channels)
+        header = EntryHeader(
+            entry_id(meta, content_hash), content_hash, sequence.dt, len(sequence), channels
+        )
         entry = Entry.create(header, meta, findings, fingerprint(sequence.ctrl, sequence.dt))
         self._file(entry).parent.mkdir(exist_ok=True)
         arrays = {c: getattr(sequence, c) for c in channels}
@@ -276,10 +289,14 @@ class Dataset:
         with self.writing():
             for pattern in patterns:
                 if not any(fnmatchcase(e.id, pattern) for e in self.entries):
-                    raise DatasetError(f"{self.path}: no sequence '{pattern}'; {JOURNAL} in it lists the ids")
+                    raise DatasetError(
+                        f"{self.path}: no sequence '{pattern}'; {JOURNAL} in it lists the ids"
+                    )
             removed = [e for e in self.entries if any(fnmatchcase(e.id, p) for p in patterns)]
             with atomic_write(self.path / JOURNAL) as temporary:
-                temporary.write_bytes(b"".join(e.line + b"\n" for e in self.entries if e not in removed))
+                temporary.write_bytes(
+                    b"".join(e.line + b"\n" for e in self.entries if e not in removed)
+                )
             for entry in removed:  # if this is cut short, the files that remain are not listed
                 self._file(entry).unlink(missing_ok=True)
                 for file in self.path.glob(f"{REPLAYS}/*/{entry.id}.*"):
@@ -298,7 +315,9 @@ class Dataset:
         """Load some channels of one sequence, (T, n) float32 each."""
         return read_arrays(self._file(entry), names, entry.rows, len(self.joint_names))
 
-    def sequences(self, entries: list[Entry] | None = None, optional: bool = True) -> list[Sequence]:
+    def sequences(
+        self, entries: list[Entry] | None = None, optional: bool = True
+    ) -> list[Sequence]:
         """Load sequences, all by default; each as `read`."""
         return [self.read(e, optional) for e in (self.entries if entries is None else entries)]
 

@@ -61,12 +61,16 @@ class AlignedSim:
             model.require_payload(payload_mass, extrapolate)
         self.robot, self.model, self.single = robot, model, num_envs is None
         self.num_envs = 1 if num_envs is None else num_envs
-        self.payload_mass = np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs))
+        self.payload_mass = np.array(
+            np.broadcast_to(np.asarray(payload_mass, float), self.num_envs)
+        )
         conditions = [Condition(float(mass), payload_side, self.dt) for mass in self.payload_mass]
         own, other_payload = conditions, simulator_payload is not None
         if other_payload:
             masses = np.broadcast_to(np.asarray(simulator_payload, float), self.num_envs)
-            own = [c._replace(payload_mass=float(m)) for c, m in zip(conditions, masses, strict=True)]
+            own = [
+                c._replace(payload_mass=float(m)) for c, m in zip(conditions, masses, strict=True)
+            ]
         self.sim = BatchSim(robot, own, nthread, locked)
         self.joint_names, self.n = self.sim.joint_names, self.sim.n
         free = robot.index(self.joint_names)
@@ -77,12 +81,18 @@ class AlignedSim:
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
         self.loop, self.transfer = None, None
         trained = model if isinstance(model, GapModel) and not other_payload else None
-        if trained is not None and trained.is_trained_in(robot) and control_periods_of(trained, self.dt) == 1:
+        if (
+            trained is not None
+            and trained.is_trained_in(robot)
+            and control_periods_of(trained, self.dt) == 1
+        ):
             self.loop = trained.loop(self.num_envs)
         elif model is not None:
             inverse = AnalyticInverse.of(BatchSim(robot, own, nthread, locked))
             self.transfer = Transfer(model, inverse, conditions, locked, nthread, extrapolate)
-        delay = max(robot.delay.max(), 0.0 if self.transfer is None else self.transfer.sim.robot.delay.max())
+        delay = max(
+            robot.delay.max(), 0.0 if self.transfer is None else self.transfer.sim.robot.delay.max()
+        )
         self._depth = 1 + int(np.ceil(delay / self.dt))  # past targets that delayed servos need
         self.target = np.zeros((self.num_envs, self.n))
         self._uncorrected = self.target[:, self.op]
@@ -120,7 +130,9 @@ class AlignedSim:
             ids: Which simulations, (k,); arrays are then (k, n).
         """
         count = len(np.arange(self.num_envs)[ids])
-        q = np.broadcast_to(self.qpos_home if qpos is None else np.asarray(qpos, float), (count, self.n))
+        q = np.broadcast_to(
+            self.qpos_home if qpos is None else np.asarray(qpos, float), (count, self.n)
+        )
         v = np.broadcast_to(np.asarray(qvel, float), (count, self.n))
         u = q if ctrl is None else np.broadcast_to(np.asarray(ctrl, float), (count, self.n))
         self.sim.reset(ids, q, v, past=self._past(u))

@@ -68,7 +68,11 @@ class CompensatorConfig:
 
     def __post_init__(self) -> None:
         numbers = np.array([x for x in vars(self).values() if not isinstance(x, str)], float)
-        valid = self.aim in ("target", "simulator") and 0 < self.gain <= 1 and min(self.limit, self.iterations) > 0
+        valid = (
+            self.aim in ("target", "simulator")
+            and 0 < self.gain <= 1
+            and min(self.limit, self.iterations) > 0
+        )
         if not valid or not ((numbers >= 0) & (numbers < np.inf)).all():
             text = "gain must be in (0, 1], limit and iterations > 0, the rest finite and ≥ 0"
             raise UsageError(f"compensator: aim is target or simulator; {text}")
@@ -135,12 +139,18 @@ class Compensator:
         self.kp, self.zero_offset = robot.kp[self.op], robot.offset[self.op]
         self.bias: Array = self.shadow.batch.bind("qfrc_bias")
         self.loop = None if model is None else model.loop(num)
-        self.feedforward = Feedforward(self.shadow, self.operated, robot, self.dt, config.acceleration_time)
+        self.feedforward = Feedforward(
+            self.shadow, self.operated, robot, self.dt, config.acceleration_time
+        )
         self.feedback = Feedback(config, self.dt)
-        self.payload_estimate = PayloadEstimate(self.shadow, self.operated, robot, len(self.masses), self.dt)
+        self.payload_estimate = PayloadEstimate(
+            self.shadow, self.operated, robot, len(self.masses), self.dt
+        )
         self._carried = np.full(num, -1)  # index of the mass that each shadow carries
         self.payload_mass, self.payload_stated, self.periods = np.zeros(num), False, 0
-        self.offset, self.command = np.zeros((2, num, len(self.op)))  # u − a′ of the iteration; last command, rad
+        self.offset, self.command = np.zeros(
+            (2, num, len(self.op))
+        )  # u − a′ of the iteration; last command, rad
         self._target: Array | None = None  # last finite target; None before `reset`
 
     # ---- use
@@ -185,7 +195,9 @@ class Compensator:
         a = self._as_rows(target)
         if not np.isfinite(a).all():
             raise UsageError("compensator: the target to begin at is not a number")
-        require_radians(a, self.robot.joint_names, self.robot, lambda row: "compensator: the target to begin at")
+        require_radians(
+            a, self.robot.joint_names, self.robot, lambda row: "compensator: the target to begin at"
+        )
         self._target, self.command, self.periods = a, a[:, self.op], 0
         if self.loop is not None:
             self.loop.reset()
@@ -224,7 +236,9 @@ class Compensator:
                 field[: self.num_envs] = field[self.num_envs + nearest]
             self._carried = nearest
 
-    def step(self, target: Array, qpos: Array | None, qvel: Array | None = None, tau: Array | None = None) -> Array:
+    def step(
+        self, target: Array, qpos: Array | None, qvel: Array | None = None, tau: Array | None = None
+    ) -> Array:
         """Commands for the coming control period, rad.
 
         Args:
@@ -238,14 +252,21 @@ class Compensator:
             UsageError, LogError: `reset` was not called before; the first position is in degrees.
         """
         if self._target is None:
-            raise UsageError("compensator: step before reset; call reset(target) once, then step every control period")
+            raise UsageError(
+                "compensator: step before reset; call reset(target) once, then step every control period"
+            )
         given = self._as_rows(target)
         self._target = targets = np.where(np.isfinite(given), given, self._target)
         a = targets[:, self.op]
         if qpos is not None:
             if self.periods == 0:
                 measured = self._as_rows(qpos)
-                require_radians(measured, self.robot.joint_names, self.robot, lambda row: "compensator: the position")
+                require_radians(
+                    measured,
+                    self.robot.joint_names,
+                    self.robot,
+                    lambda row: "compensator: the position",
+                )
             v, torque = (None if x is None else self._as_rows(x)[:, self.op] for x in (qvel, tau))
             self._process_state(self._as_rows(qpos)[:, self.op], v, torque)
         self.feedforward.update(a)
@@ -286,7 +307,9 @@ class Compensator:
             return shadow_target
         q, v = (x[: self.num_envs, self.operated] for x in (self.shadow.qpos, self.shadow.qvel))
         gain, iterations = self.config.gain, self.config.iterations
-        return self.loop.solve(q, v, shadow_target, self.payload_mass, self.offset, gain, iterations)
+        return self.loop.solve(
+            q, v, shadow_target, self.payload_mass, self.offset, gain, iterations
+        )
 
     def _process_state(self, q: Array, v: Array | None, tau: Array | None) -> None:
         """Update feedback and payload estimate from a measured state."""
@@ -310,7 +333,9 @@ class Compensator:
         values = np.asarray(values, float)
         shape = (self.num_envs, len(self.robot.joint_names))
         if values.shape != (shape[1:] if self.single else shape):
-            raise UsageError(f"compensator: arrays hold all {shape[1]} joints of {self.robot.name}, got {values.shape}")
+            raise UsageError(
+                f"compensator: arrays hold all {shape[1]} joints of {self.robot.name}, got {values.shape}"
+            )
         return values.reshape(shape)
 
 
@@ -336,18 +361,24 @@ class Feedback:
         config, limit = self.config, self.config.feedback_limit
         # A blocked joint has a large error, which must not take long to decrease.
         limited = np.clip(error, -limit, limit)
-        filtered = self._filtered + (limited - self._filtered) * min(1.0, self.dt / max(config.feedback_time, self.dt))
+        filtered = self._filtered + (limited - self._filtered) * min(
+            1.0, self.dt / max(config.feedback_time, self.dt)
+        )
         winds_up = filtered * self.saturation > 0
         integral = self.integral + config.feedback * self.dt * np.where(winds_up, 0.0, filtered)
         self._filtered = np.where(valid[:, None], filtered, self._filtered)
         self.integral = np.where(valid[:, None], np.clip(integral, -limit, limit), self.integral)
 
 
-def _simulator_of(model: GapModel, robot: RobotSpec, dt: float, config: CompensatorConfig) -> RobotSpec:
+def _simulator_of(
+    model: GapModel, robot: RobotSpec, dt: float, config: CompensatorConfig
+) -> RobotSpec:
     """Return the simulator that the model corrects: the given one or that of training."""
     model.require_rate(dt)
     if model.config.holds:
-        raise ModelError(f"{model.path}: holds corrections or sensors; to be inverted it must be trained without")
+        raise ModelError(
+            f"{model.path}: holds corrections or sensors; to be inverted it must be trained without"
+        )
     if model.is_trained_in(robot):
         return robot
     if config.aim == "simulator":

@@ -17,7 +17,9 @@ from gaponet.sim.inverse import Inertia
 from gaponet.sim.servo import friction_limit, present
 
 MAX_SPEED, MAX_ACCELERATION = 4.0, 40.0  # rad/s, rad/s²; a step of the targets would have more
-FRICTION_SPEED = 0.05  # rad/s at which three quarters of the friction are fed forward; at rest none is
+FRICTION_SPEED = (
+    0.05  # rad/s at which three quarters of the friction are fed forward; at rest none is
+)
 
 
 class Feedforward:
@@ -27,7 +29,9 @@ class Feedforward:
         target, qvel, qacc: Last targets, their velocity and filtered acceleration, (num, n operated).
     """
 
-    def __init__(self, sim: BatchSim, operated: Array, robot: RobotSpec, dt: float, acceleration_time: float) -> None:
+    def __init__(
+        self, sim: BatchSim, operated: Array, robot: RobotSpec, dt: float, acceleration_time: float
+    ) -> None:
         """
         Args:
             sim: Its present state gives the inertia.
@@ -46,7 +50,11 @@ class Feedforward:
 
     def reset(self, target: Array) -> None:
         """Start at rest at targets, (num, n operated) rad."""
-        self.target, self.qvel, self.qacc = target.copy(), np.zeros_like(target), np.zeros_like(target)
+        self.target, self.qvel, self.qacc = (
+            target.copy(),
+            np.zeros_like(target),
+            np.zeros_like(target),
+        )
 
     def update(self, target: Array) -> None:
         """Set the targets of the coming control period, (num, n operated) rad."""
@@ -60,5 +68,7 @@ class Feedforward:
         """Return the torque for motion, (num, n operated) N·m; holding is the torque against gravity."""
         inertial = np.einsum("kij,kj->ki", self.inertia.matrix(len(self.qacc)), self.qacc)
         moving = inertial + self.damping * self.qvel
-        friction = friction_limit(self.servo_terms, self.friction, self.qvel, holding + moving, holding)
+        friction = friction_limit(
+            self.servo_terms, self.friction, self.qvel, holding + moving, holding
+        )
         return np.asarray(moving + friction * np.tanh(self.qvel / FRICTION_SPEED))

@@ -33,7 +33,12 @@ class TrackingEnv(gymnasium.Env):
     """
 
     def __init__(
-        self, sim: AlignedSim, references: ListOf[Array], reach: float = 0.2, preview: int = 2, seed: int = 0
+        self,
+        sim: AlignedSim,
+        references: ListOf[Array],
+        reach: float = 0.2,
+        preview: int = 2,
+        seed: int = 0,
     ) -> None:
         """
         Args:
@@ -44,20 +49,29 @@ class TrackingEnv(gymnasium.Env):
             seed: Seed of the choice of motions.
         """
         if not sim.single:
-            raise UsageError("TrackingEnv has a single simulation: leave num_envs out; gymnasium.make_vec copies it")
+            raise UsageError(
+                "TrackingEnv has a single simulation: leave num_envs out; gymnasium.make_vec copies it"
+            )
         if not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
             raise UsageError(f"give motions (T, {sim.n}) of at least 3 rows")
         self.sim, self.references, self.reach, self.preview = sim, references, reach, preview
         self.motion, self.t, self.np_random = 0, 0, np.random.default_rng(seed)
         n = len(sim.op)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, ((2 + preview) * n,), np.float32)
+        self.observation_space = gymnasium.spaces.Box(
+            -np.inf, np.inf, ((2 + preview) * n,), np.float32
+        )
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n,), np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
         """Start a motion at its first row: a random one, or options {"motion": 3}."""
         super().reset(seed=seed)
         chosen = (options or {}).get("motion")
-        self.motion, self.t = int(self.np_random.integers(len(self.references)) if chosen is None else chosen), 0
+        self.motion, self.t = (
+            int(self.np_random.integers(len(self.references)) if chosen is None else chosen),
+            0,
+        )
         self.sim.reset(self._row(0))
         return self._observe(), {"motion": self.motion}
 
@@ -83,7 +97,11 @@ class TrackingEnv(gymnasium.Env):
 
 
 def _tracking(
-    robot: str, model: str | None = None, motions: ListOf[str] = (), payload_mass: float = 0.0, **options: Any
+    robot: str,
+    model: str | None = None,
+    motions: ListOf[str] = (),
+    payload_mass: float = 0.0,
+    **options: Any,
 ) -> TrackingEnv:
     """gymnasium.make("gaponet.deploy.gym:gaponet/Tracking-v0", robot="so101"): follow the library's motions.
 
@@ -108,12 +126,19 @@ class AlignedActions(gymnasium.Wrapper):
     """Aligns a gymnasium environment on MuJoCo (unwrapped.model, .data, .dt) whose actions are targets in rad."""
 
     def __init__(
-        self, env: gymnasium.Env, model: Reference, payload_mass: float, prefix: str = "", extrapolate: bool = False
+        self,
+        env: gymnasium.Env,
+        model: Reference,
+        payload_mass: float,
+        prefix: str = "",
+        extrapolate: bool = False,
     ) -> None:
         """Arguments as of MujocoAligner."""
         super().__init__(env)
         scene: Any = env.unwrapped
-        self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix, extrapolate)
+        self.align = MujocoAligner(
+            model, scene.model, float(scene.dt), payload_mass, prefix, extrapolate
+        )
 
     def reset(self, **how: Any) -> tuple[Any, dict[str, Any]]:
         self.align.reset()

@@ -49,7 +49,11 @@ class MujocoAligner:
         Raises:
             ModelError: The scene, the control period or the payload does not fit.
         """
-        robot, source = (model.simulator(), model.path) if isinstance(model, GapModel) else (model, model.folder)
+        robot, source = (
+            (model.simulator(), model.path)
+            if isinstance(model, GapModel)
+            else (model, model.folder)
+        )
         scene_joints = [mj_model.joint(j).name for j in range(mj_model.njnt)]
         for name in robot.operated:
             if prefix + name not in scene_joints:
@@ -105,11 +109,15 @@ def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> Anal
     """Return the inverse dynamics of a robot in a scene, without contacts."""
     model, h = copy.copy(scene), scene.opt.timestep
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    return AnalyticInverse(Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h]))
+    return AnalyticInverse(
+        Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h])
+    )
 
 
 def _actuator(scene: mujoco.MjModel, joint: str) -> int:
     actuators = np.flatnonzero(scene.actuator_trnid[:, 0] == scene.joint(joint).id)
     if len(actuators) != 1:
-        raise ModelError(f"joint '{joint}' has {len(actuators)} actuators in the scene; the model needs one, position")
+        raise ModelError(
+            f"joint '{joint}' has {len(actuators)} actuators in the scene; the model needs one, position"
+        )
     return int(actuators[0])

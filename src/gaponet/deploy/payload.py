@@ -31,7 +31,9 @@ class PayloadEstimate:
         certain: Robots with enough leverage, (num,).
     """
 
-    def __init__(self, sim: BatchSim, operated: Array, robot: RobotSpec, num_masses: int, dt: float) -> None:
+    def __init__(
+        self, sim: BatchSim, operated: Array, robot: RobotSpec, num_masses: int, dt: float
+    ) -> None:
         """
         Args:
             sim: Its last num_masses rows carry payloads from 0 to the largest. The first and last of them are used.
@@ -52,7 +54,9 @@ class PayloadEstimate:
         self.mass, self._projection, self._leverage, self._energy, self.latest = np.zeros((5, num))
         self.certain = np.zeros(num, bool)
 
-    def update(self, qpos: Array, qvel: Array, command: Array, tau: Array | None, valid: Array) -> Array:
+    def update(
+        self, qpos: Array, qvel: Array, command: Array, tau: Array | None, valid: Array
+    ) -> Array:
         """Process one control period of all robots; return the mass per robot, (num,) kg.
 
         Args:
@@ -67,13 +71,17 @@ class PayloadEstimate:
             empty, full = self.gravity(qpos[i])
             per_kg, excess = (full - empty) / self.max_mass, torque[i] - empty
             weight = 1.0 / (1.0 + (np.abs(qvel[i]).max() / HALF_WEIGHT_SPEED) ** 2)
-            self._projection[i] = keep * self._projection[i] + weight * float(per_kg @ excess) * self.dt
+            self._projection[i] = (
+                keep * self._projection[i] + weight * float(per_kg @ excess) * self.dt
+            )
             self._energy[i] = keep * self._energy[i] + weight * float(np.sum(excess**2)) * self.dt
             self._leverage[i] = keep * self._leverage[i] + weight * float(per_kg @ per_kg) * self.dt
         estimate = np.clip(self._projection / np.maximum(self._leverage, 1e-9), 0.0, self.max_mass)
         explained = self._projection * np.abs(self._projection)
         similarity = explained / np.maximum(self._leverage * self._energy, 1e-9)
-        estimate = np.where(similarity < MIN_SIMILARITY * (estimate / self.max_mass) ** 2, 0.0, estimate)
+        estimate = np.where(
+            similarity < MIN_SIMILARITY * (estimate / self.max_mass) ** 2, 0.0, estimate
+        )
         self.certain = self._leverage > MIN_LEVERAGE * FORGETTING_TIME_S * 0.1
         self.latest = np.where(self.certain, estimate, self.mass)
         change = MAX_RATE_KG_S * self.dt

@@ -71,7 +71,11 @@ class Transfer:
             _require_measured(inverse, AnalyticInverse.of(sim), sim.joint_names)
         self.joint_names = sim.joint_names
         self.op = np.array([sim.joint_names.index(name) for name in robot.operated])
-        self.periods = 1 if model is None else max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
+        self.periods = (
+            1
+            if model is None
+            else max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
+        )
         self.loop = None if model is None else model.loop(self.num_envs)
         self.payload_mass = np.array([c.payload_mass for c in conditions])
         self._delta = np.zeros((self.num_envs, len(self.op)))
@@ -111,7 +115,9 @@ class Transfer:
         if self.loop is not None:
             if self._elapsed % self.periods == 0:
                 op = self.op
-                self._delta[:] = self.loop.delta(qpos[:, op], qvel[:, op], corrected[:, op], self.payload_mass)
+                self._delta[:] = self.loop.delta(
+                    qpos[:, op], qvel[:, op], corrected[:, op], self.payload_mass
+                )
             self._elapsed += 1
             corrected[:, self.op] += self._delta
         return corrected
@@ -151,9 +157,14 @@ class TransferCorrector:
         locked = idle_limbs(start, self.robot)
         own = BatchSim(self.target, [Condition.of(s, self.target) for s in start], locked=locked)
         reference = [Condition.of(s, self.robot) for s in start]
-        self.transfer = Transfer(self.reference, AnalyticInverse.of(own), reference, locked, 0, self.extrapolate)
+        self.transfer = Transfer(
+            self.reference, AnalyticInverse.of(own), reference, locked, 0, self.extrapolate
+        )
         self.free = self.robot.index(self.transfer.joint_names)
-        first = [np.stack([getattr(s, name)[0, self.free] for s in start]) for name in ("qpos", "qvel", "ctrl")]
+        first = [
+            np.stack([getattr(s, name)[0, self.free] for s in start])
+            for name in ("qpos", "qvel", "ctrl")
+        ]
         self.transfer.reset(slice(None), first[0], first[1], past=first[2][:, None])
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
@@ -164,7 +175,9 @@ class TransferCorrector:
         return commands
 
 
-def _require_measured(inverse: AnalyticInverse, reference: AnalyticInverse, joints: tuple[str, ...]) -> None:
+def _require_measured(
+    inverse: AnalyticInverse, reference: AnalyticInverse, joints: tuple[str, ...]
+) -> None:
     """Refuse a target outside the measured ranges."""
     extra_delay = inverse.delay - reference.delay
     if extra_delay.max() > MAX_EXTRA_DELAY_S:
@@ -176,7 +189,11 @@ def _require_measured(inverse: AnalyticInverse, reference: AnalyticInverse, join
         )
     for quantity, values, (low, high) in (
         ("kp, as a ratio to the reference's,", inverse.kp / reference.kp, KP_RATIO_BOUNDS),
-        ("frictionloss / kp, rad,", inverse.frictionloss / inverse.kp, (0.0, MAX_FRICTION_BAND_RAD)),
+        (
+            "frictionloss / kp, rad,",
+            inverse.frictionloss / inverse.kp,
+            (0.0, MAX_FRICTION_BAND_RAD),
+        ),
         ("the physics step, s,", np.tile(inverse.h, len(joints)), (0.0, MAX_TIMESTEP_S)),
     ):
         for joint, *extremes in zip(joints, values.min(axis=0), values.max(axis=0), strict=True):

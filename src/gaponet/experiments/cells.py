@@ -31,7 +31,9 @@ Report = Callable[[float, str], None]  # share done, note
 Work = Callable[["Cell", Report], None]
 
 SETUP_FILE, RESULT_FILE = "setup.json", "cell.json"
-PARENT_TIMEOUT_S = 180.0  # without a heartbeat of the parent; a shared folder may show it a minute late
+PARENT_TIMEOUT_S = (
+    180.0  # without a heartbeat of the parent; a shared folder may show it a minute late
+)
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -84,11 +86,15 @@ class Cell:
             return
         file, wanted = self.folder / SETUP_FILE, self.setup(data)
         if not file.is_file():
-            raise UsageError(f"{self.folder}: is there but is no part of a comparison; choose another --out")
+            raise UsageError(
+                f"{self.folder}: is there but is no part of a comparison; choose another --out"
+            )
         stored = read_record(file)
         if stored != wanted:
             changed = ", ".join(k for k in wanted if stored.get(k) != wanted[k])
-            raise UsageError(f"{self.folder}: belongs to a comparison with another {changed}; choose another --out")
+            raise UsageError(
+                f"{self.folder}: belongs to a comparison with another {changed}; choose another --out"
+            )
 
 
 @dataclass
@@ -130,7 +136,10 @@ class _ProgressFile:
 
 
 def run_cells(
-    cells: ListOf[Cell], work: Work, pool: Pool, show: Callable[[Running, int], None] = lambda running, done: None
+    cells: ListOf[Cell],
+    work: Work,
+    pool: Pool,
+    show: Callable[[Running, int], None] = lambda running, done: None,
 ) -> dict[str, str]:
     """Do the work of each cell in a pool. Return the failures, name → reason.
 
@@ -146,7 +155,9 @@ def run_cells(
     cells = [replace(c, folder=c.folder.absolute()) for c in cells]
     shown: tuple[Running, int] = {}, 0
     heartbeat = cells[0].folder.with_name(f"{own}alive")
-    files = {c.name: _ProgressFile(c.folder.with_name(own + c.folder.name), heartbeat) for c in cells}
+    files = {
+        c.name: _ProgressFile(c.folder.with_name(own + c.folder.name), heartbeat) for c in cells
+    }
 
     def beat() -> None:
         nonlocal shown
@@ -164,7 +175,9 @@ def run_cells(
         cell.folder.parent.mkdir(parents=True, exist_ok=True)
     heartbeat.touch()
     try:
-        for outcome in pool.run(partial(_work_in_worker, work), ((c, files[c.name]) for c in cells), beat, stop):
+        for outcome in pool.run(
+            partial(_work_in_worker, work), ((c, files[c.name]) for c in cells), beat, stop
+        ):
             cell, file = outcome.job
             reason = outcome.value if outcome.error is None else str(outcome.error)
             failed |= {cell.name: reason} if reason else {}

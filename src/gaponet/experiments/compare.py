@@ -15,7 +15,14 @@ import tyro
 from gaponet.base.result_table import ResultTable, format_cell
 from gaponet.data.split import split_entries
 from gaponet.experiments.cells import Cell
-from gaponet.experiments.outcomes import BASELINES, Outcome, Show, StudyOutcomes, summarize, train_all
+from gaponet.experiments.outcomes import (
+    BASELINES,
+    Outcome,
+    Show,
+    StudyOutcomes,
+    summarize,
+    train_all,
+)
 from gaponet.experiments.result import Result
 from gaponet.experiments.study import DEFAULT_MODELS, Study
 from gaponet.report.candidate import select_entries
@@ -29,7 +36,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEASURES = ("mpjae", "rmse", "q_dis", "static", "dynamic", "large_0.05")
-Runs = dict[str, list[Outcome]]  # method → outcome of each seed; one outcome without a seed for a baseline
+Runs = dict[
+    str, list[Outcome]
+]  # method → outcome of each seed; one outcome without a seed for a baseline
 
 
 @dataclass(frozen=True)
@@ -64,7 +73,9 @@ class Compare:
         word = next(iter(outcomes.runs))
         baselines = outcomes.baselines(word)
         runs: Runs = {name: [baselines[name]] for name in BASELINES if name in baselines}
-        runs |= {word: list(outcomes.of_model(word)) for word in self.models if outcomes.of_model(word)}
+        runs |= {
+            word: list(outcomes.of_model(word)) for word in self.models if outcomes.of_model(word)
+        }
         entries, unseen = select_entries([outcomes.cells[word][0].folder], study.data)
         seeds = max(map(len, runs.values()))
         heading = (
@@ -72,7 +83,11 @@ class Compare:
             f"over {seeds} seed{'s' if seeds > 1 else ''}."
         )
         columns = ("method", "seed", "units", "group", "key", *MEASURES)
-        tables = [ResultTable("all", columns, tuple(_long_rows(runs)), shown=False), _totals(runs), _groups(runs)]
+        tables = [
+            ResultTable("all", columns, tuple(_long_rows(runs)), shown=False),
+            _totals(runs),
+            _groups(runs),
+        ]
         return outcomes.result(
             study, "compare", "Comparison", tables, {"compare": _figure(runs, study.label)}, sentences=[heading],
             motions=sorted({e.meta.motion for e in entries}), unseen=unseen, sequences=len(entries),
@@ -107,13 +122,19 @@ def _totals(runs: Runs) -> ResultTable:
         row = [title(method), _count(outcomes[0].get("parameters")), error, error.mean / nominal if nominal else None,
                summarize(outcomes, "known", "q_dis", scale=1).mean]  # fmt: skip
         if len(payloads) > 1:
-            by_payload = {p: summarize(outcomes, "known", "by_payload", p, "mpjae") for p in payloads}
+            by_payload = {
+                p: summarize(outcomes, "known", "by_payload", p, "mpjae") for p in payloads
+            }
             worst = max(by_payload, key=lambda p: by_payload[p].mean)
             row.append(f"{format_cell(by_payload[worst])} ({worst} kg)")
         if new:
             row.append(summarize(outcomes, "new", "mpjae"))
         rows.append((*row, format_cell(summarize(outcomes, "seconds", scale=1 / 60).mean, 1)))
-    note = f"Units never trained on: {', '.join(new)}; all other columns are of the units trained on." if new else ""
+    note = (
+        f"Units never trained on: {', '.join(new)}; all other columns are of the units trained on."
+        if new
+        else ""
+    )
     return ResultTable("totals", tuple(columns), tuple(rows), note)
 
 
@@ -124,7 +145,10 @@ def _groups(runs: Runs) -> ResultTable:
                                 ("new", "by_unit", "{}, never trained on"), ("known", "by_joint", "{}")):  # fmt: skip
         keys = _keys(runs, units, group)
         if len(keys) > 1 or (units == "new" and keys):
-            rows += [(label.format(k), *(summarize(o, units, group, k, "mpjae") for o in runs.values())) for k in keys]
+            rows += [
+                (label.format(k), *(summarize(o, units, group, k, "mpjae") for o in runs.values()))
+                for k in keys
+            ]
     return ResultTable("groups", ("MPJAE, mrad", *map(title, runs)), tuple(rows))
 
 
@@ -134,10 +158,19 @@ def _long_rows(runs: Runs) -> Iterator[tuple[Any, ...]]:
         for outcome in outcomes:
             for units in (u for u in ("known", "new") if u in outcome):
                 groups = {"all": {"": outcome[units]}}
-                groups |= {g: outcome[units][f"by_{g}"] for g in ("payload", "unit", "joint", "motion")}
+                groups |= {
+                    g: outcome[units][f"by_{g}"] for g in ("payload", "unit", "joint", "motion")
+                }
                 for group, parts in groups.items():
                     for key, values in parts.items():
-                        yield method, outcome.get("seed"), units, group, key, *(values[m] for m in MEASURES)
+                        yield (
+                            method,
+                            outcome.get("seed"),
+                            units,
+                            group,
+                            key,
+                            *(values[m] for m in MEASURES),
+                        )
 
 
 def _figure(runs: Runs, label: str) -> Figure:
@@ -145,15 +178,28 @@ def _figure(runs: Runs, label: str) -> Figure:
     group = "by_payload" if len(_keys(runs, "known", "by_payload")) > 1 else "by_joint"
     places = {(f"{k} kg" if group == "by_payload" else joint_label(k)): ("known", group, k)
               for k in _keys(runs, "known", group)}  # fmt: skip
-    places |= {f"{unit}\n(new unit)": ("new", "by_unit", unit) for unit in _keys(runs, "new", "by_unit")}
+    places |= {
+        f"{unit}\n(new unit)": ("new", "by_unit", unit) for unit in _keys(runs, "new", "by_unit")
+    }
     colours = palette(runs)
     methods = {
         title(m): (colours[m], [summarize(outcomes, *path, "mpjae") for path in places.values()])
         for m, outcomes in runs.items()
     }
-    return bars(list(places), methods, "MPJAE, mrad", f"Test motions, open-loop rollouts of whole motions, {label}")
+    return bars(
+        list(places),
+        methods,
+        "MPJAE, mrad",
+        f"Test motions, open-loop rollouts of whole motions, {label}",
+    )
 
 
 def _count(number: int | None) -> str:
     """Format a number of weights with three digits."""
-    return "" if number is None else f"{number / 1e6:.2f} M" if number >= 1e6 else f"{number / 1e3:.3g} k"
+    return (
+        ""
+        if number is None
+        else f"{number / 1e6:.2f} M"
+        if number >= 1e6
+        else f"{number / 1e3:.3g} k"
+    )

@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 
 
 BASELINES = ("nominal", "delay_offset", "identified")
-Show = Callable[[Running, int], None]  # called with the running cells and the number of finished ones
+Show = Callable[
+    [Running, int], None
+]  # called with the running cells and the number of finished ones
 Outcome = dict[str, Any]  # contents of a cell.json, or of a baseline's part of one
 LOCK_TIMEOUT_S = 60.0  # the cells of a comparison that was killed notice it at their next step
 CARD_FACTS = ("steps", "seconds", "val_mpjae", "gain", "sensor_r2", "parity_rad")
@@ -104,7 +106,9 @@ def _baseline_of_another_cell(folder: Path) -> DelayOffset | None:
     """Return delay and offset of another cell with the same split and simulator, since a fit takes time."""
 
     def key(place: Path) -> tuple[str, str]:
-        return (place / "split.json").read_text(encoding="utf-8"), read_record(place / SETUP_FILE)["simulator"]
+        return (place / "split.json").read_text(encoding="utf-8"), read_record(place / SETUP_FILE)[
+            "simulator"
+        ]
 
     for other in sorted(folder.parent.glob("*/delay_offset.json")):
         if key(folder) == key(other.parent):
@@ -118,12 +122,19 @@ def _card(folder: Path) -> dict[str, Any]:
 
 
 def _by_group(
-    sequences: list[Sequence], robot: RobotSpec, corrector: Corrector | None, holdout: tuple[str, ...], nthread: int = 0
+    sequences: list[Sequence],
+    robot: RobotSpec,
+    corrector: Corrector | None,
+    holdout: tuple[str, ...],
+    nthread: int = 0,
 ) -> Outcome:
     """Return {"known": summary, "new": summary of the units held out}; a group without recordings is left out."""
     replays = replay(sequences, robot, corrector, nthread, lock_idle=True)
     done = runs(sequences, [t.qpos for t in replays], robot)
-    groups = {name: [r for r in done if (r.meta.unit_id in holdout) == new] for name, new in (("known", 0), ("new", 1))}
+    groups = {
+        name: [r for r in done if (r.meta.unit_id in holdout) == new]
+        for name, new in (("known", 0), ("new", 1))
+    }
     return {name: summary(part, robot) for name, part in groups.items() if part}
 
 
@@ -132,7 +143,9 @@ class StudyOutcomes:
     """Outcomes of the finished cells by model word."""
 
     runs: Mapping[str, ListOf[Outcome]]  # outcome of each finished seed, as its cell.json holds it
-    baselines: Callable[[str], Outcome]  # outcomes of the baselines on the test motions of a model word
+    baselines: Callable[
+        [str], Outcome
+    ]  # outcomes of the baselines on the test motions of a model word
     cells: Mapping[str, ListOf[Cell]]  # the finished cells
 
     @classmethod
@@ -142,7 +155,9 @@ class StudyOutcomes:
         for cell in cells:
             if cell.done:
                 done.setdefault(cell.variant.name, []).append(cell)
-        runs = {word: [read_record(c.folder / RESULT_FILE) for c in part] for word, part in done.items()}
+        runs = {
+            word: [read_record(c.folder / RESULT_FILE) for c in part] for word, part in done.items()
+        }
         return cls(runs, cache(lambda word: _baselines(done[word][0], study)), done)
 
     def of_model(self, word: str) -> ListOf[Outcome]:
@@ -177,8 +192,12 @@ def train_all(cells: ListOf[Cell], study: Study, show: Show) -> list[str]:
         with open_pool(study.executor, study.workers, study.threads) as pool:
             failed = run_cells(todo, train_and_evaluate, pool, show)
     if not any(c.done for c in cells):
-        raise ModelError(f"{study.out}: every training failed; the first: {next(iter(failed.values()))}")
-    return [f"{name} failed and is not in these numbers: {reason}" for name, reason in failed.items()]
+        raise ModelError(
+            f"{study.out}: every training failed; the first: {next(iter(failed.values()))}"
+        )
+    return [
+        f"{name} failed and is not in these numbers: {reason}" for name, reason in failed.items()
+    ]
 
 
 def summarize(outcomes: ListOf[Outcome], *path: str, scale: float = 1e3) -> MeanStd:
@@ -204,11 +223,20 @@ def _baselines(cell: Cell, study: Study) -> Outcome:
     identified = study.identified or (study.robot if study.robot.nominal else None)
     parts = [*sorted(split_of_run(cell.folder)["test"].values()), delay_offset, model_hash(nominal)]
     parts += [*cell.holdout_units, *([model_hash(identified)] if identified else [])]
-    file = study.out / "baselines" / f"{hashlib.sha256(' '.join(parts).encode()).hexdigest()[:12]}.json"
+    file = (
+        study.out
+        / "baselines"
+        / f"{hashlib.sha256(' '.join(parts).encode()).hexdigest()[:12]}.json"
+    )
     if not file.is_file():
         sequences = study.data.sequences(select_entries([cell.folder], study.data)[0])
-        correctors = {"nominal": None, "delay_offset": DelayOffset.read(cell.folder).corrector(nominal)}
-        outcome = {k: _by_group(sequences, nominal, c, cell.holdout_units) for k, c in correctors.items()}
+        correctors = {
+            "nominal": None,
+            "delay_offset": DelayOffset.read(cell.folder).corrector(nominal),
+        }
+        outcome = {
+            k: _by_group(sequences, nominal, c, cell.holdout_units) for k, c in correctors.items()
+        }
         if identified is not None:
             outcome["identified"] = _by_group(sequences, identified, None, cell.holdout_units)
         file.parent.mkdir(parents=True, exist_ok=True)

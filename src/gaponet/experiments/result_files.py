@@ -61,7 +61,9 @@ def write(result: Result, folder: Path) -> list[Path]:
     """
     with lock_folder(folder, KIND):
         files: list[Path] = []
-        for table, stem in zip(result.tables, _stems(result.name, [t.name for t in result.tables]), strict=True):
+        for table, stem in zip(
+            result.tables, _stems(result.name, [t.name for t in result.tables]), strict=True
+        ):
             files.append(folder / f"{stem}.csv")
             write_text(files[-1], table.csv())
         stems = _stems(result.name, list(result.figures))
@@ -91,7 +93,10 @@ def _markdown(result: Result, stems: list[str]) -> str:
     parts += [t.markdown() for t in result.tables if t.shown]
     parts += [f"![]({stem}.svg)" for stem in stems]
     parts.append(
-        "\n".join(f"- {escape_markdown(key)}: {escape_markdown(value)}" for key, value in fact_rows(result.facts))
+        "\n".join(
+            f"- {escape_markdown(key)}: {escape_markdown(value)}"
+            for key, value in fact_rows(result.facts)
+        )
     )
     return "\n\n".join(parts) + "\n"
 
@@ -104,12 +109,20 @@ def write_report(folder: Path) -> Path:
     """
     records = read_results(folder)
     if not records:
-        raise DatasetError(f"{folder}: no result of gaponet experiment here; run one with this folder as OUT")
-    images = {r["name"]: [_image(folder / f"{stem}.svg") for stem in r["figures"].values()] for r in records}
+        raise DatasetError(
+            f"{folder}: no result of gaponet experiment here; run one with this folder as OUT"
+        )
+    images = {
+        r["name"]: [_image(folder / f"{stem}.svg") for stem in r["figures"].values()]
+        for r in records
+    }
     facts = {r["name"]: fact_rows(r["facts"]) for r in records}
     path = folder / "report.html"
     title = "gaponet experiments"
-    write_text(path, render("experiments.html.j2", title=title, records=records, images=images, facts=facts))
+    write_text(
+        path,
+        render("experiments.html.j2", title=title, records=records, images=images, facts=facts),
+    )
     return path
 
 

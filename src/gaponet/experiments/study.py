@@ -24,7 +24,9 @@ from gaponet.robot.spec import RobotSpec
 
 # Small rounds, fitted until the labels are fitted (progress.jsonl: label_rmse). With 200 gradient steps a product
 # network has the advantage.
-TRAINING = TrainConfig(pretraining=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
+TRAINING = TrainConfig(
+    pretraining=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800)
+)
 DEFAULT_MODELS = ("gaponet", "shared_mlp", "mlp:mlp_match=on")
 DEFAULT_BUDGET, DEFAULT_SEEDS = "76800", 3  # control steps of two rounds
 QUICK_BUDGET, QUICK_SEEDS = "2560", 1  # control steps of a training
@@ -33,7 +35,9 @@ QUICK_PRETRAINING = PretrainingConfig(
     rounds=2, num_envs=16, steps=80, gradient_steps=40, batch_size=256, sensor_states=256
 )  # fmt: skip
 QUICK_PPO = PPOConfig(num_envs=32, num_steps=16, epochs=1, critic_warmup=1)
-QUICK_SENSOR_HIDDEN = (32,)  # hidden layers of the predictor, whose fit takes most of a short training
+QUICK_SENSOR_HIDDEN = (
+    32,
+)  # hidden layers of the predictor, whose fit takes most of a short training
 QUICK_MOTIONS, QUICK_PAYLOADS, QUICK_UNITS = 6, 3, 2  # a split of six motions has 3 + 1 + 2
 QUICK_RECORDING_S = 2.0
 
@@ -103,7 +107,9 @@ class Study:
     holdout_units: tuple[str, ...] = ()
     workers: int = 0  # trainings at a time; 0 for as many as there are cores
     executor: str = LOCAL  # where they run (gaponet.base.executor)
-    identified: RobotSpec | None = None  # the identified robot, for words with identified+ in front and as a baseline
+    identified: RobotSpec | None = (
+        None  # the identified robot, for words with identified+ in front and as a baseline
+    )
     quick: bool = False  # True for a quick run, whose numbers mean nothing
 
     def __post_init__(self) -> None:
@@ -126,7 +132,12 @@ class Study:
         if one_rate and len(rates) > 1 and not config.rates:
             config = replace(config, rates=rates[:1])
         if options.quick:
-            out, config, budget, seeds = out / "quick", quick_config(config), QUICK_BUDGET, QUICK_SEEDS
+            out, config, budget, seeds = (
+                out / "quick",
+                quick_config(config),
+                QUICK_BUDGET,
+                QUICK_SEEDS,
+            )
             data = quick_dataset(data, robot, out / "data")
             units = {e.meta.unit_id for e in data.entries}
             holdout_units = tuple(u for u in holdout_units if u in units and len(units) > 1)
@@ -172,9 +183,24 @@ class Study:
         cells, data = list[Cell](), self.data.address or str(self.data.path.resolve())
         for seed in range(self.config.seed, self.config.seed + self.seeds):
             for variant in map(self.variant, words):
-                folder = self.out / "cells" / f"{re.sub(r'[^A-Za-z0-9_.=+-]+', '_', variant.name)}-{seed}"
+                folder = (
+                    self.out
+                    / "cells"
+                    / f"{re.sub(r'[^A-Za-z0-9_.=+-]+', '_', variant.name)}-{seed}"
+                )
                 robot = self.identified if variant.identified and self.identified else self.robot
-                cells.append(Cell(variant, seed, folder, data, robot, self.budget, self.holdout_units, self.threads))
+                cells.append(
+                    Cell(
+                        variant,
+                        seed,
+                        folder,
+                        data,
+                        robot,
+                        self.budget,
+                        self.holdout_units,
+                        self.threads,
+                    )
+                )
         for cell in cells:
             cell.require_same_setup(self.data)
         return cells

@@ -67,7 +67,9 @@ def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
         )
     part, name = places[field]
     owner = getattr(config, part) if part else config
-    change: dict[str, Any] = {name: _read(value, get_type_hints(type(owner))[name], f"--models {text}: {field}")}
+    change: dict[str, Any] = {
+        name: _read(value, get_type_hints(type(owner))[name], f"--models {text}: {field}")
+    }
     if part:
         change = {part: replace(owner, **change)}
     return replace(config, **change)
@@ -75,10 +77,16 @@ def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
 
 def _places(config: TrainConfig) -> Iterator[tuple[str, tuple[str, str]]]:
     """Yield (name as written, (part of the config or "", field)) of every setting."""
-    yield from ((field.name, ("model", field.name)) for field in fields(config.model) if field.name not in RESERVED)
+    yield from (
+        (field.name, ("model", field.name))
+        for field in fields(config.model)
+        if field.name not in RESERVED
+    )
     for field in (field for field in fields(config) if field.name not in RESERVED):
         if is_dataclass(part := getattr(config, field.name)):
-            yield from ((f"{field.name}.{inner.name}", (field.name, inner.name)) for inner in fields(part))
+            yield from (
+                (f"{field.name}.{inner.name}", (field.name, inner.name)) for inner in fields(part)
+            )
         else:
             yield field.name, ("", field.name)
 

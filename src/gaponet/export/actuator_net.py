@@ -38,7 +38,14 @@ PAST_S = 0.1  # beyond the longest delay
 HIDDEN = (32, 32)
 MAX_INPUT_STD = 5.0
 MAX_RECORDINGS = 40  # of each split
-ROWS, STEPS, BATCH, RATE, DECAY, NOISE = 60_000, 2000, 512, 2e-3, 1.0, 0.4  # of the fit, as in supervised pre-training
+ROWS, STEPS, BATCH, RATE, DECAY, NOISE = (
+    60_000,
+    2000,
+    512,
+    2e-3,
+    1.0,
+    0.4,
+)  # of the fit, as in supervised pre-training
 GAINS = (1.0, 0.5, 0.0)  # factors of kp · Δa that are tried on validation motions
 
 
@@ -63,13 +70,20 @@ class ActuatorNet(nn.Module):
         kp, delayed = joint["kp"], np.zeros(length)
         weights = delay_weights(np.array([joint["delay"]]), step)[:, 0]
         delayed[: len(weights)] = weights
-        damping = kp * step * (np.cumsum(delayed[::-1])[::-1] - delayed)  # q_t − q_{t-k} = step · (q̇_t + … + q̇_{t-k+1})
+        damping = (
+            kp * step * (np.cumsum(delayed[::-1])[::-1] - delayed)
+        )  # q_t − q_{t-k} = step · (q̇_t + … + q̇_{t-k+1})
         damping[0] += joint["kd"]
         servo = np.concatenate([kp * delayed, -damping])[:, None]
         self.register_buffer("servo", torch.tensor(servo, dtype=torch.float32))
         self.register_buffer("mean", torch.zeros(2 * length))
         self.register_buffer("std", torch.ones(2 * length))
-        self.rest, self.limit, self.scale, self.gain = kp * joint["offset"], joint["effort_limit"], kp, 1.0
+        self.rest, self.limit, self.scale, self.gain = (
+            kp * joint["offset"],
+            joint["effort_limit"],
+            kp,
+            1.0,
+        )
         widths = (2 * length, *HIDDEN)
         layers = [layer for a, b in pairwise(widths) for layer in (nn.Linear(a, b), nn.ELU())]
         self.net = nn.Sequential(*layers, head := nn.Linear(HIDDEN[-1], 1))
@@ -81,11 +95,15 @@ class ActuatorNet(nn.Module):
         return ((x - self.mean) / self.std).clamp(-MAX_INPUT_STD, MAX_INPUT_STD)
 
     def forward(self, x: Tensor) -> Tensor:
-        torque = x @ self.servo + self.rest + (self.gain * self.scale) * self.net(self.standardised(x))
+        torque = (
+            x @ self.servo + self.rest + (self.gain * self.scale) * self.net(self.standardised(x))
+        )
         return torque.clamp(-self.limit, self.limit)
 
 
-def read_run_recordings(run: Path, data: str | None, robot: RobotSpec, payload_mass: float) -> list[list[Sequence]]:
+def read_run_recordings(
+    run: Path, data: str | None, robot: RobotSpec, payload_mass: float
+) -> list[list[Sequence]]:
     """Read training and validation motions of a run that were made with this payload and the robot's own gains.
 
     Raises:
@@ -95,10 +113,15 @@ def read_run_recordings(run: Path, data: str | None, robot: RobotSpec, payload_m
     dataset = load_dataset(place if data or "://" in place else run / place)
     entries = [e for e in dataset.entries if e.meta.payload_mass == payload_mass]
     hashes = [set(split_of_run(run)[split].values()) for split in ("train", "val")]
-    chosen = [stratified_subset([e for e in entries if e.hash in split], MAX_RECORDINGS) for split in hashes]
+    chosen = [
+        stratified_subset([e for e in entries if e.hash in split], MAX_RECORDINGS)
+        for split in hashes
+    ]
     recordings = [comparable(dataset.sequences(split), robot, payload_mass) for split in chosen]
     if not all(recordings):
-        raise UsageError(f"no recording of {run} was made with {payload_mass:g} kg and the robot's own gains")
+        raise UsageError(
+            f"no recording of {run} was made with {payload_mass:g} kg and the robot's own gains"
+        )
     return recordings
 
 
@@ -111,18 +134,32 @@ def write_networks(
     Returns:
         Mean |error| on the motions by form, rad.
     """
-    nets = _fit_networks(sequences, replay(sequences, robot, corrector, lock_idle=True), robot, facts)
+    nets = _fit_networks(
+        sequences, replay(sequences, robot, corrector, lock_idle=True), robot, facts
+    )
     op = robot.operated_index
     aligned = zip(motions, replay(motions, robot, corrector, lock_idle=True), strict=True)
-    errors = {gain: _error_in_mujoco(folder / facts["file"], motions, robot, nets, facts, gain) for gain in GAINS}
+    errors = {
+        gain: _error_in_mujoco(folder / facts["file"], motions, robot, nets, facts, gain)
+        for gain in GAINS
+    }
     gain = min(errors, key=lambda g: errors[g])
-    info = {"length": _length(facts), "step": facts["options"]["timestep"], "gain": gain, "input_order": "pos_vel"}
+    info = {
+        "length": _length(facts),
+        "step": facts["options"]["timestep"],
+        "gain": gain,
+        "input_order": "pos_vel",
+    }
     for name, net in nets.items():
         net.gain = gain
         _write(net, folder, name, info | {"joint": name, "robot": robot.name})
     facts["actuator_net"] = info
     run = float(np.mean([mean_error(s.qpos[:, op], r.qpos[:, op]) for s, r in aligned]))
-    return {"the run, in gaponet": run, "actuator networks": errors[gain], "of these the servo alone": errors[0.0]}
+    return {
+        "the run, in gaponet": run,
+        "actuator networks": errors[gain],
+        "of these the servo alone": errors[0.0],
+    }
 
 
 def _length(facts: dict[str, Any]) -> int:
@@ -142,14 +179,26 @@ def _fit_networks(
     for name in robot.joint_names:
         i, net, rows = robot.joint_names.index(name), nets[name], ROWS // len(sequences) + 1
         if name in robot.operated:
-            samples = [_samples(s, r, i, net, facts, rng, rows) for s, r in zip(sequences, rollouts, strict=True)]
-            x, y = (torch.tensor(np.concatenate(p), dtype=torch.float32) for p in zip(*samples, strict=True))
+            samples = [
+                _samples(s, r, i, net, facts, rng, rows)
+                for s, r in zip(sequences, rollouts, strict=True)
+            ]
+            x, y = (
+                torch.tensor(np.concatenate(p), dtype=torch.float32)
+                for p in zip(*samples, strict=True)
+            )
             _fit(net, x, y)
     return {name: net.eval().requires_grad_(False) for name, net in nets.items()}
 
 
 def _samples(
-    s: Sequence, rollout: Any, i: int, net: ActuatorNet, facts: dict[str, Any], rng: np.random.Generator, rows: int
+    s: Sequence,
+    rollout: Any,
+    i: int,
+    net: ActuatorNet,
+    facts: dict[str, Any],
+    rng: np.random.Generator,
+    rows: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs of joint i's network in random physics steps of a rollout, (k, 2L), and delayed Δa, (k, 1) rad."""
     count, length = facts["decimation"], len(net.mean) // 2
@@ -161,7 +210,9 @@ def _samples(
     chosen = rng.integers(0, len(target), rows)
     past = np.maximum(chosen[:, None] - np.arange(length), 0)
     weights = net.servo[:length, 0].numpy() / facts["joints"][s.joint_names[i]]["kp"]
-    return np.concatenate([target[past] - q[past], v[past]], axis=1), (delta[past] @ weights)[:, None]
+    return np.concatenate([target[past] - q[past], v[past]], axis=1), (delta[past] @ weights)[
+        :, None
+    ]
 
 
 def _fit(net: ActuatorNet, x: Tensor, y: Tensor) -> None:
@@ -190,7 +241,10 @@ def _stacked(nets: ListOf[ActuatorNet]) -> Callable[[np.ndarray], np.ndarray]:
     stack = lambda get: np.stack([get(net).detach().numpy() for net in nets])  # noqa: E731
     servo, mean, std = (stack(lambda net, f=f: getattr(net, f)) for f in ("servo", "mean", "std"))
     rest, limit, scale = np.array([(net.rest, net.limit, net.gain * net.scale) for net in nets]).T
-    layers = [(stack(lambda net, k=k: net.net[k].weight), stack(lambda net, k=k: net.net[k].bias)) for k in (0, 2, 4)]
+    layers = [
+        (stack(lambda net, k=k: net.net[k].weight), stack(lambda net, k=k: net.net[k].bias))
+        for k in (0, 2, 4)
+    ]
 
     def torque(past: np.ndarray) -> np.ndarray:
         z = np.clip((past - mean) / std, -MAX_INPUT_STD, MAX_INPUT_STD)
@@ -238,7 +292,12 @@ def _write(net: ActuatorNet, folder: Path, name: str, info: dict[str, Any]) -> N
     """Write the three files of a joint, with metadata in Newton's form."""
     import onnx
 
-    info |= {"input_idx": list(range(info["length"])), "pos_scale": 1.0, "vel_scale": 1.0, "effort_scale": 1.0}
+    info |= {
+        "input_idx": list(range(info["length"])),
+        "pos_scale": 1.0,
+        "vel_scale": 1.0,
+        "effort_scale": 1.0,
+    }
     info |= {"units": "rad, rad/s in, N·m out", "newest": "first"}
     x = torch.zeros(2, 2 * info["length"])
     with warnings.catch_warnings():

@@ -26,13 +26,19 @@ from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, to_axes
 RANGE_PERCENT = 5, 95
 Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
 
-CACHES = "drawn_robots.json", "drawn_plain_robots.json"  # in the robot folder: with the servo model, without it
+CACHES = (
+    "drawn_robots.json",
+    "drawn_plain_robots.json",
+)  # in the robot folder: with the servo model, without it
 
 DRAWN, KEPT_SHARE = 128, 0.25  # number of units, and the share that is retained
 NEAR = 0.5  # every second unit deviates by this share of what was drawn
 WINDOWS, WINDOW_S = 8, 8.0  # rollouts that choose
 JUDGED = 20  # robots of each kind whose error on validation motions is stated
-BY_HAND, BY_HAND_FIELDS = 0.2, ("kp", "damping", "frictionloss", "armature")  # the usual randomisation: ± 20 %
+BY_HAND, BY_HAND_FIELDS = (
+    0.2,
+    ("kp", "damping", "frictionloss", "armature"),
+)  # the usual randomisation: ± 20 %
 
 
 @dataclass(frozen=True)
@@ -88,14 +94,26 @@ def draw_robots(
     first = {f: v[:DRAWN] for f, v in drawn.items()}
 
     def draw() -> DrawnRobots:
-        return _draw(base, _moved(robot, base, first), train, validation, lambda i, n, s: progress(i, n, s + note))
+        return _draw(
+            base,
+            _moved(robot, base, first),
+            train,
+            validation,
+            lambda i, n, s: progress(i, n, s + note),
+        )
 
     inputs = *first.values(), np.array([len(train), len(validation), len(engine_terms)])
-    return stored_result(robot.folder / CACHES[plain], DrawnRobots, draw, robot, [*train, *validation], *inputs)
+    return stored_result(
+        robot.folder / CACHES[plain], DrawnRobots, draw, robot, [*train, *validation], *inputs
+    )
 
 
 def _draw(
-    base: RobotSpec, drawn: Units, train: ListOf[Sequence], validation: ListOf[Sequence], progress: Progress
+    base: RobotSpec,
+    drawn: Units,
+    train: ListOf[Sequence],
+    validation: ListOf[Sequence],
+    progress: Progress,
 ) -> DrawnRobots:
     def errors_of(motions: ListOf[Sequence], robots: ListOf[RobotSpec], what: str) -> list[float]:
         errors = []
@@ -108,14 +126,24 @@ def _draw(
     best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(costs)), 1)])
     units, rng = {field: values[best] for field, values in drawn.items()}, np.random.default_rng(0)
     servos = [values for field, values in units.items() if field != "links"]
-    low, high = (np.array([np.percentile(v, side, axis=0) for v in servos]) for side in RANGE_PERCENT)
+    low, high = (
+        np.array([np.percentile(v, side, axis=0) for v in servos]) for side in RANGE_PERCENT
+    )
     alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
     robots = {
         "exported": [base], "units": robots_of(base, units)[:JUDGED],
         "one by one": robots_of(base, dict(zip(units, alone, strict=False))), "by hand": _by_hand(base, rng),
     }  # fmt: skip
-    judged = iter(errors_of(validation, [r for kind in robots.values() for r in kind], "robots on validation motions"))
-    errors = {kind: float(np.mean([next(judged) for _ in several])) for kind, several in robots.items()}
+    judged = iter(
+        errors_of(
+            validation,
+            [r for kind in robots.values() for r in kind],
+            "robots on validation motions",
+        )
+    )
+    errors = {
+        kind: float(np.mean([next(judged) for _ in several])) for kind, several in robots.items()
+    }
     return DrawnRobots({field: values.tolist() for field, values in units.items()}, errors)
 
 
@@ -123,11 +151,15 @@ def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
     """Return a robot for each row of units."""
     servos = {field: values for field, values in units.items() if field != "links"}
     robots = [
-        base.with_servos({j: {f: float(v[k, i]) for f, v in servos.items()} for i, j in enumerate(base.operated)})
+        base.with_servos(
+            {j: {f: float(v[k, i]) for f, v in servos.items()} for i, j in enumerate(base.operated)}
+        )
         for k in range(len(units["kp"]))
     ]
     if links := LinkAxes(base.before_identification).links if "links" in units else None:
-        robots = [replace(one, links=links(row)) for one, row in zip(robots, units["links"], strict=True)]
+        robots = [
+            replace(one, links=links(row)) for one, row in zip(robots, units["links"], strict=True)
+        ]
     return robots
 
 
@@ -136,7 +168,9 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     lacking = [] if base is robot else [f for f in SERVO_TERMS if not getattr(base, f).any()]
     fields = [f for f in drawn if f not in ("effort_limit", "links", *lacking)]
     own, center = (np.stack(list(to_axes(r, fields).values())) for r in (robot, base))
-    axes = np.stack([np.stack(list(to_axes(one, fields).values())) for one in robots_of(robot, drawn)])
+    axes = np.stack(
+        [np.stack(list(to_axes(one, fields).values())) for one in robots_of(robot, drawn)]
+    )
     share = np.where(np.arange(len(axes)) % 2, NEAR, 1.0)[:, None, None]
     signed = [SERVO_FIELDS[f].axis == "log" or SERVO_FIELDS[f].signed for f in fields]
     x = center + share * (axes - own)
@@ -144,13 +178,18 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     op = robot.operated_index
     units["effort_limit"] = base.effort_limit[op] * units["kp"] / base.kp[op]
     if links := ParameterUncertainty.require(robot).links if "links" in drawn else None:
-        units["links"] = np.array(links.values) + share[:, :, 0] * (drawn["links"] - np.array(links.values))
+        units["links"] = np.array(links.values) + share[:, :, 0] * (
+            drawn["links"] - np.array(links.values)
+        )
     return units
 
 
 def _by_hand(base: RobotSpec, rng: np.random.Generator) -> list[RobotSpec]:
     values = {f: getattr(base, f)[base.operated_index] for f in BY_HAND_FIELDS}
-    return robots_of(base, {f: v * rng.uniform(1 - BY_HAND, 1 + BY_HAND, (JUDGED, len(v))) for f, v in values.items()})
+    return robots_of(
+        base,
+        {f: v * rng.uniform(1 - BY_HAND, 1 + BY_HAND, (JUDGED, len(v))) for f, v in values.items()},
+    )
 
 
 def _windows(sequences: ListOf[Sequence]) -> list[Sequence]:
@@ -158,5 +197,10 @@ def _windows(sequences: ListOf[Sequence]) -> list[Sequence]:
     pieces = []
     for s in sequences:
         rows = round(WINDOW_S / s.dt)
-        pieces += [s.rows(slice(start, start + rows)) for start in range(0, max(len(s) - rows // 2, 1), rows)]
-    return [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, WINDOWS).round().astype(int))]
+        pieces += [
+            s.rows(slice(start, start + rows))
+            for start in range(0, max(len(s) - rows // 2, 1), rows)
+        ]
+    return [
+        pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, WINDOWS).round().astype(int))
+    ]

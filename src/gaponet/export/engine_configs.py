@@ -78,7 +78,10 @@ def engine_config(engine: str, robot: str, facts: dict[str, Any]) -> str:
     """Return robot_cfg.py of an engine, one of TEMPLATES, for a robot's name and facts.json."""
     joints, law = facts["plain"], ", ".join(facts["law"])
     fields = ("kp", "kd", "effort_limit", "armature", "damping", "frictionloss")
-    columns = {field: {name: s[field] for name, s in joints.items()} for field in (*fields, "offset", "delay")}
+    columns = {
+        field: {name: s[field] for name, s in joints.items()}
+        for field in (*fields, "offset", "delay")
+    }
     return TEMPLATES[engine].substitute(
         columns, robot=robot,
         servos="".join(f"    {name!r}: { {f: s[f] for f in fields} },\n" for name, s in joints.items()),

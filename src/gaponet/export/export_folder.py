@@ -52,7 +52,11 @@ CHECK_FILES: dict[str, dict[str, str]] = {
     "json": {},
     "torch": ACTION_TERM,
     "actuator-net": ACTION_TERM
-    | {"check.py": "check_mjlab.py", "check_newton.py": "check_newton.py", "actuators.py": "actuators.py"},
+    | {
+        "check.py": "check_mjlab.py",
+        "check_newton.py": "check_newton.py",
+        "actuators.py": "actuators.py",
+    },
 }
 SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, torque limits and friction; numpy or torch."""
 
@@ -69,7 +73,9 @@ SERVO_MODEL: tuple[Callable[..., Any], ...] = (
     array_module, servo.present, servo.exp, servo.torque_range, servo.passing_friction, servo.resting_friction,
     servo.friction_limit, servo.servo_torque, servo.crossed, servo.Play,
 )  # fmt: skip
-ENGINE_TERMS = {"isaaclab": ("no_load_speed",)}  # terms of the servo model that an engine's own servos have
+ENGINE_TERMS = {
+    "isaaclab": ("no_load_speed",)
+}  # terms of the servo model that an engine's own servos have
 OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts|unit_events) import")
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 DELAY_NOTES = {
@@ -125,12 +131,18 @@ def export_robot(
         recordings = motions[::2], motions[1::2] or motions
     train, validation = recordings[0], comparable(recordings[1], robot, payload_mass)
     if not validation:
-        raise UsageError(f"no validation motion was made with {payload_mass:g} kg and the robot's own gains")
+        raise UsageError(
+            f"no validation motion was made with {payload_mass:g} kg and the robot's own gains"
+        )
     plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
-    facts = simulator_facts(robot, control_period(robot, (s.dt for s in validation)), payload_mass, plain)
+    facts = simulator_facts(
+        robot, control_period(robot, (s.dt for s in validation)), payload_mass, plain
+    )
     motions = check_motions(validation, robot)
     facts |= {"file": ROBOT, "prefix": prefix, "virtual": validation[0].meta.virtual}
-    facts["error_mrad"] = {form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))}
+    facts["error_mrad"] = {
+        form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))
+    }
     errors = {"in gaponet": rollout_error(validation, robot)}
     if robot.has_servo_model:
         errors["in gaponet, without the servo model"] = rollout_error(validation, plain)
@@ -140,7 +152,9 @@ def export_robot(
             file, not_rad = edit_mjcf(source or robot.mjcf, out, plain, facts, payload_mass)
             for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
                 if form == "plain" or robot.has_servo_model:
-                    errors[f"{file.name} {what}"] = _error_in_mujoco(file, facts, validation, robot, form)
+                    errors[f"{file.name} {what}"] = _error_in_mujoco(
+                        file, facts, validation, robot, form
+                    )
             if not_rad:
                 text = f"targets of {', '.join(not_rad)} were not in rad before (degrees?)"
                 notes.append(f"{text}: now they are; ctrl of keyframes not")
@@ -148,12 +162,20 @@ def export_robot(
             assert source is not None
             file, other = edit_urdf(source, out, facts, robot)
             if other:
-                notes.append(f"inertias of {', '.join(other)} were not written: their masses in the file are others")
-                plain = replace(plain, links={n: link for n, link in plain.links.items() if n not in other})
-            errors[f"{file.name} alone, all else as before"] = rollout_error(validation, with_urdf_fields(plain))
+                notes.append(
+                    f"inertias of {', '.join(other)} were not written: their masses in the file are others"
+                )
+                plain = replace(
+                    plain, links={n: link for n, link in plain.links.items() if n not in other}
+                )
+            errors[f"{file.name} alone, all else as before"] = rollout_error(
+                validation, with_urdf_fields(plain)
+            )
         elif to != "json":
             file = out / ROBOT
-            _write_scene(robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab")
+            _write_scene(
+                robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab"
+            )
             if to in TEMPLATES:
                 write_text(out / "robot_cfg.py", engine_config(to, robot.name, facts))
         facts["file"] = str(file.relative_to(out)) if file else ROBOT
@@ -173,8 +195,12 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
                     f"{name} met something at {at} rad in the recordings; the file keeps its range: was that a stop?"
                 )
     if robot.target_speed.any():
-        ramps = ", ".join(f"{n} {v:.3g}" for n, v in zip(robot.joint_names, robot.target_speed, strict=True) if v)
-        notes.append(f"servos' own ramps ({ramps} rad/s) are in no engine: limit targets so, as in check.npz")
+        ramps = ", ".join(
+            f"{n} {v:.3g}" for n, v in zip(robot.joint_names, robot.target_speed, strict=True) if v
+        )
+        notes.append(
+            f"servos' own ramps ({ramps} rad/s) are in no engine: limit targets so, as in check.npz"
+        )
     if robot.friction_per_kelvin.any():
         warm = ", ".join(f"{t:.0f}" for t in robot.friction_temperature[robot.operated_index])
         notes.append(f"friction and damping are those at {warm} °C: no engine has a temperature")
@@ -210,7 +236,10 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
     dt = control_period(robot, model.card.get("dt") or [robot.dt])
     with lock_folder(folder, FOLDER_KIND):
         difference = export_program(model, run, folder)
-        past = {"depth": (model.config.history - 1) * model.config.stride + 1, "parity_rad": difference}
+        past = {
+            "depth": (model.config.history - 1) * model.config.stride + 1,
+            "parity_rad": difference,
+        }
         facts = simulator_facts(robot, dt, payload_mass)
         facts |= {"model": past, "payload_seen": model.card.get("payload_seen")}
         _write_scene(robot, folder / ROBOT, payload_mass, dt=dt)
@@ -238,7 +267,10 @@ def export_networks(
     robot = model.simulator()
     train, val = read_run_recordings(run, data, robot, payload_mass)
     motions, dt = check_motions(val, robot), train[0].dt
-    facts = simulator_facts(robot, dt, payload_mass) | {"file": ROBOT, "virtual": train[0].meta.virtual}
+    facts = simulator_facts(robot, dt, payload_mass) | {
+        "file": ROBOT,
+        "virtual": train[0].meta.virtual,
+    }
     with lock_folder(folder, FOLDER_KIND):
         _write_scene(robot, folder / ROBOT, payload_mass, servos=False, dt=dt)
         errors = write_networks(train, motions, model.corrector(robot), robot, folder, facts)
@@ -265,9 +297,17 @@ def _write_scene(
 
 
 def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
-    arrays: dict[str, Any] = {"count": np.array(len(motions)), "names": np.array([s.meta.motion for s in motions])}
+    arrays: dict[str, Any] = {
+        "count": np.array(len(motions)),
+        "names": np.array([s.meta.motion for s in motions]),
+    }
     for i, s in enumerate(motions):
-        arrays |= {f"ctrl_{i}": s.ctrl, f"qpos_{i}": s.qpos, f"qvel_{i}": s.qvel, f"dt_{i}": np.array(s.dt)}
+        arrays |= {
+            f"ctrl_{i}": s.ctrl,
+            f"qpos_{i}": s.qpos,
+            f"qvel_{i}": s.qvel,
+            f"dt_{i}": np.array(s.dt),
+        }
     with file.open("wb") as opened:
         np.savez_compressed(opened, **arrays)
 
@@ -295,6 +335,8 @@ def _error_in_mujoco(
     errors = []
     for s in motions:
         motion = {"ctrl": np.clip(s.ctrl, low, high), "qpos": s.qpos, "qvel": s.qvel, "dt": s.dt}
-        played = mujoco_servos.play(mujoco.MjModel.from_xml_path(str(file)), facts, motion, facts["prefix"], form)
+        played = mujoco_servos.play(
+            mujoco.MjModel.from_xml_path(str(file)), facts, motion, facts["prefix"], form
+        )
         errors.append(mean_error(s.qpos[:, op], played[:, op]))
     return float(np.mean(errors))

@@ -25,12 +25,30 @@ from gaponet.base.files import lock_folder, write_text
 from gaponet.export.simulator_facts import Joints
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.model import PAYLOAD_DENSITY, STIFF_SOLIMP, STIFF_SOLREF, TABLE, TOLERANCE, build_model
+from gaponet.sim.model import (
+    PAYLOAD_DENSITY,
+    STIFF_SOLIMP,
+    STIFF_SOLREF,
+    TABLE,
+    TOLERANCE,
+    build_model,
+)
 
 SERVO_ATTRIBUTES = ("name", "class", "group", "user")  # that a servo keeps
 JOINT_ATTRIBUTES = ("armature", "damping", "frictionloss")  # that are identified
 START_TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")
-UNCHANGED_COUNTS = ("njnt", "nsite", "nsensor", "ntendon", "neq", "nkey", "ncam", "nlight", "nmesh", "nq")
+UNCHANGED_COUNTS = (
+    "njnt",
+    "nsite",
+    "nsensor",
+    "ntendon",
+    "neq",
+    "nkey",
+    "ncam",
+    "nlight",
+    "nmesh",
+    "nq",
+)
 
 
 @dataclass
@@ -129,11 +147,14 @@ class Source:
         root = next(t for t in self.tags if t.file == self.main)
         place = self.text[self.main].rindex(b"</", 0, root.end)
         ends = "".join(
-            f"  <{name}>\n{text}  </{name}>\n" if text else f"  <{name}/>\n" for name, text in self.sections.items()
+            f"  <{name}>\n{text}  </{name}>\n" if text else f"  <{name}/>\n"
+            for name, text in self.sections.items()
         )
         edits = [*self.edits, (self.main, place, place, ends.encode())]
         # From the back. Of an insertion right before an element that changes, the element comes first.
-        for _, (file, start, end, new) in sorted(enumerate(edits), key=lambda e: (-e[1][1], e[1][1] == e[1][2], -e[0])):
+        for _, (file, start, end, new) in sorted(
+            enumerate(edits), key=lambda e: (-e[1][1], e[1][1] == e[1][2], -e[0])
+        ):
             out[file] = out[file][:start] + new + out[file][end:]
         return out
 
@@ -147,14 +168,27 @@ class Source:
         same = [tag for tag in self.tags if kinds.get(tag.parent, tag.name) == kind]
         tags = [tag for tag in same if attribute.items() <= tag.attributes.items()]
         if len(tags) > 1:
-            raise RobotError(f"{self.main}: has {len(tags)} {what}; one is needed. Delete or rename the others")
+            raise RobotError(
+                f"{self.main}: has {len(tags)} {what}; one is needed. Delete or rename the others"
+            )
         return tags[0] if tags else None
 
     def child(self, parent: Tag, name: str) -> Tag | None:
         """Return the first element of a name in another one, which is in no body in between."""
-        inside = [t for t in self.tags if t.file == parent.file and parent.open_end <= t.start < parent.end]
+        inside = [
+            t
+            for t in self.tags
+            if t.file == parent.file and parent.open_end <= t.start < parent.end
+        ]
         bodies = [t for t in inside if t.name == "body"]
-        return next((t for t in inside if t.name == name and not any(b.start < t.start < b.end for b in bodies)), None)
+        return next(
+            (
+                t
+                for t in inside
+                if t.name == name and not any(b.start < t.start < b.end for b in bodies)
+            ),
+            None,
+        )
 
     def write_changes(self, folder: Path) -> None:
         """Write the changes as a unified diff, changes.diff."""
@@ -201,15 +235,22 @@ def edit_mjcf(
         if servo["zero"]:
             ref = before.qpos0[before.joint(full).qposadr[0]] - servo["zero"]
             changed["ref"] = text_of(math.degrees(ref) if spec.compiler.degree else ref)
-        changed |= {"solreffriction": text_of(*STIFF_SOLREF), "solimpfriction": text_of(*STIFF_SOLIMP)}
+        changed |= {
+            "solreffriction": text_of(*STIFF_SOLREF),
+            "solimpfriction": text_of(*STIFF_SOLIMP),
+        }
         source.set(tag, **changed)
         delay = max(servo["delay"], facts["joints"][name]["delay"])
         samples = math.ceil(delay / before.opt.timestep - 1e-9) + 2 if delay else 0
         if actuator is not None:
-            source.replace(actuator, _servo(servo, samples, _servo_attributes(actuator, before, full)))
+            source.replace(
+                actuator, _servo(servo, samples, _servo_attributes(actuator, before, full))
+            )
             not_rad += [full] * (abs(_radians_per_unit(before, full) - 1) > 1e-3)
         else:
-            source.append("actuator", f"    {_servo(servo, samples, {'name': full, 'joint': full})}\n")
+            source.append(
+                "actuator", f"    {_servo(servo, samples, {'name': full, 'joint': full})}\n"
+            )
             added.append(text_of(servo["home"]))
     for key in source.tags if added else ():
         if key.name == "key" and "ctrl" in key.attributes:
@@ -235,7 +276,11 @@ def _servo(servo: dict[str, Any], samples: int, own: dict[str, str]) -> str:
         "biasprm": text_of(bias, -kp, -kd), "forcelimited": "true", "forcerange": text_of(-limit, limit),
     }  # fmt: skip
     if samples:
-        attributes |= {"delay": text_of(servo["delay"]), "nsample": str(samples), "interp": "linear"}
+        attributes |= {
+            "delay": text_of(servo["delay"]),
+            "nsample": str(samples),
+            "interp": "linear",
+        }
     return f"<general {_attributes(attributes)}/>"
 
 
@@ -269,11 +314,15 @@ def _add_surroundings(
     def body(name: str, what: str) -> Tag:
         tag = source.one(f"bodies '{name}'", "body", name=name)
         if tag is None:
-            raise RobotError(f"{source.main}: a [[{what}]] names body '{name}', which is not in its text")
+            raise RobotError(
+                f"{source.main}: a [[{what}]] names body '{name}', which is not in its text"
+            )
         return tag
 
     off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    if robot.table is not None and not (off and (model.geom_contype | model.geom_conaffinity).any()):
+    if robot.table is not None and not (
+        off and (model.geom_contype | model.geom_conaffinity).any()
+    ):
         own, table = build_model(robot), prefix + TABLE
         option["cone"] = "elliptic"  # a pyramid's stiffness depends on friction
         if off:  # contacts are disabled in the file, and the pairs below are the only ones
@@ -284,10 +333,20 @@ def _add_surroundings(
             name, size = f"{table}_tip_{i}", text_of(tip.radius)
             source.insert(body(prefix + tip.body, "tip"), f'<geom name="{name}" type="sphere" size="{size}"'
                           f' pos="{text_of(*tip.pos)}" mass="0" contype="0" conaffinity="0" group="3"/>')  # fmt: skip
-            words = _attributes({f: text_of(*getattr(own, f"pair_{f}")[i]) for f in ("friction", "solref", "solimp")})
-            source.append("contact", f'    <pair geom1="{name}" geom2="{table}" condim="3" {words}/>\n')
+            words = _attributes(
+                {
+                    f: text_of(*getattr(own, f"pair_{f}")[i])
+                    for f in ("friction", "solref", "solimp")
+                }
+            )
+            source.append(
+                "contact", f'    <pair geom1="{name}" geom2="{table}" condim="3" {words}/>\n'
+            )
     for name, link in robot.links.items():
-        tag, values = body(prefix + name, "identified_link"), {"mass": text_of(link.mass), "pos": text_of(*link.pos)}
+        tag, values = (
+            body(prefix + name, "identified_link"),
+            {"mass": text_of(link.mass), "pos": text_of(*link.pos)},
+        )
         inertial = f"<inertial {_attributes(values | {'fullinertia': text_of(*link.inertia)})}/>"
         own = source.child(tag, "inertial")
         source.replace(own, inertial) if own else source.insert(tag, inertial)
@@ -307,7 +366,9 @@ def _attributes(values: dict[str, str]) -> str:
 
 def _write(source: Source, out: Path) -> Path:
     """Write the edited files and all files that they name, in the same relative places; return the main one."""
-    needed = {Path(os.path.abspath(f)) for f in mujoco.mju_getXMLDependencies(str(source.main))} | set(source.text)
+    needed = {
+        Path(os.path.abspath(f)) for f in mujoco.mju_getXMLDependencies(str(source.main))
+    } | set(source.text)
     root = Path(os.path.commonpath([f.parent for f in needed]))
     with lock_folder(out, "engine"):
         for file in sorted(needed):
@@ -320,23 +381,48 @@ def _write(source: Source, out: Path) -> Path:
 
 
 def _require(
-    now: mujoco.MjModel, before: mujoco.MjModel, joints: Joints, robot: RobotSpec, prefix: str, path: Path
+    now: mujoco.MjModel,
+    before: mujoco.MjModel,
+    joints: Joints,
+    robot: RobotSpec,
+    prefix: str,
+    path: Path,
 ) -> None:
     """Refuse a copy that lacks the wanted servos, or another element of the original."""
     counts = {f: (getattr(before, f), getattr(now, f)) for f in UNCHANGED_COUNTS}
     wrong = [f"{f} {old} → {new}" for f, (old, new) in counts.items() if old != new]
     for name in robot.operated:
-        servo, dof, i = joints[name], now.joint(prefix + name).dofadr[0], _actuator(now, prefix + name)
-        passive = [float(np.ravel(getattr(now, f"dof_{field}")[dof])[0]) for field in JOINT_ATTRIBUTES]
-        actual = [*passive, now.actuator_gainprm[i, 0], *now.actuator_biasprm[i, :3], now.actuator_forcerange[i, 1]]
+        servo, dof, i = (
+            joints[name],
+            now.joint(prefix + name).dofadr[0],
+            _actuator(now, prefix + name),
+        )
+        passive = [
+            float(np.ravel(getattr(now, f"dof_{field}")[dof])[0]) for field in JOINT_ATTRIBUTES
+        ]
+        actual = [
+            *passive,
+            now.actuator_gainprm[i, 0],
+            *now.actuator_biasprm[i, :3],
+            now.actuator_forcerange[i, 1],
+        ]
         kp, bias = servo["kp"], servo["kp"] * servo["offset"]
-        wanted = [*(servo[f] for f in JOINT_ATTRIBUTES), kp, bias, -kp, -servo["kd"], servo["effort_limit"]]
+        wanted = [
+            *(servo[f] for f in JOINT_ATTRIBUTES),
+            kp,
+            bias,
+            -kp,
+            -servo["kd"],
+            servo["effort_limit"],
+        ]
         if not np.allclose(actual, wanted, rtol=1e-5, atol=1e-9):
             wrong.append(f"{name}: {np.round(actual, 6)} instead of {np.round(wanted, 6)}")
     for name, link in robot.links.items():
         body = now.body(prefix + name)
         if not np.allclose([*body.mass, *body.ipos], [link.mass, *link.pos], rtol=1e-5, atol=1e-9):
-            wrong.append(f"body {name}: {body.mass[0]:.6g} kg instead of {link.mass:.6g} (inertiafromgeom?)")
+            wrong.append(
+                f"body {name}: {body.mass[0]:.6g} kg instead of {link.mass:.6g} (inertiafromgeom?)"
+            )
     if wrong:
         raise RobotError(f"{path}: the edited copy differs from the robot: {'; '.join(wrong[:3])}")
 

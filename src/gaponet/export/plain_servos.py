@@ -45,7 +45,9 @@ class _Stored(TypedDict):
     content: Any
 
 
-def read_recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[list[Sequence], list[Sequence]] | None:
+def read_recordings(
+    folder: Path, data: str | None, robot: RobotSpec
+) -> tuple[list[Sequence], list[Sequence]] | None:
     """Read training and validation motions of a dataset, by default those that the robot was identified from.
 
     Returns:
@@ -55,7 +57,9 @@ def read_recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[l
     if data is None and origin is not None:
         data = origin["dataset"]
         if "://" not in data:
-            data = str(folder / data) if (folder / data).is_dir() else None  # it may have moved away
+            data = (
+                str(folder / data) if (folder / data).is_dir() else None
+            )  # it may have moved away
     if data is None:
         return None
     dataset = load_dataset(data)
@@ -72,7 +76,10 @@ def read_recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[l
 
 
 def fit_plain_servos(
-    robot: RobotSpec, recordings: ListOf[Sequence], progress: Progress = no_progress, engine_terms: tuple[str, ...] = ()
+    robot: RobotSpec,
+    recordings: ListOf[Sequence],
+    progress: Progress = no_progress,
+    engine_terms: tuple[str, ...] = (),
 ) -> RobotSpec:
     """Fit the parameters of PD servos, without a servo model but for the terms that the engine has, to recordings.
 
@@ -83,7 +90,9 @@ def fit_plain_servos(
         recordings: Motions that it was fitted to, or its own (`own_motions`).
         progress: Called with done, total and a note, as by `identify`.
     """
-    without: dict[str, Any] = {name: np.array(0.0) for name in SERVO_TERMS if name not in engine_terms}
+    without: dict[str, Any] = {
+        name: np.array(0.0) for name in SERVO_TERMS if name not in engine_terms
+    }
     if not any(getattr(robot, name).any() for name in without):
         return robot
     start = replace(robot, **without)
@@ -91,7 +100,11 @@ def fit_plain_servos(
     def fit() -> dict[str, dict[str, float]]:
         fitted = identify(recordings, start, terms=(), table=False, progress=progress).robot
         return {
-            joint: {name: float(v) for name in SERVO_FIELDS if np.isfinite(v := getattr(fitted, name)[i])}
+            joint: {
+                name: float(v)
+                for name in SERVO_FIELDS
+                if np.isfinite(v := getattr(fitted, name)[i])
+            }
             for i, joint in enumerate(robot.joint_names)
         }
 
@@ -100,7 +113,12 @@ def fit_plain_servos(
 
 
 def stored_result(
-    file: Path, kind: type[T], compute: Callable[[], T], robot: RobotSpec, recordings: ListOf[Sequence], *other: Array
+    file: Path,
+    kind: type[T],
+    compute: Callable[[], T],
+    robot: RobotSpec,
+    recordings: ListOf[Sequence],
+    *other: Array,
 ) -> T:
     """Return a result from a file in the robot folder if its inputs are the same, else compute and store it.
 
@@ -108,7 +126,9 @@ def stored_result(
         kind: Type of the result, for `validated`.
         robot, recordings, other: All that the result depends on.
     """
-    key = hashlib.sha256(f"{__version__} {mujoco.__version__} {model_hash(robot)} {robot.operated}".encode())
+    key = hashlib.sha256(
+        f"{__version__} {mujoco.__version__} {model_hash(robot)} {robot.operated}".encode()
+    )
     for one in (robot, robot.before_identification):
         for name in SERVO_FIELDS:
             key.update(getattr(one, name).tobytes())
@@ -124,7 +144,10 @@ def stored_result(
         if stored["key"] == key.hexdigest():
             return validated(kind, stored["content"], file, RobotError)
     result = compute()
-    with suppress(FolderError, OSError), lock_folder(file.parent, "robot"):  # not of gaponet, or not writable
+    with (
+        suppress(FolderError, OSError),
+        lock_folder(file.parent, "robot"),
+    ):  # not of gaponet, or not writable
         write_json(file, {"key": key.hexdigest(), "content": result})
     return result
 
@@ -138,7 +161,9 @@ def own_motions(robot: RobotSpec, payload_mass: float = 0.0, count: int = 24) ->
     motions = []
     for i in range(count):
         turn = 2 * np.pi * (rng.uniform(0.1, 0.6, len(op)) * t + rng.uniform(0, 1, len(op)))
-        swing = np.clip(1.5 * np.sin(turn), -1, 1) * rng.uniform(0.1, 0.8, len(op)) * np.minimum(1, t)
+        swing = (
+            np.clip(1.5 * np.sin(turn), -1, 1) * rng.uniform(0.1, 0.8, len(op)) * np.minimum(1, t)
+        )
         ctrl = np.tile(robot.qpos_home, (len(t), 1))
         ctrl[:, op] += np.where(swing > 0, high - home, home - low) * swing / 2
         meta = SequenceMeta(robot.name, "itself", f"swing-{i}", payload_mass, virtual=True)
@@ -148,16 +173,29 @@ def own_motions(robot: RobotSpec, payload_mass: float = 0.0, count: int = 24) ->
     return [replace(s, qpos=r.qpos, qvel=r.qvel) for s, r in zip(motions, rollouts, strict=True)]
 
 
-def comparable(recordings: ListOf[Sequence], robot: RobotSpec, payload_mass: float) -> list[Sequence]:
+def comparable(
+    recordings: ListOf[Sequence], robot: RobotSpec, payload_mass: float
+) -> list[Sequence]:
     """Return the recordings made with this payload, kg, and with the robot's own gains."""
-    return [s for s in recordings if Condition.of(s, robot).kp is None and s.meta.payload_mass == payload_mass]
+    return [
+        s
+        for s in recordings
+        if Condition.of(s, robot).kp is None and s.meta.payload_mass == payload_mass
+    ]
 
 
 def rollout_error(recordings: ListOf[Sequence], robot: RobotSpec) -> float:
     """Return the mean |error| of the operated joints over rollouts of recordings in gaponet, rad."""
     op = robot.operated_index
     rollouts = replay(recordings, robot, lock_idle=True)
-    return float(np.mean([mean_error(s.qpos[:, op], r.qpos[:, op]) for s, r in zip(recordings, rollouts, strict=True)]))
+    return float(
+        np.mean(
+            [
+                mean_error(s.qpos[:, op], r.qpos[:, op])
+                for s, r in zip(recordings, rollouts, strict=True)
+            ]
+        )
+    )
 
 
 def mean_error(recorded: np.ndarray, played: np.ndarray) -> float:
@@ -169,6 +207,12 @@ def check_motions(recordings: ListOf[Sequence], robot: RobotSpec) -> list[Sequen
     """Return the first motions by name, cut in length, for check.npz; targets are ramped as the servos ramp them."""
     first = {s.meta.motion: s for s in reversed(recordings)}
     low, high = robot.qpos_range.T
-    cut = [s.rows(slice(0, round(MAX_CHECK_MOTION_S / s.dt))) for s in list(first.values())[:MAX_CHECK_MOTIONS]]
+    cut = [
+        s.rows(slice(0, round(MAX_CHECK_MOTION_S / s.dt)))
+        for s in list(first.values())[:MAX_CHECK_MOTIONS]
+    ]
     speed = np.where(robot.target_speed > 0, robot.target_speed, np.inf)
-    return [replace(s, ctrl=speed_limited(np.clip(s.ctrl, low, high), s.qpos[0], speed, s.dt)) for s in cut]
+    return [
+        replace(s, ctrl=speed_limited(np.clip(s.ctrl, low, high), s.qpos[0], speed, s.dt))
+        for s in cut
+    ]

@@ -36,7 +36,9 @@ FILE = "randomization.json"
 SHIPPED = Path(__file__).parent / "shipped"
 LEAST_INVERSE = 0.2  # of a drawn value on an inverse axis, over the mean
 RANGE_SAMPLES = 4096
-UNDETERMINED_STD = 0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
+UNDETERMINED_STD = (
+    0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
+)
 MIN_ROBOTS = 3  # of a type
 
 
@@ -92,18 +94,30 @@ def sample_units(
         mean = each.mean(axis=0)
         deviations = (each - mean) * np.sqrt((1 + 1 / len(each)) / (len(each) - 1))
         what, factor = "days" if scope == "any-day" else "robots", _std_factor(len(each))
-        notes.append(f"from {len(each)} {what}: how far they differ is known to a factor of {factor:.1f}")
+        notes.append(
+            f"from {len(each)} {what}: how far they differ is known to a factor of {factor:.1f}"
+        )
     unknown = np.sqrt(np.einsum("njj->nj", covariance)) > UNDETERMINED_STD * prior_std(fields, now)
-    rng, count, single = np.random.default_rng(seed), max(RANGE_SAMPLES, samples), _uncorrelated_share(deviations)
+    rng, count, single = (
+        np.random.default_rng(seed),
+        max(RANGE_SAMPLES, samples),
+        _uncorrelated_share(deviations),
+    )
     weights = rng.standard_normal((count, len(deviations)))
     x = mean + np.sqrt(1 - single) * np.einsum("sd,dnp->snp", weights, deviations)
     x = x + np.sqrt(single * np.square(deviations).sum(axis=0)) * rng.standard_normal(x.shape)
     limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
     links, drawn = uncertainty.links if engine != "isaaclab" else None, dict[str, Array]()
     if links:
-        drawn["links"] = np.random.default_rng([seed, 1]).multivariate_normal(links.values, links.covariance, count)
+        drawn["links"] = np.random.default_rng([seed, 1]).multivariate_normal(
+            links.values, links.covariance, count
+        )
     elif spec.links:
-        why = "Isaac Lab may place or join bodies differently" if uncertainty.links else "no others are stored"
+        why = (
+            "Isaac Lab may place or join bodies differently"
+            if uncertainty.links
+            else "no others are stored"
+        )
         notes.append(f"all units have the identified links: {why}")
     for i, joint in enumerate(joints):
         error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
@@ -115,7 +129,9 @@ def sample_units(
     x = np.where(bounded, np.maximum(x, 0.0), x)
     inverse = [SERVO_FIELDS[f].axis == "inverse" for f in fields]
     optional = np.isin(fields, ("backlash", "no_load_speed"))
-    x = np.where(inverse, np.maximum(x, LEAST_INVERSE * mean), x)  # zero is no limit, which no range states
+    x = np.where(
+        inverse, np.maximum(x, LEAST_INVERSE * mean), x
+    )  # zero is no limit, which no range states
     x = np.where(optional & (mean == 0), 0.0, x)  # a joint without the effect gets none
     sampled, value = from_axes(fields, x), from_axes(fields, mean)
     ranges: dict[str, dict[str, tuple[float, float, float]]] = {j: {} for j in joints}
@@ -123,7 +139,9 @@ def sample_units(
         for field in fields:
             low, high = np.percentile(sampled[field][:, i], RANGE_PERCENT)
             ranges[joint][field] = float(low), float(value[field][i]), float(high)
-    names = tuple(f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k])
+    names = tuple(
+        f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k]
+    )
     axes = LinkAxes(spec.before_identification) if links else None
     units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit} | drawn).items()}
     return Randomization(spec.name, scope, units, ranges, names, tuple(notes), axes)
@@ -144,15 +162,24 @@ def judge_units(
     mass = recordings[0][0].meta.payload_mass if recordings and recordings[0] else 0.0
     train, validation = (comparable(part, robot, mass) for part in recordings or ((), ()))
     if made.scope != "today" or not train or not validation:
-        why = "no recording with the robot's own gains" if made.scope == "today" else f"scope {made.scope}"
-        return replace(made, notes=(*made.notes, f"{why}: the units were not compared with recordings"))
+        why = (
+            "no recording with the robot's own gains"
+            if made.scope == "today"
+            else f"scope {made.scope}"
+        )
+        return replace(
+            made, notes=(*made.notes, f"{why}: the units were not compared with recordings")
+        )
     judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
     if robot.has_servo_model:
         plain = draw_robots(robot, made.units, (train, validation), True, progress, engine_terms)
     units = {f: np.array(v) for f, v in judged.units.items()}
     ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items() if f != "links"}
     ranges = {
-        joint: {f: (float(ends[f][0, i]), value, float(ends[f][1, i])) for f, (_, value, _) in by_field.items()}
+        joint: {
+            f: (float(ends[f][0, i]), value, float(ends[f][1, i]))
+            for f, (_, value, _) in by_field.items()
+        }
         for i, (joint, by_field) in enumerate(made.ranges.items())
     }
     return replace(made, units=units, ranges=ranges, judged=judged, plain=plain)
@@ -245,12 +272,18 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
 def _written(units: Mapping[str, Any], axes: LinkAxes | None) -> dict[str, Any]:
     """Return units with links as MuJoCo has them, (units, bodies, 11)."""
     written = {f: np.round(v, 9) for f, v in units.items() if f != "links"}
-    return written | ({"links": [axes.inertials(np.array(row)) for row in units["links"]]} if axes else {})
+    return written | (
+        {"links": [axes.inertials(np.array(row)) for row in units["links"]]} if axes else {}
+    )
 
 
 def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows: joint, and low … high of each number that is not zero everywhere."""
-    fields = [SERVO_FIELDS[f] for f in next(iter(made.ranges.values())) if any(by[f][2] for by in made.ranges.values())]
+    fields = [
+        SERVO_FIELDS[f]
+        for f in next(iter(made.ranges.values()))
+        if any(by[f][2] for by in made.ranges.values())
+    ]
     rows: list[list[Any]] = [
         [j, *(f"{by[f.name][0] * f.factor:.3g} … {by[f.name][2] * f.factor:.3g}" for f in fields)]
         for j, by in made.ranges.items()

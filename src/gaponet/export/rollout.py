@@ -37,7 +37,9 @@ class RolloutPrediction:
         return np.asarray(np.abs(self.rollout - self.robot) <= self.half_width)
 
 
-def sample_robots(robot: RobotSpec, samples: int = SAMPLED_ROBOTS, seed: int = 0) -> list[RobotSpec]:
+def sample_robots(
+    robot: RobotSpec, samples: int = SAMPLED_ROBOTS, seed: int = 0
+) -> list[RobotSpec]:
     """Sample robots from the uncertainty of this robot's values today (export/randomization.py).
 
     Raises:
@@ -78,12 +80,16 @@ def predict(
             for k, q in enumerate(played)
         ]
     return [
-        RolloutPrediction(s.meta.motion, s.dt, s.ctrl[:, op], s.qpos[:, op], q, np.sqrt(error**2 + std**2))
+        RolloutPrediction(
+            s.meta.motion, s.dt, s.ctrl[:, op], s.qpos[:, op], q, np.sqrt(error**2 + std**2)
+        )
         for s, q, std in zip(rollouts, played, spread, strict=True)
     ]
 
 
-def summary(predictions: ListOf[RolloutPrediction], joints: ListOf[str]) -> dict[str, dict[str, Any]]:
+def summary(
+    predictions: ListOf[RolloutPrediction], joints: ListOf[str]
+) -> dict[str, dict[str, Any]]:
     """Return mean and largest differences of each joint over all rollouts, rad and shares of time."""
 
     def rows(values: Any) -> Array:
@@ -92,11 +98,17 @@ def summary(predictions: ListOf[RolloutPrediction], joints: ListOf[str]) -> dict
 
     difference = rows(lambda p: np.abs(p.rollout - p.robot))
     inside, band = rows(lambda p: p.inside), rows(lambda p: p.half_width)
-    rollout_behind, robot_behind = (rows(lambda p, f=f: np.abs(getattr(p, f) - p.target)) for f in ("rollout", "robot"))
-    first = np.concatenate([np.abs(p.rollout - p.robot)[1 : 1 + round(1 / p.dt)] for p in predictions])
+    rollout_behind, robot_behind = (
+        rows(lambda p, f=f: np.abs(getattr(p, f) - p.target)) for f in ("rollout", "robot")
+    )
+    first = np.concatenate(
+        [np.abs(p.rollout - p.robot)[1 : 1 + round(1 / p.dt)] for p in predictions]
+    )
     largest = np.array([np.abs(p.rollout - p.robot).max(axis=0) for p in predictions])
     worst = [predictions[i] for i in largest.argmax(axis=0)]
-    worst_at = [float(np.abs(p.rollout - p.robot)[:, j].argmax() * p.dt) for j, p in enumerate(worst)]
+    worst_at = [
+        float(np.abs(p.rollout - p.robot)[:, j].argmax() * p.dt) for j, p in enumerate(worst)
+    ]
     return {
         joint: {
             "rollout_behind": float(rollout_behind[:, j].mean()), "robot_behind": float(robot_behind[:, j].mean()),

@@ -56,7 +56,11 @@ def simulator_facts(
     plain_model = model if plain is None else build_model(plain, payload_mass, dt=dt)
     joints: dict[str, Any] = {}
     for i, name in enumerate(robot.joint_names):
-        law = {term: float(getattr(robot, term)[i]) for term in SERVO_TERMS} if robot.has_servo_model else {}
+        law = (
+            {term: float(getattr(robot, term)[i]) for term in SERVO_TERMS}
+            if robot.has_servo_model
+            else {}
+        )
         joints[name] = servo_facts(robot, model, i) | {"mujoco": joint_fields(model, name)} | law
     return {
         "format": 2, "robot": robot.name, "simulator": model_hash(robot), "units": UNITS, "meaning": MEANING,
@@ -94,12 +98,19 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
     assert option is not None
     set_attributes(option, timestep=model.opt.timestep)
     for i, pair in enumerate(root.iter("pair")):  # a table's stiffness is set after compilation
-        set_attributes(pair, **{name: getattr(model, f"pair_{name}")[i] for name in ("solref", "solimp", "friction")})
+        set_attributes(
+            pair,
+            **{
+                name: getattr(model, f"pair_{name}")[i] for name in ("solref", "solimp", "friction")
+            },
+        )
     servos = ET.SubElement(root, "actuator")
     for i in range(model.nu):
         name, bias = model.actuator(i).name, model.actuator_biasprm[i]
         if bias[0]:
-            servo = ET.SubElement(servos, "general", {"name": name, "joint": name, "biastype": "affine"})
+            servo = ET.SubElement(
+                servos, "general", {"name": name, "joint": name, "biastype": "affine"}
+            )
             set_attributes(servo, gainprm=model.actuator_gainprm[i, 0], biasprm=bias[:3])
         else:
             servo = ET.SubElement(servos, "position", {"name": name, "joint": name})
@@ -114,6 +125,11 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
     ET.indent(root)
     text = ET.tostring(root, encoding="unicode") + "\n"
     again = compile_spec(mujoco.MjSpec.from_string(text), robot.mjcf)
-    if list(model_fingerprint(again)) != list(model_fingerprint(model)) or again.opt.timestep != model.opt.timestep:
-        raise RobotError(f"{robot.mjcf}: with its servos it does not fit into one file that moves the same")
+    if (
+        list(model_fingerprint(again)) != list(model_fingerprint(model))
+        or again.opt.timestep != model.opt.timestep
+    ):
+        raise RobotError(
+            f"{robot.mjcf}: with its servos it does not fit into one file that moves the same"
+        )
     return text

@@ -49,7 +49,13 @@ class DeltaStep(nn.Module):
         self.register_buffer("high", high)
 
     def forward(
-        self, qpos: Tensor, qvel: Tensor, ctrl: Tensor, payload_mass: Tensor, frames: Tensor, fresh: Tensor
+        self,
+        qpos: Tensor,
+        qvel: Tensor,
+        ctrl: Tensor,
+        payload_mass: Tensor,
+        frames: Tensor,
+        fresh: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Return Δa, (B, n) rad, within the joint limits, and the new past. Gradients do not reach earlier periods.
 
@@ -81,9 +87,13 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
         ModelError: There is no checkpoint, or the model holds corrections, has sensors or reads the recorded state.
     """
     if model.config.holds:
-        raise ModelError(f"{model.path}: holds corrections or sensors, which torch exports do not; train without")
+        raise ModelError(
+            f"{model.path}: holds corrections or sensors, which torch exports do not; train without"
+        )
     if model.config.real_state:
-        raise ModelError(f"{model.path}: real_state is an input that torch exports lack; train without")
+        raise ModelError(
+            f"{model.path}: real_state is an input that torch exports lack; train without"
+        )
     return DeltaStep(trained_network(run, model.config, len(model.card["joint_names"])), model)
 
 
@@ -93,7 +103,9 @@ def program(step: DeltaStep) -> torch.export.ExportedProgram:
     rows = [torch.zeros(2, step.n) for _ in range(3)]
     past = [torch.zeros(2, step.depth, 3 * step.n), torch.ones(2, dtype=torch.bool)]
     with torch.no_grad():
-        return torch.export.export(step, (*rows, torch.zeros(2), *past), dynamic_shapes=({0: worlds},) * 6)
+        return torch.export.export(
+            step, (*rows, torch.zeros(2), *past), dynamic_shapes=({0: worlds},) * 6
+        )
 
 
 def export_program(model: GapModel, run: Path, folder: Path) -> float:

@@ -17,10 +17,19 @@ from gaponet.export.mjcf_edit import Source, text_of
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
 
-MISSING_FIELDS = ("kp", "kd", "armature", "delay", "offset", "zero")  # of a joint, which a URDF lacks
+MISSING_FIELDS = (
+    "kp",
+    "kd",
+    "armature",
+    "delay",
+    "offset",
+    "zero",
+)  # of a joint, which a URDF lacks
 
 
-def edit_urdf(path: Path, out: Path, facts: dict[str, Any], robot: RobotSpec) -> tuple[Path, list[str]]:
+def edit_urdf(
+    path: Path, out: Path, facts: dict[str, Any], robot: RobotSpec
+) -> tuple[Path, list[str]]:
     """Write a copy with the numbers of operated joints and of identified links.
 
     Args:
@@ -38,17 +47,26 @@ def edit_urdf(path: Path, out: Path, facts: dict[str, Any], robot: RobotSpec) ->
     source, prefix = Source(path.resolve()), facts["prefix"]
     if source.tags[0].name != "robot":
         raise RobotError(f"{path}: begins with <{source.tags[0].name}>, so it is no URDF")
-    tags = {t.attributes.get("name", ""): t for t in source.tags if t.name == "joint" and t.parent == "robot"}
+    tags = {
+        t.attributes.get("name", ""): t
+        for t in source.tags
+        if t.name == "joint" and t.parent == "robot"
+    }
     for name in robot.operated:
         if (tag := tags.get(prefix + name)) is None:
-            raise RobotError(f"{path}: has no joint '{prefix + name}' (--prefix); it has {', '.join(tags)}")
+            raise RobotError(
+                f"{path}: has no joint '{prefix + name}' (--prefix); it has {', '.join(tags)}"
+            )
         servo = facts["plain"][name]
         values = {"damping": text_of(servo["damping"]), "friction": text_of(servo["frictionloss"])}
         dynamics, limit = (source.child(tag, element) for element in ("dynamics", "limit"))
         if dynamics is not None:
             source.set(dynamics, **values)
         else:
-            source.insert(tag, f'    <dynamics damping="{values["damping"]}" friction="{values["friction"]}"/>')
+            source.insert(
+                tag,
+                f'    <dynamics damping="{values["damping"]}" friction="{values["friction"]}"/>',
+            )
         if limit is not None and np.isfinite(servo["effort_limit"]):
             source.set(limit, effort=text_of(servo["effort_limit"]))
     other = _set_links(source, robot, prefix)
@@ -70,7 +88,9 @@ def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
         if inertial is None or not np.isclose(own, before.body(name).mass[0], rtol=1e-2):
             other.append(name)
             continue
-        axes = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(text_of, link.inertia), strict=True)
+        axes = zip(
+            ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(text_of, link.inertia), strict=True
+        )
         numbers = " ".join(f'{axis}="{value}"' for axis, value in axes)
         source.replace(inertial, f'<inertial><origin xyz="{text_of(*link.pos)}"/><mass value="{text_of(link.mass)}"/>'
                                  f"<inertia {numbers}/></inertial>")  # fmt: skip

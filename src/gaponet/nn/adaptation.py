@@ -48,7 +48,9 @@ class Adaptation:
 
     def robot(self, simulator: RobotSpec) -> RobotSpec:
         """Return the simulator with the parameters of this unit."""
-        return simulator.with_servos({j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()})
+        return simulator.with_servos(
+            {j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()}
+        )
 
     def save(self, run: Path) -> Path:
         """Write RUN/adaptation/UNIT.json and return its path. It replaces an earlier file of this unit."""
@@ -78,14 +80,18 @@ class Adaptation:
         """
         units = sorted({s.meta.unit_id for s in sequences})
         if len(units) != 1:
-            raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
+            raise UsageError(
+                f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit"
+            )
         fitted = adapt(sequences, simulator, seconds, model.corrector(simulator), progress)
         servos = {
             j: {f: float(getattr(fitted.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
             for j in simulator.operated
         }
         logs = tuple(s.content_hash() for s in sequences)
-        return Adaptation(units[0], model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after)
+        return Adaptation(
+            units[0], model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after
+        )
 
     @classmethod
     def load(cls, run: Path, weights: str) -> dict[str, Adaptation]:

@@ -41,7 +41,8 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
         "kp": [float(robot.kp[i]) for i in robot.operated_index],
         "kd": [float(robot.kd[i]) for i in robot.operated_index],
         "qpos_range": [
-            [float(x) if np.isfinite(x) else None for x in robot.qpos_range[i]] for i in robot.operated_index
+            [float(x) if np.isfinite(x) else None for x in robot.qpos_range[i]]
+            for i in robot.operated_index
         ],
         "simulator": model_hash(robot),
         "model": asdict(config),
@@ -75,7 +76,9 @@ class _Card(TypedDict):
     model: dict[str, Json]
     qpos_range: NotRequired[tuple[tuple[float | None, float | None], ...]]
     dt: NotRequired[tuple[Annotated[float, Interval(ge=1e-4, le=1)], ...]]
-    payload_seen: NotRequired[Annotated[tuple[Annotated[float, Interval(ge=0, le=100)], ...], Len(1)]]
+    payload_seen: NotRequired[
+        Annotated[tuple[Annotated[float, Interval(ge=0, le=100)], ...], Len(1)]
+    ]
     units: NotRequired[tuple[str, ...]]
     recorded: NotRequired[dict[Literal["kp", "kd"], tuple[float, ...] | None]]
     virtual: NotRequired[bool]
@@ -95,12 +98,16 @@ class _Card(TypedDict):
     sha256: NotRequired[dict[str, Sha256]]
 
 
-def _require_output(network: Network, inputs: int, outputs: int, largest: float, file: Path) -> None:
+def _require_output(
+    network: Network, inputs: int, outputs: int, largest: float, file: Path
+) -> None:
     """Refuse a network whose output for inputs (k, inputs) is not (k, outputs), finite, and at most `largest` rad."""
     try:
         deltas = [network(np.zeros((k, inputs), np.float32)) for k in (1, 2)]
         fits = all(delta.shape == (k, outputs) for k, delta in enumerate(deltas, 1))
-        fits = fits and all(np.isfinite(delta).all() and np.abs(delta).max() <= largest + 1e-3 for delta in deltas)
+        fits = fits and all(
+            np.isfinite(delta).all() and np.abs(delta).max() <= largest + 1e-3 for delta in deltas
+        )
         reason = f"{inputs} numbers in do not give {outputs} finite ones up to {largest:g} rad out"
     except Exception as error:  # an unknown network can raise anything
         fits, reason = False, f"it does not run: {' '.join(str(error).split())[:120]}"
@@ -136,21 +143,27 @@ class GapModel:
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
         for name in (CARD, WEIGHTS):
             if not (folder / name).is_file():
-                raise ModelError(f"{path}: no {name}; give a run folder of gaponet train, or an artifact folder")
+                raise ModelError(
+                    f"{path}: no {name}; give a run folder of gaponet train, or an artifact folder"
+                )
         card, config = GapModel.read_card(folder / CARD)
         file = folder / WEIGHTS
         network = OnnxNetwork.read(file, threads)
         n = len(card["joint_names"])
         _require_output(network, config.input_dim(n), n, config.delta_max, file)
         if card.get("sha256", {}).get(WEIGHTS, digest := sha256(file)) != digest:
-            raise ModelError(f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN again")
+            raise ModelError(
+                f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN again"
+            )
         return cls(folder, card, config, network)
 
     @property
     def qpos_range(self) -> Array:
         """Limits of the operated joints, (n, 2) rad; ±inf where there is none, or the card does not have them."""
         limits = self.card.get("qpos_range", [[None, None]] * len(self.card["joint_names"]))
-        return np.array([[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits])
+        return np.array(
+            [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits]
+        )
 
     def loop(self, num_envs: int = 1) -> DeltaLoop:
         """Return the control loop of num_envs robots: loop.delta(qpos, qvel, ctrl, payload_mass).
@@ -278,7 +291,9 @@ class GapModel:
         lists |= {f"recorded.{name}": values for name, values in card.get("recorded", {}).items()}
         for name, values in lists.items():
             if values is not None and len(values) != n:
-                raise ModelError(f"{file}: {name}: should have one entry for each of {n} joints; {mend}")
+                raise ModelError(
+                    f"{file}: {name}: should have one entry for each of {n} joints; {mend}"
+                )
         for low, high in card.get("qpos_range", []):
             if low is not None and high is not None and not low < high:
                 raise ModelError(f"{file}: qpos_range: {low} to {high} is no range; {mend}")
@@ -292,7 +307,9 @@ class GapModel:
         stages = card["stages"]
         (done, planned), updates = stages.get("pretraining_rounds", (0, 0)), stages["ppo_updates"]
         if not planned and updates:
-            return f"{updates} updates of PPO from the untrained network, no supervised pre-training"
+            return (
+                f"{updates} updates of PPO from the untrained network, no supervised pre-training"
+            )
         rounds = f"{done} rounds" if done >= planned else f"{done} of {planned} rounds"
         pretraining = f"supervised pre-training ({rounds})"
         if stages.get("ppo_from_untrained"):

@@ -90,7 +90,9 @@ class ModelConfig:
                 "mlp_match or shared_mlp without mlp_hidden: give the proportions of the hidden layers, e.g. 4 2 1"
             )
         if self.delta_hold > 1 and self.sensor_hold > 1:
-            raise UsageError(f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them")
+            raise UsageError(
+                f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them"
+            )
 
     def require_kind(self) -> None:
         """Refuse options of the paper's network in another one. The command line sets the kind after these options.
@@ -100,7 +102,9 @@ class ModelConfig:
         """
         for name in PAPER_ONLY if self.kind != "paper" else ():
             if (value := getattr(self, name)) != getattr(ModelConfig, name):
-                raise UsageError(f"{name} {value}: model {self.kind} has no such switch; use --model paper")
+                raise UsageError(
+                    f"{name} {value}: model {self.kind} has no such switch; use --model paper"
+                )
 
     @property
     def holds(self) -> bool:

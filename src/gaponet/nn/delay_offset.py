@@ -61,7 +61,9 @@ class DelayOffset:
             rollouts = replay(pieces, robot, candidate.corrector(robot), nthread, lock_idle=True)
             for k, (j, name) in enumerate(zip(op, names, strict=True)):
                 pairs = zip(pieces, rollouts, strict=True)
-                errors = [(s.qpos - r.qpos)[1:, j] for s, r in pairs if name not in s.meta.unrecorded]
+                errors = [
+                    (s.qpos - r.qpos)[1:, j] for s, r in pairs if name not in s.meta.unrecorded
+                ]
                 e = np.concatenate(errors or [np.zeros(1)])
                 offset[i, k] = np.median(e)
                 error[i, k] = np.abs(e - offset[i, k]).mean()
@@ -72,7 +74,9 @@ class DelayOffset:
         )
 
     @staticmethod
-    def pieces(sequences: ListOf[Sequence], seconds: float = PIECE_S, max_rows: int = MAX_FIT_ROWS) -> list[Sequence]:
+    def pieces(
+        sequences: ListOf[Sequence], seconds: float = PIECE_S, max_rows: int = MAX_FIT_ROWS
+    ) -> list[Sequence]:
         """Cut sequences into pieces, and take an even subset with about max_rows rows."""
         pieces = []
         for s in sequences:
@@ -90,7 +94,9 @@ class DelayOffsetCorrector:
         self.range = robot.qpos_range[self.operated]
         for joint in robot.operated:
             if joint not in values.delay or joint not in values.offset:
-                raise ModelError(f"delay and offset of joint '{joint}' are not known (delay_offset.json); train again")
+                raise ModelError(
+                    f"delay and offset of joint '{joint}' are not known (delay_offset.json); train again"
+                )
         self.delay = np.array([values.delay[j] for j in robot.operated])
         self.offset = np.array([values.offset[j] for j in robot.operated])
         self.periods = np.zeros((0, len(self.delay)), int)  # delay in control periods, (k, n)
@@ -98,7 +104,9 @@ class DelayOffsetCorrector:
 
     def reset(self, start: ListOf[Sequence]) -> None:
         """Start one simulation per sequence."""
-        self.periods = np.round(self.delay[None, :] / np.array([s.dt for s in start])[:, None]).astype(int)
+        self.periods = np.round(
+            self.delay[None, :] / np.array([s.dt for s in start])[:, None]
+        ).astype(int)
         self.past = []
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
@@ -110,5 +118,7 @@ class DelayOffsetCorrector:
         index = np.maximum(len(past) - 1 - self.periods, 0)
         delayed = np.take_along_axis(past, index[None], axis=0)[0]
         corrected = np.array(target, float)
-        corrected[:, self.operated] = np.clip(delayed + self.offset, self.range[:, 0], self.range[:, 1])
+        corrected[:, self.operated] = np.clip(
+            delayed + self.offset, self.range[:, 0], self.range[:, 1]
+        )
         return corrected

@@ -19,11 +19,16 @@ from gaponet.nn.observation import Layout
 MAX_FEATURE = 5.0  # standard deviations; larger features are clamped
 
 
-def dense(inputs: int, hidden: Sequence[int], outputs: int, zero_output: bool = False) -> nn.Sequential:
+def dense(
+    inputs: int, hidden: Sequence[int], outputs: int, zero_output: bool = False
+) -> nn.Sequential:
     """Return linear layers with ELU between them. With zero_output, the initial output is 0."""
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU(inplace=True)]  # in place: half the memory traffic
+        layers += [
+            nn.Linear(inputs, width),
+            nn.ELU(inplace=True),
+        ]  # in place: half the memory traffic
         inputs = width
     head = nn.Linear(inputs, outputs)
     if zero_output:
@@ -77,10 +82,14 @@ class Features(nn.Module):
         self.layout = Layout(config, n)
         self.dim = self.layout.query.stop
         self.standardise = Standardise(self.dim)
-        moved = self.layout.shifted(np.eye(n))[:, self.layout.query]  # features that a shift of each joint changes
+        moved = self.layout.shifted(np.eye(n))[
+            :, self.layout.query
+        ]  # features that a shift of each joint changes
         moved[:, self.layout.q] = 0.0
         self.register_buffer("position_column", torch.from_numpy(moved.argmax(0)), persistent=False)
-        self.register_buffer("is_position", torch.from_numpy(moved.max(0)).float(), persistent=False)
+        self.register_buffer(
+            "is_position", torch.from_numpy(moved.max(0)).float(), persistent=False
+        )
 
     def relative(self, x: Tensor) -> Tensor:
         """(B, dim of x) → (B, dim): subtract q_t from past positions, past targets and a_t."""

@@ -35,7 +35,12 @@ class DeltaLoop:
     """
 
     def __init__(
-        self, config: ModelConfig, qpos_range: Array, num_envs: int, network: Network | None = None, like: Any = None
+        self,
+        config: ModelConfig,
+        qpos_range: Array,
+        num_envs: int,
+        network: Network | None = None,
+        like: Any = None,
     ) -> None:
         """
         Args:
@@ -46,18 +51,23 @@ class DeltaLoop:
         n = len(qpos_range)
         self.config, self.n, self.num_envs = config, n, num_envs
         self.layout = layout = Layout(config, n)
-        self.x = x = zeros_like(np.empty(0, np.float32) if like is None else like, num_envs, layout.dim)
+        self.x = x = zeros_like(
+            np.empty(0, np.float32) if like is None else like, num_envs, layout.dim
+        )
         self.history = History(config, n, x)
         self._numpy, self._xp = isinstance(x, np.ndarray), array_module(x)
         # Internal arrays of one robot have one dimension: numpy needs half the time.
         shape = (n,) if num_envs == 1 else (num_envs, n)
         self._shapes = {shape, (num_envs, n)}
         rows = x[0] if num_envs == 1 else x
-        self._q, self._v, self._action = (rows[..., part] for part in (layout.q, layout.v, layout.action))
+        self._q, self._v, self._action = (
+            rows[..., part] for part in (layout.q, layout.v, layout.action)
+        )
         self._payload = x[:, layout.payload.start] if config.payload_input else None
         self.answer = self._bind(network, shape)
         self.low, self.high = (
-            np.array(side, float) if self._numpy else x.new_tensor(side) for side in np.transpose(qpos_range)
+            np.array(side, float) if self._numpy else x.new_tensor(side)
+            for side in np.transpose(qpos_range)
         )
         self._applied: Any = zeros_like(x, *shape)
         self.holds, self.age = config.holds, zeros_like(x, num_envs)
@@ -150,13 +160,19 @@ class DeltaLoop:
                 f"delta: qpos {q}, qvel {v}, ctrl {a}; give the {self.n} operated joints of {self.num_envs} robots "
                 "each, or make another loop for another number of robots: model.loop(num_envs)"
             )
-        if not (self._numpy and np.vdot(ctrl, ctrl) < np.inf):  # the fastest test for finite numbers
+        if not (
+            self._numpy and np.vdot(ctrl, ctrl) < np.inf
+        ):  # the fastest test for finite numbers
             ctrl = self._finite(qpos, ctrl)
         self.observe(qpos, qvel, ctrl, payload_mass)
         delta = self.answer()
         if self.config.delta_hold > 1:
-            delta = self.held = self._xp.where(self._due(self.config.delta_hold)[1], delta, self.held)
-        self._applied = applied = self._xp.minimum(self._xp.maximum(ctrl + delta, self.low), self.high)
+            delta = self.held = self._xp.where(
+                self._due(self.config.delta_hold)[1], delta, self.held
+            )
+        self._applied = applied = self._xp.minimum(
+            self._xp.maximum(ctrl + delta, self.low), self.high
+        )
         if self.holds:
             self.push(qpos, qvel, applied)
         else:
@@ -164,7 +180,14 @@ class DeltaLoop:
         return applied - ctrl
 
     def solve(
-        self, qpos: Array, qvel: Array, wanted: Array, payload_mass: Array, offset: Array, gain: float, iterations: int
+        self,
+        qpos: Array,
+        qvel: Array,
+        wanted: Array,
+        payload_mass: Array,
+        offset: Array,
+        gain: float,
+        iterations: int,
     ) -> Array:
         """Invert the correction: return u with u + Δa(u) = wanted. Call this instead of `delta`, once per period.
 
@@ -222,13 +245,17 @@ class DeltaCorrector:
 
     def reset(self, start: ListOf[Sequence]) -> None:
         """Start one simulation per sequence at its first row. That row is repeated as history."""
-        loop = DeltaLoop(self.config, self.robot.qpos_range[self.operated], len(start), self.network)
+        loop = DeltaLoop(
+            self.config, self.robot.qpos_range[self.operated], len(start), self.network
+        )
         self.payload = np.array([s.meta.payload_mass for s in start], np.float32)
         if self.config.needs_simulator:
             from gaponet.nn.sensor import ProbeOracle
             from gaponet.sim.batch import Condition
 
-            oracle = ProbeOracle(self.robot, self.config, [Condition.of(s, self.robot) for s in start])
+            oracle = ProbeOracle(
+                self.robot, self.config, [Condition.of(s, self.robot) for s in start]
+            )
 
             def answers() -> Array:
                 assert self._state is not None

@@ -34,10 +34,14 @@ class OperatorNet(DeltaNet):
             inputs = config.observation_dim(n)
             self.predictor = SensorPredictor(inputs, config.sensor_hidden, config.sensor_dim(n))
         branch, trunk = self.joint_columns(config, n)
-        self.register_buffer("columns", torch.from_numpy(np.hstack([branch, trunk]).ravel()), persistent=False)
+        self.register_buffer(
+            "columns", torch.from_numpy(np.hstack([branch, trunk]).ravel()), persistent=False
+        )
         self.branch_inputs, self.trunk_inputs = branch.shape[1], trunk.shape[1]
         self.branch = dense(self.branch_inputs, config.branch_hidden, config.num_basis)
-        self.trunk = dense(self.trunk_inputs, config.trunk_hidden, config.num_basis, zero_output=True)
+        self.trunk = dense(
+            self.trunk_inputs, config.trunk_hidden, config.num_basis, zero_output=True
+        )
         self.bias = nn.Parameter(torch.zeros(n))
 
     @staticmethod
@@ -65,14 +69,19 @@ class OperatorNet(DeltaNet):
         if self.config.sensors != "off":
             z = torch.cat([z, self.sensors(z)], dim=1)
         z = pad(pad(z, (0, 1)), (0, 1), value=1.0)
-        return z.index_select(1, self.columns).reshape(-1, self.n, self.branch_inputs + self.trunk_inputs)
+        return z.index_select(1, self.columns).reshape(
+            -1, self.n, self.branch_inputs + self.trunk_inputs
+        )
 
     def correct(self, prepared: Tensor) -> Tensor:
         """⟨branch, trunk⟩ + c → Δa, (B, n) rad."""
         rows = prepared.flatten(0, -2)  # two-dimensional, so that linear layers copy nothing
         branch_rows, trunk_rows = rows[:, : self.branch_inputs], rows[:, self.branch_inputs :]
         shape = (-1, self.n, self.config.num_basis)
-        branch, trunk = self.branch(branch_rows).reshape(shape), self.trunk(trunk_rows).reshape(shape)
+        branch, trunk = (
+            self.branch(branch_rows).reshape(shape),
+            self.trunk(trunk_rows).reshape(shape),
+        )
         return self.bounded((branch * trunk).sum(-1) + self.bias)
 
     def sensors(self, z: Tensor) -> Tensor:
@@ -86,7 +95,9 @@ class DeltaMLP(DeltaNet):
     def __init__(self, config: ModelConfig, n: int, hidden: Sequence[int] | None = None) -> None:
         """hidden: Widths of the hidden layers; default config.mlp_hidden."""
         super().__init__(config, n)
-        self.net = dense(self.features.dim, config.mlp_hidden if hidden is None else hidden, n, zero_output=True)
+        self.net = dense(
+            self.features.dim, config.mlp_hidden if hidden is None else hidden, n, zero_output=True
+        )
 
     def correct(self, prepared: Tensor) -> Tensor:
         return self.bounded(self.net(prepared))
@@ -125,7 +136,9 @@ class SharedMLP(OperatorNet):
         inputs = self.branch_inputs + self.trunk_inputs
         weights = num_parameters(self.branch) + num_parameters(self.trunk) + n
         del self.branch, self.trunk, self.bias
-        hidden = DeltaMLP.matched_hidden(config.mlp_hidden, weights, lambda widths: dense(inputs, widths, 1))
+        hidden = DeltaMLP.matched_hidden(
+            config.mlp_hidden, weights, lambda widths: dense(inputs, widths, 1)
+        )
         self.net = dense(inputs, hidden, 1, zero_output=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
@@ -148,5 +161,7 @@ def build_network(config: ModelConfig, n: int) -> DeltaNet:
         return NETWORKS[config.kind](config, n)
     with torch.device("meta"):  # shapes only
         parameters = num_parameters(OperatorNet(replace(config, kind="gaponet"), n))
-    hidden = DeltaMLP.matched_hidden(config.mlp_hidden, parameters, lambda widths: DeltaMLP(config, n, widths))
+    hidden = DeltaMLP.matched_hidden(
+        config.mlp_hidden, parameters, lambda widths: DeltaMLP(config, n, widths)
+    )
     return DeltaMLP(config, n, hidden)

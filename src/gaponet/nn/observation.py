@@ -29,7 +29,10 @@ class Layout:
     def __init__(self, config: ModelConfig, n: int) -> None:
         self.n, self.history = n, config.history
         o = config.observation_dim(n)
-        answers, real = config.sensor_dim(n) * config.needs_simulator, (2 * n + 1) * config.real_state
+        answers, real = (
+            config.sensor_dim(n) * config.needs_simulator,
+            (2 * n + 1) * config.real_state,
+        )
         sizes = (n, n, 3 * n * config.history, int(config.payload_input), n, answers, real)
         parts = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
         self.q, self.v, self.past, self.payload, self.action, self.sensors, self.real = parts
@@ -41,7 +44,9 @@ class Layout:
         k, n = shift.shape
         out = np.zeros((k, self.dim))
         out[:, self.q] = out[:, self.action] = shift
-        out[:, self.past] = np.tile(np.concatenate([shift, np.zeros((k, n)), shift], axis=1), (1, self.history))
+        out[:, self.past] = np.tile(
+            np.concatenate([shift, np.zeros((k, n)), shift], axis=1), (1, self.history)
+        )
         return out
 
 
@@ -68,8 +73,16 @@ class History:
         self._numpy = isinstance(x, np.ndarray)
         # Internal arrays of one robot have one dimension: numpy needs half the time.
         memory, self._present = (a[0] if len(x) == 1 else a for a in (memory, x[:, layout.state]))
-        self._q, self._v, self._u = memory[..., :n], memory[..., n : 2 * n], memory[..., 2 * n : 3 * n]
-        self._state, self._newer, self._older = memory[..., : 2 * n], memory[..., : -3 * n], memory[..., 3 * n :]
+        self._q, self._v, self._u = (
+            memory[..., :n],
+            memory[..., n : 2 * n],
+            memory[..., 2 * n : 3 * n],
+        )
+        self._state, self._newer, self._older = (
+            memory[..., : 2 * n],
+            memory[..., : -3 * n],
+            memory[..., 3 * n :],
+        )
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, u: Any) -> None:
         """Fill histories with frames from before the start, never with zeros.

@@ -68,7 +68,10 @@ class _FusedFeatures(nn.Module):
         super().__init__()
         mean, std = net.features.standardise.mean, net.features.standardise.std
         relative, zero = net.features.relative(torch.eye(len(mean))), torch.zeros(1, len(mean))
-        weight, bias = net.arrange(relative / std) - net.arrange(zero), net.arrange(zero - mean / std)
+        weight, bias = (
+            net.arrange(relative / std) - net.arrange(zero),
+            net.arrange(zero - mean / std),
+        )
         self.net, self.shape = net, bias.shape[1:]
         self.register_buffer("weight", weight.flatten(1).T)
         self.register_buffer("bias", bias.flatten())
@@ -101,12 +104,16 @@ def trained_network(run: Path, config: ModelConfig, n: int) -> DeltaNet:
     """
     path = run / "checkpoint.pt"
     if not path.is_file():
-        raise ModelError(f"{run}: no checkpoint.pt; give a run folder of gaponet train, not the artifact alone")
+        raise ModelError(
+            f"{run}: no checkpoint.pt; give a run folder of gaponet train, not the artifact alone"
+        )
     net = build_network(config, n)
     try:
         net.load_state_dict(torch.load(path, weights_only=True)["best_state"])
     except (RuntimeError, KeyError, EOFError, ValueError) as error:
-        raise ModelError(f"{path}: does not fit this model or is damaged ({str(error).splitlines()[0]})") from None
+        raise ModelError(
+            f"{path}: does not fit this model or is damaged ({str(error).splitlines()[0]})"
+        ) from None
     return net.eval()
 
 
@@ -117,5 +124,11 @@ def sample_inputs(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
     z = torch.randn(count, features.dim, generator=generator)
     relative = features.standardise.mean + features.standardise.std * z
     # relative(x) is linear in x.
-    x = torch.linalg.solve(features.relative(torch.eye(features.dim)).T.double(), relative.double().T).T
-    return torch.nn.functional.pad(x.float(), (0, net.config.input_dim(net.n) - features.dim)).contiguous().numpy()
+    x = torch.linalg.solve(
+        features.relative(torch.eye(features.dim)).T.double(), relative.double().T
+    ).T
+    return (
+        torch.nn.functional.pad(x.float(), (0, net.config.input_dim(net.n) - features.dim))
+        .contiguous()
+        .numpy()
+    )

@@ -26,7 +26,9 @@ class OnnxNetwork:
         options = ort.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads do not use a core
+        options.add_session_config_entry(
+            "session.intra_op.allow_spinning", "0"
+        )  # idle threads do not use a core
         self.session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
     def __call__(self, x: Array) -> Array:
@@ -40,7 +42,9 @@ class OnnxNetwork:
             shape: Shape of the result. All calls return the same array.
         """
         delta, binding = self(x), self.session.io_binding()
-        value = _onnxruntime().OrtValue.ortvalue_from_numpy  # on the CPU it shares the array's memory
+        value = (
+            _onnxruntime().OrtValue.ortvalue_from_numpy
+        )  # on the CPU it shares the array's memory
         binding.bind_ortvalue_input("x", value(x))
         binding.bind_ortvalue_output(self.session.get_outputs()[0].name, value(delta))
         run, result = self.session.run_with_iobinding, delta.reshape(shape)
@@ -71,7 +75,9 @@ def _onnxruntime() -> Any:
     try:
         import onnxruntime
     except ImportError:
-        raise ModelError("onnxruntime is not installed; run: pip install 'gaponet[deploy]'") from None
+        raise ModelError(
+            "onnxruntime is not installed; run: pip install 'gaponet[deploy]'"
+        ) from None
     return onnxruntime
 
 
@@ -81,6 +87,8 @@ def _test(path: Path) -> None:
         network = OnnxNetwork(path.read_bytes())
     except Exception as error:  # onnxruntime's errors have no base of their own
         reason = " ".join(str(error).split())[:120]
-        raise ModelError(f"{path}: not a readable ONNX file ({reason}); train or copy it again") from None
+        raise ModelError(
+            f"{path}: not a readable ONNX file ({reason}); train or copy it again"
+        ) from None
     for x in (0.0, 1.0, -1.0):
         network(np.full((2, network.session.get_inputs()[0].shape[1]), x, np.float32))

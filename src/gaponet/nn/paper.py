@@ -83,14 +83,22 @@ class PaperNet(DeltaNet):
         super().__init__(config, n)
         layout, sensors, outputs = self.features.layout, config.sensor_dim(n), config.num_basis * n
         self.observation = layout.observation
-        self.query = slice(layout.payload.start if config.payload_trunk else layout.action.start, layout.action.stop)
+        self.query = slice(
+            layout.payload.start if config.payload_trunk else layout.action.start,
+            layout.action.stop,
+        )
         queries = self.query.stop - self.query.start
-        self.observation_scale, self.query_scale = Standardise(self.observation.stop), Standardise(queries)
+        self.observation_scale, self.query_scale = (
+            Standardise(self.observation.stop),
+            Standardise(queries),
+        )
         self.probes: nn.Parameter | None = None
         if config.needs_simulator:
             self.sensor_scale = Standardise(sensors)
         elif config.sensor_source == "learned":
-            start = torch.from_numpy(ProbeOracle.probe_offsets(config, n)).float() / config.probe_limit
+            start = (
+                torch.from_numpy(ProbeOracle.probe_offsets(config, n)).float() / config.probe_limit
+            )
             self.probes = nn.Parameter(start.atanh())
             self.predictor = SensorPredictor(self.observation.stop + n, PREDICTOR_HIDDEN, 2 * n)
         else:
@@ -98,7 +106,9 @@ class PaperNet(DeltaNet):
         self.real_state_scale = [*(scale for scale in REAL_STATE_SCALES for _ in range(n)), 1.0]
         observations = self.observation.stop * config.branch_observation
         self.extra_inputs = observations + len(self.real_state_scale) * config.real_state
-        self.branch = nn.Sequential(*dense(self.extra_inputs + sensors, BRANCH_HIDDEN, outputs), nn.ELU())
+        self.branch = nn.Sequential(
+            *dense(self.extra_inputs + sensors, BRANCH_HIDDEN, outputs), nn.ELU()
+        )
         self.trunk = dense(queries, TRUNK_HIDDEN, outputs, zero_output=True)
 
     def fit_inputs(self, x: Tensor) -> None:
@@ -135,18 +145,30 @@ class PaperNet(DeltaNet):
         state_weight, probe_weight = first.weight.split([observations, self.n], dim=1)
         state = linear(inputs[:, :observations], state_weight)
         probes = linear(self.probes.tanh(), probe_weight, first.bias)
-        mean, log_var = SensorPredictor.distribution(self.predictor.net[1:](state.unsqueeze(1) + probes))  # (B, m, 2n)
+        mean, log_var = SensorPredictor.distribution(
+            self.predictor.net[1:](state.unsqueeze(1) + probes)
+        )  # (B, m, 2n)
         if not self.training:
             return mean.flatten(1)
-        return torch.addcmul(mean.flatten(1), inputs[:, observations:], (0.5 * log_var).exp().flatten(1))
+        return torch.addcmul(
+            mean.flatten(1), inputs[:, observations:], (0.5 * log_var).exp().flatten(1)
+        )
 
     def prepare(self, x: Tensor) -> Tensor:
         """x → [trunk input | extra branch inputs | S]."""
         z, config = self.sensor_inputs(x), self.config
         relative = self.features(x) if config.branch_observation or config.relative_action else x
         extra = [relative[:, self.observation]] if config.branch_observation else []
-        extra += [x[:, self.features.layout.real] / x.new_tensor(self.real_state_scale)] if config.real_state else []
-        query = relative[:, self.query] if config.relative_action else self.query_scale(x[:, self.query])
+        extra += (
+            [x[:, self.features.layout.real] / x.new_tensor(self.real_state_scale)]
+            if config.real_state
+            else []
+        )
+        query = (
+            relative[:, self.query]
+            if config.relative_action
+            else self.query_scale(x[:, self.query])
+        )
         return torch.cat([query, *extra, self.sensors(x, z)], dim=1)
 
     def correct(self, prepared: Tensor) -> Tensor:

@@ -29,9 +29,14 @@ class ProbeOracle:
     ) -> None:
         """conditions: Payload, rate and gains of each state. States have the joints that are not in `locked`."""
         self.offsets = self.probe_offsets(config, len(robot.operated))
-        self.dt, self.absolute = np.array([c[2] for c in conditions]), config.sensor_target == "absolute"
+        self.dt, self.absolute = (
+            np.array([c[2] for c in conditions]),
+            config.sensor_target == "absolute",
+        )
         m = len(self.offsets)
-        no_delay = np.zeros(len(robot.joint_names))  # a delayed servo would not respond within the control period
+        no_delay = np.zeros(
+            len(robot.joint_names)
+        )  # a delayed servo would not respond within the control period
         copies = [c for c in conditions for _ in range(m)]
         self.sim = sim = BatchSim(replace(robot, delay=no_delay), copies, nthread, locked)
         self.operated = np.array([sim.joint_names.index(name) for name in robot.operated])
@@ -62,11 +67,17 @@ class ProbeOracle:
         rows, state = np.arange(k * m), np.repeat(np.arange(k), m)
         q, v = qpos[state], qvel[state]
         target = q.astype(float)
-        target[:, op] += np.tile(self.offsets, (k, 1)) if offsets is None else offsets.reshape(k * m, -1)
+        target[:, op] += (
+            np.tile(self.offsets, (k, 1)) if offsets is None else offsets.reshape(k * m, -1)
+        )
         sim.reset(rows, q, v, past=target[:, None])
         self.target[rows] = target
         sim.step(self.target, None if len(rows) == sim.num_envs else rows)
         start = 0.0 if self.absolute else 1.0
         positions = sim.qpos[rows][:, op] - start * q[:, op]
         velocities = (sim.qvel[rows][:, op] - start * v[:, op]) * self.dt[state][:, None]
-        return np.concatenate([positions, velocities], axis=1).astype(np.float32).reshape(k, m, 2 * len(op))
+        return (
+            np.concatenate([positions, velocities], axis=1)
+            .astype(np.float32)
+            .reshape(k, m, 2 * len(op))
+        )

@@ -20,8 +20,14 @@ from gaponet.nn.layers import DeltaNet
 
 TREES, LEAVES, MAX_DEPTH = 120, 31, 8  # per joint; per tree
 NODES = 2 * LEAVES - 1
-MIN_LEAF_ROWS, MAX_ROWS, MEASURED_ROWS = 60, 60_000, 2_000  # of a leaf; of the fit of a joint; of the error of a fit
-MAX_DIFFERENCE = 1e-4  # between scikit-learn and the stored trees, in units of the RMS of the labels
+MIN_LEAF_ROWS, MAX_ROWS, MEASURED_ROWS = (
+    60,
+    60_000,
+    2_000,
+)  # of a leaf; of the fit of a joint; of the error of a fit
+MAX_DIFFERENCE = (
+    1e-4  # between scikit-learn and the stored trees, in units of the RMS of the labels
+)
 
 
 def trees_available() -> bool:
@@ -84,7 +90,9 @@ class TreesNet(DeltaNet):
             ModelError: It stores trees in another form than the versions that gaponet knows.
         """
         if not trees_available():
-            raise UsageError("--model trees: scikit-learn is not installed; run: pip install 'gaponet[trees]'")
+            raise UsageError(
+                "--model trees: scikit-learn is not installed; run: pip install 'gaponet[trees]'"
+            )
         from sklearn.ensemble import HistGradientBoostingRegressor as Ensemble
 
         rows = np.random.default_rng(seed).permutation(len(x))[: self.n * MAX_ROWS]
@@ -96,9 +104,18 @@ class TreesNet(DeltaNet):
                     early_stopping=False,
                 ).fit(inputs[some], column[some])  # fmt: skip
                 self._store(j, ensemble)
-                stored = self._sums(torch.from_numpy(inputs[some[:MIN_LEAF_ROWS]]).to(x.device))[:, j].cpu().numpy()
-                if not np.abs(stored - ensemble.predict(inputs[some[:MIN_LEAF_ROWS]])).max() < MAX_DIFFERENCE:
-                    raise ModelError("this scikit-learn stores trees in an unknown form; install 1.5 to 1.9")
+                stored = (
+                    self._sums(torch.from_numpy(inputs[some[:MIN_LEAF_ROWS]]).to(x.device))[:, j]
+                    .cpu()
+                    .numpy()
+                )
+                if (
+                    not np.abs(stored - ensemble.predict(inputs[some[:MIN_LEAF_ROWS]])).max()
+                    < MAX_DIFFERENCE
+                ):
+                    raise ModelError(
+                        "this scikit-learn stores trees in an unknown form; install 1.5 to 1.9"
+                    )
         error = self(x[rows[:MEASURED_ROWS]]).cpu().numpy() - targets[:MEASURED_ROWS]
         return np.array([np.nanmean(error**2)])
 
@@ -106,13 +123,23 @@ class TreesNet(DeltaNet):
         """Copy the trees of joint j; scikit-learn has no public access to them."""
         for t, (tree,) in enumerate(ensemble._predictors):
             nodes, start = tree.nodes, (j * TREES + t) * NODES
-            leaf, own, part = nodes["is_leaf"].astype(bool), np.arange(len(nodes)), slice(start, start + len(nodes))
+            leaf, own, part = (
+                nodes["is_leaf"].astype(bool),
+                np.arange(len(nodes)),
+                slice(start, start + len(nodes)),
+            )
             children = [start + np.where(leaf, own, nodes[side]) for side in ("left", "right")]
             limits = np.where(leaf, 0.0, nodes["num_threshold"])
-            near = limits.astype(np.float32)  # rounded down: float32 inputs then fall on the same side
+            near = limits.astype(
+                np.float32
+            )  # rounded down: float32 inputs then fall on the same side
             lower = np.where(near > limits, np.nextafter(near, np.float32(-np.inf)), near)
             self.feature[part] = torch.from_numpy(np.where(leaf, 0, nodes["feature_idx"]))
             self.threshold[part] = torch.from_numpy(lower)
-            self.child[2 * part.start : 2 * part.stop] = torch.from_numpy(np.stack(children, axis=1).ravel())
-            self.value[part] = torch.from_numpy(np.where(leaf, nodes["value"], 0.0).astype(np.float32))
+            self.child[2 * part.start : 2 * part.stop] = torch.from_numpy(
+                np.stack(children, axis=1).ravel()
+            )
+            self.value[part] = torch.from_numpy(
+                np.where(leaf, nodes["value"], 0.0).astype(np.float32)
+            )
         self.base[j] = ensemble._baseline_prediction.item()

@@ -56,7 +56,9 @@ class Candidate:
         """
         if not is_robot(folder):
             return cls(folder, corrected_robot(folder, robot), GapModel.load(folder))
-        own = require_same_robot(load_robot(folder), robot, folder, RobotError, "data of this robot")
+        own = require_same_robot(
+            load_robot(folder), robot, folder, RobotError, "data of this robot"
+        )
         if own.nominal is None:
             raise UsageError(
                 f"{folder}: nothing was identified of this robot; gaponet identify DATASET --out FOLDER does"
@@ -88,7 +90,10 @@ def corrected_robot(run: Path, robot: RobotSpec) -> RobotSpec:
 
 
 def select_entries(
-    folders: list[Path], dataset: Dataset, motions: tuple[str, ...] = (), units: tuple[str, ...] = ()
+    folders: list[Path],
+    dataset: Dataset,
+    motions: tuple[str, ...] = (),
+    units: tuple[str, ...] = (),
 ) -> tuple[list[Entry], bool]:
     """Select recordings for an evaluation. Return them, and True if no candidate was fitted to any of them.
 
@@ -138,17 +143,25 @@ class FittedData:
         model = GapModel.load(folder)
         logs = {h for c in Adaptation.load(folder, model.weights_hash()).values() for h in c.logs}
         origin = read_origin(folder / STORED_ROBOT)  # of the robot under the model
-        logs |= set() if origin is None else {h for part in ("train", "val") for h in origin["parts"][part].values()}
+        logs |= (
+            set()
+            if origin is None
+            else {h for part in ("train", "val") for h in origin["parts"][part].values()}
+        )
         return cls._of(split_of_run(folder), model.card.get("motions", {}), logs)
 
     @classmethod
-    def _of(cls, split: Any, motions: Mapping[str, Any], more: set[str] | None = None) -> FittedData:
+    def _of(
+        cls, split: Any, motions: Mapping[str, Any], more: set[str] | None = None
+    ) -> FittedData:
         hashes = {h for part in ("train", "val") for h in split[part].values()} | (more or set())
         used = {m for part in ("train", "val") for m in motions.get(part, ())}
         return cls(frozenset(hashes), frozenset(used), frozenset(split["test"].values()) - hashes)
 
     def __contains__(self, entry: Entry) -> bool:
-        return entry.hash in self.hashes or (entry.hash not in self.test and entry.meta.motion in self.motions)
+        return entry.hash in self.hashes or (
+            entry.hash not in self.test and entry.meta.motion in self.motions
+        )
 
 
 def split_of_run(run: Path) -> dict[str, dict[str, str]]:
@@ -167,7 +180,11 @@ def read_origin(folder: Path) -> _Origin | None:
     if not file.is_file():
         return None
     return read_json(
-        _Origin, file, RobotError, "identify again, or remove it: all recordings then count as seen", allow_extra=True
+        _Origin,
+        file,
+        RobotError,
+        "identify again, or remove it: all recordings then count as seen",
+        allow_extra=True,
     )
 
 
@@ -183,6 +200,8 @@ def describe_provenance(dataset: Dataset) -> str:
     label = robot_label(dataset.entries)
     if label == dataset.robot_name:
         return f"Recordings of a real {label}."
-    fleets = sorted({e.meta.source for e in dataset.entries if e.meta.virtual and "fleet" in e.meta.source})
+    fleets = sorted(
+        {e.meta.source for e in dataset.entries if e.meta.virtual and "fleet" in e.meta.source}
+    )
     names = f" ({', '.join(fleets)})" if fleets else ""
     return f"{label[0].upper()}{label[1:]}{names}: these numbers say nothing about real hardware."

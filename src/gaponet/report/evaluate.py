@@ -57,10 +57,18 @@ class Evaluation:
         reals = self.runs["nominal"]
         picked = evenly_spaced(list(range(len(reals))), STORED_TRAJECTORIES)
         shown = [
-            {"motion": r.meta.motion, "unit_id": r.meta.unit_id, "payload_mass": r.meta.payload_mass, "dt": r.dt}
+            {
+                "motion": r.meta.motion,
+                "unit_id": r.meta.unit_id,
+                "payload_mass": r.meta.payload_mass,
+                "dt": r.dt,
+            }
             for r in (reals[i] for i in picked)
         ]
-        result = self.result | {"date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "shown": shown}
+        result = self.result | {
+            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            "shown": shown,
+        }
         arrays = {}
         for row, i in enumerate(picked):
             arrays[f"{row}/recorded"] = reals[i].qpos_real
@@ -71,7 +79,9 @@ class Evaluation:
                 arrays[f"{row}/delta/{name}"] = delta[i]
         with lock_folder(folder, "robot" if is_robot(folder) else "run"):
             with atomic_write(folder / "trajectories.npz") as temporary:
-                np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})  # type: ignore[arg-type]
+                np.savez_compressed(
+                    temporary, **{k: v.astype(np.float32) for k, v in arrays.items()}
+                )  # type: ignore[arg-type]
             write_json(folder / "metrics.json", result)
 
 
@@ -99,7 +109,9 @@ def evaluate(
     for path in folders:
         candidate = Candidate.load(path, robot)
         if candidate.method in candidates:
-            raise UsageError(f"{path}: a second run of {title(candidate.method)}; give runs of different methods")
+            raise UsageError(
+                f"{path}: a second run of {title(candidate.method)}; give runs of different methods"
+            )
         candidates[candidate.method] = candidate
     first = next(iter(candidates.values()))
     models = {name: c.model for name, c in candidates.items() if c.model is not None}
@@ -116,11 +128,17 @@ def evaluate(
     simulators: dict[str, str] = {}
     for name, simulator, corrector in _methods(candidates, nominal, target):
         simulators[name] = model_hash(simulator)
-        replays = replay(sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True)
+        replays = replay(
+            sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True
+        )
         done_runs[name] = runs(sequences, [t.qpos for t in replays], robot)
         if name in models:
-            deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, replays, strict=True)]
-    adapted = Adaptation.load(first.folder, first.model.weights_hash()) if first.model is not None else {}
+            deltas[name] = [
+                (t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, replays, strict=True)
+            ]
+    adapted = (
+        Adaptation.load(first.folder, first.model.weights_hash()) if first.model is not None else {}
+    )
     if any(s.meta.unit_id in adapted for s in sequences):
         replays = _by_unit(sequences, first, adapted, with_note(progress, "adapted"))
         done_runs["adapted"] = runs(sequences, [t.qpos for t in replays], robot)
@@ -143,7 +161,14 @@ def evaluate(
 
 def _command(folders: ListOf[Path], dataset: str, motions: tuple[str, ...]) -> str:
     """Return the shell command that repeats an evaluation."""
-    words = ["gaponet", "eval", str(folders[0]), dataset, *["--also"] * (len(folders) > 1), *map(str, folders[1:])]
+    words = [
+        "gaponet",
+        "eval",
+        str(folders[0]),
+        dataset,
+        *["--also"] * (len(folders) > 1),
+        *map(str, folders[1:]),
+    ]
     return shlex.join(words + (["--motions", ",".join(motions)] if motions else []))
 
 
@@ -163,9 +188,13 @@ def _methods(
     first = next(iter(candidates.values()))
     if (first.folder / "delay_offset.json").is_file():
         yield "delay_offset", nominal, DelayOffset.read(first.folder).corrector(nominal)
-    identified = {model_hash(c.robot): c.robot for c in candidates.values() if c.robot.nominal is not None}
+    identified = {
+        model_hash(c.robot): c.robot for c in candidates.values() if c.robot.nominal is not None
+    }
     if len(identified) > 1:
-        raise UsageError("these start from different identified simulators; compare those of one identification")
+        raise UsageError(
+            "these start from different identified simulators; compare those of one identification"
+        )
     for robot in identified.values():
         yield "identified", robot, None
     for name in sorted(candidates, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):

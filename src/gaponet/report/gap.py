@@ -31,7 +31,10 @@ MAX_COMPARED = 60  # recordings that are searched for equal commands
 
 
 def gap_by_step(
-    candidate: Candidate, dataset: Dataset, motions: tuple[str, ...] = (), progress: Progress = no_progress
+    candidate: Candidate,
+    dataset: Dataset,
+    motions: tuple[str, ...] = (),
+    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Mean |error| after each step, in open-loop rollouts of motions that the candidate was not fitted to.
 
@@ -57,12 +60,21 @@ def gap_by_step(
     causes, done = cause_steps(robot), {}
     for name, physics, corrector in _steps(candidate, causes):
         report = with_note(progress, name)
-        replays = replay(sequences, physics, corrector, lock_idle=True, progress=report, creeps=name == "friction")
+        replays = replay(
+            sequences,
+            physics,
+            corrector,
+            lock_idle=True,
+            progress=report,
+            creeps=name == "friction",
+        )
         done[name] = runs(sequences, [t.qpos for t in replays], robot)
     units = {s.meta.unit_id for s in sequences}
     others = (dataset.sequences([e])[0] for e in dataset.entries if e.meta.unit_id in units)
     floors = error_floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
-    floors["all"] = {k: _mean([f[k] for f in floors.values()]) for k in ("encoder", "repeatability", "both")}
+    floors["all"] = {
+        k: _mean([f[k] for f in floors.values()]) for k in ("encoder", "repeatability", "both")
+    }
     last = list(done)[-1]
     methods = {"nominal": "nominal"} | ({"delay_offset": "offset"} if "offset" in done else {})
     methods |= {"identified": causes[-1][0]} if causes else {}
@@ -88,16 +100,23 @@ def gap_by_step(
     }  # fmt: skip
 
 
-def _steps(candidate: Candidate, causes: list[tuple[str, RobotSpec]]) -> list[tuple[str, RobotSpec, Corrector | None]]:
+def _steps(
+    candidate: Candidate, causes: list[tuple[str, RobotSpec]]
+) -> list[tuple[str, RobotSpec, Corrector | None]]:
     """Return name, simulator and corrector of each step, from the nominal simulator over the causes to the model."""
     nominal = candidate.robot.before_identification
     start: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
-    middle: list[tuple[str, RobotSpec, Corrector | None]] = [(cause, physics, None) for cause, physics in causes]
+    middle: list[tuple[str, RobotSpec, Corrector | None]] = [
+        (cause, physics, None) for cause, physics in causes
+    ]
     if candidate.model is None:
         return start + middle
     fitted = DelayOffset.read(candidate.folder)
     only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
-    start += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
+    start += [
+        ("delay", nominal, only_delay.corrector(nominal)),
+        ("offset", nominal, fitted.corrector(nominal)),
+    ]
     return [*start, *middle, (candidate.method, candidate.robot, candidate.corrector())]
 
 
@@ -108,7 +127,12 @@ def _sources(
     left = {name: metrics(part, columns)["mpjae"] for name, part in done.items()}
     least, last = floor["both"], list(left.values())[-1]
     unexplained = None if least is None else max(last - least, 0.0)
-    return {"left": left, "removed": reductions(done, columns), "unexplained": unexplained, "floor": floor}
+    return {
+        "left": left,
+        "removed": reductions(done, columns),
+        "unexplained": unexplained,
+        "floor": floor,
+    }
 
 
 # Fields in which an identified simulator differs from the nominal one, in the order of the steps.
@@ -123,28 +147,42 @@ def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
     robot, steps = simulator.before_identification, []
     for cause, fields in CAUSES.items():
         servos = {
-            joint: {f: float(getattr(simulator, f)[i]) for f in fields if np.isfinite(getattr(simulator, f)[i])}
+            joint: {
+                f: float(getattr(simulator, f)[i])
+                for f in fields
+                if np.isfinite(getattr(simulator, f)[i])
+            }
             for i, joint in enumerate(simulator.joint_names)
         }
         changed = robot.with_servos(servos)
         more = {"contact": "table", "hand": "payload_mounts", "links": "links"}.get(cause)
         changed = replace(changed, **{more: getattr(simulator, more)}) if more else changed
         if model_hash(changed) != model_hash(robot):
-            steps += [(cause, changed)] if cause != "friction" else [(cause, changed), ("creep", changed)]
+            steps += (
+                [(cause, changed)]
+                if cause != "friction"
+                else [(cause, changed), ("creep", changed)]
+            )
         robot = changed
     return steps
 
 
-def reductions(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
+def reductions(
+    done: dict[str, list[Run]], columns: list[int] | None = None
+) -> dict[str, list[float]]:
     """Return the reduction of the error by each step and its standard error over independent motions, rad."""
     held = {name: [r for r in part if r.holds(columns)] for name, part in done.items()}
     errors = {name: np.array([r.mean_error(columns) for r in part]) for name, part in held.items()}
     metas = [r.meta for r in next(iter(held.values()))]
     pairs = pairwise(errors)
-    return {after: list(mean_reduction(metas, errors[before], errors[after])) for before, after in pairs}
+    return {
+        after: list(mean_reduction(metas, errors[before], errors[after])) for before, after in pairs
+    }
 
 
-def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
+def error_floor(
+    sequences: Iterable[Sequence], robot: RobotSpec
+) -> dict[str, dict[str, float | None]]:
     """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability", "both"}, rad; None if unknown.
 
     An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from one repetition, or
@@ -161,9 +199,15 @@ def error_floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, di
         for period in Repetitions.periods(s):
             groups[*same, "period"].add(period)
     repeated = [g.result() for g in groups.values() if g.count > 1]
-    std = Repetitions.summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
+    std = (
+        Repetitions.summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"]
+        if repeated
+        else {}
+    )
     if not std:  # recordings of one command under several names
-        differences = zip(robot.operated, repetition_difference(some, robot.operated).tolist(), strict=True)
+        differences = zip(
+            robot.operated, repetition_difference(some, robot.operated).tolist(), strict=True
+        )
         std = {joint: difference / np.sqrt(2) for joint, difference in differences if difference}
     floors: dict[str, dict[str, float | None]] = {}
     for i, joint in enumerate(robot.operated):

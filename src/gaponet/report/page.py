@@ -16,7 +16,9 @@ from gaponet.base.text import escape
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_FITTING_WIDTH = 6.0  # inches; a wider figure scrolls on a phone, so that its letters stay readable
+MAX_FITTING_WIDTH = (
+    6.0  # inches; a wider figure scrolls on a phone, so that its letters stay readable
+)
 MAX_SVG_CHARACTERS = 400_000  # a figure with more becomes a PNG
 
 
@@ -65,4 +67,6 @@ def page_figure(fig: Figure, caption: str, title: str = "") -> PageFigure:
 
 def inline_image(data: bytes, mime_type: str) -> Markup:
     """Return an img element that contains the image. Scripts of an SVG do not run in it."""
-    return Markup('<img src="data:{};base64,{}">').format(mime_type, base64.b64encode(data).decode())
+    return Markup('<img src="data:{};base64,{}">').format(
+        mime_type, base64.b64encode(data).decode()
+    )

@@ -19,7 +19,14 @@ from gaponet.nn.artifact import GapModel
 from gaponet.report.candidate import is_robot, read_origin
 from gaponet.report.methods import method, title
 from gaponet.report.page import inline_image, page_figure, render
-from gaponet.report.run_files import REPAIR_HINT, read_config, read_gap, read_metrics, read_progress, read_trajectories
+from gaponet.report.run_files import (
+    REPAIR_HINT,
+    read_config,
+    read_gap,
+    read_metrics,
+    read_progress,
+    read_trajectories,
+)
 from gaponet.report.tables import by_group, mrad, mrad_and_degrees, totals
 from gaponet.report.verdict import network_gain, verdict
 from gaponet.robot.folder import load_stored_robot
@@ -52,8 +59,13 @@ class _Evaluated(NamedTuple):
         card, config = (None, {}) if model is None else (model.card, read_config(folder))
         metrics, curve = read_metrics(folder), read_progress(folder)
         missing = [] if card is None else [name for name in CARD_FACTS if name not in card]
-        moves, joints = set(metrics.get("moves", ())), set(metrics["methods"]["nominal"]["by_joint"])
-        complete = {"date", "command", "shown"} <= metrics.keys() and joints <= moves == set(robot.operated)
+        moves, joints = (
+            set(metrics.get("moves", ())),
+            set(metrics["methods"]["nominal"]["by_joint"]),
+        )
+        complete = {"date", "command", "shown"} <= metrics.keys() and joints <= moves == set(
+            robot.operated
+        )
         if not complete or own not in metrics["methods"]:
             missing.append(f"a whole evaluation of {title(own)}")
         if card is not None and not curve:
@@ -83,15 +95,26 @@ def write_report(
         DatasetError: The dataset of an evaluation is not there.
     """
     model = None if is_robot(run) else GapModel.load(run)
-    given = None if robot is None else require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
-    spec = load_robot(run) if model is None else given or load_stored_robot(run, model.card["robot"])
+    given = (
+        None
+        if robot is None
+        else require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
+    )
+    spec = (
+        load_robot(run) if model is None else given or load_stored_robot(run, model.card["robot"])
+    )
     if dataset is not None or not (run / "trajectories.npz").is_file():
         _evaluate(run, dataset, given, progress)
     evaluated = _Evaluated.read(run, model, spec)
     progress(0, 1, "drawing")
     values = _values(evaluated, picture)
     path = run / "report.html"
-    write_text(path, render("report.html.j2", report_command=f"gaponet report {shlex.quote(str(run))}", **values))
+    write_text(
+        path,
+        render(
+            "report.html.j2", report_command=f"gaponet report {shlex.quote(str(run))}", **values
+        ),
+    )
     progress(1, 1, "drawing")
     return path
 
@@ -102,12 +125,16 @@ def _evaluate(run: Path, dataset: Path | None, robot: RobotSpec | None, progress
     origin = read_origin(run) if is_robot(run) else read_config(run)
     fitted_to = "" if origin is None else origin["dataset"]
     if dataset is None and "://" in fitted_to:
-        raise DatasetError(f"{run}: fitted to {fitted_to}; evaluate it first: gaponet eval {run} '{fitted_to}'")
+        raise DatasetError(
+            f"{run}: fitted to {fitted_to}; evaluate it first: gaponet eval {run} '{fitted_to}'"
+        )
     place = dataset or run / fitted_to
     try:
         data = Dataset(place)
     except DatasetError as error:
-        raise DatasetError(f"{error}. Say where the dataset is: gaponet report {run} --dataset DIR") from None
+        raise DatasetError(
+            f"{error}. Say where the dataset is: gaponet report {run} --dataset DIR"
+        ) from None
     robot = robot or dataset_robot(data, run)
     evaluate([run], data, robot, progress=progress).save(run)
 
@@ -119,11 +146,18 @@ def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
 
     methods, name = e.metrics["methods"], title(e.own)
     bars = [
-        page_figure(draw.by_group(methods, "joint", joint_label), "Mean |q_sim − q_robot| of each operated joint."),
-        page_figure(draw.by_horizon(methods), "Error in the last half of the time since the common start."),
+        page_figure(
+            draw.by_group(methods, "joint", joint_label),
+            "Mean |q_sim − q_robot| of each operated joint.",
+        ),
+        page_figure(
+            draw.by_horizon(methods), "Error in the last half of the time since the common start."
+        ),
     ]
     if len(methods["nominal"]["by_payload"]) > 1:
-        bars.append(page_figure(draw.by_group(methods, "payload", "{} kg".format), "Payload in each hand."))
+        bars.append(
+            page_figure(draw.by_group(methods, "payload", "{} kg".format), "Payload in each hand.")
+        )
     joint_columns, joint_rows = _by_joint(e)
     shown, trajectories = e.metrics["shown"], []
     drawn = draw.trajectories(e.arrays, shown, e.robot.operated, list(methods))
@@ -166,7 +200,9 @@ def _by_joint(e: _Evaluated) -> tuple[list[str], list[list[str]]]:
     for joint, *errors in table.texts():
         moving = e.metrics["moves"][joint]
         moves = f"{moving} of {e.metrics['sequences']}" if moving else "none: stands still"
-        rows.append([joint, *errors, *(mrad(joints[joint][k]) for k in ("static", "dynamic")), moves])
+        rows.append(
+            [joint, *errors, *(mrad(joints[joint][k]) for k in ("static", "dynamic")), moves]
+        )
     return [*table.columns, f"{own} static", f"{own} dynamic", "moves in"], rows
 
 
@@ -177,13 +213,24 @@ def _photo(e: _Evaluated, row: int | None, picture: Picture | None) -> dict[str,
         return {"photo": None, "photo_error": ""}
     shown = metrics["shown"][row]
     meta = SequenceMeta(
-        e.robot.name, shown["unit_id"], shown["motion"], shown["payload_mass"], virtual=metrics["virtual"]
+        e.robot.name,
+        shown["unit_id"],
+        shown["motion"],
+        shown["payload_mass"],
+        virtual=metrics["virtual"],
     )
-    qpos = {n: arrays[f"{row}/{n}"] for n in dict.fromkeys(("command", "nominal", e.own, "recorded"))}
-    qpos["command"] = np.roll(qpos["command"], 1, axis=0)  # the command of row t is the target at t + 1
+    qpos = {
+        n: arrays[f"{row}/{n}"] for n in dict.fromkeys(("command", "nominal", e.own, "recorded"))
+    }
+    qpos["command"] = np.roll(
+        qpos["command"], 1, axis=0
+    )  # the command of row t is the target at t + 1
     qpos["command"][0] = qpos["recorded"][0]
     try:
-        return {"photo": inline_image(picture(e.robot, meta, shown["dt"], qpos), "image/png"), "photo_error": ""}
+        return {
+            "photo": inline_image(picture(e.robot, meta, shown["dt"], qpos), "image/png"),
+            "photo_error": "",
+        }
     except UsageError as error:
         return {"photo": None, "photo_error": str(error)}
 
@@ -192,20 +239,34 @@ def warnings(card: dict[str, Any] | None, own: str, metrics: dict[str, Any]) -> 
     """Return warnings about the evaluation; own is its method, card that of its model if any."""
     out, methods = [], metrics["methods"]
     if metrics["virtual"]:
-        out.append("The recordings come from a virtual robot: these numbers say nothing about real hardware.")
+        out.append(
+            "The recordings come from a virtual robot: these numbers say nothing about real hardware."
+        )
     if not metrics["unseen"]:
-        out.append("Some recordings were used in training or for choosing the model: not a test result.")
-    worse = [j for j, m in methods[own]["by_joint"].items() if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]]
+        out.append(
+            "Some recordings were used in training or for choosing the model: not a test result."
+        )
+    worse = [
+        j
+        for j, m in methods[own]["by_joint"].items()
+        if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]
+    ]
     last = [f"Worse than the nominal simulator on: {', '.join(worse)}."] if worse else []
     if card is None:
         return out + last
-    better = [n for n, m in methods.items() if n not in (own, "adapted") and m["mpjae"] <= methods[own]["mpjae"]]
+    better = [
+        n
+        for n, m in methods.items()
+        if n not in (own, "adapted") and m["mpjae"] <= methods[own]["mpjae"]
+    ]
     if better:
         out.append(f"The model does not beat {', '.join(map(title, better))}: do not use it.")
     seen, evaluated = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]
     outside = [p for p in evaluated if not min(seen) <= p <= max(seen)]
     if outside:
-        out.append(f"Payloads {outside} kg lie outside those trained on ({min(seen):g} to {max(seen):g} kg).")
+        out.append(
+            f"Payloads {outside} kg lie outside those trained on ({min(seen):g} to {max(seen):g} kg)."
+        )
     if len(card["units"]) == 1:
         out.append(
             f"Trained on one unit ({card['units'][0]}): another unit's zero offsets and friction are unknown to it."
@@ -218,7 +279,11 @@ def warnings(card: dict[str, Any] | None, own: str, metrics: dict[str, Any]) -> 
         )
     done, planned = card.get("stages", {}).get("pretraining_rounds", (0, 0))
     if done < planned:
-        longer = "" if "identified" in methods and not network_gain(methods, own).helps else "; train longer"
+        longer = (
+            ""
+            if "identified" in methods and not network_gain(methods, own).helps
+            else "; train longer"
+        )
         rounds = f"{done} of {planned} rounds of supervised pre-training"
         out.append(f"Undertrained: the budget ended after {rounds}{longer}.")
     if card.get("interrupted"):

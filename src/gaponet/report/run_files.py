@@ -125,14 +125,20 @@ def read_config(run: Path) -> dict[str, Any]:
 def read_metrics(run: Path) -> dict[str, Any]:
     """Read metrics.json of a run. Every method has the groups of the nominal one; absent numbers are NaN."""
     file = run / "metrics.json"
-    metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, REPAIR_HINT, allow_extra=True)}
+    metrics: dict[str, Any] = {
+        **read_json(_Metrics, file, ModelError, REPAIR_HINT, allow_extra=True)
+    }
     methods = metrics["methods"]
     if "nominal" not in methods or not set(methods) <= set(metrics["ratio_to_nominal"]):
-        raise ModelError(f"{file}: methods: nominal is missing, or a method has no ratio to it; {REPAIR_HINT}")
+        raise ModelError(
+            f"{file}: methods: nominal is missing, or a method has no ratio to it; {REPAIR_HINT}"
+        )
     for name, scores in methods.items():
         for group in GROUPS:
             if set(scores.get(group, ())) != set(methods["nominal"].get(group, ())):
-                raise ModelError(f"{file}: methods.{name}.{group}: should have what nominal has; {REPAIR_HINT}")
+                raise ModelError(
+                    f"{file}: methods.{name}.{group}: should have what nominal has; {REPAIR_HINT}"
+                )
         if "whole" not in scores["by_horizon"]:
             raise ModelError(f"{file}: methods.{name}.by_horizon.whole: is missing; {REPAIR_HINT}")
     return metrics
@@ -162,7 +168,11 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
         return []
     lines = file.read_bytes().split(b"\n")[:-1]
     return [
-        {**parse_json(_Validation, line, f"{file}:{number}", ModelError, REPAIR_HINT, allow_extra=True)}
+        {
+            **parse_json(
+                _Validation, line, f"{file}:{number}", ModelError, REPAIR_HINT, allow_extra=True
+            )
+        }
         for number, line in enumerate(lines, 1)
         if line.strip()
     ]

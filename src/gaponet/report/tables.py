@@ -13,13 +13,19 @@ from gaponet.report.methods import title
 
 def mrad(value: float | None) -> str:
     """Format an angle in rad as milliradian; a dash if there is none, such as the standard error over one motion."""
-    return "–" if value is None or value != value else f"{round(value * 1e3, 2) + 0.0:.2f}"  # no −0.00
+    return (
+        "–" if value is None or value != value else f"{round(value * 1e3, 2) + 0.0:.2f}"
+    )  # no −0.00
 
 
 def mrad_with_error(value: float, standard_error: float) -> str:
     """Format an angle in rad with its standard error over independent motions, which is NaN if there is one."""
     one = standard_error != standard_error
-    return f"{mrad(value)} mrad (one motion)" if one else f"{mrad(value)} ± {mrad(standard_error)} mrad"
+    return (
+        f"{mrad(value)} mrad (one motion)"
+        if one
+        else f"{mrad(value)} ± {mrad(standard_error)} mrad"
+    )
 
 
 def mrad_and_degrees(value: float) -> str:
@@ -28,7 +34,9 @@ def mrad_and_degrees(value: float) -> str:
 
 
 def totals(
-    methods: dict[str, Any], angle: Callable[[float], str] = mrad, simulators: Mapping[str, str] | None = None
+    methods: dict[str, Any],
+    angle: Callable[[float], str] = mrad,
+    simulators: Mapping[str, str] | None = None,
 ) -> ResultTable:
     """Return a row per method.
 
@@ -48,7 +56,9 @@ def totals(
     ))  # fmt: skip
 
 
-def by_group(methods: dict[str, Any], group: str, angle: Callable[[float], str] = mrad) -> ResultTable:
+def by_group(
+    methods: dict[str, Any], group: str, angle: Callable[[float], str] = mrad
+) -> ResultTable:
     """Return the MPJAE by joint, payload, unit, horizon or motion: a row for each, a column per method."""
     parts = [m[f"by_{group}"] for m in methods.values()]
     rows = tuple((key, *(angle(part[key]["mpjae"]) for part in parts)) for key in parts[0])

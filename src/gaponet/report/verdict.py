@@ -37,7 +37,9 @@ class NetworkGain(NamedTuple):
     @property
     def helps(self) -> bool:
         """True if the reduction exceeds its standard error and MIN_RELATIVE_REDUCTION."""
-        return self.reduction > max(np.nan_to_num(self.standard_error), MIN_RELATIVE_REDUCTION * self.base_error)
+        return self.reduction > max(
+            np.nan_to_num(self.standard_error), MIN_RELATIVE_REDUCTION * self.base_error
+        )
 
 
 def network_gain(methods: Scores, own: str) -> NetworkGain:
@@ -48,7 +50,9 @@ def network_gain(methods: Scores, own: str) -> NetworkGain:
     before, after = (methods[name] for name in (base, own))
     paired = [m["mpjae"] - after["by_independent_motion"][name]["mpjae"]
               for name, m in before["by_independent_motion"].items()]  # fmt: skip
-    return NetworkGain(base, before["mpjae"] - after["mpjae"], standard_error(paired), before["mpjae"])
+    return NetworkGain(
+        base, before["mpjae"] - after["mpjae"], standard_error(paired), before["mpjae"]
+    )
 
 
 def verdict(methods: Scores) -> list[str]:
@@ -66,20 +70,30 @@ def verdict(methods: Scores) -> list[str]:
         end = "." if error < nominal else ": identify again, on logs like these."
         motions = len(methods["identified"]["by_independent_motion"])
         count = f"{motions} independent motion{'s' * (motions != 1)}"
-        sentences.append(f"After identification the error is {mrad(error)} mrad, {change}, on {count}{end}")
-    return sentences + [_about_network(methods, own) for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
+        sentences.append(
+            f"After identification the error is {mrad(error)} mrad, {change}, on {count}{end}"
+        )
+    return sentences + [
+        _about_network(methods, own) for own in methods if own.removeprefix(IDENTIFIED) in LEARNED
+    ]
 
 
 def _about_network(methods: Scores, own: str) -> str:
     gain, error = network_gain(methods, own), methods[own]["mpjae"]
-    end = f", {100 * gain.reduction / gain.base_error:.0f} %." if gain.helps else ": leave the network out."
+    end = (
+        f", {100 * gain.reduction / gain.base_error:.0f} %."
+        if gain.helps
+        else ": leave the network out."
+    )
     return (
         f"With {title(own)} the error is {mrad(error)} mrad: the correction reduces the error of {title(gain.base)} by "
         f"{gain.text}{end}"
     )
 
 
-def next_step(methods: Scores, dataset: str, folder: Path | None = None, reported: bool = False) -> str:
+def next_step(
+    methods: Scores, dataset: str, folder: Path | None = None, reported: bool = False
+) -> str:
     """Return the next command: identify, or export without a useful network, else report.
 
     Args:
@@ -89,8 +103,17 @@ def next_step(methods: Scores, dataset: str, folder: Path | None = None, reporte
     networks = [own for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
     if any(network_gain(methods, own).helps for own in networks):
         return shlex.join(
-            ["gaponet", *(["export", str(folder), "--to", "torch"] if reported else ["report", str(folder)])]
+            [
+                "gaponet",
+                *(
+                    ["export", str(folder), "--to", "torch"]
+                    if reported
+                    else ["report", str(folder)]
+                ),
+            ]
         )
     if "identified" not in methods or folder is None:
         return shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
-    return shlex.join(["gaponet", "export", str(folder / STORED_ROBOT if networks else folder), "--to", "mjcf"])
+    return shlex.join(
+        ["gaponet", "export", str(folder / STORED_ROBOT if networks else folder), "--to", "mjcf"]
+    )

@@ -24,7 +24,9 @@ from gaponet.robot.toml_file import Metres
 
 Point = tuple[Metres, Metres, Metres]
 CLEARANCE_M = 0.03  # between capsules: a loaded arm sags by centimetres below its command
-POSTURE_STEP_RAD = 0.03  # between checked postures: a hand at 0.7 m moves by less than the clearance
+POSTURE_STEP_RAD = (
+    0.03  # between checked postures: a hand at 0.7 m moves by less than the clearance
+)
 Radius = Annotated[float, Interval(ge=0, le=100)]
 Capsule = TypedDict("Capsule", {"body": str, "from": Point, "to": Point, "radius": Radius})
 
@@ -67,7 +69,11 @@ class Collision:
     """
 
     def __init__(
-        self, robot: RobotSpec, model: mujoco.MjModel, height: float | None = None, unchecked: bool = False
+        self,
+        robot: RobotSpec,
+        model: mujoco.MjModel,
+        height: float | None = None,
+        unchecked: bool = False,
     ) -> None:
         """
         Args:
@@ -82,37 +88,54 @@ class Collision:
         self.checked, self.clearance = bool(shapes.capsule), shapes.clearance
         self.names = [c["body"] for c in shapes.capsule]
         self.body = np.array([model.body(name).id for name in self.names], int)
-        self.ends = np.array([[c["from"], c["to"]] for c in shapes.capsule], float).reshape(-1, 2, 3)
+        self.ends = np.array([[c["from"], c["to"]] for c in shapes.capsule], float).reshape(
+            -1, 2, 3
+        )
         self.radius = np.array([c["radius"] for c in shapes.capsule], float)
         self.pairs = np.array(
             [
                 (i, k)
                 for i, k in itertools.combinations(range(len(self.names)), 2)
-                if self.names[i] != self.names[k] and not _grouped(self.names[i], self.names[k], groups)
+                if self.names[i] != self.names[k]
+                and not _grouped(self.names[i], self.names[k], groups)
             ],
             int,
         ).reshape(-1, 2)
         plane = shapes.plane
         self.height = plane.height if height is None and plane else height
         if not abs(self.height or 0.0) <= 10:
-            raise RobotError(f"the plane is at {self.height:g} m; give its height in metres, up to 10 (--plane)")
+            raise RobotError(
+                f"the plane is at {self.height:g} m; give its height in metres, up to 10 (--plane)"
+            )
         stands = tuple(plane.stands.split()) if plane else ()
-        above = [i for i, n in enumerate(self.names) if self.height is not None and not n.startswith(stands)]
+        above = [
+            i
+            for i, n in enumerate(self.names)
+            if self.height is not None and not n.startswith(stands)
+        ]
         self.above = np.array(above, int)
 
     def distances(self, qpos: Array) -> Array:
         """Return distances of pairs, then of capsules to the plane, (T, n) rad → (T, pairs + capsules) m."""
-        position, rotation = np.empty((len(qpos), len(self.body), 3)), np.empty((len(qpos), len(self.body), 9))
+        position, rotation = (
+            np.empty((len(qpos), len(self.body), 3)),
+            np.empty((len(qpos), len(self.body), 9)),
+        )
         data, body = self.data, self.body
         for t, q in enumerate(qpos):
             data.qpos = q
             mujoco.mj_kinematics(self.model, data)
             position[t], rotation[t] = data.xpos[body], data.xmat[body]
-        ends = self.ends @ rotation.reshape(*rotation.shape[:2], 3, 3).swapaxes(-1, -2) + position[:, :, None]
+        ends = (
+            self.ends @ rotation.reshape(*rotation.shape[:2], 3, 3).swapaxes(-1, -2)
+            + position[:, :, None]
+        )
         i, k = self.pairs.T
         between = segment_distance(ends[:, i, 0], ends[:, i, 1], ends[:, k, 0], ends[:, k, 1])
         low = ends[:, self.above][..., 2].min(axis=-1) - (self.height or 0.0)
-        return np.concatenate([between - self.radius[i] - self.radius[k], low - self.radius[self.above]], axis=1)
+        return np.concatenate(
+            [between - self.radius[i] - self.radius[k], low - self.radius[self.above]], axis=1
+        )
 
     def distance(self, qpos: Array) -> Array:
         """Return the smallest distance at each posture, (T, n) rad → (T,) m; inf without shapes."""
@@ -144,7 +167,9 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     Detection, 5.1.9).
     """
     u, v, w = a1 - a0, b1 - b0, a0 - b0
-    uu, vv, uv, uw, vw = (np.einsum("...i,...i", x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
+    uu, vv, uv, uw, vw = (
+        np.einsum("...i,...i", x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w))
+    )
     tiny = 1e-12
     s = np.clip((uv * vw - uw * vv) / np.maximum(uu * vv - uv * uv, tiny), 0.0, 1.0)
     t = np.clip((uv * s + vw) / np.maximum(vv, tiny), 0.0, 1.0)
@@ -160,7 +185,11 @@ def read_shapes(folder: Path) -> Shapes:
         RobotError: It names the file and the field.
     """
     path = folder / "collision.toml"
-    return read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields") if path.is_file() else Shapes()
+    return (
+        read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
+        if path.is_file()
+        else Shapes()
+    )
 
 
 def _require_bodies(robot: RobotSpec, model: mujoco.MjModel, shapes: Shapes) -> None:
@@ -168,7 +197,9 @@ def _require_bodies(robot: RobotSpec, model: mujoco.MjModel, shapes: Shapes) -> 
     for capsule in shapes.capsule:
         if capsule["body"] not in bodies:
             path, there = robot.folder / "collision.toml", ", ".join(bodies)
-            raise RobotError(f"{path}: capsule names body '{capsule['body']}', the MJCF has: {there}")
+            raise RobotError(
+                f"{path}: capsule names body '{capsule['body']}', the MJCF has: {there}"
+            )
 
 
 def _grouped(a: str, b: str, groups: list[list[str]]) -> bool:

@@ -49,11 +49,19 @@ class Drive:
     def passive_source(self) -> str:
         """Source of these values."""
         values = ", ".join(self.passive) or "no values"
-        return f"servo {self.servo.name} ({values}: {self.servo.source})" if self.servo else "the model"
+        return (
+            f"servo {self.servo.name} ({values}: {self.servo.source})"
+            if self.servo
+            else "the model"
+        )
 
 
 def drives(
-    model: mujoco.MjModel, joints: list[str], pose: np.ndarray, given: dict[str, tuple[str, ...]], file: str
+    model: mujoco.MjModel,
+    joints: list[str],
+    pose: np.ndarray,
+    given: dict[str, tuple[str, ...]],
+    file: str,
 ) -> tuple[Drive, ...]:
     """Determine the drives of hinge joints.
 
@@ -66,8 +74,13 @@ def drives(
         UsageError: An option is no number or names no joint, or a joint has no kp.
     """
     words = {name: _by_joint(name, given[name], joints) for name in given}
-    servos = {j: servo_type(word.rpartition("=")[2], f"--servo {word}") for j, word in words.pop("servo").items()}
-    options = {name: {j: _number(name, word) for j, word in by.items()} for name, by in words.items()}
+    servos = {
+        j: servo_type(word.rpartition("=")[2], f"--servo {word}")
+        for j, word in words.pop("servo").items()
+    }
+    options = {
+        name: {j: _number(name, word) for j, word in by.items()} for name, by in words.items()
+    }
     result, without_gain = [], []
     for name in joints:
         j = model.joint(name).id
@@ -81,10 +94,18 @@ def drives(
         if not kd:
             sources["kd"] = f"its actuator in {file} has none" if actuators else f"{file} has none"
         if name in options["kp"]:
-            kp, kd, sources["kp"], sources["kd"] = options["kp"][name], 0.0, "--kp", "--kp was given without --kd"
+            kp, kd, sources["kp"], sources["kd"] = (
+                options["kp"][name],
+                0.0,
+                "--kp",
+                "--kp was given without --kd",
+            )
         if name in options["kd"]:
             kd, sources["kd"] = options["kd"][name], "--kd"
-        limits = [*_limits(model, j, actuators, file), (NO_LIMIT, f"{file} has none: write the motor's")]
+        limits = [
+            *_limits(model, j, actuators, file),
+            (NO_LIMIT, f"{file} has none: write the motor's"),
+        ]
         limit, why = min(limits, key=lambda x: x[0])
         servo = servos.get(name)
         if servo is not None and servo.effort_limit is not None:
@@ -93,7 +114,9 @@ def drives(
             limit, why = options["effort_limit"][name], "--effort-limit"
         actuator = model.actuator(actuators[0]).name if len(actuators) == 1 else ""
         home = float(pose[model.jnt_qposadr[j]])
-        result.append(Drive(name, actuator, kp, sources["kp"], kd, sources["kd"], limit, why, home, servo))
+        result.append(
+            Drive(name, actuator, kp, sources["kp"], kd, sources["kd"], limit, why, home, servo)
+        )
     if without_gain:
         raise UsageError(
             f"{file} has no position gain for {abbreviate(without_gain)}: give those of the controller that recorded "
@@ -114,15 +137,23 @@ def _gains(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
     return round(max(kp, 0.0), 9), round(max(kd, 0.0), 9)
 
 
-def _limits(model: mujoco.MjModel, j: int, actuators: list[int], file: str) -> Iterator[tuple[float, str]]:
+def _limits(
+    model: mujoco.MjModel, j: int, actuators: list[int], file: str
+) -> Iterator[tuple[float, str]]:
     """Yield the torque limits that the model states for a joint, with sources; of both directions, the smaller."""
     if model.jnt_actfrclimited[j]:
-        yield float(np.abs(model.jnt_actfrcrange[j]).min()), f"actuatorfrcrange (in a URDF, effort) in {file}"
+        yield (
+            float(np.abs(model.jnt_actfrcrange[j]).min()),
+            f"actuatorfrcrange (in a URDF, effort) in {file}",
+        )
     for a in actuators:
         gear = abs(model.actuator_gear[a, 0])
         if model.actuator_forcelimited[a]:
             yield float(gear * np.abs(model.actuator_forcerange[a]).min()), f"forcerange in {file}"
-        if model.actuator_ctrllimited[a] and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
+        if (
+            model.actuator_ctrllimited[a]
+            and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
+        ):
             most = np.abs(model.actuator_ctrlrange[a] * model.actuator_gainprm[a, 0]).min()
             yield float(gear * most), f"ctrlrange of its motor in {file}"
 
@@ -131,7 +162,9 @@ def _by_joint(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str,
     """Return joint → its last word among ("100", "*wrist*=20")."""
     by, option = dict[str, str](), f"--{name.replace('_', '-')}"
     if any("=" not in word for word in words[1:]):
-        raise UsageError(f"{option} {' '.join(words)}: give one value for all joints first, then {joints[0]}=NUMBER")
+        raise UsageError(
+            f"{option} {' '.join(words)}: give one value for all joints first, then {joints[0]}=NUMBER"
+        )
     for word in words:
         matches = [j for j in joints if fnmatchcase(j, word.rpartition("=")[0] or "*")]
         if not matches:
@@ -146,5 +179,7 @@ def _number(name: str, word: str) -> float:
     except ValueError:
         value = np.nan
     if not 0 <= value <= NO_LIMIT:
-        raise UsageError(f"--{name.replace('_', '-')} {word}: give a number from 0 to {NO_LIMIT:g}, or PATTERN=NUMBER")
+        raise UsageError(
+            f"--{name.replace('_', '-')} {word}: give a number from 0 to {NO_LIMIT:g}, or PATTERN=NUMBER"
+        )
     return value

@@ -16,7 +16,11 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 NO_DECIMAL = 1.0471975511965976
-LENGTH_STEP, MASS_STEP, INERTIA_STEP = 1e-7 * NO_DECIMAL, 1e-7 * NO_DECIMAL, 1e-11 * NO_DECIMAL  # m, kg, kg·m²
+LENGTH_STEP, MASS_STEP, INERTIA_STEP = (
+    1e-7 * NO_DECIMAL,
+    1e-7 * NO_DECIMAL,
+    1e-11 * NO_DECIMAL,
+)  # m, kg, kg·m²
 MESH_STEP = 1e-4 * NO_DECIMAL  # m, of the extent of a mesh
 JOINT_FIELDS = ("solref", "solimp", "margin", "actgravcomp")
 DOF_FIELDS = ("armature", "frictionloss", "solref", "solimp")
@@ -28,7 +32,13 @@ OPTIONS = (
     "integrator", "cone", "solver", "gravity", "wind", "density", "viscosity", "impratio", "iterations", "tolerance",
     "ls_iterations", "ls_tolerance", "noslip_iterations", "noslip_tolerance", "ccd_iterations", "ccd_tolerance",
 )  # fmt: skip
-IGNORED_FLAGS = {"mjDSBL_WARMSTART", "mjDSBL_SENSOR", "mjDSBL_MIDPHASE", "mjDSBL_AUTORESET", "mjDSBL_ISLAND"}
+IGNORED_FLAGS = {
+    "mjDSBL_WARMSTART",
+    "mjDSBL_SENSOR",
+    "mjDSBL_MIDPHASE",
+    "mjDSBL_AUTORESET",
+    "mjDSBL_ISLAND",
+}
 GEOM_FIELDS = ("type", "contype", "conaffinity", "condim", "priority", "friction", "margin", "gap", "solref", "solimp",
         "solmix", "fluid")  # fmt: skip
 
@@ -39,10 +49,15 @@ def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
     roots = [b for b in range(1, model.nbody) if model.body_weldid[b] == b and model.body_jntnum[b]]
-    link = {b: roots.index(root) + 1 if root in roots else 0 for b, root in enumerate(model.body_weldid.tolist())}
+    link = {
+        b: roots.index(root) + 1 if root in roots else 0
+        for b, root in enumerate(model.body_weldid.tolist())
+    }
     yield from _options(model)
     for number, root in enumerate(roots, 1):
-        yield f"link {number} on {link[int(model.body_parentid[root])]}" + _inertia(model, data, root)
+        yield f"link {number} on {link[int(model.body_parentid[root])]}" + _inertia(
+            model, data, root
+        )
     for j in range(model.njnt):
         yield from _joint(model, data, j, link)
     for i in range(model.nu):
@@ -62,12 +77,20 @@ def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
 def _options(model: mujoco.MjModel) -> Iterator[str]:
     for name in OPTIONS:
         yield f"{name} {_exact(getattr(model.opt, name))}"
-    for kind, flags in ((mujoco.mjtDisableBit, "disableflags"), (mujoco.mjtEnableBit, "enableflags")):
-        bits = [bit for bit in kind.__members__.values() if "BL_" in bit.name]  # not the count of flags
+    for kind, flags in (
+        (mujoco.mjtDisableBit, "disableflags"),
+        (mujoco.mjtEnableBit, "enableflags"),
+    ):
+        bits = [
+            bit for bit in kind.__members__.values() if "BL_" in bit.name
+        ]  # not the count of flags
         names = {bit.name for bit in bits if getattr(model.opt, flags) & bit.value}
         yield f"{flags} {' '.join(sorted(names - IGNORED_FLAGS))}"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
-        yield " ".join(_exact(getattr(model.opt, f)) for f in ("o_margin", "o_solref", "o_solimp", "o_friction"))
+        yield " ".join(
+            _exact(getattr(model.opt, f))
+            for f in ("o_margin", "o_solref", "o_solimp", "o_friction")
+        )
 
 
 def _inertia(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> str:
@@ -79,7 +102,9 @@ def _inertia(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> str:
     total = mass.sum()
     middle = mass @ centre / max(total, mujoco.mjMINVAL)
     arm = centre - middle
-    inertia += mass[:, None, None] * ((arm**2).sum(1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None, :])
+    inertia += mass[:, None, None] * (
+        (arm**2).sum(1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None, :]
+    )
     tensor = inertia.sum(axis=0)[np.triu_indices(3)]
     compensated = mass * model.body_gravcomp[bodies]
     return (
@@ -88,7 +113,9 @@ def _inertia(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> str:
     )
 
 
-def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, link: dict[int, int]) -> Iterator[str]:
+def _joint(
+    model: mujoco.MjModel, data: mujoco.MjData, j: int, link: dict[int, int]
+) -> Iterator[str]:
     dof, at = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
     yield (
         f"joint {model.joint(j).name} of {link[int(model.jnt_bodyid[j])]} type {model.jnt_type[j]} "
@@ -117,7 +144,9 @@ def _couplings(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int])
     yield f"wrap {_exact(model.wrap_type)} {_exact(model.wrap_objid)} {_exact(model.wrap_prm)}"
 
 
-def _geoms(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int], touching: bool) -> Iterator[str]:
+def _geoms(
+    model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int], touching: bool
+) -> Iterator[str]:
     """Yield geoms that can collide or interact with a fluid; a mesh by the mean and extent of its vertices."""
     paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
     for g in range(model.ngeom):
@@ -137,7 +166,16 @@ def _geoms(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int], tou
         yield f"geom on {link[int(model.geom_bodyid[g])]} {text} {shape}"
     if touching:
         yield f"exclude {_exact(model.exclude_signature)}"
-        for name in ("signature", "dim", "friction", "margin", "gap", "solref", "solreffriction", "solimp"):
+        for name in (
+            "signature",
+            "dim",
+            "friction",
+            "margin",
+            "gap",
+            "solref",
+            "solreffriction",
+            "solimp",
+        ):
             yield f"pair {name} {_exact(getattr(model, f'pair_{name}'))}"
 
 

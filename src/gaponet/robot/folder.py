@@ -19,9 +19,19 @@ MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"
 PROVENANCE_FILE = "identified.json"  # what a robot was identified from (report/candidate.py)
 UNCERTAINTY_FILE = "uncertainty.json"  # of its values (sysid/uncertainty.py)
 OLD_UNCERTAINTY_FILE = "known.json"  # the same in folders that older versions wrote
-COPIED_FILES = ("collision.toml", "look.toml", PROVENANCE_FILE, UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE)
-IDENTIFIED_HEADING = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
-IDENTIFIED_TABLES = re.compile(r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL)
+COPIED_FILES = (
+    "collision.toml",
+    "look.toml",
+    PROVENANCE_FILE,
+    UNCERTAINTY_FILE,
+    OLD_UNCERTAINTY_FILE,
+)
+IDENTIFIED_HEADING = (
+    "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
+)
+IDENTIFIED_TABLES = re.compile(
+    r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL
+)
 FILE_REFERENCES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
 
 
@@ -48,7 +58,9 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         value, text = getattr(robot, name), re.sub(rf"(?m)^{name}\s*=.*\n", "", text)
         text = text if value == default else f"{name} = {str(value).lower()}\n{text}"
     if robot.nominal is not None:
-        text += f"\n{IDENTIFIED_HEADING}\n" + "".join(_servo(robot, joint) for joint in robot.operated)
+        text += f"\n{IDENTIFIED_HEADING}\n" + "".join(
+            _servo(robot, joint) for joint in robot.operated
+        )
         if robot.table is not None and robot.table != robot.nominal.table:
             lines = [f"{name} = {value!r}\n" for name, value in vars(robot.table).items()]
             text += "[identified_table]\n" + "".join(lines)
@@ -65,19 +77,27 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     xml = self_contained_mjcf(robot.mjcf) if FILE_REFERENCES.search(xml) else xml
     copied = {name: robot.folder / name for name in COPIED_FILES if (robot.folder / name).is_file()}
     with lock_folder(folder, "robot"):
-        (folder / "robot.toml").unlink(missing_ok=True)  # its presence marks a complete folder: it is written last
+        (folder / "robot.toml").unlink(
+            missing_ok=True
+        )  # its presence marks a complete folder: it is written last
         write_text(folder / "robot.xml", xml)
         for name, file in copied.items():
             write_text(folder / name, file.read_text(encoding="utf-8"))
         write_text(folder / "robot.toml", text)
-    if not np.allclose(load_robot(folder).before_identification.kd, (robot.nominal or robot).kd, rtol=1e-4):
-        raise RobotError(f"{robot.folder}/robot.toml: write each joint as a [[joint]] table of its own")
+    if not np.allclose(
+        load_robot(folder).before_identification.kd, (robot.nominal or robot).kd, rtol=1e-4
+    ):
+        raise RobotError(
+            f"{robot.folder}/robot.toml: write each joint as a [[joint]] table of its own"
+        )
 
 
 def require_self_contained(folder: Path) -> None:
     """Refuse a stored robot whose MJCF names other files: a downloaded one could name any file of this machine."""
     file = folder / "robot.xml"
-    if not file.is_file() or FILE_REFERENCES.search(file.read_text(encoding="utf-8", errors="replace")):
+    if not file.is_file() or FILE_REFERENCES.search(
+        file.read_text(encoding="utf-8", errors="replace")
+    ):
         raise RobotError(f"{file}: is missing, or names other files; a stored robot needs none")
 
 
@@ -123,7 +143,11 @@ def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     values = {name: float(getattr(robot, name)[i]) for name in SERVO_FIELDS}
     optional = (*SERVO_TERMS, *TERMS["temperature"], "target_speed")  # 0 if absent
-    stated = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in optional)}
+    stated = {
+        name: value
+        for name, value in values.items()
+        if np.isfinite(value) and (value or name not in optional)
+    }
     lines = [f"{name} = {value!r}\n" for name, value in stated.items()]
     return f"[identified.{_key(joint)}]\n" + "".join(lines)
 

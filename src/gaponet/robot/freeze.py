@@ -12,7 +12,11 @@ from gaponet.base.errors import RobotError
 
 def units_per_si(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
     """Return the specification's units per rad or m of a joint: an MJCF may use degrees."""
-    return math.degrees(1) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+    return (
+        math.degrees(1)
+        if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+        else 1.0
+    )
 
 
 def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
@@ -23,13 +27,17 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
     """
     body, move = joint.parent, value - joint.ref / units_per_si(spec, joint)
     if move and body.joints[0].name != joint.name:
-        raise RobotError(f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp both")
+        raise RobotError(
+            f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp both"
+        )
     turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)
     slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
     axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
     mujoco.mju_axisAngle2Quat(turn, axis, 0.0 if slides else move)
     mujoco.mju_rotVecQuat(offset, np.array(joint.pos), turn)
-    mujoco.mju_rotVecQuat(offset, axis * move if slides else np.array(joint.pos) - offset, np.array(body.quat))
+    mujoco.mju_rotVecQuat(
+        offset, axis * move if slides else np.array(joint.pos) - offset, np.array(body.quat)
+    )
     mujoco.mju_mulQuat(quat, np.array(body.quat), turn)
     body.pos, body.quat = np.array(body.pos) + offset, quat
     spec.delete(joint)

@@ -30,8 +30,18 @@ PLAIN_TAGS = {
     "keyframe", "key", "sensor", "jointpos", "jointvel", "actuatorfrc", "gyro", "accelerometer", "framepos",
 }  # fmt: skip
 MAX_PLAIN_ELEMENTS = 2000
-EXPANDING_ATTRIBUTES = {"nsample", "resolution", "builtin", "file", "num", "dim"}  # create more than the file shows
-USER_SIZES = [f"nuser_{kind}" for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")]
+EXPANDING_ATTRIBUTES = {
+    "nsample",
+    "resolution",
+    "builtin",
+    "file",
+    "num",
+    "dim",
+}  # create more than the file shows
+USER_SIZES = [
+    f"nuser_{kind}"
+    for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")
+]
 SOLVER_ITERATIONS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations",
                      "sdf_initpoints")  # fmt: skip
 LIMITED_ATTRIBUTES = {"size": {"nuserdata", "nkey", *USER_SIZES}, "option": {*SOLVER_ITERATIONS}}
@@ -55,7 +65,9 @@ def read_mjcf(path: Path, tried: bool = False) -> mujoco.MjSpec:
 
     inspection = inspect_mjcf(path)
     state = frozenset(inspection.files)
-    if not (tried or inspection.plain or state in _ACCEPTED or path.resolve().is_relative_to(PACKAGED)):
+    if not (
+        tried or inspection.plain or state in _ACCEPTED or path.resolve().is_relative_to(PACKAGED)
+    ):
         _try(path)
         _ACCEPTED.add(state)
     with mujoco_errors(path, "not valid MJCF"):
@@ -73,7 +85,9 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     for name in ("body_mass", "body_inertia", "body_pos", "body_ipos", "geom_pos", "jnt_pos"):
         values = getattr(model, name)
         if values.size and not -MAX_VALUE <= values.min() <= values.max() <= MAX_VALUE:
-            raise RobotError(f"{path}: {name.replace('_', ' ')} is above {MAX_VALUE:g} in SI units; correct it")
+            raise RobotError(
+                f"{path}: {name.replace('_', ' ')} is above {MAX_VALUE:g} in SI units; correct it"
+            )
     return model
 
 
@@ -88,7 +102,11 @@ def mujoco_errors(path: Path, problem: str) -> Iterator[None]:
         text = " ".join(str(error).split())
         if sandbox.in_sandbox() and "allocat" in text:
             raise MemoryError from None
-        text = "MuJoCo gives no reason; is the model too large?" if "unknown exception" in text else text
+        text = (
+            "MuJoCo gives no reason; is the model too large?"
+            if "unknown exception" in text
+            else text
+        )
         raise RobotError(f"{path}: {problem}: {text}") from None
 
 
@@ -103,7 +121,9 @@ def require_simulable(model: mujoco.MjModel, path: Path) -> None:
 
     data = mujoco.MjData(model)
     if mujoco.mj_sizeModel(model) + data.nbuffer > MAX_BYTES:
-        raise RobotError(f"{path}: a simulation of it takes more than {MAX_BYTES >> 20} MiB; gaponet does not load it")
+        raise RobotError(
+            f"{path}: a simulation of it takes more than {MAX_BYTES >> 20} MiB; gaponet does not load it"
+        )
     mujoco.mj_step(model, data)
 
 
@@ -124,7 +144,9 @@ def inspect_mjcf(path: Path) -> _Inspection:
     return inspection
 
 
-def _count(path: Path, folder: Path, seen: set[Path], inspection: _Inspection, times: float) -> None:
+def _count(
+    path: Path, folder: Path, seen: set[Path], inspection: _Inspection, times: float
+) -> None:
     """Count the elements of a file and its <include>s; refuses too many."""
     if not path.is_file():
         raise RobotError(f"{path}: is no file, nor a robot of the package (gaponet robot list)")
@@ -139,10 +161,16 @@ def _count(path: Path, folder: Path, seen: set[Path], inspection: _Inspection, t
         tag, times = open_tags.pop()
         times *= _copies(tag)
         inspection.count += times
-        inspection.plain = inspection.plain and tag.tag in PLAIN_TAGS and not EXPANDING_ATTRIBUTES & tag.attrib.keys()
+        inspection.plain = (
+            inspection.plain
+            and tag.tag in PLAIN_TAGS
+            and not EXPANDING_ATTRIBUTES & tag.attrib.keys()
+        )
         cells = max(_extent(tag, "width", "height"), _extent(tag, "nrow", "ncol"))
         if inspection.count > MAX_ELEMENTS or cells > MAX_CELLS:
-            raise RobotError(f"{path}: <{tag.tag}> makes a model far larger than a robot; gaponet does not load it")
+            raise RobotError(
+                f"{path}: <{tag.tag}> makes a model far larger than a robot; gaponet does not load it"
+            )
         if tag.tag == "size" and _bytes(tag.get("memory", "0")) > MAX_BYTES:
             raise RobotError(
                 f"{path}: <size memory> is above {MAX_BYTES >> 20} MiB; delete it, MuJoCo chooses the size"
@@ -161,11 +189,18 @@ def _count(path: Path, folder: Path, seen: set[Path], inspection: _Inspection, t
     _require_files(root, path, folder, inspection)
 
 
-def _require_files(root: ElementTree.Element, path: Path, folder: Path, inspection: _Inspection) -> None:
+def _require_files(
+    root: ElementTree.Element, path: Path, folder: Path, inspection: _Inspection
+) -> None:
     places = {folder} | {
-        folder / tag.get(key, "") for tag in root.iter("compiler") for key in ("meshdir", "texturedir", "assetdir")
+        folder / tag.get(key, "")
+        for tag in root.iter("compiler")
+        for key in ("meshdir", "texturedir", "assetdir")
     }
-    for name in {path.name, *(tag.get(key, "") for tag in root.iter() for key in ("file", "filename"))}:
+    for name in {
+        path.name,
+        *(tag.get(key, "") for tag in root.iter() for key in ("file", "filename")),
+    }:
         for place in places:
             file = place / name
             if not file.exists() or file.is_dir():
@@ -173,7 +208,9 @@ def _require_files(root: ElementTree.Element, path: Path, folder: Path, inspecti
             status = file.stat()
             inspection.files.add((str(file.resolve()), status.st_size, status.st_mtime_ns))
             if not file.is_file() or status.st_size > MAX_BYTES:
-                raise RobotError(f"{path}: {name} is not a file, or has more than {MAX_BYTES >> 20} MiB")
+                raise RobotError(
+                    f"{path}: {name} is not a file, or has more than {MAX_BYTES >> 20} MiB"
+                )
 
 
 def _copies(tag: ElementTree.Element) -> float:
@@ -188,7 +225,9 @@ def _extent(tag: ElementTree.Element, *names: str) -> float:
 
 
 def _bytes(text: str) -> float:
-    unit = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}.get(text.strip()[-1:].upper(), 1)
+    unit = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}.get(
+        text.strip()[-1:].upper(), 1
+    )
     return max([0.0, *_numbers(text.strip().rstrip("KMGTPEkmgtpe"))]) * unit
 
 

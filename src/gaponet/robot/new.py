@@ -22,7 +22,10 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.robot.vendor import read_vendor
 
 HAND_PREFIXES = ("attachment", "tcp", "tool", "flange", "palm", "grip", "hand", "wrist")
-IMPLICIT_INTEGRATORS = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+IMPLICIT_INTEGRATORS = (
+    mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+)
 
 
 @dataclass(frozen=True)
@@ -78,13 +81,17 @@ def new_robot(path: Path, out: Path, options: RobotOptions) -> NewRobot:
     notes += _notes(spec, model, logged, pose, path)
     for d in joint_drives:
         for name, value in d.passive.items():
-            polynomial = np.ndim(getattr(spec.joint(d.name), name))  # of newer MuJoCo; a number of older
+            polynomial = np.ndim(
+                getattr(spec.joint(d.name), name)
+            )  # of newer MuJoCo; a number of older
             setattr(spec.joint(d.name), name, [[value], [0.0], [0.0]] if polynomial else value)
     text = _robot_xml(spec, model, logged, pose, path, options.contacts)
     robot_toml = _robot_toml(model, joint_drives, options, path, source)
     for name in (*_joint_names(model), *(model.body(b).name for b in range(model.nbody))):
         if "/" in name:  # a joint name may become a file name
-            text, robot_toml = (t.replace(f'"{name}"', f'"{name.replace("/", "_")}"') for t in (text, robot_toml))
+            text, robot_toml = (
+                t.replace(f'"{name}"', f'"{name.replace("/", "_")}"') for t in (text, robot_toml)
+            )
     if (out / "robot.toml").exists():
         raise UsageError(f"{out}: holds a robot; choose another --out, or move it away")
     with lock_folder(out, "robot"):
@@ -118,7 +125,10 @@ def _logged_joints(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path)
             raise UsageError(f"--joints {pattern}: no such joint; there are: {', '.join(hinges)}")
     if patterns:
         return [name for name in hinges if any(fnmatchcase(name, p) for p in patterns)]
-    actuated = {model.joint(j).name for j in model.actuator_trnid[np.isin(model.actuator_trntype, ON_JOINT), 0]}
+    actuated = {
+        model.joint(j).name
+        for j in model.actuator_trnid[np.isin(model.actuator_trntype, ON_JOINT), 0]
+    }
     return [name for name in hinges if name in actuated] or hinges
 
 
@@ -141,13 +151,19 @@ def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray,
     return pose, source
 
 
-def _notes(spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path) -> list[str]:
+def _notes(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path
+) -> list[str]:
     """Describe what is fixed and omitted."""
     notes, fixed = [], []
     for name, kind, at in zip(_joint_names(model), model.jnt_type, model.jnt_qposadr, strict=True):
-        unit = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}.get(int(kind))
+        unit = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}.get(
+            int(kind)
+        )
         if name not in logged:
-            fixed.append(f"{name or 'unnamed'} {f'at {pose[at]:.3g} {unit}' if unit else f'where {path.name} has it'}")
+            fixed.append(
+                f"{name or 'unnamed'} {f'at {pose[at]:.3g} {unit}' if unit else f'where {path.name} has it'}"
+            )
     if fixed:
         notes.append(f"frozen: {', '.join(fixed)}")
     for e in spec.equalities:
@@ -159,18 +175,27 @@ def _notes(spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: 
                 f"are those of its own link, smaller in proportion to the mass of both links"
             )
     if (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
-        notes.append("the base is fixed here: fasten the robot while it is recorded, a hanging base swings")
+        notes.append(
+            "the base is fixed here: fasten the robot while it is recorded, a hanging base swings"
+        )
     dropped = {"actuator": model.nu, "keyframe": model.nkey, "sensor": model.nsensor}
     gone = ", ".join(f"{count} {kind}(s)" for kind, count in dropped.items() if count)
     if gone:
         notes.append(f"left out: {gone}; gains and limits stand in robot.toml")
     if spec.option.integrator not in IMPLICIT_INTEGRATORS:
-        notes.append("integrator: implicitfast, which takes servos' kd into account; the model's own does not")
+        notes.append(
+            "integrator: implicitfast, which takes servos' kd into account; the model's own does not"
+        )
     return notes
 
 
 def _robot_xml(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path, contacts: bool
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    logged: list[str],
+    pose: np.ndarray,
+    path: Path,
+    contacts: bool,
 ) -> str:
     """Return robot.xml: one file without fixed joints and the elements that refer to them."""
     values = dict(zip(_joint_names(model), pose[model.jnt_qposadr], strict=True))
@@ -183,15 +208,21 @@ def _robot_xml(
         spec.delete(equality)
     for tendon in [t for t in spec.tendons if t.name in tendons]:
         spec.delete(tendon)
-    for joint in [j for j in spec.joints if j.type in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)]:
+    for joint in [
+        j for j in spec.joints if j.type in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+    ]:
         spec.delete(joint)
     if spec.option.integrator not in IMPLICIT_INTEGRATORS:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    plain = mujoco.MjSpec.from_string(self_contained_text(spec, path))  # explicit inertias, quaternions, no classes
+    plain = mujoco.MjSpec.from_string(
+        self_contained_text(spec, path)
+    )  # explicit inertias, quaternions, no classes
     for joint in [j for j in plain.joints if j.name not in logged]:
         freeze(plain, joint, values[joint.name])
     for joint in plain.joints:
-        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # effort_limit of robot.toml is the limit
+        joint.actfrclimited = (
+            mujoco.mjtLimited.mjLIMITED_FALSE
+        )  # effort_limit of robot.toml is the limit
     if not contacts:
         _disable_contacts(plain)
     return self_contained_text(plain, path)
@@ -217,7 +248,11 @@ def _disable_contacts(spec: mujoco.MjSpec) -> None:
 
 
 def _robot_toml(
-    model: mujoco.MjModel, joint_drives: tuple[Drive, ...], options: RobotOptions, path: Path, source: str
+    model: mujoco.MjModel,
+    joint_drives: tuple[Drive, ...],
+    options: RobotOptions,
+    path: Path,
+    source: str,
 ) -> str:
     if not (0 < options.rate <= 1000):
         raise UsageError(f"--rate {options.rate}: give the rate of the commands in Hz, up to 1000")
@@ -251,23 +286,41 @@ def _robot_toml(
 def _mounts(model: mujoco.MjModel, joints: list[str]) -> list[tuple[str, str, np.ndarray, str]]:
     """Guess payload mounts: side, body, position in it (m), and source."""
     moved = {int(model.jnt_bodyid[model.joint(name).id]) for name in joints}
-    ends = tips = [b for b in sorted(moved) if not moved & set(_beyond(model, b)[1:])]  # nothing moves beyond them
+    ends = tips = [
+        b for b in sorted(moved) if not moved & set(_beyond(model, b)[1:])
+    ]  # nothing moves beyond them
     if len(ends) > 1:
-        ends = _palms(model, [e for e in ends if any(_hand(model.body(b).name) for b in _beyond(model, e))])
+        ends = _palms(
+            model, [e for e in ends if any(_hand(model.body(b).name) for b in _beyond(model, e))]
+        )
     result: list[tuple[str, str, np.ndarray, str]] = []
     for end in ends:
         beyond = _beyond(model, end)
-        sites = [s for s in range(model.nsite) if model.site_bodyid[s] in beyond and _hand(model.site(s).name)]
-        bodies = [b for b in beyond if b != end and _hand(model.body(b).name)] if end in tips else []
+        sites = [
+            s
+            for s in range(model.nsite)
+            if model.site_bodyid[s] in beyond and _hand(model.site(s).name)
+        ]
+        bodies = (
+            [b for b in beyond if b != end and _hand(model.body(b).name)] if end in tips else []
+        )
         if sites:
-            body, pos, why = int(model.site_bodyid[sites[0]]), model.site_pos[sites[0]], model.site(sites[0]).name
+            body, pos, why = (
+                int(model.site_bodyid[sites[0]]),
+                model.site_pos[sites[0]],
+                model.site(sites[0]).name,
+            )
         elif bodies:
             body, pos, why = bodies[-1], np.zeros(3), model.body(bodies[-1]).name
         else:
             body, pos, why = end, model.body_ipos[end], "the last link's centre of mass"
         name = model.body(end).name.lower()
-        side = next((word for word in ("left", "right") if word in name), f"hand{len(result) or ''}")
-        result.append((side, model.body(body).name, pos, f"a guess: {why}; correct side, body and pos"))
+        side = next(
+            (word for word in ("left", "right") if word in name), f"hand{len(result) or ''}"
+        )
+        result.append(
+            (side, model.body(body).name, pos, f"a guess: {why}; correct side, body and pos")
+        )
     return result
 
 
@@ -276,7 +329,9 @@ def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
     sides: dict[str, list[int]] = {}
     for end in ends:
         name = model.body(end).name.lower()
-        sides.setdefault(next((word for word in ("left", "right") if word in name), ""), []).append(end)
+        sides.setdefault(next((word for word in ("left", "right") if word in name), ""), []).append(
+            end
+        )
     result = []
     for side_ends in sides.values():
         palm = max(set.intersection(*(set(_chain(model, end)) for end in side_ends)))

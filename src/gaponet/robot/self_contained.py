@@ -21,9 +21,27 @@ from gaponet.robot.mjcf import compile_spec, read_mjcf
 
 Counters = dict[str, Iterator[int]]  # tag → index of the next element in the model
 
-DROPPED_SECTIONS = ("actuator", "sensor", "keyframe", "asset", "visual", "statistic", "custom", "size")
+DROPPED_SECTIONS = (
+    "actuator",
+    "sensor",
+    "keyframe",
+    "asset",
+    "visual",
+    "statistic",
+    "custom",
+    "size",
+)
 COMPILER_ATTRIBUTES = {"angle": "radian", "autolimits": "true", "inertiafromgeom": "auto"}
-DROPPED_GEOM_ATTRIBUTES = ("class", "childclass", "material", "mesh", "density", "shellinertia", "fitscale", "fromto")
+DROPPED_GEOM_ATTRIBUTES = (
+    "class",
+    "childclass",
+    "material",
+    "mesh",
+    "density",
+    "shellinertia",
+    "fitscale",
+    "fromto",
+)
 
 
 def self_contained_mjcf(path: Path) -> str:
@@ -51,7 +69,9 @@ def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
     ET.indent(root)
     text = ET.tostring(root, encoding="unicode") + "\n"
     if _fingerprint(model) != _fingerprint(compile_spec(mujoco.MjSpec.from_string(text), path)):
-        what = "does not fit into one file that moves the same; write it without <include> and files"
+        what = (
+            "does not fit into one file that moves the same; write it without <include> and files"
+        )
         raise RobotError(f"{path}: {what}")
     return text
 
@@ -61,7 +81,12 @@ def _fingerprint(model: mujoco.MjModel) -> list[str]:
 
 
 def _fill(
-    element: ET.Element, body: int, model: mujoco.MjModel, asset: ET.Element, counters: Counters, bodies: Iterator[int]
+    element: ET.Element,
+    body: int,
+    model: mujoco.MjModel,
+    asset: ET.Element,
+    counters: Counters,
+    bodies: Iterator[int],
 ) -> None:
     """Copy the model's numbers into a body and its descendants, depth first, which is the model's order."""
     _unwrap(element)
@@ -129,11 +154,22 @@ def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element)
             size = np.maximum(model.geom_aabb[g, 3:], 1e-4)
     element.set("type", kind)
     rgba = model.geom_rgba[g] if model.geom_matid[g] < 0 else model.mat_rgba[model.geom_matid[g]]
-    set_attributes(element, pos=pos, quat=model.geom_quat[g], mass=0.0, rgba=rgba, friction=model.geom_friction[g])
+    set_attributes(
+        element,
+        pos=pos,
+        quat=model.geom_quat[g],
+        mass=0.0,
+        rgba=rgba,
+        friction=model.geom_friction[g],
+    )
     for name in ("contype", "conaffinity", "condim", "group", "priority"):
         element.set(name, str(int(getattr(model, f"geom_{name}")[g])))
     set_attributes(
-        element, **{n: getattr(model, f"geom_{n}")[g] for n in ("solmix", "solref", "solimp", "margin", "gap")}
+        element,
+        **{
+            n: getattr(model, f"geom_{n}")[g]
+            for n in ("solmix", "solref", "solimp", "margin", "gap")
+        },
     )
     if kind != "mesh":
         set_attributes(element, size=size)
@@ -145,7 +181,9 @@ def _mesh(model: mujoco.MjModel, mesh: int, asset: ET.Element) -> str:
     """Add a compiled mesh to the assets, once, and return its name."""
     name = f"mesh{mesh}"
     if all(child.get("name") != name for child in asset):
-        vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
+        vertices = slice(
+            model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh]
+        )
         faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
         element = ET.SubElement(asset, "mesh", {"name": name, "inertia": "shell"})
         set_attributes(element, vertex=model.mesh_vert[vertices].astype(float))

@@ -14,7 +14,17 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 # Terms of the servo model that identification may add, one by one; `ServoField.term` names a field's.
-Term = Literal["stribeck", "load", "limit", "external", "min_torque", "encoder", "speed", "backlash", "temperature"]
+Term = Literal[
+    "stribeck",
+    "load",
+    "limit",
+    "external",
+    "min_torque",
+    "encoder",
+    "speed",
+    "backlash",
+    "temperature",
+]
 DEFAULT_TERMS: tuple[Term, ...] = ("stribeck", "load", "backlash")
 Axis = Literal["value", "log", "over kp", "inverse"]
 
@@ -149,7 +159,9 @@ TERMS: dict[Term, tuple[str, ...]] = {
 }
 
 
-def warmed(warming: Any, damping: Any, frictionloss: Any, per_kelvin: Any, damping_per_kelvin: Any) -> tuple[Any, Any]:
+def warmed(
+    warming: Any, damping: Any, frictionloss: Any, per_kelvin: Any, damping_per_kelvin: Any
+) -> tuple[Any, Any]:
     """Return damping and friction `warming` K above the temperature of the given ones; arrays that broadcast."""
     factor = np.maximum(1.0 + per_kelvin * warming, MIN_FRICTION_FACTOR)
     return damping + damping_per_kelvin * warming, frictionloss * factor

@@ -24,9 +24,26 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.base.structure import read_toml
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, warmed
-from gaponet.robot.toml_file import Link, PayloadMount, RobotTable, ServoTable, ServoType, Table, Tip
+from gaponet.robot.toml_file import (
+    Link,
+    PayloadMount,
+    RobotTable,
+    ServoTable,
+    ServoType,
+    Table,
+    Tip,
+)
 
-__all__ = ["Link", "PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "load_robot", "packaged_robots"]
+__all__ = [
+    "Link",
+    "PayloadMount",
+    "RobotSpec",
+    "ServoType",
+    "Table",
+    "Tip",
+    "load_robot",
+    "packaged_robots",
+]
 
 PACKAGE_FOLDER = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
@@ -128,11 +145,15 @@ class RobotSpec:
         for name in ("kp", "kd", "effort_limit", "qpos_home"):
             if np.shape(getattr(self, name)) != (n,):
                 shape = np.shape(getattr(self, name))
-                raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got shape {shape}")
+                raise RobotError(
+                    f"{self.name}: {name} must be {n} finite numbers, got shape {shape}"
+                )
         for name in ("qpos_home", *SERVO_FIELDS):
             value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
             record = SERVO_FIELDS.get(name)
-            if np.isinf(value).any() or (np.isnan(value).any() and not (record and record.from_mjcf)):
+            if np.isinf(value).any() or (
+                np.isnan(value).any() and not (record and record.from_mjcf)
+            ):
                 raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
             if record and not record.signed and (value < 0).any():
                 raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
@@ -140,7 +161,9 @@ class RobotSpec:
             object.__setattr__(self, name, value)
         object.__setattr__(self, "servos", self.servos or (None,) * n)
         if not self.operated:
-            raise RobotError(f"{self.name}: no joint has operated = true; the operator needs at least one")
+            raise RobotError(
+                f"{self.name}: no joint has operated = true; the operator needs at least one"
+            )
         ratio = self.dt / self.timestep
         if abs(ratio - round(ratio)) > 1e-9 or ratio < 1:
             raise RobotError(
@@ -151,12 +174,16 @@ class RobotSpec:
     def __getstate__(self) -> dict[str, Any]:
         """Include the files: another process may run on a machine without this folder."""
         files = [self.mjcf, *self.folder.glob("*.toml")]
-        return vars(self) | {"files": {file.name: file.read_bytes() for file in files if file.is_file()}}
+        return vars(self) | {
+            "files": {file.name: file.read_bytes() for file in files if file.is_file()}
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         files: dict[str, bytes] = state.pop("files")
         vars(self).update(state)
-        if {f.name: f.read_bytes() for f in map(self.mjcf.parent.joinpath, files) if f.is_file()} != files:
+        if {
+            f.name: f.read_bytes() for f in map(self.mjcf.parent.joinpath, files) if f.is_file()
+        } != files:
             folder = _unpacked(tuple(sorted(files.items())))
             vars(self).update(folder=folder, mjcf=folder / self.mjcf.name)
 
@@ -199,11 +226,16 @@ class RobotSpec:
         if kp is None and kd is None:
             return self
         nominal = self.nominal or self
-        new_kp, new_kd = np.array(nominal.kp if kp is None else kp), np.array(nominal.kd if kd is None else kd)
+        new_kp, new_kd = (
+            np.array(nominal.kp if kp is None else kp),
+            np.array(nominal.kd if kd is None else kd),
+        )
         if np.allclose((new_kp, new_kd), (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):
             return self
         kp_ratio = np.divide(new_kp, nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
-        kd_ratio = np.divide(self.kd, nominal.kd, out=np.ones_like(nominal.kd), where=nominal.kd > 0)
+        kd_ratio = np.divide(
+            self.kd, nominal.kd, out=np.ones_like(nominal.kd), where=nominal.kd > 0
+        )
         nominal = dataclasses.replace(nominal, kp=new_kp, kd=new_kd)
         own = self.nominal and nominal
         return dataclasses.replace(self, kp=self.kp * kp_ratio, kd=new_kd * kd_ratio, nominal=own)
@@ -216,14 +248,18 @@ class RobotSpec:
         values = self.damping, self.frictionloss, self.friction_per_kelvin, self.damping_per_kelvin
         damping, friction = warmed(warming, *values)
         kd = np.maximum(self.kd + np.fmin(damping, 0.0), 0.0)
-        return dataclasses.replace(self, frictionloss=friction, damping=np.maximum(damping, 0.0), kd=kd)
+        return dataclasses.replace(
+            self, frictionloss=friction, damping=np.maximum(damping, 0.0), kd=kd
+        )
 
     def with_gain_scale(self, scale: float) -> RobotSpec:
         """Return the same robot with the operated joints set to `scale` times the kp and kd of [[joint]]."""
         ratio = np.ones(len(self.joint_names))
         ratio[self.operated_index] = scale / self.gain_scale
         nominal = self.nominal and self.nominal.with_gain_scale(scale)
-        return dataclasses.replace(self, kp=self.kp * ratio, kd=self.kd * ratio, gain_scale=scale, nominal=nominal)
+        return dataclasses.replace(
+            self, kp=self.kp * ratio, kd=self.kd * ratio, gain_scale=scale, nominal=nominal
+        )
 
     @functools.cached_property
     def qpos_range(self) -> Array:
@@ -240,7 +276,9 @@ class RobotSpec:
 
     def stopped(self, ranges: Array) -> Array:
         """Narrow joint ranges (n, 2) of the MJCF, rad, by identified stops."""
-        return np.stack([np.fmax(ranges[:, 0], self.stop_low), np.fmin(ranges[:, 1], self.stop_high)], axis=1)
+        return np.stack(
+            [np.fmax(ranges[:, 0], self.stop_low), np.fmin(ranges[:, 1], self.stop_high)], axis=1
+        )
 
     @property
     def operated_index(self) -> Array:
@@ -272,7 +310,11 @@ class RobotSpec:
             if mapped is not None:
                 full = short = mapped
         exact = next((n for n in (full.replace("/", "_"), short) if n in self.joint_names), None)
-        matches = [exact] if exact else [joint for joint in self.joint_names if _letters(joint) == _letters(short)]
+        matches = (
+            [exact]
+            if exact
+            else [joint for joint in self.joint_names if _letters(joint) == _letters(short)]
+        )
         if len(matches) != 1:
             message, nearest = self._unknown(short, where)
             raise JointMismatchError(f"{message}. Map it with --map {short}={nearest}")
@@ -317,11 +359,15 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
     folder = _folder(name_or_path)
     toml = folder / "robot.toml"
     if not toml.is_file():
-        raise RobotError(f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose another")
+        raise RobotError(
+            f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose another"
+        )
     table = read_toml(RobotTable, toml, RobotError, "docs/new-robot.md lists the fields")
     mjcf = folder / table.mjcf
     if not mjcf.is_file():
-        raise RobotError(f'{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "..."')
+        raise RobotError(
+            f'{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "..."'
+        )
     try:
         return _spec(table, mjcf, folder)
     except RobotError as error:
@@ -340,10 +386,18 @@ def _folder(name_or_path: str | Path) -> Path:
         return folder
     packaged, here = PACKAGE_FOLDER / text, (folder / "robot.toml").is_file()
     if text not in packaged_robots():
-        what = f"for the folder here write ./{text}" if here else "or give a folder, with a slash: ./my_robot"
-        raise RobotError(f"no robot '{text}': in the package are {', '.join(packaged_robots())}; {what}")
+        what = (
+            f"for the folder here write ./{text}"
+            if here
+            else "or give a folder, with a slash: ./my_robot"
+        )
+        raise RobotError(
+            f"no robot '{text}': in the package are {', '.join(packaged_robots())}; {what}"
+        )
     if here and not packaged.samefile(folder):
-        raise RobotError(f"'{text}' is a robot of the package and a folder here; write {packaged} or ./{text}")
+        raise RobotError(
+            f"'{text}' is a robot of the package and a folder here; write {packaged} or ./{text}"
+        )
     return packaged
 
 
@@ -360,14 +414,20 @@ def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoT
         raise RobotError(f"{where}: two [[servo]] have the name '{name}'")
     if name not in types:
         near = " or ".join(difflib.get_close_matches(name, types, n=MAX_SUGGESTIONS, cutoff=0.0))
-        raise RobotError(f"{where}: servo '{name}' is no [[servo]], nor in gaponet robot servos; nearest: {near}")
+        raise RobotError(
+            f"{where}: servo '{name}' is no [[servo]], nor in gaponet robot servos; nearest: {near}"
+        )
     return types[name]
 
 
 def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     joints = table.joint
-    if len(set(names := [x for j in joints for x in dict.fromkeys((j.name, *j.aliases))])) != len(names):
-        raise RobotError(f"{table.name}: a joint name appears twice in {', '.join(names)} (names and aliases)")
+    if len(set(names := [x for j in joints for x in dict.fromkeys((j.name, *j.aliases))])) != len(
+        names
+    ):
+        raise RobotError(
+            f"{table.name}: a joint name appears twice in {', '.join(names)} (names and aliases)"
+        )
     robot = RobotSpec(
         name=table.name,
         description=table.description or table.name,
@@ -384,7 +444,10 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         payload_mounts=table.payload_mount,
         dt=table.dt,
         timestep=table.timestep,
-        servos=tuple(servo_type(j.servo, f"joint '{j.name}'", table.servo) if j.servo else None for j in joints),
+        servos=tuple(
+            servo_type(j.servo, f"joint '{j.name}'", table.servo) if j.servo else None
+            for j in joints
+        ),
         tips=table.tip,
         table=table.table,
         contacts=table.contacts,
@@ -392,10 +455,14 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     ).with_gain_scale(table.gain_scale)
     identified_table = table.identified_table
     if (robot.table or identified_table) and not robot.tips:
-        raise RobotError("[table]: no [[tip]] can touch it; add a [[tip]] with body, pos and radius")
+        raise RobotError(
+            "[table]: no [[tip]] can touch it; add a [[tip]] with body, pos and radius"
+        )
     for joint in table.identified:
         if joint not in robot.joint_names:
-            raise RobotError(f"[identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}")
+            raise RobotError(
+                f"[identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}"
+            )
     servos = {
         joint: {name: value for name, value in vars(servo).items() if value is not None}
         for joint, servo in table.identified.items()
@@ -406,9 +473,13 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     sides = [mount.side for mount in robot.payload_mounts]
     for side in table.identified_mount:
         if side not in sides:
-            raise RobotError(f"[identified_mount.{side}] names no [[payload_mount]]; sides are {', '.join(sides)}")
+            raise RobotError(
+                f"[identified_mount.{side}] names no [[payload_mount]]; sides are {', '.join(sides)}"
+            )
     if moved := {side: vars(mount) for side, mount in table.identified_mount.items()}:
-        mounts = tuple(dataclasses.replace(m, **moved.get(m.side, {})) for m in robot.payload_mounts)
+        mounts = tuple(
+            dataclasses.replace(m, **moved.get(m.side, {})) for m in robot.payload_mounts
+        )
         identified = dataclasses.replace(identified, payload_mounts=mounts, nominal=robot)
     if table.identified_link:
         identified = dataclasses.replace(identified, links=table.identified_link, nominal=robot)

@@ -38,7 +38,9 @@ class Spread:
 
     def __post_init__(self) -> None:
         if not self.low <= self.value <= self.high:
-            raise RobotError(f"value {self.value:g} must lie from low {self.low:g} to high {self.high:g}")
+            raise RobotError(
+                f"value {self.value:g} must lie from low {self.low:g} to high {self.high:g}"
+            )
 
 
 @dataclass(frozen=True)
@@ -53,11 +55,15 @@ class ServoType:
     robots: Count = 0  # that the values are of
     joints: Count = 0
     gain: Gain | None = None  # N·m/rad for a firmware kp of 1
-    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = None  # V, of its supply; gain is in proportion
+    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = (
+        None  # V, of its supply; gain is in proportion
+    )
     effort_limit: Gain | None = None  # N·m
     speed_limit: Gain | None = None  # rad/s
     limit_source: str = ""
-    damping: Spread | Gain | None = None  # N·m·s/rad beside the stated kd; below 0 the servo acts with less kd
+    damping: Spread | Gain | None = (
+        None  # N·m·s/rad beside the stated kd; below 0 the servo acts with less kd
+    )
     frictionloss: Spread | Gain | None = None  # N·m
     armature: Spread | Gain | None = None  # kg·m²
     stribeck: Spread | Gain | None = None  # N·m
@@ -68,11 +74,16 @@ class ServoType:
     def measured(self) -> dict[str, Spread]:
         """Measured values by field; one without an interval is its own."""
         values = ((f, getattr(self, f)) for f in MEASURED_FIELDS)
-        return {f: x if isinstance(x, Spread) else Spread(x, x, x) for f, x in values if x is not None}
+        return {
+            f: x if isinstance(x, Spread) else Spread(x, x, x) for f, x in values if x is not None
+        }
 
     def text(self, field: str) -> str:
         """Return a value in the unit of the field's heading, with its interval or supply; "" if there is none."""
-        value, factor = getattr(self, field), SERVO_FIELDS[field].factor if field in MEASURED_FIELDS else 1.0
+        value, factor = (
+            getattr(self, field),
+            SERVO_FIELDS[field].factor if field in MEASURED_FIELDS else 1.0,
+        )
         if isinstance(value, Spread):
             middle, low, high = (f"{float(f'{factor * x:.2g}'):g}" for x in vars(value).values())
             return f"{middle} ({low}…{high})"
@@ -157,7 +168,9 @@ class RobotTable:
     table: Table | None = None
     contacts: bool = False  # links collide as the MJCF states; else only tips and table collide
     carries_payload: bool = True  # false: the simulator omits the payload
-    gain_scale: Annotated[float, Interval(gt=0, le=1000)] = 1.0  # factor on kp and kd of operated joints in [[joint]]
+    gain_scale: Annotated[float, Interval(gt=0, le=1000)] = (
+        1.0  # factor on kp and kd of operated joints in [[joint]]
+    )
     identified: dict[str, IdentifiedServo] = field(default_factory=dict)
     identified_table: Table | None = None
     identified_mount: dict[str, _Mount] = field(default_factory=dict)

@@ -11,7 +11,13 @@ import numpy as np
 from gaponet.base.errors import RobotError
 from gaponet.base.sandbox import sandboxed
 from gaponet.robot.finding import abbreviate
-from gaponet.robot.mjcf import compile_spec, inspect_mjcf, mujoco_errors, read_mjcf, require_simulable
+from gaponet.robot.mjcf import (
+    compile_spec,
+    inspect_mjcf,
+    mujoco_errors,
+    read_mjcf,
+    require_simulable,
+)
 
 MESHES = (".stl", ".obj", ".msh")  # formats that MuJoCo reads
 URDF_COMPILER = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
@@ -30,12 +36,16 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
         RobotError: The file is neither MJCF nor URDF, or is damaged.
     """
     if path.is_dir():
-        models = sorted(p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}"))
+        models = sorted(
+            p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}")
+        )
         raise RobotError(
             f"{path}: is a folder; name the model in it: {abbreviate(models) or 'there is no .xml or .urdf'}"
         )
     if path.suffix == ".xacro":
-        raise RobotError(f"{path}: expand it first: xacro {path.name} > {path.name.split('.')[0]}.urdf")
+        raise RobotError(
+            f"{path}: expand it first: xacro {path.name} > {path.name.split('.')[0]}.urdf"
+        )
     inspect_mjcf(path)
     packages = {name: folder.absolute() for name, folder in packages.items()}
     _try(path, packages)
@@ -56,7 +66,11 @@ def _read(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[st
 def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
     spec = read_mjcf(path, tried=True)
     place = path.parent / spec.meshdir
-    missing = {m.name or Path(m.file).stem: m for m in spec.meshes if m.file and not (place / m.file).is_file()}
+    missing = {
+        m.name or Path(m.file).stem: m
+        for m in spec.meshes
+        if m.file and not (place / m.file).is_file()
+    }
     for geom in [g for g in spec.geoms if g.meshname in missing]:
         spec.delete(geom)
     for mesh in missing.values():
@@ -64,7 +78,9 @@ def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
     return spec, _left_out(sorted(missing), f"are not in {place}") + _drop_unreadable_meshes(spec)
 
 
-def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
+def _urdf(
+    root: ET.Element, path: Path, packages: dict[str, Path]
+) -> tuple[mujoco.MjSpec, list[str]]:
     missing: list[str] = []
     unread: list[str] = []
     for element in [e for e in root if e.tag in ("transmission", "gazebo", "ros2_control")]:
@@ -103,14 +119,18 @@ def _correct_inertias(root: ET.Element) -> list[str]:
     impossible, light = [], []
     for link in root.iter("link"):
         inertial = link.find("inertial")
-        mass, inertia = (None, None) if inertial is None else (inertial.find("mass"), inertial.find("inertia"))
+        mass, inertia = (
+            (None, None) if inertial is None else (inertial.find("mass"), inertial.find("inertia"))
+        )
         m = _number(mass, "value")
         if inertial is not None and mass is not None and m <= 0:
             link.remove(inertial)
         if inertial is None or mass is None or m <= 0:
             light.append(link.get("name", ""))
             continue
-        xx, yy, zz, xy, xz, yz = (_number(inertia, f"i{axes}") for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+        xx, yy, zz, xy, xz, yz = (
+            _number(inertia, f"i{axes}") for axes in ("xx", "yy", "zz", "xy", "xz", "yz")
+        )
         matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         if inertia is None or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] > 0:
             continue
@@ -122,7 +142,9 @@ def _correct_inertias(root: ET.Element) -> list[str]:
              if j.get("type") != "fixed" and j.find("child") is not None}  # fmt: skip
     notes = []
     if impossible:
-        notes.append(f"inertia that no body has, taken as a ball's of the link's mass: {abbreviate(impossible)}")
+        notes.append(
+            f"inertia that no body has, taken as a ball's of the link's mass: {abbreviate(impossible)}"
+        )
     if light := [name for name in light if name in moved]:
         notes.append(f"links without mass behind a joint, taken as 1 mg: {abbreviate(light)}")
     return notes
@@ -146,7 +168,14 @@ def _drop_unreadable_meshes(spec: mujoco.MjSpec) -> list[str]:
             break
         except (ValueError, mujoco.FatalError) as error:
             why = " ".join(str(error).split())
-            bad = next((m for m in spec.meshes if (m.file and Path(m.file).name in why) or f"'{m.name}'" in why), None)
+            bad = next(
+                (
+                    m
+                    for m in spec.meshes
+                    if (m.file and Path(m.file).name in why) or f"'{m.name}'" in why
+                ),
+                None,
+            )
             if bad is None:
                 break
             omitted.append(f"mesh left out: {why}")

@@ -21,12 +21,24 @@ from typing import Any
 from gaponet.base.files import FOLDER_MARKER, flush_to_disk, lock_file, write_text
 from gaponet.base.progress import progress_bar
 from gaponet.base.text import remove_credentials
-from gaponet.share.remote import INDEX, MAX_INDEX_BYTES, FileRecord, Index, Kind, RemoteError, lost_race, network_errors
+from gaponet.share.remote import (
+    INDEX,
+    MAX_INDEX_BYTES,
+    FileRecord,
+    Index,
+    Kind,
+    RemoteError,
+    lost_race,
+    network_errors,
+)
 
 MODULES = {"s3": "s3fs", "gs": "gcsfs", "file": "fsspec"}  # scheme → library
 OBJECTS = "sha256"
 TRANSFERS = 8  # at a time
-SERVER_TIMEOUT_S = {"s3": 28, "gs": 12}  # for the first byte of an answer, per attempt: two minutes in all
+SERVER_TIMEOUT_S = {
+    "s3": 28,
+    "gs": 12,
+}  # for the first byte of an answer, per attempt: two minutes in all
 S3_ATTEMPTS = 2  # of s3fs, each with two attempts of botocore; gcsfs makes six attempts with pauses
 MIN_PRUNE_AGE_S = 24 * 3600  # a younger object may belong to a push that is running
 
@@ -42,9 +54,13 @@ class Bucket:
         self.address = remove_credentials(address)
         self.scheme, _, rest = address.partition("://")
         if self.scheme not in MODULES or not rest.strip("/") or "::" in rest:
-            raise RemoteError(f"{self.address}: no such place; use USER/NAME, s3://, gs:// or file:// and a folder")
+            raise RemoteError(
+                f"{self.address}: no such place; use USER/NAME, s3://, gs:// or file:// and a folder"
+            )
         if self.scheme != "file" and "@" in rest:
-            raise RemoteError(f"{self.address}: an address holds no keys; set them as docs/reference/datasets.md says")
+            raise RemoteError(
+                f"{self.address}: an address holds no keys; set them as docs/reference/datasets.md says"
+            )
         import_module(MODULES[self.scheme])
         import fsspec
 
@@ -64,14 +80,24 @@ class Bucket:
             self._index_info = self._info(self._index_path)
             if self._index_info.get("type") == "file":
                 if self._index_info["size"] > MAX_INDEX_BYTES:
-                    raise RemoteError(f"{self.address}: {INDEX} has more than {MAX_INDEX_BYTES >> 20} MiB")
+                    raise RemoteError(
+                        f"{self.address}: {INDEX} has more than {MAX_INDEX_BYTES >> 20} MiB"
+                    )
                 self._index = self.fs.cat_file(self._index_path)
             elif bucket and not self.fs.exists(bucket):
-                raise RemoteError(f"{self.address}: no bucket '{bucket}'; make it with the provider's tools")
+                raise RemoteError(
+                    f"{self.address}: no bucket '{bucket}'; make it with the provider's tools"
+                )
             elif self._info(self.root):
-                names = {path.rpartition("/")[2] for path in self.fs.ls(self.root, detail=False)} - {"", OBJECTS}
-                if name := min((name for name in names if not name.startswith(FOLDER_MARKER)), default=""):
-                    raise RemoteError(f"{self.address}: holds {name} and no {INDEX}: gaponet did not push it")
+                names = {
+                    path.rpartition("/")[2] for path in self.fs.ls(self.root, detail=False)
+                } - {"", OBJECTS}
+                if name := min(
+                    (name for name in names if not name.startswith(FOLDER_MARKER)), default=""
+                ):
+                    raise RemoteError(
+                        f"{self.address}: holds {name} and no {INDEX}: gaponet did not push it"
+                    )
         return self._index
 
     def sizes(self, paths: list[str], index: Index) -> list[int | None]:
@@ -79,15 +105,22 @@ class Bucket:
         with network_errors(self.address):
             if self.scheme != "file":
                 return list(self.fs.sizes(objects))
-            infos = [self._info(path) for path in objects]  # opening a pipe or a device would never end
-            return [info["size"] if info.get("type") == "file" and not info["islink"] else None for info in infos]
+            infos = [
+                self._info(path) for path in objects
+            ]  # opening a pipe or a device would never end
+            return [
+                info["size"] if info.get("type") == "file" and not info["islink"] else None
+                for info in infos
+            ]
 
     def outdated(self, index: Index) -> set[str]:
         objects, listed = self._objects(), _digests(self._index)
         return {
             path
             for path, record in index.files.items()
-            if not self._intact(objects.get(self._object(record.sha256)), record, record.sha256 in listed)
+            if not self._intact(
+                objects.get(self._object(record.sha256)), record, record.sha256 in listed
+            )
         }
 
     def _intact(self, info: dict[str, Any] | None, record: FileRecord, listed: bool) -> bool:
@@ -103,14 +136,24 @@ class Bucket:
 
     def fetch(self, paths: list[str], index: Index, folder: Path) -> None:
         files = {folder / path: index.files[path] for path in paths}
-        missing = {f: record for f, record in files.items() if not f.is_file() or FileRecord.of(f) != record}
+        missing = {
+            f: record
+            for f, record in files.items()
+            if not f.is_file() or FileRecord.of(f) != record
+        }
         for file in missing:
             file.parent.mkdir(parents=True, exist_ok=True)
-        self._transfer("downloading", self.fs.get, [(self._object(r.sha256), str(f)) for f, r in missing.items()])
+        self._transfer(
+            "downloading",
+            self.fs.get,
+            [(self._object(r.sha256), str(f)) for f, r in missing.items()],
+        )
 
     def store(self, folder: Path, index: Index, paths: Collection[str], private: bool) -> None:
         objects = {self._object(index.files[path].sha256): folder / path for path in paths}
-        self._transfer("uploading", self.fs.put, [(str(file), path) for path, file in objects.items()])
+        self._transfer(
+            "uploading", self.fs.put, [(str(file), path) for path, file in objects.items()]
+        )
         if self.scheme == "file":
             for path in objects:
                 flush_to_disk(Path(path))
@@ -131,12 +174,20 @@ class Bucket:
     def _replace_index(self, before: bytes | None, text: str) -> None:
         """Write the index on condition that it is still the one that was read last."""
         if self.scheme == "s3":
-            condition = {"IfNoneMatch": "*"} if before is None else {"IfMatch": self._index_info["ETag"]}
+            condition = (
+                {"IfNoneMatch": "*"} if before is None else {"IfMatch": self._index_info["ETag"]}
+            )
             self.fs.pipe_file(self._index_path, text.encode(), **condition)
         elif self.scheme == "gs":
             bucket, name = self._index_path.split("/", 1)
-            head, types = json.dumps({"name": name}), ("application/json; charset=UTF-8", "application/json")
-            parts = "".join(f"--{INDEX}\nContent-Type: {t}\n\n{x}\n" for t, x in zip(types, (head, text), strict=True))
+            head, types = (
+                json.dumps({"name": name}),
+                ("application/json; charset=UTF-8", "application/json"),
+            )
+            parts = "".join(
+                f"--{INDEX}\nContent-Type: {t}\n\n{x}\n"
+                for t, x in zip(types, (head, text), strict=True)
+            )
             self.fs.call(  # gcsfs has conditions for new objects only
                 "POST", f"{self.fs._location}/upload/storage/v1/b/{bucket}/o", uploadType="multipart",
                 ifGenerationMatch=self._index_info.get("generation", "0"), data=f"{parts}--{INDEX}--".encode(),
@@ -156,7 +207,11 @@ class Bucket:
     def prune(self, index: Index) -> int:
         current = set(map(self._object, _digests(index.text().encode()) | _digests(self._index)))
         now = time.time()
-        old = [p for p, i in self._objects().items() if p not in current and now - _modified(i) > MIN_PRUNE_AGE_S]
+        old = [
+            p
+            for p, i in self._objects().items()
+            if p not in current and now - _modified(i) > MIN_PRUNE_AGE_S
+        ]
         with network_errors(self.address):
             if old:
                 self.fs.rm(old)
@@ -171,13 +226,17 @@ class Bucket:
             return dict(self.fs.info(path))
         return {}
 
-    def _transfer(self, title: str, function: Callable[..., Any], pairs: list[tuple[str, str]]) -> None:
+    def _transfer(
+        self, title: str, function: Callable[..., Any], pairs: list[tuple[str, str]]
+    ) -> None:
         """Upload or download (source, destination) pairs with a progress bar."""
         from fsspec.callbacks import Callback
 
         if pairs:
             with progress_bar(title) as update, network_errors(self.address):
-                show = Callback(hooks={"bar": lambda size, value, **_: update(value, size or 0, "")})
+                show = Callback(
+                    hooks={"bar": lambda size, value, **_: update(value, size or 0, "")}
+                )
                 function(*map(list, zip(*pairs, strict=True)), callback=show, batch_size=TRANSFERS)
 
     def _objects(self) -> dict[str, dict[str, Any]]:
@@ -198,9 +257,13 @@ def _options(scheme: str) -> dict[str, Any]:
         return {"config_kwargs": timeouts | {"retries": {"max_attempts": 1}}}
     from aiohttp import ClientTimeout
 
-    logging.getLogger(MODULES[scheme]).addHandler(logging.NullHandler())  # gcsfs logs what it raises, too
+    logging.getLogger(MODULES[scheme]).addHandler(
+        logging.NullHandler()
+    )  # gcsfs logs what it raises, too
     return {
-        "requests_timeout": ClientTimeout(sock_connect=SERVER_TIMEOUT_S[scheme], sock_read=SERVER_TIMEOUT_S[scheme])
+        "requests_timeout": ClientTimeout(
+            sock_connect=SERVER_TIMEOUT_S[scheme], sock_read=SERVER_TIMEOUT_S[scheme]
+        )
     }
 
 

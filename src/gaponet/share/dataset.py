@@ -52,7 +52,9 @@ def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
     (folder / SIDECAR / STORED_ROBOT / ".gaponet").unlink()
     copy_sidecars(dataset.path, folder / SIDECAR, dataset)
     card = make_card(dataset)
-    text = dataset_readme(card, card_markdown(card), address, [part.path.as_posix() for part in sets])
+    text = dataset_readme(
+        card, card_markdown(card), address, [part.path.as_posix() for part in sets]
+    )
     write_text(folder / "README.md", text)
     write_text(folder / SOURCE, source)
     return contents
@@ -61,7 +63,10 @@ def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
 def is_pushed(path: Path, address: str, index: Index) -> bool:
     """True if a dataset and everything that is pushed with it are as in the push of this index."""
     record = index.files.get(SOURCE)
-    return record is not None and record.sha256 == hashlib.sha256(_source_text(path, address).encode()).hexdigest()
+    return (
+        record is not None
+        and record.sha256 == hashlib.sha256(_source_text(path, address).encode()).hexdigest()
+    )
 
 
 def _source_text(path: Path, address: str) -> str:
@@ -70,9 +75,16 @@ def _source_text(path: Path, address: str) -> str:
     The journal lists the content hash of every recording, so that no recording is read.
     """
     names = ("dataset.json", JOURNAL, *COPIED_FILES, "splits/*.json", f"{STORED_ROBOT}/*.*")
-    files = sorted(file for name in names for file in path.glob(name) if file.is_file() and file.name != FOLDER_MARKER)
+    files = sorted(
+        file
+        for name in names
+        for file in path.glob(name)
+        if file.is_file() and file.name != FOLDER_MARKER
+    )
     hashes = {file.relative_to(path).as_posix(): FileRecord.of(file).sha256 for file in files}
-    return json.dumps({"gaponet": __version__, "address": address, "files": hashes}, indent=1) + "\n"
+    return (
+        json.dumps({"gaponet": __version__, "address": address, "files": hashes}, indent=1) + "\n"
+    )
 
 
 def add_missing(pushed: Dataset, robot: RobotSpec, out: Path, new: bool) -> None:
@@ -100,7 +112,9 @@ def add_missing(pushed: Dataset, robot: RobotSpec, out: Path, new: bool) -> None
 
 def copy_sidecars(source: Path, out: Path, dataset: Dataset) -> None:
     """Copy splits, recipe and offsets of a dataset, checked, where `out` has none yet."""
-    for file in [source / name for name in COPIED_FILES] + sorted((source / "splits").glob("*.json")):
+    for file in [source / name for name in COPIED_FILES] + sorted(
+        (source / "splits").glob("*.json")
+    ):
         copy = out / file.relative_to(source)
         if file.is_file() and not copy.exists():
             if file.parent != source:

@@ -20,7 +20,17 @@ from gaponet.base.files import FOLDER_MARKER, lock_folder, write_text
 from gaponet.data.store import Dataset
 from gaponet.share import dataset as datasets
 from gaponet.share import run as runs
-from gaponet.share.remote import FORMAT, INDEX, FileRecord, Index, Kind, RemoteError, download, file_errors, read_index
+from gaponet.share.remote import (
+    FORMAT,
+    INDEX,
+    FileRecord,
+    Index,
+    Kind,
+    RemoteError,
+    download,
+    file_errors,
+    read_index,
+)
 from gaponet.share.stream import RemoteDataset, open_remote
 
 
@@ -35,7 +45,11 @@ class TransferResult:
 
 
 def push(
-    path: str | Path, address: str, private: bool = False, replace: bool = False, prune: bool = False
+    path: str | Path,
+    address: str,
+    private: bool = False,
+    replace: bool = False,
+    prune: bool = False,
 ) -> TransferResult:
     """Put a dataset or a run where others can pull it, with a card; one that is there already is brought up to date.
 
@@ -55,7 +69,11 @@ def push(
     kind, remote = _kind(path), open_remote(address)
     content = remote.index(kind)
     present = None if replace or content is None else read_index(remote, content)
-    same = present and kind == present.kind == "dataset" and datasets.is_pushed(path, remote.address, present)
+    same = (
+        present
+        and kind == present.kind == "dataset"
+        and datasets.is_pushed(path, remote.address, present)
+    )
     if present and same and not remote.outdated(present):
         pruned = remote.prune(present) if prune else 0
         return TransferResult(kind, len(present.files), present.size(present.files), pruned)
@@ -64,7 +82,9 @@ def push(
         files = folder / "files"
         files.mkdir()
         try:
-            contents = (datasets if kind == "dataset" else runs).write_files(path, files, remote.address)
+            contents = (datasets if kind == "dataset" else runs).write_files(
+                path, files, remote.address
+            )
             _require_newer(present, kind, contents, remote.address)
             records = {
                 file.relative_to(files).as_posix(): FileRecord.of(file)
@@ -100,7 +120,9 @@ def pull(address: str, out: str | Path) -> TransferResult:
     remote = open_remote(address)
     index = read_index(remote, remote.index())
     if present is not None and index.kind != "dataset":
-        raise UsageError(f"{out}: is a dataset, and {remote.address} holds a run; choose a new folder")
+        raise UsageError(
+            f"{out}: is a dataset, and {remote.address} holds a run; choose a new folder"
+        )
     if present is not None and all(present.find(digest) for digest in index.contents):
         return TransferResult(index.kind, 0, 0)
     with _work_folder(out.absolute(), "pull") as folder:
@@ -110,9 +132,13 @@ def pull(address: str, out: str | Path) -> TransferResult:
         work.mkdir(exist_ok=True)
         if index.kind == "dataset":
             pushed = RemoteDataset(remote, index, work)
-            fetched = pushed.fetch([e for e in pushed.entries if present is None or present.find(e.hash) is None])
+            fetched = pushed.fetch(
+                [e for e in pushed.entries if present is None or present.find(e.hash) is None]
+            )
             new = work / "dataset"
-            datasets.add_missing(pushed, pushed.robot, new if present is None else out, new=present is None)
+            datasets.add_missing(
+                pushed, pushed.robot, new if present is None else out, new=present is None
+            )
         else:
             fetched, new = sorted(index.files), work
             with file_errors(remote.address, work):
@@ -132,10 +158,14 @@ def _kind(path: Path) -> Kind:
         return "dataset"
     if (path / "split.json").is_file() and (path / "config.json").is_file():
         return "run"
-    raise UsageError(f"{path}: neither a dataset nor a run of gaponet train; send a robot folder as a .zip")
+    raise UsageError(
+        f"{path}: neither a dataset nor a run of gaponet train; send a robot folder as a .zip"
+    )
 
 
-def _require_newer(present: Index | None, kind: Kind, contents: tuple[str, ...], address: str) -> None:
+def _require_newer(
+    present: Index | None, kind: Kind, contents: tuple[str, ...], address: str
+) -> None:
     """Refuse to replace a push with content that this one lacks."""
     lost = set(present.contents) - set(contents) if present else set()
     if present and (present.kind != kind or lost):
@@ -148,7 +178,9 @@ def _require_newer(present: Index | None, kind: Kind, contents: tuple[str, ...],
 @contextmanager
 def _work_folder(path: Path, purpose: str) -> Iterator[Path]:
     """Hidden folder beside a path, for one process at a time; it is removed at the end if the block does not fail."""
-    parent = path.parent if os.access(path.parent, os.W_OK) else Path(gettempdir())  # a disk that is only read
+    parent = (
+        path.parent if os.access(path.parent, os.W_OK) else Path(gettempdir())
+    )  # a disk that is only read
     folder = parent / f"{FOLDER_MARKER}-{purpose}-{path.name}"
     with lock_folder(folder, purpose):
         yield folder

@@ -24,7 +24,9 @@ def load_dataset(place: str | Path) -> Dataset:
 
 
 def open_dataset(
-    dataset: Dataset | str | Path, robot: RobotSpec | str | Path | None = None, run: str | Path | None = None
+    dataset: Dataset | str | Path,
+    robot: RobotSpec | str | Path | None = None,
+    run: str | Path | None = None,
 ) -> tuple[Dataset, RobotSpec]:
     """Open a dataset for reading; return it and its robot, with the gains that all recordings state.
 
@@ -43,11 +45,15 @@ def open_dataset(
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if robot is not None:
         return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
-    from gaponet.sim.dataset_robot import dataset_robot  # imports mujoco, before which view and report choose OpenGL
+    from gaponet.sim.dataset_robot import (
+        dataset_robot,
+    )  # imports mujoco, before which view and report choose OpenGL
 
     spec = dataset_robot(data, None if run is None else Path(run))
     if not has_stored_robot(data.path) and (run is None or not has_stored_robot(Path(run))):
         logging.getLogger("gaponet").warning(
-            "%s holds no robot (written before November 2026): the package's %s is used", data.path, spec.name
+            "%s holds no robot (written before November 2026): the package's %s is used",
+            data.path,
+            spec.name,
         )
     return data, spec

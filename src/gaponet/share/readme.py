@@ -10,7 +10,15 @@ from gaponet.data.card import NOT_STATED
 from gaponet.nn.artifact import GapModel
 from gaponet.report.tables import totals
 
-LICENCES = ("apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-4.0", "cc-by-sa-4.0", "cc-by-nc-4.0")  # the Hub's
+LICENCES = (
+    "apache-2.0",
+    "mit",
+    "bsd-3-clause",
+    "cc0-1.0",
+    "cc-by-4.0",
+    "cc-by-sa-4.0",
+    "cc-by-nc-4.0",
+)  # the Hub's
 
 
 def dataset_readme(card: dict[str, Any], text: str, address: str, sets: list[str]) -> str:
@@ -20,20 +28,34 @@ def dataset_readme(card: dict[str, Any], text: str, address: str, sets: list[str
         sets: Folders of the sets, below the repository.
     """
     licence = card["licence"]
-    configs = [{"config_name": s.strip("./") or "default", "data_files": f"{s}/data/*/*.parquet"} for s in sets]
-    header: dict[str, Any] = {"task_categories": ["robotics"], "tags": _tags(card, "LeRobot"), "configs": configs}
+    configs = [
+        {"config_name": s.strip("./") or "default", "data_files": f"{s}/data/*/*.parquet"}
+        for s in sets
+    ]
+    header: dict[str, Any] = {
+        "task_categories": ["robotics"],
+        "tags": _tags(card, "LeRobot"),
+        "configs": configs,
+    }
     if licence.lower() in LICENCES:
         header["license"] = licence.lower()
     elif licence != NOT_STATED:
         header |= {"license": "other", "license_name": licence}
-    use = [f"    gaponet pull {address} DATASET", "", "LeRobot reads the files too: a LeRobotDataset v3.0 in SI units."]
+    use = [
+        f"    gaponet pull {address} DATASET",
+        "",
+        "LeRobot reads the files too: a LeRobotDataset v3.0 in SI units.",
+    ]
     return _page(header, text.splitlines(), use)
 
 
 def run_readme(facts: dict[str, Any], address: str) -> str:
     """Return a model card: corrected joints, training data, and errors on the test motions."""
     card, metrics = facts["card"], facts["metrics"]
-    virtual, rates = ", trained on VIRTUAL robots", ", ".join(f"{1 / dt:.2f}" for dt in card.get("dt", []))
+    virtual, rates = (
+        ", trained on VIRTUAL robots",
+        ", ".join(f"{1 / dt:.2f}" for dt in card.get("dt", [])),
+    )
     lines = [
         f"# {escape_markdown(card['robot'])}: a model of its motor gap{virtual * bool(card.get('virtual'))}",
         "",

@@ -73,7 +73,10 @@ class Index:
     def __post_init__(self) -> None:
         for path in self.files:
             parts = path.split("/")
-            invalid = any(p in ("", "..") or p.startswith(".") or "\\" in p or not p.isprintable() for p in parts)
+            invalid = any(
+                p in ("", "..") or p.startswith(".") or "\\" in p or not p.isprintable()
+                for p in parts
+            )
             too_long = len(parts) > MAX_FOLDER_DEPTH or len(path) > MAX_PATH_LENGTH
             if invalid or too_long or ":" in path or path == INDEX:
                 raise RemoteError(f"files: '{path}' is not the name of a file inside a folder")
@@ -127,7 +130,9 @@ class Remote(Protocol):
 
 def lost_race(address: str) -> RemoteError:
     """Return the error of the slower one of two simultaneous pushes."""
-    return RemoteError(f"{address}: somebody else pushed at the same time, and nothing was replaced; push again")
+    return RemoteError(
+        f"{address}: somebody else pushed at the same time, and nothing was replaced; push again"
+    )
 
 
 def read_index(remote: Remote, content: bytes | None) -> Index:
@@ -141,7 +146,9 @@ def read_index(remote: Remote, content: bytes | None) -> Index:
     where = f"{remote.address}: {INDEX}"
     index = parse_json(Index, content, where, RemoteError, "push it again, with --replace")
     if index.format > FORMAT:
-        raise RemoteError(f"{where}: format {index.format} is newer than this gaponet reads; upgrade gaponet")
+        raise RemoteError(
+            f"{where}: format {index.format} is newer than this gaponet reads; upgrade gaponet"
+        )
     return index
 
 
@@ -158,7 +165,9 @@ def download(remote: Remote, index: Index, paths: list[str], folder: Path) -> No
             raise RemoteError(wrong.format(remote.address, path))
     needed, free = index.size(paths), shutil.disk_usage(folder).free
     if needed + MIN_FREE_BYTES > free:
-        raise RemoteError(f"{remote.address}: has {needed / 1e9:.2f} GB; {free / 1e9:.2f} GB of the disk are free")
+        raise RemoteError(
+            f"{remote.address}: has {needed / 1e9:.2f} GB; {free / 1e9:.2f} GB of the disk are free"
+        )
     remote.fetch(paths, index, folder)
     for path in paths:
         if FileRecord.of(folder / path) != index.files[path]:
@@ -168,8 +177,14 @@ def download(remote: Remote, index: Index, paths: list[str], folder: Path) -> No
 
 def _network_error_types() -> tuple[type[Exception], ...]:
     """Return the errors that network libraries raise; a library that was not imported cannot have raised one."""
-    loaded = ((sys.modules[module], names) for module, names in LIBRARY_ERRORS.items() if module in sys.modules)
-    own = (getattr(module, name) for module, names in loaded for name in names if hasattr(module, name))
+    loaded = (
+        (sys.modules[module], names)
+        for module, names in LIBRARY_ERRORS.items()
+        if module in sys.modules
+    )
+    own = (
+        getattr(module, name) for module, names in loaded for name in names if hasattr(module, name)
+    )
     return (OSError, ValueError, RuntimeError, *own)  # Xet raises RuntimeError
 
 
@@ -180,7 +195,9 @@ def network_errors(address: str) -> Iterator[None]:
         yield
     except _network_error_types() as error:
         text = re.sub(r"\?\S+", "?…", " ".join(str(error).split()))  # a query may hold a signature
-        missing, refused = (isinstance(error, kind) for kind in (FileNotFoundError, PermissionError))
+        missing, refused = (
+            isinstance(error, kind) for kind in (FileNotFoundError, PermissionError)
+        )
         reason = "not found: " * missing + "no permission: " * refused
         raise RemoteError(f"{address}: {reason}{text[:300] or type(error).__name__}") from None
 

@@ -11,7 +11,12 @@ from gaponet.base.errors import ModelError
 from gaponet.base.files import lock_folder, write_text
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.report.run_files import read_config, read_metrics
-from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot, require_self_contained
+from gaponet.robot.folder import (
+    STORED_ROBOT,
+    has_stored_robot,
+    load_stored_robot,
+    require_self_contained,
+)
 from gaponet.share.readme import run_readme
 from gaponet.share.remote import Index, RemoteError
 
@@ -51,7 +56,9 @@ def require_pushed_run(folder: Path, index: Index) -> None:
     """
     with lock_folder(folder, "run"):
         if sha256(folder / "model" / WEIGHTS) not in index.contents:
-            raise RemoteError("model/model.onnx is not the network that was pushed, by its hash; push it again")
+            raise RemoteError(
+                "model/model.onnx is not the network that was pushed, by its hash; push it again"
+            )
         _facts(folder)
     shutil.rmtree(folder / ".cache", ignore_errors=True)  # of huggingface_hub
 
@@ -63,4 +70,9 @@ def _facts(run: Path) -> dict[str, Any]:
     config, model = read_config(run), GapModel.load(run)
     load_stored_robot(run, config["robot"])
     metrics = read_metrics(run) if (run / "metrics.json").is_file() else None
-    return {"card": model.card, "config": config, "metrics": metrics, "weights": model.weights_hash()}
+    return {
+        "card": model.card,
+        "config": config,
+        "metrics": metrics,
+        "weights": model.weights_hash(),
+    }

@@ -26,7 +26,15 @@ from gaponet.data.journal import Entry, EntryHeader
 from gaponet.data.sequence import ARRAYS, SequenceMeta, to_sequence
 from gaponet.data.store import Dataset, entry_id
 from gaponet.share import dataset as datasets
-from gaponet.share.remote import INDEX, Index, Remote, RemoteError, download, file_errors, read_index
+from gaponet.share.remote import (
+    INDEX,
+    Index,
+    Remote,
+    RemoteError,
+    download,
+    file_errors,
+    read_index,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -63,8 +71,15 @@ class RemoteDataset(Dataset):
         """
         if index.kind != "dataset":
             raise RemoteError(f"{remote.address}: holds a run, not a dataset")
-        self._remote, self._index, self.files, self.address = remote, index, folder / "files", remote.address
-        self._locations: dict[str, tuple[Set, dict[str, Any], int]] = {}  # content hash → set, episode, first row
+        self._remote, self._index, self.files, self.address = (
+            remote,
+            index,
+            folder / "files",
+            remote.address,
+        )
+        self._locations: dict[
+            str, tuple[Set, dict[str, Any], int]
+        ] = {}  # content hash → set, episode, first row
         self._present = {path for path in index.files if "data" not in path.split("/")[:-1]}
         download(remote, index, sorted(self._present), self.files)
         with file_errors(self.address, self.files):
@@ -73,7 +88,11 @@ class RemoteDataset(Dataset):
             for part in self._sets:
                 if part.ours is None:
                     raise RemoteError(f"{part.path}: gaponet did not write this set")
-                stated = {k: str(v) for k, v in part.ours["dataset"].items() if k in Stated.__annotations__}
+                stated = {
+                    k: str(v)
+                    for k, v in part.ours["dataset"].items()
+                    if k in Stated.__annotations__
+                }
                 made.set_provenance(**stated)
             super().__init__(made.path, remote.address)
             if sorted(entry.hash for entry in self.entries) != sorted(index.contents):
@@ -83,7 +102,10 @@ class RemoteDataset(Dataset):
     def fetch(self, entries: list[Entry]) -> list[str]:
         """Download the missing files with these recordings; return all files that are on this machine."""
         with file_errors(self.address, self.files):
-            files = {part.data_file(episode) for part, episode, _ in (self._locations[entry.hash] for entry in entries)}
+            files = {
+                part.data_file(episode)
+                for part, episode, _ in (self._locations[entry.hash] for entry in entries)
+            }
             wanted = {file.relative_to(self.files).as_posix() for file in files} - self._present
             if unlisted := wanted - self._index.files.keys():
                 raise RemoteError(f"{min(unlisted)} is not in {INDEX}; {AGAIN}")
@@ -102,9 +124,15 @@ class RemoteDataset(Dataset):
         part, episode, first = self._locations[entry.hash]
         with file_errors(self.address, self.files):
             table = _rows_of(part.data_file(episode), first, entry.rows)
-            sequence = to_sequence(read_episode(part, episode, self.robot, table), self.robot, entry.meta)
-            if replace(sequence, meta=entry.meta).content_hash() != entry.hash:  # motion and unit as recorded
-                raise RemoteError(f"'{entry.id}' is not what was pushed, by its content hash; {AGAIN}")
+            sequence = to_sequence(
+                read_episode(part, episode, self.robot, table), self.robot, entry.meta
+            )
+            if (
+                replace(sequence, meta=entry.meta).content_hash() != entry.hash
+            ):  # motion and unit as recorded
+                raise RemoteError(
+                    f"'{entry.id}' is not what was pushed, by its content hash; {AGAIN}"
+                )
         return {name: getattr(sequence, name) for name in names}
 
     @property
@@ -115,7 +143,9 @@ class RemoteDataset(Dataset):
     @contextmanager
     def writing(self) -> Iterator[None]:
         """Raise DatasetError: a remote dataset cannot be changed."""
-        raise DatasetError(f"{self.address}: is only read; to change it, gaponet pull it and push it again")
+        raise DatasetError(
+            f"{self.address}: is only read; to change it, gaponet pull it and push it again"
+        )
         yield
 
     def _read_entries(self) -> Iterator[Entry]:
@@ -127,7 +157,9 @@ class RemoteDataset(Dataset):
                 digest, first = str(episode.get("content_hash")), rows.get(file, 0)
                 channels = tuple(c for c in ARRAYS if FEATURES[c] in part.features)
                 findings = episode["findings"]
-                header = EntryHeader(entry_id(meta, digest), digest, part.dt, episode["length"], channels)
+                header = EntryHeader(
+                    entry_id(meta, digest), digest, part.dt, episode["length"], channels
+                )
                 entry = Entry.create(header, meta, findings)
                 self._locations[digest], rows[file] = (part, episode, first), first + entry.rows
                 yield entry
@@ -157,12 +189,19 @@ def _rows_of(file: Path, first: int, rows: int) -> pa.Table:
     import pyarrow.parquet as pq
 
     parquet = pq.ParquetFile(file)
-    ends = np.cumsum([parquet.metadata.row_group(i).num_rows for i in range(parquet.num_row_groups)])
+    ends = np.cumsum(
+        [parquet.metadata.row_group(i).num_rows for i in range(parquet.num_row_groups)]
+    )
     groups = np.flatnonzero((ends > first) & (ends <= first + rows)).tolist()
     parts = [parquet.metadata.row_group(i) for i in groups]
-    if 8 * sum(part.column(k).num_values for part in parts for k in range(part.num_columns)) > MAX_ARRAYS_BYTES:
+    if (
+        8 * sum(part.column(k).num_values for part in parts for k in range(part.num_columns))
+        > MAX_ARRAYS_BYTES
+    ):
         raise RemoteError(f"{file}: a recording in it has more than {MAX_ARRAYS_BYTES >> 20} MiB")
     table = parquet.read_row_groups(groups, use_threads=False)
     if len(table) != rows:
-        raise RemoteError(f"{file}: rows {first} to {first + rows} are not whole row groups; {AGAIN}")
+        raise RemoteError(
+            f"{file}: rows {first} to {first + rows} are not whole row groups; {AGAIN}"
+        )
     return table

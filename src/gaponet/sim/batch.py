@@ -64,7 +64,9 @@ class OneByOne:
         self._call(np.array([i]), mujoco.mj_step1)
         return copy.copy(self._data)
 
-    def _call(self, ids: Array | None, function: Callable[[mujoco.MjModel, mujoco.MjData], None]) -> None:
+    def _call(
+        self, ids: Array | None, function: Callable[[mujoco.MjModel, mujoco.MjData], None]
+    ) -> None:
         model, data = self._model, self._data
         for i in np.arange(self.nsim)[slice(None) if ids is None else ids]:
             for name, x in self._expanded.items():
@@ -84,10 +86,15 @@ else:
         from mujoco.batch import MODEL_FIELDS, Batch
     except ImportError:  # before MuJoCo 3.17
         Batch = OneByOne
-        MODEL_FIELDS = {n for n in dir(mujoco.MjModel) if n[0] != "_"} | {f"opt.{n}" for n in dir(mujoco.MjOption)}
+        MODEL_FIELDS = {n for n in dir(mujoco.MjModel) if n[0] != "_"} | {
+            f"opt.{n}" for n in dir(mujoco.MjOption)
+        }
 
 
-MAX_RAMP_LEAD_RAD, MAX_RAMP_LEAD_S = 0.05, 0.1  # of a ramp beyond its joint: fixed, and at the ramp's speed
+MAX_RAMP_LEAD_RAD, MAX_RAMP_LEAD_S = (
+    0.05,
+    0.1,
+)  # of a ramp beyond its joint: fixed, and at the ramp's speed
 
 
 def ramp_start(target: Any, qpos: Any, speed: Any) -> Any:
@@ -123,7 +130,13 @@ class Condition(NamedTuple):
         meta, gains = sequence.meta, sequence.meta.recorded_gains
         other = (None, None) if robot.with_gains(*gains) is robot else gains
         warm = any(robot.friction_per_kelvin) or any(robot.damping_per_kelvin)
-        return cls(meta.payload_mass, meta.payload_side, sequence.dt, *other, sequence.temperatures if warm else None)
+        return cls(
+            meta.payload_mass,
+            meta.payload_side,
+            sequence.dt,
+            *other,
+            sequence.temperatures if warm else None,
+        )
 
 
 class BatchSim:
@@ -144,13 +157,20 @@ class BatchSim:
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
         conditions = [Condition(*c) for c in conditions]
-        robots = {c: robot.with_gains(c.kp, c.kd).at_temperature(c.temperature) for c in dict.fromkeys(conditions)}
-        self.models = {c: build_model(r, *c[:3], locked, physics_only=True) for c, r in robots.items()}
+        robots = {
+            c: robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
+            for c in dict.fromkeys(conditions)
+        }
+        self.models = {
+            c: build_model(r, *c[:3], locked, physics_only=True) for c, r in robots.items()
+        }
         first = self.models[conditions[0]]
         kp_ratio = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
         self._kp_ratio = np.array([kp_ratio[c] for c in conditions])
         self._kd = np.array([robots[c].kd for c in conditions])
-        threads = nthread or max(1, min(os.cpu_count() or 1, len(conditions) // 16))  # fewer each: threads mostly wait
+        threads = nthread or max(
+            1, min(os.cpu_count() or 1, len(conditions) // 16)
+        )  # fewer each: threads mostly wait
         self.batch = Batch(first, nsim=len(conditions), nthread=threads)
         # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
         self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])
@@ -159,21 +179,29 @@ class BatchSim:
         bind: Callable[[str], Array] = self.batch.bind
         self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         self.torque, self._warmstart = bind("actuator_force"), bind("qacc_warmstart")
-        self.servo_model = ServoModel(self.batch, first) if robot.has_servo_model or servo_model else None
-        self._history = CommandHistory(bind("history"), bind("time"), first) if first.nhistory else None
+        self.servo_model = (
+            ServoModel(self.batch, first) if robot.has_servo_model or servo_model else None
+        )
+        self._history = (
+            CommandHistory(bind("history"), bind("time"), first) if first.nhistory else None
+        )
         # Physics steps per control period, and their length in s, of each simulation.
         self.nstep = np.array([robot.steps_per(c[2]) for c in conditions])
         self._one_rate = bool((self.nstep == self.nstep[0]).all())
         self.timestep = np.array([self.models[c].opt.timestep for c in conditions])
         self.range = qpos_range(first)
         speed = robot.target_speed[robot.index(self.joint_names)]
-        self.max_change = self._max_change(speed) if speed.any() else None  # None without speed limits
+        self.max_change = (
+            self._max_change(speed) if speed.any() else None
+        )  # None without speed limits
 
     def array(self, values: Any) -> Array:
         """Return values as an array of this simulator: numpy here, torch in sim/warp.py."""
         return np.asarray(values)
 
-    def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None) -> None:
+    def reset(
+        self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None
+    ) -> None:
         """Put simulations `ids` into a state, (k, n) rad and rad/s.
 
         `past` are the targets of the control periods before, newest first, (k, depth, n) rad, for servos with a delay
@@ -187,7 +215,9 @@ class BatchSim:
             self.ctrl[ids] = qpos if past is None else ramp_start(past[:, 0], self.qpos[ids], speed)
         if self._history is not None:
             if past is None:
-                raise UsageError(f"{self.robot.name} has delayed servos: give the targets before as `past`")
+                raise UsageError(
+                    f"{self.robot.name} has delayed servos: give the targets before as `past`"
+                )
             self._history.fill(ids, past, self.nstep[ids], self.timestep[ids])
         if self.servo_model is not None:
             rows = np.arange(self.num_envs)[ids]
@@ -202,7 +232,11 @@ class BatchSim:
         """
         if self.max_change is not None:
             near = np.clip(ctrl, self.ctrl - self.max_change, self.ctrl + self.max_change)
-            ctrl = near if ids is None else np.where(np.isin(np.arange(self.num_envs), ids)[:, None], near, self.ctrl)
+            ctrl = (
+                near
+                if ids is None
+                else np.where(np.isin(np.arange(self.num_envs), ids)[:, None], near, self.ctrl)
+            )
         np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
         if self._one_rate:
             self._advance(ids, int(self.nstep[0]))
@@ -233,11 +267,17 @@ class BatchSim:
             UsageError: A value that these simulations cannot take, such as a delay where the robot has none.
         """
         model, batch = next(iter(self.models.values())), self.batch
-        fixed = STOP_FIELDS + ("delay",) * (not model.nhistory) + SERVO_TERMS * (self.servo_model is None)
+        fixed = (
+            STOP_FIELDS
+            + ("delay",) * (not model.nhistory)
+            + SERVO_TERMS * (self.servo_model is None)
+        )
         if refused := [f for f in fixed if f in values and np.any(values[f])]:
             raise UsageError(f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: give them "
                              "to the robot (with_servos) that BatchSim is made with")  # fmt: skip
-        at = np.array([model.actuator(j).id for j in joints])  # of the joint and of its degree of freedom too
+        at = np.array(
+            [model.actuator(j).id for j in joints]
+        )  # of the joint and of its degree of freedom too
         own = self.robot.index(joints)
         gain, bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         kp = values["kp"] * self._kp_ratio[:, own]
@@ -258,11 +298,16 @@ class BatchSim:
         if "zero" in values:
             batch.expand("qpos0")[:, at] = model.qpos0[at] + self.robot.zero[own] - values["zero"]
         if "target_speed" in values:
-            speed = np.tile(self.robot.target_speed[self.robot.index(self.joint_names)], (self.num_envs, 1))
+            speed = np.tile(
+                self.robot.target_speed[self.robot.index(self.joint_names)], (self.num_envs, 1)
+            )
             speed[:, at] = values["target_speed"]
             self.max_change = self._max_change(speed)
         if self.servo_model is not None:
-            self.servo_model.bias[:, at], self.servo_model.frictionloss[:, at] = bias[:, at, 0], values["frictionloss"]
+            self.servo_model.bias[:, at], self.servo_model.frictionloss[:, at] = (
+                bias[:, at, 0],
+                values["frictionloss"],
+            )
             self.servo_model.armature[:, at] = values["armature"]
             self.servo_model.damping[:, at] = np.maximum(values["damping"], 0.0)
             for name in SERVO_TERMS:
@@ -270,7 +315,9 @@ class BatchSim:
 
     def _max_change(self, speed: Array) -> Array:
         """Return the largest change of targets per period at `speed`, (…, n) rad/s (0: no limit), (num_envs, n) rad."""
-        return np.asarray((self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf))
+        return np.asarray(
+            (self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf)
+        )
 
     def state(self) -> dict[str, Array]:
         """Return copies of the complete state."""

@@ -21,8 +21,15 @@ def dataset_robot(data: Dataset, run: Path | None = None) -> RobotSpec:
     own = load_robot(stored) if stored is not None and (stored / "robot.toml").is_file() else None
     if own is not None and stored != run and not has_stored_robot(data.path):
         return own
-    robot, gains = load_stored_robot(data.path, data.robot_name), {e.meta.recorded_gains for e in data.entries}
+    robot, gains = (
+        load_stored_robot(data.path, data.robot_name),
+        {e.meta.recorded_gains for e in data.entries},
+    )
     recorded = robot.with_gains(*gains.pop()) if len(gains) == 1 else robot
     if recorded is robot or own is None:
         return recorded
-    return robot if model_hash(own.before_identification) == model_hash(robot.before_identification) else recorded
+    return (
+        robot
+        if model_hash(own.before_identification) == model_hash(robot.before_identification)
+        else recorded
+    )

@@ -67,7 +67,9 @@ def tips_of(robot: RobotSpec) -> Callable[[Array], Array] | None:
     """Return the height of the lowest tip by postures (k, n), (k,) m; None if robot.toml names no tip."""
     if not robot.tips:
         return None
-    return partial(_lowest_tip, build_model(replace(robot, table=None), physics_only=True), robot.tips)
+    return partial(
+        _lowest_tip, build_model(replace(robot, table=None), physics_only=True), robot.tips
+    )
 
 
 def _lowest_tip(model: mujoco.MjModel, tips: tuple[Tip, ...], postures: Array) -> Array:

@@ -49,7 +49,9 @@ class Inertia:
     def __init__(self, batch: Batch, model: mujoco.MjModel, dof: Array) -> None:
         place = np.full(model.nv, -1)
         place[dof] = np.arange(len(dof))
-        row = place[np.repeat(np.arange(model.nv), model.M_rownnz)]  # MuJoCo keeps the lower triangle, row by row
+        row = place[
+            np.repeat(np.arange(model.nv), model.M_rownnz)
+        ]  # MuJoCo keeps the lower triangle, row by row
         column = place[model.M_colind]
         self._entries = np.flatnonzero((row >= 0) & (column >= 0))
         self.row, self.column, self.n = row[self._entries], column[self._entries], len(dof)
@@ -72,7 +74,12 @@ class AnalyticInverse:
     """
 
     def __init__(
-        self, batch: Batch, model: mujoco.MjModel, joints: tuple[str, ...], nstep: Array, timestep: Array
+        self,
+        batch: Batch,
+        model: mujoco.MjModel,
+        joints: tuple[str, ...],
+        nstep: Array,
+        timestep: Array,
     ) -> None:
         """
         Args:
@@ -91,15 +98,28 @@ class AnalyticInverse:
         self.kp, self.kd = _own(batch, model, "actuator_gainprm")[:, act, 0], -bias[..., 2]
         self.offset, self.delay = bias[..., 0] / self.kp, model.actuator_delay[act]
         self.low, self.high = _most_torque(model, joints, act)
-        self.frictionloss, self.damping = model.dof_frictionloss[self.dof], model.dof_damping[self.dof]
+        self.frictionloss, self.damping = (
+            model.dof_frictionloss[self.dof],
+            model.dof_damping[self.dof],
+        )
         has_terms = model.nuser_actuator == len(SERVO_TERMS)
-        self.terms = present(dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True)) if has_terms else {})
-        self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER  # kd takes the speed before the step
+        self.terms = present(
+            dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True)) if has_terms else {}
+        )
+        self.explicit = (
+            model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        )  # kd takes the speed before the step
         self.h, self.dt = timestep[:, None], (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
-        before, speeds = zip(*(self.within_period(int(n), int(nstep.max())) for n in nstep), strict=True)
-        self.before, self.speeds = (np.array(x).transpose(1, 2, 0)[..., None] for x in (before, speeds))
-        self.share = (np.arange(nstep.max())[:, None] < nstep) / nstep  # of each physics step, (steps, num)
+        before, speeds = zip(
+            *(self.within_period(int(n), int(nstep.max())) for n in nstep), strict=True
+        )
+        self.before, self.speeds = (
+            np.array(x).transpose(1, 2, 0)[..., None] for x in (before, speeds)
+        )
+        self.share = (
+            np.arange(nstep.max())[:, None] < nstep
+        ) / nstep  # of each physics step, (steps, num)
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
         self.bias, self.passive = batch.bind("qfrc_bias"), batch.bind("qfrc_passive")
         self.inertia = Inertia(batch, model, self.dof)
@@ -107,7 +127,9 @@ class AnalyticInverse:
     @classmethod
     def of(cls, sim: BatchSim) -> AnalyticInverse:
         """Return the inverse of a simulation that nothing else uses."""
-        return cls(sim.batch, next(iter(sim.models.values())), sim.joint_names, sim.nstep, sim.timestep)
+        return cls(
+            sim.batch, next(iter(sim.models.values())), sim.joint_names, sim.nstep, sim.timestep
+        )
 
     def set_state(self, data: mujoco.MjData) -> None:
         """Copy positions and velocities of a scene, (nq,) rad and (nv,) rad/s."""
@@ -129,7 +151,9 @@ class AnalyticInverse:
     def _targets_in_force(self, period: Period) -> Array:
         displacement, gain = period.next_qpos - period.qpos, period.next_qvel - period.qvel
         ends = np.stack([self.h * period.qvel, self.h * period.next_qvel, displacement])
-        qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self.before, ends)  # at which physics steps begin
+        qpos = period.qpos + np.einsum(
+            "ibkx,bkj->ikj", self.before, ends
+        )  # at which physics steps begin
         before = np.einsum("ibkx,bkj->ikj", self.speeds, ends) / self.h
         after, mean = before[1:], lambda x: np.einsum("ik,ikj->kj", self.share, x)
         torque = self._torque(mean(qpos), mean(before[:-1]), gain / self.dt, period.friction)
@@ -141,7 +165,9 @@ class AnalyticInverse:
         low, high = torque_range(self.high, before[:-1] / no_load)
         return self._targets(np.clip(torque, mean(low), mean(high)), back, low, high, mean)
 
-    def _targets(self, torque: Array, back: Array, low: Array, high: Array, mean: Callable[[Array], Array]) -> Array:
+    def _targets(
+        self, torque: Array, back: Array, low: Array, high: Array, mean: Callable[[Array], Array]
+    ) -> Array:
         """Return targets u (num, n) for which the mean over steps of kp·u − back, (steps, num, n), within the motors'
         limits, (n,) or (steps, num, n), is torque (num, n)."""
         out = (torque + mean(back)) / self.kp
@@ -158,7 +184,11 @@ class AnalyticInverse:
         self.qpos[:, self.at], self.qvel[:, self.dof] = qpos, qvel
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         load = self.bias[:, self.dof]
-        torque = load - self.passive[:, self.dof] + np.einsum("kij,kj->ki", self.inertia.matrix(self.num), qacc)
+        torque = (
+            load
+            - self.passive[:, self.dof]
+            + np.einsum("kij,kj->ki", self.inertia.matrix(self.num), qacc)
+        )
         return torque + friction * friction_limit(self.terms, self.frictionloss, qvel, torque, load)
 
     def agrees_with(self, other: AnalyticInverse, limits: Array) -> bool:
@@ -188,7 +218,9 @@ class AnalyticInverse:
             of h·speeds from the first to that after the last step, (rows + 1, 3). Rows beyond the period are zero.
         """
         i = np.arange(count + 1.0)
-        shape = np.linalg.pinv([[count, count**2], [i.sum(), (i**2).sum()]])  # α, β of v = v_0 + α i + β i²
+        shape = np.linalg.pinv(
+            [[count, count**2], [i.sum(), (i**2).sum()]]
+        )  # α, β of v = v_0 + α i + β i²
         weights = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
         speeds, before = np.zeros((rows + 1, 3)), np.zeros((rows, 3))
         speeds[: count + 1] = np.stack([i, i**2], axis=1) @ weights + [1.0, 0.0, 0.0]
@@ -207,7 +239,10 @@ def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Arra
     at = np.array([model.joint(name).id for name in joints])
     limits = [(model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators]),
               (model.jnt_actfrclimited[at], model.jnt_actfrcrange[at])]  # fmt: skip
-    low, high = zip(*(np.where(limited[:, None], both, [-np.inf, np.inf]).T for limited, both in limits), strict=True)
+    low, high = zip(
+        *(np.where(limited[:, None], both, [-np.inf, np.inf]).T for limited, both in limits),
+        strict=True,
+    )
     return np.array([np.max(low, axis=0), np.min(high, axis=0)])
 
 
@@ -216,11 +251,24 @@ def _position_actuator(model: mujoco.MjModel, joint: str) -> int:
     of_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     mine = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == model.joint(joint).id))
     if len(mine) != 1:
-        raise UsageError(f"joint '{joint}' has {len(mine)} actuators in the simulator; there must be one, position")
+        raise UsageError(
+            f"joint '{joint}' has {len(mine)} actuators in the simulator; there must be one, position"
+        )
     i = int(mine[0])
     kinds = (model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i])
-    plain = kinds == (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE, mujoco.mjtDyn.mjDYN_NONE)
+    plain = kinds == (
+        mujoco.mjtGain.mjGAIN_FIXED,
+        mujoco.mjtBias.mjBIAS_AFFINE,
+        mujoco.mjtDyn.mjDYN_NONE,
+    )
     kp = model.actuator_gainprm[i, 0]
-    if not plain or kp <= 0 or abs(model.actuator_biasprm[i, 1] + kp) > 1e-6 * kp or model.actuator_gear[i, 0] != 1:
-        raise UsageError(f"joint '{joint}': its actuator is no position actuator (<position>, gear 1) in the simulator")
+    if (
+        not plain
+        or kp <= 0
+        or abs(model.actuator_biasprm[i, 1] + kp) > 1e-6 * kp
+        or model.actuator_gear[i, 0] != 1
+    ):
+        raise UsageError(
+            f"joint '{joint}': its actuator is no position actuator (<position>, gear 1) in the simulator"
+        )
     return i

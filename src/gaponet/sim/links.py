@@ -18,7 +18,11 @@ from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.model import build_model, principal_axes
 
 COORDINATES = 10  # of a link: log of mass, of stretches (3), shears (3) and shifts (3)
-MASS_LOG_STD, STRETCH_STD, SHIFT_STD = np.log(1.3), 0.15, 0.15  # of the prior; shifts relative to the link's length
+MASS_LOG_STD, STRETCH_STD, SHIFT_STD = (
+    np.log(1.3),
+    0.15,
+    0.15,
+)  # of the prior; shifts relative to the link's length
 MIN_LENGTH_M = 0.02
 MAX_STD_SHARE = 0.7  # of the prior's; a value with more is not determined
 
@@ -35,11 +39,15 @@ class LinkAxes:
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)
-        self._bodies: list[list[tuple[str, Array, Array]]] = []  # of each link: body, its frame in the link's, P
+        self._bodies: list[
+            list[tuple[str, Array, Array]]
+        ] = []  # of each link: body, its frame in the link's, P
         self.names, scale, self._arms = list[str](), list[Array](), list[Array]()
         for root in range(1, model.nbody):
             if model.body_weldid[root] == root and model.body_jntnum[root]:
-                welded = np.flatnonzero((model.body_weldid == root) & (model.body_mass > 0)).tolist()
+                welded = np.flatnonzero(
+                    (model.body_weldid == root) & (model.body_mass > 0)
+                ).tolist()
                 own = [b for b in welded if not model.body(b).name.startswith("payload_")]
                 if own and all(model.body(b).name and not model.body_simple[b] for b in own):
                     self.names.append(model.body(root).name)
@@ -55,19 +63,25 @@ class LinkAxes:
         links = dict(self._robot.links)
         for own, bodies in zip(x.reshape(-1, COORDINATES) * self.scale, self._bodies, strict=True):
             if own.any():
-                links |= {name: _link(_upper(own) @ p @ _upper(own).T, frame) for name, frame, p in bodies}
+                links |= {
+                    name: _link(_upper(own) @ p @ _upper(own).T, frame) for name, frame, p in bodies
+                }
         return links
 
     def inertials(self, x: Array) -> Array:
         """Return mass, centre of mass, principal inertia and its quaternion as MuJoCo has them, (bodies, 11)."""
         links = self.links(np.where(x == 0, 1e-12, x))  # of all bodies, those of the file too
         each = [links[name] for name in self.bodies]
-        return np.array([[one.mass, *one.pos, *np.concatenate(principal_axes(one))] for one in each])
+        return np.array(
+            [[one.mass, *one.pos, *np.concatenate(principal_axes(one))] for one in each]
+        )
 
     def moments(self, x: Array) -> Array:
         """Return mass, kg, centre of mass, m from the file's, and moment about the joint, kg·m, (L, 7); body's axes."""
         rows = []
-        for own, bodies, arm in zip(x.reshape(-1, COORDINATES) * self.scale, self._bodies, self._arms, strict=True):
+        for own, bodies, arm in zip(
+            x.reshape(-1, COORDINATES) * self.scale, self._bodies, self._arms, strict=True
+        ):
             p = _upper(own) @ sum(p for _, _, p in bodies) @ _upper(own).T
             mass, centre = p[3, 3], p[:3, 3] / p[3, 3]
             rows.append([mass, *centre, *mass * (arm + centre)])
@@ -78,14 +92,22 @@ def _centre(model: mujoco.MjModel, data: mujoco.MjData, own: list[int]) -> Array
     return np.asarray(model.body_mass[own] @ data.xipos[own] / model.body_mass[own].sum())
 
 
-def _members(model: mujoco.MjModel, data: mujoco.MjData, root: int, own: list[int]) -> list[tuple[str, Array, Array]]:
+def _members(
+    model: mujoco.MjModel, data: mujoco.MjData, root: int, own: list[int]
+) -> list[tuple[str, Array, Array]]:
     """Return name, frame (4, 4) and pseudo-inertia of bodies, about their common centre of mass in the axes of root."""
     centre = _centre(model, data, own)
     turn, members = data.xmat[root].reshape(3, 3), []
     for b in own:
         frame, inertial = np.eye(4), np.eye(4)
-        frame[:3, :3], frame[:3, 3] = turn.T @ data.xmat[b].reshape(3, 3), turn.T @ (data.xpos[b] - centre)
-        inertial[:3, :3], inertial[:3, 3] = turn.T @ data.ximat[b].reshape(3, 3), turn.T @ (data.xipos[b] - centre)
+        frame[:3, :3], frame[:3, 3] = (
+            turn.T @ data.xmat[b].reshape(3, 3),
+            turn.T @ (data.xpos[b] - centre),
+        )
+        inertial[:3, :3], inertial[:3, 3] = (
+            turn.T @ data.ximat[b].reshape(3, 3),
+            turn.T @ (data.xipos[b] - centre),
+        )
         moments, mass = model.body_inertia[b], model.body_mass[b]
         second = np.diag([*(moments.sum() / 2 - moments), mass])
         members.append((model.body(b).name, frame, inertial @ second @ inertial.T))
@@ -95,7 +117,9 @@ def _members(model: mujoco.MjModel, data: mujoco.MjData, root: int, own: list[in
 def _prior_std(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Array:
     """Return the standard deviations of a link's coordinates; its length is that to its centre or next joint."""
     own = model.body_weldid == root
-    others = [data.xpos[b] for b in range(1, model.nbody) if own[model.body_parentid[b]] and not own[b]]
+    others = [
+        data.xpos[b] for b in range(1, model.nbody) if own[model.body_parentid[b]] and not own[b]
+    ]
     ends = np.array([*data.xipos[own & (model.body_mass > 0)], *others]) - data.xpos[root]
     length = max(float(np.linalg.norm(ends, axis=1).max()), MIN_LENGTH_M)
     return np.array([MASS_LOG_STD / 2, *[STRETCH_STD] * 6, *[SHIFT_STD * length] * 3])
@@ -115,9 +139,14 @@ def _link(p: Array, frame: Array) -> Link:
     p = back @ p @ back.T
     centre = p[:3, 3] / p[3, 3]
     second = p[:3, :3] - p[3, 3] * np.outer(centre, centre)
-    second += 1e-6 * np.trace(second) * np.eye(3)  # a flat link stays physical when its numbers are rounded
+    second += (
+        1e-6 * np.trace(second) * np.eye(3)
+    )  # a flat link stays physical when its numbers are rounded
     inertia = np.trace(second) * np.eye(3) - second
-    numbers = [float(f"{v:.9g}") for v in (p[3, 3], *centre, *np.diag(inertia), *inertia[[0, 0, 1], [1, 2, 2]])]
+    numbers = [
+        float(f"{v:.9g}")
+        for v in (p[3, 3], *centre, *np.diag(inertia), *inertia[[0, 0, 1], [1, 2, 2]])
+    ]
     return Link(numbers[0], (numbers[1], numbers[2], numbers[3]), tuple(numbers[4:]))
 
 
@@ -129,7 +158,9 @@ class LinkResult:
     x: Array
     covariance: Array
     values: dict[str, Array]
-    servo_slopes: dict[str, Array] = field(default_factory=dict)  # field → its change for one of x, (n, Q)
+    servo_slopes: dict[str, Array] = field(
+        default_factory=dict
+    )  # field → its change for one of x, (n, Q)
 
     def moments(self) -> tuple[Array, Array, Array, Array]:
         """Return `LinkAxes.moments` before and now, their standard errors now and by the prior alone, (L, 7) each."""
@@ -138,12 +169,19 @@ class LinkResult:
         ahead = [self.axes.moments(self.x + step * row) for row in np.eye(len(self.x))]
         jac = (np.array(ahead) - now) / step  # (10 L, L, 7)
         std = np.sqrt(np.einsum("plk,pq,qlk->lk", jac, self.covariance, jac))
-        return self.axes.moments(np.zeros_like(self.x)), now, std, np.sqrt(np.square(jac).sum(axis=0))
+        return (
+            self.axes.moments(np.zeros_like(self.x)),
+            now,
+            std,
+            np.sqrt(np.square(jac).sum(axis=0)),
+        )
 
     def sentences(self) -> list[str]:
         """Return what is known of each link that changed, ± standard errors, and what is not determined."""
         sentences = []
-        for k, (name, before, now, std, prior) in enumerate(zip(self.axes.names, *self.moments(), strict=True)):
+        for k, (name, before, now, std, prior) in enumerate(
+            zip(self.axes.names, *self.moments(), strict=True)
+        ):
             if not self.x.reshape(-1, COORDINATES)[k].any():
                 continue
             known = std < MAX_STD_SHARE * prior
@@ -160,7 +198,9 @@ class LinkResult:
                 for i, axis in enumerate("xyz", 4)
                 if moved[i] and not known[[0, i - 3]].all()
             ]
-            unknown = ", ".join(what for what, one in zip(("mass", *"xyz"), known, strict=False) if not one)
+            unknown = ", ".join(
+                what for what, one in zip(("mass", *"xyz"), known, strict=False) if not one
+            )
             parts += [f"not determined by themselves: {unknown}"] * bool(unknown)
             sentences.append(f"{name}: {', '.join(parts)}")
         return sentences

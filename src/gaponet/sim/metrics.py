@@ -38,7 +38,9 @@ def by_motion(metas: Iterable[SequenceMeta], values: Array) -> Array:
     return np.array([values[names == name].mean() for name in dict.fromkeys(names.tolist())])
 
 
-def mean_reduction(metas: Iterable[SequenceMeta], before: Array, after: Array) -> tuple[float, float]:
+def mean_reduction(
+    metas: Iterable[SequenceMeta], before: Array, after: Array
+) -> tuple[float, float]:
     """Return the mean of before − after, (recordings,) each, and its standard error over independent motions."""
     reduction = before - after
     return float(reduction.mean()), standard_error(by_motion(metas, reduction))
@@ -89,7 +91,9 @@ class Comparison:
         if not freedom:
             least = MIN_RELATIVE_GAIN_ONE_MOTION
         relative = (self.before - self.after) / np.maximum(self.before + self.after, 1e-12)
-        significant = not freedom or relative.mean() > confidence_factor(freedom) * standard_error(relative)
+        significant = not freedom or relative.mean() > confidence_factor(freedom) * standard_error(
+            relative
+        )
         return bool(significant and self.gain[0] > least * self.before.mean())
 
 
@@ -135,7 +139,9 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
     Joints that no recording holds are left out of by_joint.
     """
     joints: dict[str, list[int]] = {j: [i] for i, j in enumerate(robot.operated)}
-    no_wrist = [i for i, j in enumerate(robot.operated) if "wrist" not in j]  # the paper's figure 3 is without wrists
+    no_wrist = [
+        i for i, j in enumerate(robot.operated) if "wrist" not in j
+    ]  # the paper's figure 3 is without wrists
     rows: dict[str, dict[str, list[_Row]]] = defaultdict(lambda: defaultdict(list))
     for run in part:
         meta = run.meta
@@ -151,10 +157,17 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
         for horizon, error in _horizons(run).items():
             rows["horizon"][horizon].append({"mpjae": error})
     held = [j for j in joints if rows["joint"][j]]
-    order = {"joint": held, **{g: sorted(rows[g]) for g in ("motion", "independent_motion", "payload", "unit")}}
-    order["horizon"] = [h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]]
+    order = {
+        "joint": held,
+        **{g: sorted(rows[g]) for g in ("motion", "independent_motion", "payload", "unit")},
+    }
+    order["horizon"] = [
+        h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]
+    ]
     total = {"mpjae_no_wrist": float("nan")} | _mean(rows[""][""])
-    return total | {f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()}
+    return total | {
+        f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()
+    }
 
 
 def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, float]:
@@ -169,7 +182,10 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
 
 
 def _mean(rows: list[_Row]) -> _Row:
-    return {k: float(np.mean([row[k] for row in rows if k in row])) for k in dict.fromkeys(k for r in rows for k in r)}
+    return {
+        k: float(np.mean([row[k] for row in rows if k in row]))
+        for k in dict.fromkeys(k for r in rows for k in r)
+    }
 
 
 def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
@@ -191,7 +207,8 @@ def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
         "range": np.ptp(size, axis=0).mean(),
         "correlation": _mean_correlation(real, sim),
         "cosine": (
-            (real * sim).sum(0) / np.maximum(np.linalg.norm(real, axis=0) * np.linalg.norm(sim, axis=0), 1e-12)
+            (real * sim).sum(0)
+            / np.maximum(np.linalg.norm(real, axis=0) * np.linalg.norm(sim, axis=0), 1e-12)
         ).mean(),
         "mape": (size / np.maximum(np.abs(real), 0.01)).mean() * 100,
     }
@@ -208,5 +225,9 @@ def _mean_correlation(real: Array, sim: Array) -> float:
 def _horizons(run: Run) -> _Row:
     """Return the mean |error| at horizons after the start, over the last half of each, and over the whole motion."""
     error = np.abs(run.error[:, list(run.recorded)])
-    lasts = {f"{s:g}": last for s in HORIZONS_S if (last := max(round(s / run.dt), 1)) <= len(error)}
-    return {h: error[last // 2 : last].mean() for h, last in lasts.items()} | {"whole": error.mean()}
+    lasts = {
+        f"{s:g}": last for s in HORIZONS_S if (last := max(round(s / run.dt), 1)) <= len(error)
+    }
+    return {h: error[last // 2 : last].mean() for h, last in lasts.items()} | {
+        "whole": error.mean()
+    }

@@ -72,7 +72,9 @@ def build_model(
     address = [model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked]
     if address != list(range(model.nq)):
         order = ", ".join(model.joint(i).name for i in range(model.njnt))
-        raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {order}")
+        raise RobotError(
+            f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {order}"
+        )
     stiffen_friction(model)
     _soften_table(model, robot)
     return model
@@ -95,11 +97,17 @@ def build_spec(
     spec = read_mjcf(robot.mjcf)
     names = sorted(j.name for j in spec.joints)
     if missing := [name for name in robot.joint_names if name not in names]:
-        raise RobotError(f"{robot.mjcf}: robot.toml names joint '{missing[0]}', the MJCF has: {', '.join(names)}")
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
+        raise RobotError(
+            f"{robot.mjcf}: robot.toml names joint '{missing[0]}', the MJCF has: {', '.join(names)}"
+        )
+    spec.option.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_ISLAND
+    )  # few joints, no contacts: islands cost more
     period = robot.dt if dt is None else dt
     if not 0 < period <= 1:
-        raise UsageError(f"dt is {dt}; the control period in seconds must be positive and at most 1")
+        raise UsageError(
+            f"dt is {dt}; the control period in seconds must be positive and at most 1"
+        )
     spec.option.timestep = period / robot.steps_per(period)
     spec.option.tolerance = TOLERANCE
     for joint in spec.joints:
@@ -156,7 +164,9 @@ def model_hash(robot: RobotSpec) -> str:
     return str(vars(robot)["_model_hash"])
 
 
-def require_stored_robot(holder: Path, robot: RobotSpec, error: type[GAPONetError], hint: str) -> RobotSpec:
+def require_stored_robot(
+    holder: Path, robot: RobotSpec, error: type[GAPONetError], hint: str
+) -> RobotSpec:
     """Return the robot stored in a run or dataset; refuse `robot` if the nominal simulators differ, whatever the names.
 
     Args:
@@ -196,22 +206,32 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
         stops = unit * robot.stop_low[i], unit * robot.stop_high[i]
         if np.isfinite(stops).any():
             low, high = joint.range if joint.range[0] < joint.range[1] else (-np.inf, np.inf)
-            joint.range = [np.fmax(low, stops[0]), np.fmin(high, stops[1])]  # a stop only narrows the range
+            joint.range = [
+                np.fmax(low, stops[0]),
+                np.fmin(high, stops[1]),
+            ]  # a stop only narrows the range
             joint.limited = True
         if np.isfinite(robot.damping[i]):
-            joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
+            joint.damping = np.concatenate(
+                [[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)]
+            )
 
 
 def _set_links(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
     """Set identified masses, centres of mass and inertias in place of the MJCF's."""
-    if robot.links and spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+    if (
+        robot.links
+        and spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    ):
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
         for body in spec.bodies:
             body.explicitinertial = False
     for name, link in robot.links.items():
         body = spec.body(name)
         if body is None:
-            raise RobotError(f"{robot.mjcf}: an [identified_link] names body '{name}', which is missing")
+            raise RobotError(
+                f"{robot.mjcf}: an [identified_link] names body '{name}', which is missing"
+            )
         body.explicitinertial, body.mass, body.ipos = True, link.mass, link.pos
         body.iquat, body.inertia, body.fullinertia = (1, 0, 0, 0), (0, 0, 0), link.inertia
 
@@ -237,7 +257,11 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
             continue  # of a locked limb
         body = model.body(name)
-        body.mass[:], body.ipos[:], (body.inertia[:], body.iquat[:]) = link.mass, link.pos, principal_axes(link)
+        body.mass[:], body.ipos[:], (body.inertia[:], body.iquat[:]) = (
+            link.mass,
+            link.pos,
+            principal_axes(link),
+        )
         model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     mujoco.mj_setConst(model, mujoco.MjData(model))
     stiffen_friction(model)
@@ -283,16 +307,24 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
         raise UsageError(f"payload_mass is {mass}; give the mass in kg, 0 for an empty hand")
     sides = [m.side for m in robot.payload_mounts]
     if side != "both" and side not in sides:
-        raise UsageError(f"payload side '{side}' is unknown to {robot.name}; use both or one of {', '.join(sides)}")
+        raise UsageError(
+            f"payload side '{side}' is unknown to {robot.name}; use both or one of {', '.join(sides)}"
+        )
     if mass and not sides:
-        raise RobotError(f"{robot.name} has no [[payload_mount]]; add one to robot.toml to attach {mass} kg")
+        raise RobotError(
+            f"{robot.name} has no [[payload_mount]]; add one to robot.toml to attach {mass} kg"
+        )
     for mount in robot.payload_mounts:
         # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch steps them together.
-        carried = mount.mass + (mass if robot.carries_payload and side in ("both", mount.side) else 0.0)
+        carried = mount.mass + (
+            mass if robot.carries_payload and side in ("both", mount.side) else 0.0
+        )
         radius = max((3 * carried / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
         parent = spec.body(mount.body)
         if parent is None:
-            raise RobotError(f"{robot.mjcf}: payload mount '{mount.side}' names body '{mount.body}', which is missing")
+            raise RobotError(
+                f"{robot.mjcf}: payload mount '{mount.side}' names body '{mount.body}', which is missing"
+            )
         body = parent.add_body(name=f"payload_{mount.side}", pos=mount.pos)
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=carried, contype=0, conaffinity=0,
@@ -301,7 +333,9 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
 
 
 TABLE = "gaponet_table"
-IMPEDANCE = 0.5  # of the contact: with a constant one its stiffness in N/m does not depend on the posture
+IMPEDANCE = (
+    0.5  # of the contact: with a constant one its stiffness in N/m does not depend on the posture
+)
 SIZE = 2.0  # m, for looking at
 
 
@@ -342,7 +376,9 @@ def _soften_table(model: mujoco.MjModel, robot: RobotSpec) -> None:
         model.pair_solref[:] = _solref(model, np.array(robot.table.stiffness))
 
 
-def write_table(batch: Batch, model: mujoco.MjModel, height: Array, friction: Array, stiffness: Array) -> None:
+def write_table(
+    batch: Batch, model: mujoco.MjModel, height: Array, friction: Array, stiffness: Array
+) -> None:
     """Give every simulation of a batch a table of its own, (nsim,) m, 1 and N/m; their model has one."""
     batch.expand("geom_pos")[:, model.geom(TABLE).id, 2] = height
     batch.expand("pair_friction")[:, :, :2] = friction[:, None, None]

@@ -60,15 +60,23 @@ def replay(
         lock_idle: Clamp limbs that no command moves at home: faster, and equal up to rounding for others.
         creeps: Use MuJoCo's own friction, which creeps.
     """
-    idle: list[tuple[str, ...]] = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
+    idle: list[tuple[str, ...]] = (
+        _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
+    )
     locked = [_held(s, robot, limbs) for s, limbs in zip(sequences, idle, strict=True)]
     digest, total, done = model_hash(robot), sum(len(s) - 1 for s in sequences), 0
     replays: dict[int, SimulatedReplay] = {}
     for chunk in _chunks(sequences, locked):
-        part, clamped, home = [sequences[i] for i in chunk], locked[chunk[0]], np.array(robot.qpos_home)
+        part, clamped, home = (
+            [sequences[i] for i in chunk],
+            locked[chunk[0]],
+            np.array(robot.qpos_home),
+        )
         joints = tuple(joint for joint, _ in clamped)
         home[robot.index(joints)] = [angle for _, angle in clamped]
-        sim = BatchSim(replace(robot, qpos_home=home), [Condition.of(s, robot) for s in part], nthread, joints)
+        sim = BatchSim(
+            replace(robot, qpos_home=home), [Condition.of(s, robot) for s in part], nthread, joints
+        )
         if creeps:  # MuJoCo's own mobility and impedance
             sim.batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
             sim.batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
@@ -81,7 +89,10 @@ def replay(
 
 
 def rollout_errors(
-    sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, corrector: Corrector | None = None
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    nthread: int = 0,
+    corrector: Corrector | None = None,
 ) -> Array:
     """Return the mean |error| of each sequence's rollout, of the operated joints that it holds, (sequences,) rad."""
     replays = replay(sequences, robot, corrector, nthread, lock_idle=True)
@@ -96,7 +107,11 @@ def motion_errors(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
 
 def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:
     """Return the joints of limbs that no command of these sequences moves and that have no operated joint."""
-    return tuple(sorted(set.intersection(*map(set, _idle_limbs(sequences, robot))), key=robot.joint_names.index))
+    return tuple(
+        sorted(
+            set.intersection(*map(set, _idle_limbs(sequences, robot))), key=robot.joint_names.index
+        )
+    )
 
 
 def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clamped:
@@ -163,7 +178,10 @@ def rollout(
             out[channel, t + 1][:, free] = now
         out[3, t] = target
         for i in ids[touch[t + 1, ids]].tolist() if touch is not None else ():
-            sim.qpos[i], sim.qvel[i] = sequences[i].qpos[t + 1, free], sequences[i].qvel[t + 1, free]
+            sim.qpos[i], sim.qvel[i] = (
+                sequences[i].qpos[t + 1, free],
+                sequences[i].qvel[t + 1, free],
+            )
         finished += len(ids)
         if t % 200 == 0 or t == last:
             progress(finished)
@@ -185,19 +203,27 @@ def pair_dataset(
     """
     dataset.require_robot(robot)
     digest = model_hash(robot)
-    todo = sorted((e for e in entries or dataset.entries if not dataset.has_replay(e, digest)), key=lambda e: e.rows)
+    todo = sorted(
+        (e for e in entries or dataset.entries if not dataset.has_replay(e, digest)),
+        key=lambda e: e.rows,
+    )
     if not todo:
         return 0
     total, done = sum(e.rows - 1 for e in todo), 0
     parts = [todo[start : start + BATCH] for start in range(0, len(todo), BATCH)]
-    sequences, work = map(dataset.sequences, parts), partial(replay, robot=robot, lock_idle=lock_idle)
+    sequences, work = (
+        map(dataset.sequences, parts),
+        partial(replay, robot=robot, lock_idle=lock_idle),
+    )
     with dataset.writing_replays(), ExitStack() as stack:
         if executor == LOCAL:
             replayed: Iterator[list[SimulatedReplay]] = (
                 work(part, progress=lambda k, of: progress(done + k, total)) for part in sequences
             )
         else:
-            replayed = stack.enter_context(open_pool(executor, 0, 1)).map(partial(work, nthread=1), sequences)
+            replayed = stack.enter_context(open_pool(executor, 0, 1)).map(
+                partial(work, nthread=1), sequences
+            )
         for part, replays in zip(parts, replayed, strict=True):
             for entry, simulated in zip(part, replays, strict=True):
                 dataset.write_replay(entry, simulated)

@@ -22,7 +22,9 @@ HOLD_S, HOLD_START_RAD = 60.0, 0.01  # of a hold at home, and distance from home
 MAX_REST_SPEED = 0.05  # rad/s in the last ten seconds of the hold
 MAX_CREEP_RAD, MAX_SAG_RAD = 1e-3, 0.1  # in the second half of the hold; at its end
 MAX_GROWTH = 1e-3  # relative, of a small motion in one physics step
-MIN_OSCILLATION_RAD = 0.1  # phase per step: an unstable step oscillates, a joint that falls does not
+MIN_OSCILLATION_RAD = (
+    0.1  # phase per step: an unstable step oscillates, a joint that falls does not
+)
 MAX_POSTURES = 8  # in which small motions are examined
 MIN_ARMATURE = 1e-5  # kg·m²; less is none
 MIN_PENETRATION_M = 1e-4  # of links that collide
@@ -36,7 +38,9 @@ class _Growth(NamedTuple):
     oscillates: bool
 
 
-def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures: Array | None = None) -> list[Finding]:
+def check_robot(
+    robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures: Array | None = None
+) -> list[Finding]:
     """Step the nominal simulator of a robot and return findings, worst first.
 
     Args:
@@ -46,12 +50,18 @@ def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures
     Raises:
         RobotError: It does not compile.
     """
-    models = {mass: build_model(replace(robot, delay=np.zeros(len(robot.kp))), mass) for mass in payloads}
+    models = {
+        mass: build_model(replace(robot, delay=np.zeros(len(robot.kp))), mass) for mass in payloads
+    }
     model = models[payloads[0]]
     if (robot.folder / "collision.toml").is_file():
         Collision(robot, model)  # raises where it is wrong
     low, high = np.clip(robot.qpos_range.T, -np.pi, np.pi)
-    places = np.random.default_rng(0).uniform(low, high, (100, len(robot.kp))) if postures is None else postures
+    places = (
+        np.random.default_rng(0).uniform(low, high, (100, len(robot.kp)))
+        if postures is None
+        else postures
+    )
     findings = [
         *_joints(robot), *_loads(robot, models), *_limits(robot, model), *_couplings(robot, model),
         *_contacts(robot, places, postures is not None), *_steps(robot, models, places),
@@ -72,7 +82,9 @@ def _joints(robot: RobotSpec) -> Iterator[Finding]:
             yield Finding("warning", "gains", text, (name,))
         if not low <= robot.qpos_home[i] <= high:
             text = f"{name}: home {robot.qpos_home[i]:g} lies outside its range [{low:.2f}, {high:.2f}]: write home"
-            yield Finding("warning", "home", f"{text} in robot.toml, or range in robot.xml", (name,))
+            yield Finding(
+                "warning", "home", f"{text} in robot.toml, or range in robot.xml", (name,)
+            )
         if not np.isfinite(low):
             text = f"{name}: has no range in the MJCF; commands are not clipped and doctor cannot judge positions"
             yield Finding("warning", "range", f"{text}: write range in robot.xml", (name,))
@@ -91,7 +103,13 @@ def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Fi
                 f"{robot.joint_names[i]}: needs {load[i]:.3g} N·m to hold its home{carrying}, its limit is "
                 f"{robot.effort_limit[i]:g}: check effort_limit in robot.toml, masses and home"
             )
-            yield Finding("warning", "load", text, (robot.joint_names[i],), {"torque": load[i], "payload_mass": mass})
+            yield Finding(
+                "warning",
+                "load",
+                text,
+                (robot.joint_names[i],),
+                {"torque": load[i], "payload_mass": mass},
+            )
 
 
 def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
@@ -116,7 +134,12 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
             yield Finding("note", "couplings", f"{text} of the robot")
     springs = names[model.jnt_stiffness > 0].tolist()
     if springs:
-        yield Finding("note", "couplings", f"springs at {abbreviate(springs)}: stiffness in robot.xml", tuple(springs))
+        yield Finding(
+            "note",
+            "couplings",
+            f"springs at {abbreviate(springs)}: stiffness in robot.xml",
+            tuple(springs),
+        )
     if abs(np.linalg.norm(model.opt.gravity) - 9.81) > 0.1:
         text = f"gravity in robot.xml is {model.opt.gravity.tolist()} m/s²: write gravity in <option> if that is not so"
         yield Finding("warning", "couplings", text)
@@ -143,7 +166,9 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
     """Find links that lie inside each other."""
     model = build_model(replace(robot, contacts=True, table=None))
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-        yield Finding("ok", "contacts", "robot.xml has contacts off: nothing touches but tips a table")
+        yield Finding(
+            "ok", "contacts", "robot.xml has contacts off: nothing touches but tips a table"
+        )
         return
     data = mujoco.MjData(model)
     name = lambda geom: model.body(model.geom_bodyid[geom]).name  # noqa: E731
@@ -152,7 +177,9 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
         data.qpos[:] = qpos
         mujoco.mj_fwdPosition(model, data)
         return {
-            " and ".join(sorted((name(c.geom1), name(c.geom2)))) for c in data.contact if c.dist < -MIN_PENETRATION_M
+            " and ".join(sorted((name(c.geom1), name(c.geom2))))
+            for c in data.contact
+            if c.dist < -MIN_PENETRATION_M
         }
 
     home = pairs(robot.qpos_home)
@@ -169,15 +196,25 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
     if share and (logged or robot.contacts):
         what = "of the logs' postures" if logged else "of random postures"
         often = sorted(set().union(*seen) - set(always))
-        does = "and touch: the logs' robot did not go through itself" if robot.contacts else "(contacts are off)"
+        does = (
+            "and touch: the logs' robot did not go through itself"
+            if robot.contacts
+            else "(contacts are off)"
+        )
         level = "warning" if robot.contacts and logged else "note"
         yield Finding(level, "contacts", f"in {share:.0%} {what} {abbreviate(often)} lie inside each other {does}",
                       values={"pairs": often, "share": share})  # fmt: skip
     if not always and not share:
-        yield Finding("ok", "contacts", f"no links lie inside each other at home and in {len(postures)} postures")
+        yield Finding(
+            "ok",
+            "contacts",
+            f"no links lie inside each other at home and in {len(postures)} postures",
+        )
 
 
-def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Array) -> Iterator[Finding]:
+def _steps(
+    robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Array
+) -> Iterator[Finding]:
     """Find small motions that grow under gains, inertias and physics step; friction, which hides them, is left out."""
     thin = [robot.qpos_home, *postures[:: max(1, len(postures) // MAX_POSTURES)][:MAX_POSTURES]]
     cases = [(mass, model, q) for mass, model in models.items() for q in thin]
@@ -185,7 +222,9 @@ def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Arra
     (growth, joint, oscillates), mass = max(each, key=lambda one: one[0].factor)
     name = robot.joint_names[joint]
     if growth <= 1 + MAX_GROWTH:
-        yield Finding("ok", "step", "gains, inertias and physics step go together", values={"growth": growth})
+        yield Finding(
+            "ok", "step", "gains, inertias and physics step go together", values={"growth": growth}
+        )
     elif not oscillates:
         load = f" with {mass:g} kg" if mass else ""
         text = (
@@ -195,18 +234,30 @@ def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Arra
         yield Finding("warning", "step", text, (name,), {"growth": growth})
     else:
         stable = lambda h, a: all(_growth(m, q, h, a)[0] <= 1 + MAX_GROWTH for _, m, q in cases)  # noqa: E731
-        step = next((h for h in (robot.timestep / 2**k for k in range(1, 7)) if stable(h, 0.0)), None)
-        armature = next((a for a in (1e-4 * 2**k for k in range(14)) if stable(robot.timestep, a)), None)
+        step = next(
+            (h for h in (robot.timestep / 2**k for k in range(1, 7)) if stable(h, 0.0)), None
+        )
+        armature = next(
+            (a for a in (1e-4 * 2**k for k in range(14)) if stable(robot.timestep, a)), None
+        )
         cures = [f"timestep = {step:g} in robot.toml"] if step else []
         cures += [f"armature = {armature:g} in robot.xml where it is less"] if armature else []
         text = (
             f"{name}: kp {robot.kp[joint]:g} and kd {robot.kd[joint]:g} on so little inertia are unstable in physics "
             f"steps of {robot.timestep * 1e3:g} ms: write {' or '.join([*cures, 'a smaller kp'])}"
         )
-        yield Finding("error", "step", text, (name,), {"growth": growth, "timestep": step, "armature": armature})
+        yield Finding(
+            "error",
+            "step",
+            text,
+            (name,),
+            {"growth": growth, "timestep": step, "armature": armature},
+        )
 
 
-def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, armature: float = 0.0) -> _Growth:
+def _growth(
+    model: mujoco.MjModel, q: Array, timestep: float | None = None, armature: float = 0.0
+) -> _Growth:
     """Return the growth of the worst small motion about a posture that targets hold against gravity."""
     model = copy(model)
     model.opt.timestep = timestep or model.opt.timestep
@@ -225,7 +276,9 @@ def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, arma
     values, vectors = np.linalg.eig(slopes)
     k = int(np.abs(values).argmax())
     joint = int(np.abs(vectors[: model.nv, k]).argmax())
-    return _Growth(float(np.abs(values[k])), joint, bool(abs(np.angle(values[k])) > MIN_OSCILLATION_RAD))
+    return _Growth(
+        float(np.abs(values[k])), joint, bool(abs(np.angle(values[k])) > MIN_OSCILLATION_RAD)
+    )
 
 
 def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
@@ -233,7 +286,12 @@ def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
     sim = BatchSim(robot, [Condition(mass, "both", robot.dt) for mass in payloads], nthread=1)
     home = np.tile(robot.qpos_home, (len(payloads), 1))
     low, high = robot.qpos_range.T
-    sim.reset(slice(None), np.clip(home + HOLD_START_RAD, low, high), np.zeros_like(home), past=home[:, None])
+    sim.reset(
+        slice(None),
+        np.clip(home + HOLD_START_RAD, low, high),
+        np.zeros_like(home),
+        past=home[:, None],
+    )
     rows = round(HOLD_S / robot.dt)
     speed, full, middle = np.zeros_like(home), np.zeros(home.shape, bool), home
     for t in range(rows):
@@ -253,9 +311,27 @@ def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
         )
     clean = True
     for what, amount, most, level, cure in (
-        ("does not come to rest: {:.2g} rad/s after a minute", speed, MAX_REST_SPEED, "error", swings),
-        ("creeps {:.2g} rad in half a minute of a hold", creep, MAX_CREEP_RAD, "warning", f"friction gives way{light}"),
-        ("hangs {:.2g} rad from its target", sag, MAX_SAG_RAD, "note", "check kp and effort_limit against masses"),
+        (
+            "does not come to rest: {:.2g} rad/s after a minute",
+            speed,
+            MAX_REST_SPEED,
+            "error",
+            swings,
+        ),
+        (
+            "creeps {:.2g} rad in half a minute of a hold",
+            creep,
+            MAX_CREEP_RAD,
+            "warning",
+            f"friction gives way{light}",
+        ),
+        (
+            "hangs {:.2g} rad from its target",
+            sag,
+            MAX_SAG_RAD,
+            "note",
+            "check kp and effort_limit against masses",
+        ),
     ):
         wrong = np.argwhere(~(amount <= most))
         if not len(wrong) or (level != "error" and not clean):
@@ -266,7 +342,13 @@ def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
         load = f" with {payloads[p]:g} kg" if payloads[p] else ""
         more = f" ({len(names) - 1} more joints do)" if len(names) > 1 else ""
         text = f"{robot.joint_names[j]} {what.format(amount[p, j])}{load}{more}: {cure}"
-        yield Finding(level, "hold", text, names, {"payload_mass": payloads[p], "amount": float(amount[p, j])})
+        yield Finding(
+            level, "hold", text, names, {"payload_mass": payloads[p], "amount": float(amount[p, j])}
+        )
     if clean:
         masses = ", ".join(f"{p:g}" for p in payloads)
-        yield Finding("ok", "hold", f"home is held for {HOLD_S:g} s with {masses} kg without creeping or swinging")
+        yield Finding(
+            "ok",
+            "hold",
+            f"home is held for {HOLD_S:g} s with {masses} kg without creeping or swinging",
+        )

@@ -21,13 +21,17 @@ import numpy as np
 from gaponet.base.arrays import Array, array_module
 from gaponet.robot.servo_fields import SERVO_TERMS
 
-ServoTerms = dict[str, Any]  # name of SERVO_TERMS → values that broadcast to the simulations' joints, numpy or torch
+ServoTerms = dict[
+    str, Any
+]  # name of SERVO_TERMS → values that broadcast to the simulations' joints, numpy or torch
 
 SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
 PLAY = SERVO_TERMS.index("backlash")
 OPENED = 1 - 1e-9  # of half the width: a gap that opens
-DEADBAND_STEPS = 0.5  # encoder steps: a motor with a least torque rests while it reads a smaller error
+DEADBAND_STEPS = (
+    0.5  # encoder steps: a motor with a least torque rests while it reads a smaller error
+)
 
 
 def present(terms: ServoTerms) -> ServoTerms:
@@ -74,7 +78,9 @@ def friction_limit(terms: ServoTerms, frictionloss: Any, qvel: Any, torque: Any,
         by_motor, by_load = terms.get("friction_motor", 0.0), terms.get("friction_external", 0.0)
         limit = limit + passing_friction(by_motor, by_load, torque, load)
     if "stribeck" in terms:
-        limit = limit + resting_friction(terms["stribeck"], terms.get("stribeck_speed", SLOWEST), qvel)
+        limit = limit + resting_friction(
+            terms["stribeck"], terms.get("stribeck_speed", SLOWEST), qvel
+        )
     return limit
 
 
@@ -88,7 +94,11 @@ def servo_torque(terms: ServoTerms, kp: Any, aim: Any, qpos: Any) -> Any:
     torque = kp * (aim - read)
     if "min_torque" not in terms:
         return torque
-    return xp.where(abs(torque) > deadband, xp.copysign(xp.maximum(abs(torque), terms["min_torque"]), torque), 0.0)
+    return xp.where(
+        abs(torque) > deadband,
+        xp.copysign(xp.maximum(abs(torque), terms["min_torque"]), torque),
+        0.0,
+    )
 
 
 def requested_torque(kp: Any, aim: Any, qpos: Any, least: Any, step: Any, deadband: Any) -> Any:
@@ -103,7 +113,14 @@ def requested_torque(kp: Any, aim: Any, qpos: Any, least: Any, step: Any, deadba
 
 
 def joint_friction(
-    dry: Any, stribeck: Any, speed: Any, by_motor: Any, by_load: Any, qvel: Any, torque: Any, load: Any
+    dry: Any,
+    stribeck: Any,
+    speed: Any,
+    by_motor: Any,
+    by_load: Any,
+    qvel: Any,
+    torque: Any,
+    load: Any,
 ) -> Any:
     """Return `friction_limit` of one joint, in N·m, for numba and Warp."""
     limit = dry + passing_friction(by_motor, by_load, torque, load)
@@ -113,7 +130,16 @@ def joint_friction(
 
 
 def crossed(
-    half: Any, gap: Any, rotor: Any, pressed: Any, link: Any, torque: Any, damping: Any, most: Any, mass: Any, h: Any
+    half: Any,
+    gap: Any,
+    rotor: Any,
+    pressed: Any,
+    link: Any,
+    torque: Any,
+    damping: Any,
+    most: Any,
+    mass: Any,
+    h: Any,
 ) -> tuple[Any, Any]:
     """Return the gaps (motor ahead of link), rad, and the motors' speeds, rad/s, after a step of h s; numpy arrays.
 
@@ -134,10 +160,16 @@ class Play:
         seen: Speed of the link after the last step, rad/s; a speed that was written since then moves the motor too.
     """
 
-    def __init__(self, width: Any, armature: Any, damping: Any, kd: Any, load: Any, qvel: Any) -> None:
+    def __init__(
+        self, width: Any, armature: Any, damping: Any, kd: Any, load: Any, qvel: Any
+    ) -> None:
         """Begin on the side that carries `load`, N·m; armature, damping and kd are the motor's."""
         self.half, self._own, self._kd = width / 2, (armature, damping), kd
-        self.gap, self.rotor, self.seen = np.where(load < 0, -self.half, self.half), qvel.copy(), qvel.copy()
+        self.gap, self.rotor, self.seen = (
+            np.where(load < 0, -self.half, self.half),
+            qvel.copy(),
+            qvel.copy(),
+        )
 
     def before(self, limit: Any, kp: Any, qpos: Any, qvel: Any, h: Any) -> tuple[Any, ...]:
         """Return friction limit, armature, damping, applied torque and gear of the links for the next step of h s, and
@@ -145,17 +177,36 @@ class Play:
         (armature, damping), closed = self._own, abs(self.gap) >= self.half
         self.rotor += qvel - self.seen
         self.seen[:] = qvel
-        self._limit, self._qvel, self._impact = limit.copy(), qvel.copy(), armature * (self.rotor - qvel) / h
+        self._limit, self._qvel, self._impact = (
+            limit.copy(),
+            qvel.copy(),
+            armature * (self.rotor - qvel) / h,
+        )
         bias = np.where(closed, 0.0, -kp * qpos - self._kd * qvel)
-        return limit * closed, armature * closed, damping * closed, self._impact * closed, 1.0 * closed, bias
+        return (
+            limit * closed,
+            armature * closed,
+            damping * closed,
+            self._impact * closed,
+            1.0 * closed,
+            bias,
+        )
 
-    def after(self, qvel: Any, torque: Any, constraint: Any, h: Any, rows: Any = slice(None)) -> None:
+    def after(
+        self, qvel: Any, torque: Any, constraint: Any, h: Any, rows: Any = slice(None)
+    ) -> None:
         """Advance the gaps of rows, from speeds, the servos' torques and the constraints' torques after a step."""
-        (armature, damping), closed, change = self._own, abs(self.gap) >= self.half, qvel - self._qvel
+        (armature, damping), closed, change = (
+            self._own,
+            abs(self.gap) >= self.half,
+            qvel - self._qvel,
+        )
         # A contact counts as friction, up to the limit of friction: under contact the gap is only approximate.
         force = torque + self._impact - damping * qvel - (self._kd + armature / h) * change
         force = force + np.clip(constraint, -self._limit, self._limit)
-        gap, rotor = crossed(self.half, self.gap, self.rotor, closed, qvel, torque, damping, self._limit, armature, h)
+        gap, rotor = crossed(
+            self.half, self.gap, self.rotor, closed, qvel, torque, damping, self._limit, armature, h
+        )
         gap = np.where(closed & (force * gap < 0), OPENED * gap, gap)
         self.gap[rows], self.rotor[rows], self.seen[rows] = gap[rows], rotor[rows], qvel[rows]
 
@@ -199,7 +250,9 @@ def set_joints(
             if least > 0.0 or step > 0.0:
                 kp, q = gain[i, j], qpos[i, j]
                 aim = ctrl[i, j] + own_bias[i, j] / kp
-                bias[i, j] = requested_torque(kp, aim, q, least, step, deadband) - kp * (ctrl[i, j] - q)
+                bias[i, j] = requested_torque(kp, aim, q, least, step, deadband) - kp * (
+                    ctrl[i, j] - q
+                )
             if no_load > 0.0:
                 least, most = torque_range(effort[i, j], qvel[i, j] / no_load)
                 force_range[i, j, 0], force_range[i, j, 1] = least, most
@@ -222,7 +275,14 @@ def advance(
         v, rows = np.ascontiguousarray(values[:, j].T), lengths[p]
         kp, mass, offset, limit = v[0] * stiffer[p, j], v[3], v[4], v[6]
         damping, dry = warm[0, :, j, p], warm[1, :, j, p]
-        rest, speed, by_motor, by_load, least, step = v[7], np.maximum(v[8], SLOWEST), v[9], v[10], v[11], v[12]
+        rest, speed, by_motor, by_load, least, step = (
+            v[7],
+            np.maximum(v[8], SLOWEST),
+            v[9],
+            v[10],
+            v[11],
+            v[12],
+        )
         deadband, no_load = DEADBAND_STEPS * (least > 0), np.where(v[13] > 0, v[13], np.inf)
         fades = np.isfinite(no_load).any()
         brake, own = np.maximum(kd[p, j] + np.minimum(damping, 0.0), 0.0), np.maximum(damping, 0.0)
@@ -249,10 +309,14 @@ def advance(
                     wanted -= brake[c] * w[c]
                     torque = min(max(wanted, low), high)
                     if has_terms:
-                        most = joint_friction(dry[c], rest[c], speed[c], by_motor[c], by_load[c], w[c], torque, load)
+                        most = joint_friction(
+                            dry[c], rest[c], speed[c], by_motor[c], by_load[c], w[c], torque, load
+                        )
                     net = torque - load - here[2] - own[c] * w[c]
                     net += min(max(-heavy / h * w[c] - net, -most), most)
-                    implicit = own[c] + brake[c] * (torque == wanted)  # as MuJoCo: not kd of a motor at its limit
+                    implicit = own[c] + brake[c] * (
+                        torque == wanted
+                    )  # as MuJoCo: not kd of a motor at its limit
                     both = w[c] + h / (heavy + h * implicit) * net
                     if half[c] > 0.0:
                         both, rotor[c], gap[c] = cross_gap(
@@ -289,7 +353,14 @@ def compiled(function: Any) -> Any:
 def _extend(extending: Any) -> None:
     """Make functions of this file known to numba."""
     extending.overload(exp)(lambda x: lambda x: np.exp(x))
-    functions = torque_range, passing_friction, resting_friction, requested_torque, joint_friction, cross_gap
+    functions = (
+        torque_range,
+        passing_friction,
+        resting_friction,
+        requested_torque,
+        joint_friction,
+        cross_gap,
+    )
     for function in functions:
         extending.register_jitable(function)
 
@@ -310,8 +381,14 @@ class ServoModel:
     def __init__(self, batch: Any, model: mujoco.MjModel) -> None:
         """Take the MuJoCo model's parameters for all simulations of a Batch, or of an object with its methods."""
         self.batch, self.model = batch, model
-        user = model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(SERVO_TERMS)))
-        self._qpos, self._qvel, self._ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
+        user = (
+            model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(SERVO_TERMS)))
+        )
+        self._qpos, self._qvel, self._ctrl = (
+            batch.bind("qpos"),
+            batch.bind("qvel"),
+            batch.bind("ctrl"),
+        )
         self._force, self._passing = batch.bind("actuator_force"), batch.bind("qfrc_bias")
         self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         self._limit = batch.expand("dof_frictionloss")
@@ -323,7 +400,9 @@ class ServoModel:
         limits = model.actuator_forcerange if own is None else own
         self.effort = np.array(np.broadcast_to(limits[..., 1], self.bias.shape))
         self._range = np.zeros((0, 0, 2))  # of torques, expanded where a term changes it
-        self.armature, self.damping = (np.zeros(self._force.shape) + x for x in (model.dof_armature, model.dof_damping))
+        self.armature, self.damping = (
+            np.zeros(self._force.shape) + x for x in (model.dof_armature, model.dof_damping)
+        )
         self.play: Play | None = None
         self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
         self._set_joints = compiled(set_joints)
@@ -361,10 +440,21 @@ class ServoModel:
         )  # fmt: skip
         self._constraint = bind("qfrc_constraint")
         self._h = self.model.opt.timestep if step is None else np.array(step).reshape(-1, 1)
-        play = Play(self.values["backlash"], self.armature, self.damping, -self._bias[..., 2], self.load, self._qvel)
+        play = Play(
+            self.values["backlash"],
+            self.armature,
+            self.damping,
+            -self._bias[..., 2],
+            self.load,
+            self._qvel,
+        )
         if self.play is not None:
             others = np.delete(np.arange(len(play.gap)), ids)
-            for mine, before in ((play.gap, self.play.gap), (play.rotor, self.play.rotor), (play.seen, self.play.seen)):
+            for mine, before in (
+                (play.gap, self.play.gap),
+                (play.rotor, self.play.rotor),
+                (play.seen, self.play.seen),
+            ):
                 mine[others] = before[others]
         self.play = play
 

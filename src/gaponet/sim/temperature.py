@@ -67,7 +67,10 @@ def temperature_findings(
     sentences, warm = [], recorded_temperatures(sequences, robot.operated_index)
     whole, among = temperature_spread(sequences, robot)
     for i, (joint, at) in enumerate(zip(robot.operated, robot.operated_index, strict=True)):
-        per_kelvin, error = robot.friction_per_kelvin[at], std[joint].get("friction_per_kelvin", 0.0)
+        per_kelvin, error = (
+            robot.friction_per_kelvin[at],
+            std[joint].get("friction_per_kelvin", 0.0),
+        )
         between = f"{warm[:, i].min():.0f} to {warm[:, i].max():.0f} °C"
         if per_kelvin:
             change = "rises" if per_kelvin > 0 else "falls"

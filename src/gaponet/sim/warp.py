@@ -24,13 +24,19 @@ from gaponet.sim import servo
 from gaponet.sim.batch import BatchSim, CommandHistory, ramp_start
 
 MAX_CONTACTS, CONSTRAINTS_PER_CONTACT = 48, 4  # of a simulation whose links collide
-STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}  # field of Data → name in BatchSim.state
+STATE = {
+    "qpos": "qpos",
+    "qvel": "qvel",
+    "qacc_warmstart": "warmstart",
+}  # field of Data → name in BatchSim.state
 HISTORY = {"history": "history", "time": "time"}
 SERVO = {"actuator_force": "servo_torque", "qfrc_bias": "servo_load"}
 TARGET = {"ctrl": "ctrl"}
 
 _Floats: Any = warp.array2d(dtype=float)
-_Numbers: Any = warp.array2d(dtype=warp.types.vector(len(SERVO_TERMS), float))  # in the order of SERVO_TERMS
+_Numbers: Any = warp.array2d(
+    dtype=warp.types.vector(len(SERVO_TERMS), float)
+)  # in the order of SERVO_TERMS
 _Pairs: Any = warp.array2d(dtype=warp.vec2)
 _Parameters: Any = warp.array2d(dtype=warp.types.vector(10, float))  # of an actuator's gain or bias
 
@@ -64,7 +70,9 @@ def _set_servos(
     i, j = warp.tid()
     own, kp, q = terms[i, j], gain[i, j][0], qpos[i, j]
     speed, least, step = max(own[1], servo.SLOWEST), own[4], own[5]
-    limit[i, j] = _friction(dry[i, j], own[0], speed, own[2], own[3], qvel[i, j], torque[i, j], load[i, j])
+    limit[i, j] = _friction(
+        dry[i, j], own[0], speed, own[2], own[3], qvel[i, j], torque[i, j], load[i, j]
+    )
     if least > 0.0 or step > 0.0:
         aim = ctrl[i, j] + offset[i, j] / kp
         bias[i, j][0] = _torque(kp, aim, q, least, step, deadband) - kp * (ctrl[i, j] - q)
@@ -77,13 +85,23 @@ class _Worlds:
     """Simulations of one control period: mujoco_warp steps all of its worlds, equally often."""
 
     def __init__(self, sim: BatchSim, rows: np.ndarray, device: str) -> None:
-        self.device, self.nstep, self._graphs = warp.get_device(device), int(sim.nstep[rows[0]]), dict[Any, Any]()
+        self.device, self.nstep, self._graphs = (
+            warp.get_device(device),
+            int(sim.nstep[rows[0]]),
+            dict[Any, Any](),
+        )
         model = next(iter(sim.models.values()))
-        own = {name: x[rows] for name in sorted(MODEL_FIELDS) if (x := sim.batch.expanded(name)) is not None}
+        own = {
+            name: x[rows]
+            for name in sorted(MODEL_FIELDS)
+            if (x := sim.batch.expanded(name)) is not None
+        }
         timestep = own.pop("opt.timestep", np.full(len(rows), model.opt.timestep))
         # MuJoCo's other fields are precomputed values or have no effect on motion.
         own = {name: x for name, x in own.items() if name in mujoco_warp.Model.__dataclass_fields__}
-        contacts = 0 if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT else MAX_CONTACTS
+        contacts = (
+            0 if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT else MAX_CONTACTS
+        )
         constraints = max(64, 2 * model.nv + CONSTRAINTS_PER_CONTACT * contacts)
         with warp.ScopedDevice(self.device):
             try:
@@ -96,10 +114,14 @@ class _Worlds:
                 model, mujoco.MjData(model), len(rows), contacts or None, njmax=constraints
             )
             self.model.opt.timestep = warp.array(timestep, dtype=float)
-            self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
+            self.model.opt.tolerance = warp.array(
+                [model.opt.tolerance], dtype=float
+            )  # put_model's is 1e-6 at least
             # float32 seldom reaches that tolerance: no message each time, as in C MuJoCo.
             self.model.opt.warn_overflow &= ~mujoco_warp.OverflowType.ITERATIONS
-            self._servo_inputs = None if sim.servo_model is None else self._inputs(sim.servo_model, rows)
+            self._servo_inputs = (
+                None if sim.servo_model is None else self._inputs(sim.servo_model, rows)
+            )
         for name, x in own.items():
             view = warp.to_torch(getattr(self.model, name))
             view.copy_(torch.tensor(x).reshape(view.shape))
@@ -142,7 +164,9 @@ class _Worlds:
 
     def _captured(self, kernels: Callable[[], None]) -> Any:
         """Return the kernels as a CUDA graph; they are compiled by a launch that is undone."""
-        moved = [self.bind(name) for name in (*STATE, *HISTORY, *SERVO) if getattr(self.data, name).size]
+        moved = [
+            self.bind(name) for name in (*STATE, *HISTORY, *SERVO) if getattr(self.data, name).size
+        ]
         before = [x.clone() for x in moved]
         torch.cuda.synchronize()
         kernels()
@@ -169,26 +193,34 @@ class WarpSim:
             UsageError: No such device, or servos with backlash.
         """
         if sim.servo_model is not None and sim.servo_model.values["backlash"].any():
-            raise UsageError(f"{sim.robot.name}: no GPU simulates its backlash; use --device cpu, or backlash = 0")
+            raise UsageError(
+                f"{sim.robot.name}: no GPU simulates its backlash; use --device cpu, or backlash = 0"
+            )
         warp.config.log_level = warp.LOG_WARNING if device == "cuda" else warp.LOG_ERROR
         device = f"cuda:{torch.cuda.current_device()}" if device == "cuda" else "cpu"
         try:
             warp.get_device(device)
         except (ValueError, RuntimeError) as error:
-            raise UsageError(f"device {device}: Warp has no such device ({error}); use cpu") from None
+            raise UsageError(
+                f"device {device}: Warp has no such device ({error}); use cpu"
+            ) from None
         self.robot, self.joint_names, self.num_envs = sim.robot, sim.joint_names, sim.num_envs
         self.n, self.range = sim.n, sim.range
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
         self._worlds = [_Worlds(sim, rows, device) for rows in rates]
         self._delayed = next(iter(sim.models.values())).nhistory > 0
-        self._stored = STATE | (HISTORY if self._delayed else {}) | (SERVO if sim.servo_model else {})
+        self._stored = (
+            STATE | (HISTORY if self._delayed else {}) | (SERVO if sim.servo_model else {})
+        )
         self._stored |= {} if sim.max_change is None else TARGET
         names = [*self._stored, "ctrl", "actuator_force"]
         self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
         if len(self._worlds) == 1:
             self._all = self._views[0]
         else:
-            self._all = {name: x.new_zeros(self.num_envs, *x.shape[1:]) for name, x in self._views[0].items()}
+            self._all = {
+                name: x.new_zeros(self.num_envs, *x.shape[1:]) for name, x in self._views[0].items()
+            }
         self.qpos, self.qvel, self.ctrl = (self._all[name] for name in ("qpos", "qvel", "ctrl"))
         self.torque = self._all["actuator_force"]
         self._ids = [self.array(rows) for rows in rates]
@@ -196,7 +228,9 @@ class WarpSim:
         self._max_change = None if sim.max_change is None else self.array(sim.max_change)
         if sim.servo_model:
             gain, servos = sim.batch.expand("actuator_gainprm")[..., 0], sim.servo_model
-            self._gain, self._bias, self._effort = map(self.array, (gain, servos.bias, servos.effort))
+            self._gain, self._bias, self._effort = map(
+                self.array, (gain, servos.bias, servos.effort)
+            )
         self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
         if self._delayed:
             model = next(iter(sim.models.values()))
@@ -206,7 +240,11 @@ class WarpSim:
     def array(self, values: Any) -> Tensor:
         """Copy values to the device, floats as float32, without waiting."""
         values = torch.as_tensor(values)
-        return values.to(self.qpos.device, torch.float32 if values.is_floating_point() else None, non_blocking=True)
+        return values.to(
+            self.qpos.device,
+            torch.float32 if values.is_floating_point() else None,
+            non_blocking=True,
+        )
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
         """Reset as BatchSim.reset does; arrays of any kind."""
@@ -216,10 +254,14 @@ class WarpSim:
         if self._max_change is not None:
             speed = self._max_change[ids] / (self.nstep * self.timestep)[ids, None]
             here = self.qpos[ids]
-            self.ctrl[ids] = here if past is None else ramp_start(self.array(past)[:, 0], here, speed)
+            self.ctrl[ids] = (
+                here if past is None else ramp_start(self.array(past)[:, 0], here, speed)
+            )
         if self._delayed:
             if past is None:
-                raise UsageError(f"{self.robot.name} has delayed servos: give the targets before as `past`")
+                raise UsageError(
+                    f"{self.robot.name} has delayed servos: give the targets before as `past`"
+                )
             self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
         if SERVO.keys() <= self._stored.keys():
             ahead = 0.0 if past is None else self.array(past)[:, 0] - self.qpos[ids]
@@ -250,7 +292,9 @@ class WarpSim:
         torch.clamp(ctrl, self._low, self._high, out=self.ctrl)
         for worlds in self._each_rate():
             worlds.launch(worlds.period)
-        if self._delayed:  # a float32 tells physics steps apart for minutes only, so the clock starts again
+        if (
+            self._delayed
+        ):  # a float32 tells physics steps apart for minutes only, so the clock starts again
             self._commands.times -= self._commands.time[:, None, None]
             self._commands.time.zero_()
         if ids is not None:

@@ -22,7 +22,9 @@ from gaponet.sysid.table_contact import TableFit, tip_heights
 
 Std = dict[str, dict[str, float]]  # joint → field → standard error
 Links = dict[str, Link]  # MJCF body → mass, centre of mass and inertia
-Covariance = dict[str, tuple[list[str], Array]]  # joint → fields (P), (P, P) on the axes of uncertainty.py
+Covariance = dict[
+    str, tuple[list[str], Array]
+]  # joint → fields (P), (P, P) on the axes of uncertainty.py
 
 MIN_CROSS_VALIDATED = 4  # motions; a fit to two of three says little about a fit to all
 MIN_JUDGES = 3  # motions of each set of recorded joints; fewer are too few to validate without cross-validation
@@ -43,7 +45,9 @@ def held_out_errors(folds: Iterable[HeldOut]) -> Array:
 Split = tuple[list[Sequence], list[Sequence]]  # recordings to fit, recordings that judge
 
 
-def cross_validation(sequences: ListOf[Sequence], validation: ListOf[Sequence], folds: int) -> list[Split]:
+def cross_validation(
+    sequences: ListOf[Sequence], validation: ListOf[Sequence], folds: int
+) -> list[Split]:
     """Return folds by motion, or the given split if at least MIN_JUDGES motions validate each set of recorded joints.
 
     Motions of one set of joints are dealt out to the folds. A set with a single motion is fitted in every fold.
@@ -53,16 +57,24 @@ def cross_validation(sequences: ListOf[Sequence], validation: ListOf[Sequence], 
         {joints: hash_order(s.meta.independent_motion for s in part if s.meta.unrecorded == joints)
          for joints in {s.meta.unrecorded for s in part}} for part in (validation, every)
     )  # fmt: skip
-    enough = min((len(judges.get(joints, ())) for joints, names in motions.items() if len(names) > 1), default=0)
+    enough = min(
+        (len(judges.get(joints, ())) for joints, names in motions.items() if len(names) > 1),
+        default=0,
+    )
     count = min(folds, max(map(len, motions.values())))
     few = len({s.meta.independent_motion for s in every}) < MIN_CROSS_VALIDATED
     if not validation or enough >= MIN_JUDGES or count < 2 or few:
         return [(list(sequences), list(validation))]
     fold = {
-        (joints, name): i % count for joints, names in motions.items() if len(names) > 1 for i, name in enumerate(names)
+        (joints, name): i % count
+        for joints, names in motions.items()
+        if len(names) > 1
+        for i, name in enumerate(names)
     }
     pairs = [(s, fold.get((s.meta.unrecorded, s.meta.independent_motion))) for s in every]
-    return [([s for s, k in pairs if k != i], [s for s, k in pairs if k == i]) for i in range(count)]
+    return [
+        ([s for s, k in pairs if k != i], [s for s, k in pairs if k == i]) for i in range(count)
+    ]
 
 
 @dataclass(frozen=True)
@@ -126,17 +138,26 @@ class Judge:
     fitted to all recordings, which no motion judges. Repetitions of a motion count as one.
     """
 
-    def __init__(self, folds: ListOf[ListOf[Sequence]], robot: RobotSpec, contact_height: float, nthread: int) -> None:
+    def __init__(
+        self, folds: ListOf[ListOf[Sequence]], robot: RobotSpec, contact_height: float, nthread: int
+    ) -> None:
         """Take the recordings that judge, fold by fold; rows with a tip below `contact_height`, m, do not count."""
-        self._folds: list[tuple[RobotRollouts, list[Array]]] = []  # rollouts, and the rows of each motion
+        self._folds: list[
+            tuple[RobotRollouts, list[Array]]
+        ] = []  # rollouts, and the rows of each motion
         names = []
         for sequences in folds:
             touch = _contact_rows(sequences, robot, contact_height)
             rollouts = RobotRollouts(list(sequences), robot, nthread, touch=touch)
             # Repetitions, pieces and gains of what one unit plays with one payload are one judge.
             metas = [s.meta for s in sequences]
-            keys = [(m.independent_motion, m.unit_id, m.payload_mass, m.payload_side) for m in metas]
-            rows = {one: np.array([key == one for key in keys])[rollouts.window] for one in dict.fromkeys(keys)}
+            keys = [
+                (m.independent_motion, m.unit_id, m.payload_mass, m.payload_side) for m in metas
+            ]
+            rows = {
+                one: np.array([key == one for key in keys])[rollouts.window]
+                for one in dict.fromkeys(keys)
+            }
             rows = {key: counted for key, counted in rows.items() if counted.any()}
             self._folds.append((rollouts, list(rows.values())))
             names += [motion for motion, *_ in rows]
@@ -146,9 +167,15 @@ class Judge:
     def _sums(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> tuple[Array, Array]:
         """Return the sums of |error| over counted rows, rad, and their numbers, by motion and joint, (motions, n)."""
         totals, counts = [], []
-        for k, ((rollouts, motions), values) in enumerate(zip(self._folds, candidate, strict=False)):
+        for k, ((rollouts, motions), values) in enumerate(
+            zip(self._folds, candidate, strict=False)
+        ):
             own = links[k : k + 1]
-            key = k, b"".join(f.encode() + values[f].tobytes() for f in sorted(values)) + repr(own).encode()
+            key = (
+                k,
+                b"".join(f.encode() + values[f].tobytes() for f in sorted(values))
+                + repr(own).encode(),
+            )
             if key not in self._sums_of:
                 size = np.abs(rollouts.flat_errors({f: v[None] for f, v in values.items()}, own))[0]
                 self._sums_of[key] = np.stack([size[:, rows].sum(axis=1) for rows in motions])
@@ -164,7 +191,9 @@ class Judge:
     def errors_by_joint(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> Array:
         """Return the mean |error| of each joint, (n,) rad."""
         total, count = self._sums(candidate, links)
-        return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
+        return np.asarray(
+            (total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1)
+        )
 
     def compare(self, name: str, before: ListOf[Values], after: ListOf[Values]) -> Comparison:
         """Compare a candidate with the one before it."""
@@ -175,13 +204,18 @@ class Judge:
 
         Units and payloads of a motion count as one, since a robot that is identified already needs evidence to change.
         """
-        errors = {name: self._joint_errors(v) for name, v in candidates.items()}  # (motions, n), NaN: not held
+        errors = {
+            name: self._joint_errors(v) for name, v in candidates.items()
+        }  # (motions, n), NaN: not held
         given, *others = errors
         winner = np.zeros(errors[given].shape[1], int)
         for i in range(len(winner)):
             held = ~np.isnan(errors[given][:, i])
             name = min(others, key=lambda other: float(np.nansum(errors[other][:, i])))
-            if held.any() and Comparison(name, errors[given][held, i], errors[name][held, i]).accepted:
+            if (
+                held.any()
+                and Comparison(name, errors[given][held, i], errors[name][held, i]).accepted
+            ):
                 winner[i] = list(errors).index(name)
         mixed = [_by_joint(each, winner) for each in zip(*candidates.values(), strict=True)]
         return ("mixed", mixed) if winner.any() else (given, candidates[given])
@@ -210,8 +244,14 @@ class Judge:
         for other in (*others, *(candidates.keys() & {"mixed"})):
             limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[name].mean()
             much_better = other != "mixed" and errors[other].mean() < limit
-            name = other if much_better or Comparison(other, errors[name], errors[other]).accepted else name
-        name = name if errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean() else given
+            name = (
+                other
+                if much_better or Comparison(other, errors[name], errors[other]).accepted
+                else name
+            )
+        name = (
+            name if errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean() else given
+        )
         return name, candidates[name]
 
 
@@ -221,7 +261,9 @@ def _by_joint(candidates: ListOf[Values], winner: Array) -> Values:
     return {f: np.stack([v[f] for v in candidates])[winner, np.arange(len(winner))] for f in fields}
 
 
-def _contact_rows(sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float) -> Array | None:
+def _contact_rows(
+    sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float
+) -> Array | None:
     """Return the rows in which a tip is below a height, (sequences, rows)."""
     if not robot.tips:
         return None

@@ -27,8 +27,14 @@ from gaponet.sysid.robot_rollouts import WINDOW_S, RobotRollouts, cut
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
 FIELDS: tuple[Field, ...] = get_args(Field)
 PRIOR_RAD = 0.3  # price of a large change of one joint
-SHARED_PRIOR_RATIO = 0.05  # the same where all joints change by the same share: a cold day, a slow bus
-SHARED_FIELDS = ("damping", "frictionloss", "delay")  # such a day moves no zeros and softens no gains
+SHARED_PRIOR_RATIO = (
+    0.05  # the same where all joints change by the same share: a cold day, a slow bus
+)
+SHARED_FIELDS = (
+    "damping",
+    "frictionloss",
+    "delay",
+)  # such a day moves no zeros and softens no gains
 ITERATIONS, MIN_DECREASE = 4, 1e-3  # at most; relative decrease of the cost for another one
 MAX_FOLDS = 4  # of motions that judge
 MAX_SHORT_WINDOW_S = 4.0  # too short to validate another window
@@ -77,7 +83,9 @@ def adapt(
     accepted = not judge or parts[0].duration > MAX_SHORT_WINDOW_S
     if len(judged[0]):
         accepted = not Comparison("adapted", *judged).harmful
-        parts = [parts[i] for motions in _motions_that_judge(parts) for motion in motions for i in motion]
+        parts = [
+            parts[i] for motions in _motions_that_judge(parts) for motion in motions for i in motion
+        ]
     rollouts = RobotRollouts(parts, robot, corrector=corrector)
     problem = _Problem(rollouts, first_values(robot), robot.kd[rollouts.op])
     done = 0
@@ -94,7 +102,9 @@ def adapt(
     before, after = (problem.rms(p) for p in (np.zeros_like(x[0, 0]), x[0, 0]))
     accepted = accepted and not (judge and after > (1 - MIN_RELATIVE_GAIN) * before)
     values = problem.values(x[0])
-    return Adapted(with_values(robot, {str(f): values[f][0] for f in FIELDS}), before, after, judged, accepted)
+    return Adapted(
+        with_values(robot, {str(f): values[f][0] for f in FIELDS}), before, after, judged, accepted
+    )
 
 
 def _motions_that_judge(parts: list[Sequence]) -> list[list[list[int]]]:
@@ -107,18 +117,32 @@ def _motions_that_judge(parts: list[Sequence]) -> list[list[list[int]]]:
     for i, p in enumerate(parts):
         groups.setdefault(p.meta.unrecorded, {}).setdefault(p.meta.motion, []).append(i)
     every = [list(motions.values()) for motions in groups.values()]
-    every = [[[i] for i in m[0]] if len(m) == 1 and parts[m[0][0]].duration > MAX_SHORT_WINDOW_S else m for m in every]
+    every = [
+        [[i] for i in m[0]] if len(m) == 1 and parts[m[0][0]].duration > MAX_SHORT_WINDOW_S else m
+        for m in every
+    ]
     return [motions for motions in every if len(motions) > 1]
 
 
-def _cross_validated(parts: list[Sequence], robot: RobotSpec, corrector: Corrector | None) -> tuple[Array, Array]:
+def _cross_validated(
+    parts: list[Sequence], robot: RobotSpec, corrector: Corrector | None
+) -> tuple[Array, Array]:
     """Return the mean |error| of motions, of the robot and of the fit to the other motions, (motions,) rad."""
     every, errors = _motions_that_judge(parts), list[tuple[float, ...]]()
     for k in range(min(MAX_FOLDS, max(map(len, every), default=0))):
         test = [motion for motions in every for motion in motions[k::MAX_FOLDS]]
-        rest = [parts[i] for motions in every for motion in motions if motion not in test for i in motion]
+        rest = [
+            parts[i]
+            for motions in every
+            for motion in motions
+            if motion not in test
+            for i in motion
+        ]
         both = robot, adapt(rest, robot, len(rest) * WINDOW_S, corrector=corrector).robot
-        errors += [tuple(rollout_errors([parts[i] for i in motion], r).mean() for r in both) for motion in test]
+        errors += [
+            tuple(rollout_errors([parts[i] for i in motion], r).mean() for r in both)
+            for motion in test
+        ]
     before, after = np.array(errors).reshape(-1, 2).T
     return before, after
 
@@ -161,14 +185,18 @@ class _Problem:
         here, count = x[0, 0], len(FIELDS)
         field = np.tile(np.arange(count), self.n)
         step = np.where(here + DIFFERENCE_STEP > high[0], -DIFFERENCE_STEP, DIFFERENCE_STEP)
-        tried = here + np.concatenate([np.zeros((1, len(here))), (field == np.arange(count)[:, None]) * step])
+        tried = here + np.concatenate(
+            [np.zeros((1, len(here))), (field == np.arange(count)[:, None]) * step]
+        )
         each = self._errors(tried)  # (1 + count, n, rows)
         jac = np.zeros((*each.shape[1:], len(here)), np.float32)
         for i in range(len(here)):
             joint = i // count
             jac[joint, :, i] = (each[1 + field[i], joint] - each[0, joint]) / step[i]
         base = np.concatenate([each[0].ravel(), self.prior @ here])
-        return base[None, None], np.concatenate([jac.reshape(-1, len(here)), self.prior])[None, None]
+        return base[None, None], np.concatenate([jac.reshape(-1, len(here)), self.prior])[
+            None, None
+        ]
 
     def _errors(self, xs: Array) -> Array:
         """Return errors of rollouts, (k, n, rows) in ERROR_SCALE_RAD."""

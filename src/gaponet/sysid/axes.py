@@ -30,10 +30,21 @@ MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillat
 MAX_KP_LOG_CHANGE, LARGE_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.2, 0.3
 MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
-UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")  # of an unexcited joint, fitted as others move it
+UNEXCITED_FIELDS = (
+    "kp",
+    "offset",
+    "damping",
+    "frictionloss",
+)  # of an unexcited joint, fitted as others move it
 MIN_INVERSE = 1e-5  # on an inverse axis; less counts as none
-MIN_LINE, LARGE_LINE_CHANGE = 0.2, 0.1  # share of the torque that a motor has lost at a joint's greatest speed
-SPEED_QUANTILE, MIN_SPEED = 0.995, 0.1  # of a joint's recorded speeds, and rad/s: the greatest is at least this
+MIN_LINE, LARGE_LINE_CHANGE = (
+    0.2,
+    0.1,
+)  # share of the torque that a motor has lost at a joint's greatest speed
+SPEED_QUANTILE, MIN_SPEED = (
+    0.995,
+    0.1,
+)  # of a joint's recorded speeds, and rad/s: the greatest is at least this
 BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
 
 
@@ -42,7 +53,13 @@ def to_axis(field: str, value: Array, kp: Array) -> Array:
     axis = SERVO_FIELDS[field].axis
     if axis == "inverse":
         return np.divide(1.0, value, out=np.zeros_like(value, float), where=value > 0)
-    return np.log(np.maximum(value, 1e-9)) if axis == "log" else value / kp if axis == "over kp" else value
+    return (
+        np.log(np.maximum(value, 1e-9))
+        if axis == "log"
+        else value / kp
+        if axis == "over kp"
+        else value
+    )
 
 
 def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
@@ -56,15 +73,23 @@ def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
 
 def greatest_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     """Return the greatest recorded speed of each operated joint, at least MIN_SPEED, (n,) rad/s; without outliers."""
-    speeds = [np.quantile(np.abs(s.qvel[:, robot.operated_index]), SPEED_QUANTILE, axis=0) for s in sequences]
+    speeds = [
+        np.quantile(np.abs(s.qvel[:, robot.operated_index]), SPEED_QUANTILE, axis=0)
+        for s in sequences
+    ]
     return np.maximum(np.max(speeds, axis=0), MIN_SPEED)
 
 
 def first_values(robot: RobotSpec) -> Values:
     """Return the robot's own values, (n,) each. Damping is the MJCF's; below zero it is taken from the servo's kd."""
     model, op = build_model(replace(robot, table=None)), robot.operated_index
-    passive = {f: np.array(getattr(model, f"dof_{f}")[op]) for f in ("damping", "frictionloss", "armature")}
-    return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS, *WARM)}
+    passive = {
+        f: np.array(getattr(model, f"dof_{f}")[op]) for f in ("damping", "frictionloss", "armature")
+    }
+    return passive | {
+        f: getattr(robot, f)[op]
+        for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS, *WARM)
+    }
 
 
 def identified_joints(robot: RobotSpec) -> set[str]:
@@ -93,11 +118,17 @@ class Changes:
         """first: Own values, (n,); kd_slack: kd that damping may take from the servos, N·m·s/rad."""
         self.fields, self._first = tuple(fields), first
         kp, one = first["kp"], np.ones_like(first["kp"])
-        damping, friction, armature, delay = (first[f] for f in ("damping", "frictionloss", "armature", "delay"))
+        damping, friction, armature, delay = (
+            first[f] for f in ("damping", "frictionloss", "armature", "delay")
+        )
         # Field → a large change, the lowest and the highest one.
         ends: dict[str, tuple[Array, Array, Array]] = {
             "kp": (LARGE_KP_LOG_CHANGE * one, -MAX_KP_LOG_CHANGE * one, MAX_KP_LOG_CHANGE * one),
-            "damping": (np.fmax(damping, 0.01 * kp), -damping - kd_slack, MAX_ON_AXIS["damping"] * kp),
+            "damping": (
+                np.fmax(damping, 0.01 * kp),
+                -damping - kd_slack,
+                MAX_ON_AXIS["damping"] * kp,
+            ),
             "frictionloss": (np.fmax(friction, 0.005 * kp), -friction, kp),
             "armature": (np.fmax(armature, 1e-3 * one), -armature, MAX_ARMATURE_TIME_S**2 * kp),
             "offset": (0.02 * one, -MAX_ON_AXIS["offset"] * one, MAX_ON_AXIS["offset"] * one),
@@ -115,8 +146,15 @@ class Changes:
         """Return the values of x; fields that are not changed stay. A bound of zero is met exactly."""
         moved = dict(zip(self.fields, np.moveaxis(x * self._large, -1, 0), strict=True))
         rest = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self._first.items()}
-        values = {f: self._first[f] * np.exp(v) if f == "kp" else self._first[f] + v for f, v in moved.items()}
-        positive = {f: np.maximum(values[f], 0.0) for f in ("armature", "frictionloss", "delay") if f in values}
+        values = {
+            f: self._first[f] * np.exp(v) if f == "kp" else self._first[f] + v
+            for f, v in moved.items()
+        }
+        positive = {
+            f: np.maximum(values[f], 0.0)
+            for f in ("armature", "frictionloss", "delay")
+            if f in values
+        }
         return rest | values | positive
 
 
@@ -150,13 +188,17 @@ class Bounds:
             "delay": np.maximum(self.first["delay"], START_DELAY_S),
             "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),
         }
-        self.start |= {f: np.where(self.unexcited, self.first[f], self.start[f]) for f in ("delay", "armature")}
+        self.start |= {
+            f: np.where(self.unexcited, self.first[f], self.start[f]) for f in ("delay", "armature")
+        }
         self.start |= {f: self.first[f] for f in (*SERVO_TERMS, *WARM) if self.first[f].any()}
         slow = 1 / greatest_speeds(sequences, robot)  # s/rad
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)
         self.limits: dict[str, tuple[Array, Array, Array]] = {
-            f.name: (f.bounds[0] * one, f.bounds[1] * one, f.bounds[2] * one) for f in SERVO_FIELDS.values() if f.bounds
+            f.name: (f.bounds[0] * one, f.bounds[1] * one, f.bounds[2] * one)
+            for f in SERVO_FIELDS.values()
+            if f.bounds
         } | {
             "kp": (np.log(kp) - MAX_KP_LOG_CHANGE, np.log(kp) + MAX_KP_LOG_CHANGE, 0.3 * one),
             "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
@@ -169,7 +211,9 @@ class Bounds:
             (low, high, large), own = self.limits[f], to_axis(f, self.first[f], kp)
             self.limits[f] = np.where(varies, low, own), np.where(varies, high, own), large
         guess = {
-            f.name: f.guess * (varies if f.name in WARM else one) for f in SERVO_FIELDS.values() if f.guess is not None
+            f.name: f.guess * (varies if f.name in WARM else one)
+            for f in SERVO_FIELDS.values()
+            if f.guess is not None
         }
         self.guess = from_axis(guess, kp) | {
             "effort_limit": 0.6 * limit,  # one that is too high has no slope
@@ -187,7 +231,9 @@ class Bounds:
             return np.where(slow & (np.abs(values[field]) < MIN_PER_KELVIN), 0.0, values[field])
         inverse = SERVO_FIELDS[field].axis == "inverse"
         least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field][2] if inverse else 0.0
-        return np.where(inverse & (to_axis(field, values[field], values["kp"]) < least), 0.0, values[field])
+        return np.where(
+            inverse & (to_axis(field, values[field], values["kp"]) < least), 0.0, values[field]
+        )
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
@@ -195,8 +241,12 @@ class Bounds:
         x = axes.normalize(values)
         for i, joint in enumerate(self._joints):
             for k, f in enumerate(names):
-                fixed = axes.low[i, k] == axes.high[i, k] or (f == "stribeck_speed" and not values["stribeck"][i])
-                below = x[i, k] - axes.low[i, k] < BOUND_TOLERANCE and (f == "damping" or axes.low[i, k] != 0)
+                fixed = axes.low[i, k] == axes.high[i, k] or (
+                    f == "stribeck_speed" and not values["stribeck"][i]
+                )
+                below = x[i, k] - axes.low[i, k] < BOUND_TOLERANCE and (
+                    f == "damping" or axes.low[i, k] != 0
+                )
                 if fixed or not (below or axes.high[i, k] - x[i, k] < BOUND_TOLERANCE):
                     continue
                 if f == "damping" and below:
@@ -220,7 +270,9 @@ class Axes:
 
     def __init__(self, bounds: Bounds, fields: ListOf[str], rest: Values) -> None:
         self.names, self.rest, self._kd_slack = list(dict.fromkeys(fields)), rest, bounds.kd
-        low, high, self.unit = (np.stack([bounds.limits[f][i] for f in self.names], axis=1) for i in range(3))
+        low, high, self.unit = (
+            np.stack([bounds.limits[f][i] for f in self.names], axis=1) for i in range(3)
+        )
         self.low, self.high = low / self.unit, high / self.unit
         here = self._unclipped(rest)
         fixed = bounds.unexcited[:, None] & ~np.isin(self.names, UNEXCITED_FIELDS)
@@ -239,4 +291,6 @@ class Axes:
         own = dict(zip(self.names, np.moveaxis(x * self.unit, -1, 0), strict=True))
         values = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()}
         values |= from_axis(own, values["kp"])
-        return values | {"damping": values["damping"] - self._kd_slack} if "damping" in own else values
+        return (
+            values | {"damping": values["damping"] - self._kd_slack} if "damping" in own else values
+        )

@@ -51,7 +51,10 @@ def probability(fit: JointFit, without: Values, values: Values) -> Array:
 def only_probable(without: ListOf[Values], values: ListOf[Values], chance: Array) -> list[Values]:
     """Return values (n,) with backlash at the joints where it is probable, and the others' without."""
     pairs = zip(without, values, strict=True)
-    return [{f: np.where(chance >= MIN_PROBABILITY, v, a.get(f, 0.0)) for f, v in b.items()} for a, b in pairs]
+    return [
+        {f: np.where(chance >= MIN_PROBABILITY, v, a.get(f, 0.0)) for f, v in b.items()}
+        for a, b in pairs
+    ]
 
 
 def findings(
@@ -70,7 +73,9 @@ def findings(
             chance_of_it = "above 0.99" if p > 0.99 else f"{p:.2f}"
             sentences.append(f"{joint}: backlash {size} mrad (probability {chance_of_it})")
         elif p >= MIN_PROBABILITY:
-            sentences.append(f"{joint}: validation motions do not show a gap of {1e3 * gap:.1f} mrad that fits suggest")
+            sentences.append(
+                f"{joint}: validation motions do not show a gap of {1e3 * gap:.1f} mrad that fits suggest"
+            )
         elif gap > MIN_WIDTH_RAD:
             sentences.append(
                 f"{joint}: backlash of {1e3 * gap:.1f} mrad is not distinguishable from static friction (probability "

@@ -48,14 +48,18 @@ from gaponet.sysid.servo_types import far_from_servo_type
 from gaponet.sysid.table_contact import contact_height, fit_table, low_windows, tip_heights
 from gaponet.sysid.torque import TorqueFit, with_torque
 
-ONE_PAYLOAD = "masses and gains are known up to a common factor: record two payloads before you trust a third"
+ONE_PAYLOAD = (
+    "masses and gains are known up to a common factor: record two payloads before you trust a third"
+)
 FOLDS = 3  # of the cross-validation
 WINDOWS = 40  # of joints by themselves
 ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
 POLISH_ITERATIONS = 2  # of the whole robot with a term of the servo model
 JOINTS_TIME_SHARE, ROBOT_TIME_SHARE, TERMS_TIME_SHARE = 0.3, 0.4, 0.3  # of a time budget
 
-Progress = Callable[[float, float, str], None]  # iterations done, in all, what is fitted and its error
+Progress = Callable[
+    [float, float, str], None
+]  # iterations done, in all, what is fitted and its error
 
 
 class _SearchProgress:
@@ -105,7 +109,10 @@ class _SearchProgress:
         def tell(cost: Array) -> bool:
             each = 1e3 * ERROR_SCALE_RAD * np.sqrt(2 * cost / np.maximum(rows, 1))
             self._done += 1
-            self.tell(self._done, f"{what}: {each.mean():.2f} mrad, {joints[int(each.argmax())]} {each.max():.2f}")
+            self.tell(
+                self._done,
+                f"{what}: {each.mean():.2f} mrad, {joints[int(each.argmax())]} {each.max():.2f}",
+            )
             return self.expired()
 
         return tell
@@ -161,17 +168,26 @@ def _fit_robot(
     masses: bool, budget: float | None,
 ) -> Identified:  # fmt: skip
     """Fit to positions, with the speed limits that the robot's servos have; arguments as of `identify`."""
-    given, robot = robot, with_stops(robot, sequences)  # stops that nobody confirmed are taken back in the end
+    given, robot = (
+        robot,
+        with_stops(robot, sequences),
+    )  # stops that nobody confirmed are taken back in the end
     heights = tip_heights(sequences, robot)
     contact = contact_height(robot, heights)
     fitted_sets = [train for train, _ in splits] + [[*sequences, *validation]] * (len(splits) > 1)
     fits = [
-        JointFit(JointRollouts(cut(train, windows), robot, contact, nthread), robot, Bounds(robot, train))
+        JointFit(
+            JointRollouts(cut(train, windows), robot, contact, nthread), robot, Bounds(robot, train)
+        )
         for train in fitted_sets
     ]
-    judge = Judge([held_out or fits[0].rollouts.parts for _, held_out in splits], robot, contact, nthread)
+    judge = Judge(
+        [held_out or fits[0].rollouts.parts for _, held_out in splits], robot, contact, nthread
+    )
     searches = _SearchProgress(budget, len(terms) + masses, len(fits), progress)
-    wholes, each = zip(*(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True)
+    wholes, each = zip(
+        *(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True
+    )
     candidates = {name: [one[name] for one in each] for name in each[0]}
     identified = given.nominal is not None
     chosen, values = judge.best_by_joint(candidates) if identified else judge.best(candidates)
@@ -180,8 +196,13 @@ def _fit_robot(
     linked, links = None, list[Links]()
     if masses:
         start = values if any(c.accepted for c in comparisons) else base
-        gains = [{j: (g.kp, g.error) for j, g in TorqueFit(one, robot).known.items()} for one in fitted_sets]
-        comparison, linked, links, values = _with_links(wholes, judge, start, values, gains, searches)
+        gains = [
+            {j: (g.kp, g.error) for j, g in TorqueFit(one, robot).known.items()}
+            for one in fitted_sets
+        ]
+        comparison, linked, links, values = _with_links(
+            wholes, judge, start, values, gains, searches
+        )
         comparisons = *comparisons, comparison
     chosen = "whole" if chosen == "given" and any(c.accepted for c in comparisons) else chosen
     joints, whole, first = fits[-1], wholes[-1], [one.bounds.first for one in fits]
@@ -202,7 +223,12 @@ def _fit_robot(
     held_out = [HeldOut(list(validation), fitted)] if validation else []
     if len(splits) > 1:
         held_out = [
-            HeldOut(part, replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high))
+            HeldOut(
+                part,
+                replace(
+                    one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high
+                ),
+            )
             for (_, part), one in zip(splits, robots, strict=False)
         ]
     one_payload = bool(links and robot.payload_mounts and not gains[-1])
@@ -234,17 +260,23 @@ def _classic_candidates(
     given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
     searches.begin()
     report = searches.report("joints, each on its own", names, joints.rollouts.rows)
-    late = joints.search(("offset", "delay"), given, only=True, report=lambda cost: searches.expired())
+    late = joints.search(
+        ("offset", "delay"), given, only=True, report=lambda cost: searches.expired()
+    )
     joints.prior.residual = residual  # of other fields' searches
     alone = joints.search(CLASSIC, bounds.start, joints.regressed(), report=report)
     joints.prior.update_correlation_time(joints.rollouts, alone)
     whole = joints.robot_fit(nthread)
     searches.begin()
     report = searches.report("whole robot", names, whole.rollouts.rows)
-    together = whole.descend(CLASSIC, bounds.start, (alone, bounds.start), ROBOT_ITERATIONS, report=report)
+    together = whole.descend(
+        CLASSIC, bounds.start, (alone, bounds.start), ROBOT_ITERATIONS, report=report
+    )
     chains = together
     if not searches.expired():
-        chains = whole.descend_chains(together, lambda names, rows: searches.report("kinematic chains", names, rows))
+        chains = whole.descend_chains(
+            together, lambda names, rows: searches.report("kinematic chains", names, rows)
+        )
     return whole, {
         "given": given, "limbs": chains, "joints": alone, "whole": together, "delay and offset": late,
     }  # fmt: skip
@@ -265,22 +297,32 @@ def _with_terms(
         if searches.over():
             searches.untried = terms[i:]
             break
-        if term == "backlash" and ("backlash" in base[-1] or not backlash.worth_a_search(fits[-1], base[-1])):
+        if term == "backlash" and (
+            "backlash" in base[-1] or not backlash.worth_a_search(fits[-1], base[-1])
+        ):
             continue
         each = [_fit_term(term, *one, searches) for one in zip(fits, wholes, base, strict=True)]
         richer = [together if together is not None else alone for alone, together in each]
         if each[0][1] is not None:
-            richer = min([alone for alone, _ in each], richer, key=lambda v: float(judge.errors(v).mean()))
-        richer = [v | {first: fit.bounds.visible(first, v)} for fit, v in zip(fits, richer, strict=True)]
+            richer = min(
+                [alone for alone, _ in each], richer, key=lambda v: float(judge.errors(v).mean())
+            )
+        richer = [
+            v | {first: fit.bounds.visible(first, v)} for fit, v in zip(fits, richer, strict=True)
+        ]
         if term == "backlash":
             without = fits[-1].search((), base[-1], report=lambda cost: searches.expired())
             chance = backlash.probability(fits[-1], without, each[-1][0])
             gaps = richer[-1]["backlash"], chance
             richer = backlash.only_probable(values, richer, chance)
         comparisons.append(judge.compare(term, values, richer))
-        if comparisons[-1].accepted:  # a term that is zero in every joint only gave the others more iterations
+        if comparisons[
+            -1
+        ].accepted:  # a term that is zero in every joint only gave the others more iterations
             used = any(v[first].any() for v in richer)
-            values = base = [{f: x for f, x in v.items() if f not in TERMS[term] or used} for v in richer]
+            values = base = [
+                {f: x for f, x in v.items() if f not in TERMS[term] or used} for v in richer
+            ]
     return tuple(comparisons), values, gaps
 
 
@@ -293,14 +335,21 @@ def _with_links(
     searches: _SearchProgress,
 ) -> tuple[Comparison, LinkResult | None, list[Links], list[Values]]:
     """Fit the links with the servos from `start`; return them and the servos' values if they are better."""
-    results, fits = list[LinkResult](), [LinkFit(*one) for one in zip(wholes, start, gains, strict=True)]
+    results, fits = (
+        list[LinkResult](),
+        [LinkFit(*one) for one in zip(wholes, start, gains, strict=True)],
+    )
     for fit in fits:
         searches.begin()
-        report = searches.report("masses", ("all joints",), fit.whole.rollouts.rows.sum(keepdims=True))
+        report = searches.report(
+            "masses", ("all joints",), fit.whole.rollouts.rows.sum(keepdims=True)
+        )
         results.append(fit.descend(report))
     links, servos = [r.axes.links(r.x) for r in results], [r.values for r in results]
     before = judge.errors(values)
-    comparison = Comparison("masses", before, judge.errors(servos, links) if results[-1].x.any() else before)
+    comparison = Comparison(
+        "masses", before, judge.errors(servos, links) if results[-1].x.any() else before
+    )
     slopes = fits[-1].servo_slopes(results[-1]) if comparison.accepted else {}
     accepted = comparison, replace(results[-1], servo_slopes=slopes), links, servos
     return accepted if comparison.accepted else (comparison, None, [], values)
@@ -318,4 +367,6 @@ def _fit_term(
     if any(SERVO_FIELDS[f].single_joint for f in TERMS[term]):
         return alone, None
     report = searches.report(f"{term}, whole robot", names, whole.rollouts.rows)
-    return alone, whole.descend(robot_fields(alone), alone, (alone,), (POLISH_ITERATIONS,), report=report)
+    return alone, whole.descend(
+        robot_fields(alone), alone, (alone,), (POLISH_ITERATIONS,), report=report
+    )

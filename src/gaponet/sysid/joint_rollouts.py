@@ -30,22 +30,40 @@ from gaponet.sim.temperature import recorded_temperatures, warm_values
 
 advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
-ERROR_SCALE_RAD = 0.01  # errors beyond count linearly (soft L1), so that one blocked joint does not decide
+ERROR_SCALE_RAD = (
+    0.01  # errors beyond count linearly (soft L1), so that one blocked joint does not decide
+)
 ROW_PERIOD_S = 0.01  # between rows that are compared
 SETTLE_S = 0.1  # after a window's start, where velocities are measured ones
 UNLIMITED_STOP_RAD = 7.0  # stops of a joint without any
 MAX_REGRESSION_ROWS, MAX_REGRESSION_DELAY_S = 20_000, 0.1
 SLIP_SPEED = 0.02  # rad/s, of the regression: at which friction is whole
 CUTOFF_HZ = 10.0  # of the other joints' accelerations: above the arms' bandwidth
-GRAVITY_STEP_RAD, GRAVITY_ROWS = 0.02, 5  # of the derivative of gravity's torque; rows that share one
-KERNEL_FIELDS = ("kp", "damping", "frictionloss", "armature", "offset", "delay", "effort_limit", *SERVO_TERMS)
+GRAVITY_STEP_RAD, GRAVITY_ROWS = (
+    0.02,
+    5,
+)  # of the derivative of gravity's torque; rows that share one
+KERNEL_FIELDS = (
+    "kp",
+    "damping",
+    "frictionloss",
+    "armature",
+    "offset",
+    "delay",
+    "effort_limit",
+    *SERVO_TERMS,
+)
 
 
 class JointRollouts:
     """Rollouts of windows of recordings, n operated joints; rows in which a tip may touch something do not count."""
 
     def __init__(
-        self, parts: list[Sequence], robot: RobotSpec, contact_height: float = -np.inf, nthread: int = 0
+        self,
+        parts: list[Sequence],
+        robot: RobotSpec,
+        contact_height: float = -np.inf,
+        nthread: int = 0,
     ) -> None:
         """
         Args:
@@ -57,17 +75,28 @@ class JointRollouts:
         self.nthread = nthread or os.cpu_count() or 1
         self.periods = np.array([p.dt for p in parts])  # (windows,) s
         self.dt = float(self.periods.max())
-        self.count = robot.steps_per(self.dt)  # physics steps of every period, so that windows step side by side
+        self.count = robot.steps_per(
+            self.dt
+        )  # physics steps of every period, so that windows step side by side
         self.thin = max(1, round(ROW_PERIOD_S / self.dt))
         # Rows of each window from one that is compared to the next, (windows,): multiples of `thin`.
-        thins = self.thin * np.maximum(1, np.round(ROW_PERIOD_S / self.periods / self.thin)).astype(int)
+        thins = self.thin * np.maximum(1, np.round(ROW_PERIOD_S / self.periods / self.thin)).astype(
+            int
+        )
         self._thins, rows = thins, max(map(len, parts))
         payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in parts]
-        models = {x: build_model(robot, *x, self.dt, physics_only=True) for x in dict.fromkeys(payloads)}
-        loads = [_loads_along(p, models[x], self.op, k) for p, x, k in zip(parts, payloads, thins, strict=True)]
+        models = {
+            x: build_model(robot, *x, self.dt, physics_only=True) for x in dict.fromkeys(payloads)
+        }
+        loads = [
+            _loads_along(p, models[x], self.op, k)
+            for p, x, k in zip(parts, payloads, thins, strict=True)
+        ]
         low, high = robot.qpos_range[self.op].T
 
-        def stacked(xs: list[Array]) -> Array:  # (n, windows, rows), so that a rollout reads contiguous memory
+        def stacked(
+            xs: list[Array],
+        ) -> Array:  # (n, windows, rows), so that a rollout reads contiguous memory
             return np.stack([_extended(x, rows) for x in xs]).transpose(2, 0, 1).astype(np.float32)
 
         def at_middle(x: Array) -> Array:
@@ -77,11 +106,15 @@ class JointRollouts:
         self.ctrl = stacked([np.clip(p.ctrl[:, self.op], low, high) for p in parts])
         if (speed := robot.target_speed[self.op]).any():
             most = np.where(speed > 0, speed, np.inf)[:, None]
-            limited = speed_limited(np.moveaxis(self.ctrl, -1, 0), self.qpos[..., 0], most, self.periods)
+            limited = speed_limited(
+                np.moveaxis(self.ctrl, -1, 0), self.qpos[..., 0], most, self.periods
+            )
             self.ctrl = np.ascontiguousarray(np.moveaxis(limited, 0, -1))
         self.qvel = stacked([p.qvel[:, self.op] for p in parts])
         # In the middle of each period: inertia, gravity's torque at an angle of zero, the others' torque, its slope.
-        inertia, weight, pull, slope = (at_middle(stacked([load[i] for load in loads])) for i in range(4))
+        inertia, weight, pull, slope = (
+            at_middle(stacked([load[i] for load in loads])) for i in range(4)
+        )
         self.tables = np.stack([inertia, weight - slope * at_middle(self.qpos), pull, slope])
         # A rollout stops at the ends of the range or of the recording, so that none diverges.
         reached = self.qpos.min(axis=(1, 2)), self.qpos.max(axis=(1, 2))
@@ -90,10 +123,14 @@ class JointRollouts:
             np.maximum(np.where(np.isfinite(high), high, UNLIMITED_STOP_RAD), reached[1]),
         ], axis=1).astype(np.float32)  # fmt: skip
         heights = tips_of(robot) or (lambda qpos: np.full(len(qpos), np.inf))
-        self.touch = np.stack([_extended(heights(p.qpos), rows) for p in parts]) < contact_height  # (windows, rows)
+        self.touch = (
+            np.stack([_extended(heights(p.qpos), rows) for p in parts]) < contact_height
+        )  # (windows, rows)
         self.lengths = np.array([len(p) for p in parts])
         # Joints that a window does not hold have no error, (n, windows).
-        self.recorded = np.array([[j not in p.meta.unrecorded for p in parts] for j in robot.operated])
+        self.recorded = np.array(
+            [[j not in p.meta.unrecorded for p in parts] for j in robot.operated]
+        )
         self.counted = self._counted()
         # Gains of each recording: kp over the robot's own, kd in N·m·s/rad, (windows, n).
         acting = [robot.with_gains(*p.meta.recorded_gains) for p in parts]
@@ -104,9 +141,19 @@ class JointRollouts:
     def _counted(self) -> Array:
         """Return the rows that count, (windows, rows): after the start has settled, away from contacts."""
         rows, after = self.touch.shape[1], np.round(SETTLE_S / self.periods).astype(int)
-        near = np.array([np.convolve(t, np.ones(k + 1))[:rows] > 0.5 for t, k in zip(self.touch, after, strict=True)])
+        near = np.array(
+            [
+                np.convolve(t, np.ones(k + 1))[:rows] > 0.5
+                for t, k in zip(self.touch, after, strict=True)
+            ]
+        )
         time, thin = np.arange(rows), self._thins[:, None]
-        counted = (time > np.maximum(after, 1)[:, None]) & (time < self.lengths[:, None]) & ~near & (time % thin == 0)
+        counted = (
+            (time > np.maximum(after, 1)[:, None])
+            & (time < self.lengths[:, None])
+            & ~near
+            & (time % thin == 0)
+        )
         return np.asarray(counted[:, :: self.thin])
 
     @property
@@ -135,7 +182,9 @@ class JointRollouts:
         is 0 where it fails.
         """
         n = len(self.op)
-        best = {f: np.zeros(n) for f in ("kp", "damping", "frictionloss", "armature", "offset", "delay")}
+        best = {
+            f: np.zeros(n) for f in ("kp", "damping", "frictionloss", "armature", "offset", "delay")
+        }
         row = np.concatenate([np.arange(length) for length in self.lengths])
         window = np.repeat(np.arange(len(self.lengths)), self.lengths)
         some = slice(None, None, max(1, len(row) // MAX_REGRESSION_ROWS))
@@ -144,15 +193,23 @@ class JointRollouts:
                       for w, k in enumerate(self.lengths)]  # fmt: skip
             speed = [np.gradient(x, dt) for x, dt in zip(smooth, self.periods, strict=True)]
             q, v = np.concatenate(smooth), np.concatenate(speed)
-            a = np.concatenate([np.gradient(x, dt) for x, dt in zip(speed, self.periods, strict=True)])
+            a = np.concatenate(
+                [np.gradient(x, dt) for x, dt in zip(speed, self.periods, strict=True)]
+            )
             inertia, weight, pull, slope = self.tables[:, j, window, row]
             torque, least = inertia * a + weight + slope * q + pull, np.inf
             for delay in np.arange(0.0, MAX_REGRESSION_DELAY_S, max(self.dt / 2, 5e-3)):
                 late = row - delay / self.periods[window]
                 whole = np.floor(late).astype(int)
-                aim = [self.ctrl[j, window, np.clip(whole + i, 0, self.lengths[window] - 1)] for i in (0, 1)]
+                aim = [
+                    self.ctrl[j, window, np.clip(whole + i, 0, self.lengths[window] - 1)]
+                    for i in (0, 1)
+                ]
                 error = aim[0] + (late - whole) * (aim[1] - aim[0]) - q
-                columns = np.stack([error, -v, -np.tanh(v / SLIP_SPEED), -a, np.ones_like(q), -np.ones_like(q)], axis=1)
+                columns = np.stack(
+                    [error, -v, -np.tanh(v / SLIP_SPEED), -a, np.ones_like(q), -np.ones_like(q)],
+                    axis=1,
+                )
                 size = np.sqrt(np.square(columns[some]).mean(axis=0)) + 1e-12
                 x, residual = nnls(columns[some] / size, torque[some])
                 x = x / size
@@ -182,7 +239,10 @@ class JointRollouts:
         """Roll out by numba, shared by threads."""
         k, (n, windows) = len(values["kp"]), self.qpos.shape[:2]
         own = {"effort_limit": self.robot.effort_limit[self.op]}
-        packed = np.stack([np.broadcast_to(values.get(f, own.get(f, 0.0)), (k, n)) for f in KERNEL_FIELDS], axis=-1)
+        packed = np.stack(
+            [np.broadcast_to(values.get(f, own.get(f, 0.0)), (k, n)) for f in KERNEL_FIELDS],
+            axis=-1,
+        )
         terms = any(values[f].any() for f in SERVO_TERMS if f in values)
         out = np.zeros((k, n * windows, self.counted.shape[1]), np.float32)
         ends = np.linspace(0, n * windows, self.nthread + 1).astype(int)
@@ -224,12 +284,17 @@ class JointRollouts:
                 load = slope * q + weight
                 most = friction_limit(terms, dry, w, torque, load)
                 net = torque - load - pull - own * w
-                before, w = w, w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most))
+                before, w = (
+                    w,
+                    w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most)),
+                )
                 if "backlash" in terms:
                     force = inertia * (w - before) / h + load + pull
                     pressed = (abs(gap) >= half) & (force * gap >= 0)
                     link = np.where(pressed, w, before - h / inertia * (load + pull))
-                    gap, rotor = crossed(half, gap, rotor, pressed, link, torque, own, most, armature, h)
+                    gap, rotor = crossed(
+                        half, gap, rotor, pressed, link, torque, own, most, armature, h
+                    )
                     both = (inertia * link + armature * rotor) / heavy
                     met = abs(gap) >= half
                     w, rotor = np.where(met, both, link), np.where(met, both, rotor)
@@ -238,7 +303,10 @@ class JointRollouts:
                 q = np.minimum(np.maximum(q, low), high)
             touch = self.touch[:, t + 1]
             if touch.any():  # goes on from the recording
-                q[..., touch], w[..., touch] = self.qpos[:, touch, t + 1], self.qvel[:, touch, t + 1]
+                q[..., touch], w[..., touch] = (
+                    self.qpos[:, touch, t + 1],
+                    self.qvel[:, touch, t + 1],
+                )
                 rotor[..., touch] = w[..., touch]
             if (t + 1) % self.thin == 0:
                 out[..., (t + 1) // self.thin] = q - self.qpos[..., t + 1]
@@ -247,12 +315,17 @@ class JointRollouts:
     def _targets(self, t: int, delay: Array) -> Array:
         """Return the commands in force in the physics steps of a period, (count, k, n, windows); interpolated in the
         step in which they change."""
-        at = np.arange(self.count)[:, None, None, None] / self.count - delay[..., None] / self.periods  # rows from t
+        at = (
+            np.arange(self.count)[:, None, None, None] / self.count
+            - delay[..., None] / self.periods
+        )  # rows from t
         row = np.floor(at).astype(int)
         share = np.maximum((at - row - 1) * self.count + 1, 0).astype(np.float32)
         last, joint = self.lengths - 1, np.arange(len(self.op))[:, None]
         window = np.arange(len(self.lengths))
-        first, then = (self.ctrl[joint, window, np.clip(t + row + more, 0, last)] for more in (0, 1))
+        first, then = (
+            self.ctrl[joint, window, np.clip(t + row + more, 0, last)] for more in (0, 1)
+        )
         return np.asarray((1 - share) * first + share * then)
 
 
@@ -263,7 +336,9 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
     accelerations, N·m; slope of the second over the joint's angle, N·m/rad.
     """
     data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # no forces of servos and of a table
+    model.opt.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    )  # no forces of servos and of a table
 
     def bias(qpos: Array, qvel: Array) -> Array:
         data.qpos[:], data.qvel[:] = qpos, qvel
@@ -285,9 +360,15 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
             for k, j in enumerate(op):
                 turned = part.qpos[t].astype(float)
                 turned[j] += GRAVITY_STEP_RAD
-                slope[i : i + GRAVITY_ROWS, k] = (bias(turned, qvel[t])[j] - here[j]) / GRAVITY_STEP_RAD
+                slope[i : i + GRAVITY_ROWS, k] = (
+                    bias(turned, qvel[t])[j] - here[j]
+                ) / GRAVITY_STEP_RAD
     rows = np.arange(len(part))
-    return loads[:, : len(part)] if thin == 1 else np.apply_along_axis(lambda y: np.interp(rows, at, y), 1, loads)
+    return (
+        loads[:, : len(part)]
+        if thin == 1
+        else np.apply_along_axis(lambda y: np.interp(rows, at, y), 1, loads)
+    )
 
 
 def _filled(x: Array, shape: tuple[int, ...]) -> Array:

@@ -30,8 +30,13 @@ from gaponet.sysid.torque import Gains, servo_gains
 MIN_MOVE_RAD = 0.05  # of a command that moves a joint
 MAX_END_DIFFERENCE = 0.05  # of two commands that count as one, over the range of a joint's commands
 SETTLE_S = 0.1
-MAX_REPETITION_STD = 3.0  # standard deviations of a repetition within which neighbours are repetitions
-MIN_NM_PER_KG, MIN_BAND_DISTANCE = 0.3, 2.5  # distance in widths of a band, from which a joint determines its payload
+MAX_REPETITION_STD = (
+    3.0  # standard deviations of a repetition within which neighbours are repetitions
+)
+MIN_NM_PER_KG, MIN_BAND_DISTANCE = (
+    0.3,
+    2.5,
+)  # distance in widths of a band, from which a joint determines its payload
 MIN_RECORDINGS = 4  # of a joint, for its gains from torque
 MAX_PAYLOAD_ERROR_KG = 0.5  # from a label
 PAYLOAD_IN_NAME = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
@@ -117,7 +122,9 @@ class Labels:
         ]
 
 
-def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: int, gain: dict[str, float]) -> Labels:
+def estimate(
+    logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: int, gain: dict[str, float]
+) -> Labels:
     """Estimate payload and unit of every recording. Payloads in files' names are only compared with the estimates.
 
     Args:
@@ -134,11 +141,15 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     copies: list[tuple[LabelledRecording, LabelledRecording]] = []
     for name, log in logs:
         one = _read(name, log, gain)
-        digest = hashlib.sha256(b"".join(log.channels[c].values.tobytes() for c in ("ctrl", "qpos"))).hexdigest()
+        digest = hashlib.sha256(
+            b"".join(log.channels[c].values.tobytes() for c in ("ctrl", "qpos"))
+        ).hexdigest()
         first = seen.setdefault((one.joint, digest), one)
         if first is not one:
             one.copy_of = first.name
-            first.named_payload = one.named_payload if first.named_payload is None else first.named_payload
+            first.named_payload = (
+                one.named_payload if first.named_payload is None else first.named_payload
+            )
             copies.append((one, first))
         recordings.append(one)
     own = list(seen.values())
@@ -183,13 +194,20 @@ def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
         servo_rows = np.stack([ctrl.values[:, j], at("qpos"), speed, at("tau")])
     else:
         time = qpos.time
-        values = gain[joint] * (ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j])
+        values = gain[joint] * (
+            ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j]
+        )
     later = time[: len(values)] >= time[0] + SETTLE_S
     commands = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
     kilograms = PAYLOAD_IN_NAME.search(Path(log.source.partition("#")[0]).stem)
     payload = float(kilograms[1].replace("p", ".")) if kilograms else None
     return LabelledRecording(
-        name, joint, float(ctrl.values[-1, j]), (values[later], commands), payload, servo_rows=servo_rows
+        name,
+        joint,
+        float(ctrl.values[-1, j]),
+        (values[later], commands),
+        payload,
+        servo_rows=servo_rows,
     )
 
 
@@ -221,10 +239,14 @@ def _fit(part: list[LabelledRecording], payloads: Sequence[float], units: int) -
         return LabelGroup(part[0].joint, part[0].command, len(part), 0.0, 0.0, np.zeros(0), False)
     step = float(np.median(np.abs(np.diff(x)))) / 0.954  # most neighbours are repetitions
     width, slope, base = _bands(x, masses)
-    start = [base + np.array(d) * width for d in itertools.combinations(np.linspace(-2, 2, 9), units)]
+    start = [
+        base + np.array(d) * width for d in itertools.combinations(np.linspace(-2, 2, 9), units)
+    ]
     fits = [_mixture(x, masses, a, slope, 0.5 * width, max(step / 2, 0.04 * slope)) for a in start]
     _, zero, slope, _ = max((f for f in fits if f[2] > 0), key=lambda f: f[0], default=fits[0])
-    load = masses[np.abs(x[:, None] - (zero[:, None] + slope * masses).ravel()).argmin(axis=1) % len(masses)]
+    load = masses[
+        np.abs(x[:, None] - (zero[:, None] + slope * masses).ravel()).argmin(axis=1) % len(masses)
+    ]
     new = (np.abs(np.diff(x)) > MAX_REPETITION_STD * max(step, 1e-6)) | (np.diff(load) != 0)
     group = np.concatenate([[0], np.cumsum(new)])
     mean = np.bincount(group, x) / np.bincount(group)
@@ -236,7 +258,13 @@ def _fit(part: list[LabelledRecording], payloads: Sequence[float], units: int) -
         r.payload, r.torque_payload = float(m), float(kg)
         r.unit, r.determined = int(unit[g]), determined
     return LabelGroup(
-        part[0].joint, part[0].command, len(part), sign * slope, float(slope / width), sign * own, determined
+        part[0].joint,
+        part[0].command,
+        len(part),
+        sign * slope,
+        float(slope / width),
+        sign * own,
+        determined,
     )
 
 
@@ -248,7 +276,12 @@ def _at_equal_commands(recordings: list[tuple[Array, Array]]) -> Array:
     if not high > low:
         return np.array([torque.mean() for torque, _ in recordings])
     grid = np.linspace(low, high, 50)
-    return np.array([np.interp(grid, r, torque).mean() for r, (torque, _) in zip(risen, recordings, strict=True)])
+    return np.array(
+        [
+            np.interp(grid, r, torque).mean()
+            for r, (torque, _) in zip(risen, recordings, strict=True)
+        ]
+    )
 
 
 def _ranked(rest: Array, load: Array, units: int) -> tuple[Array, Array]:
@@ -298,7 +331,10 @@ def _mixture(
         n = np.maximum(w.sum(axis=(0, 2)), 1e-9)
         m, mean = (w * masses).sum(axis=(0, 2)) / n, (w * x[:, None, None]).sum(axis=(0, 2)) / n
         aside = masses - m[:, None]
-        slope = float((w * aside * (x[:, None, None] - mean[:, None])).sum() / max((w * aside**2).sum(), 1e-12))
+        slope = float(
+            (w * aside * (x[:, None, None] - mean[:, None])).sum()
+            / max((w * aside**2).sum(), 1e-12)
+        )
         zero = mean - slope * m
         apart = x[:, None, None] - zero[:, None] - slope * masses
         width = max(float(np.sqrt((w * apart**2).sum() / len(x))), least, 1e-9)
@@ -319,6 +355,9 @@ def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
         sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", estimated,
                         "yes" if r.copy_of else "no"])  # fmt: skip
     write_text(folder / "labels.csv", text.getvalue())
-    lines = ["# gaponet data labels: units and payloads are estimated from held torque", 'manifest = "labels.csv"']
+    lines = [
+        "# gaponet data labels: units and payloads are estimated from held torque",
+        'manifest = "labels.csv"',
+    ]
     lines += [f"rate = {rate:g}"] if rate else []
     write_text(folder / "logs.toml", "\n".join(lines) + "\n")

@@ -18,7 +18,9 @@ DAMPING_FACTORS = np.array([1e-3, 0.1, 1.0, 30.0])  # of the last best damping, 
 MIN_RELATIVE_DECREASE = 1e-4  # of the cost, for another iteration
 
 Progress = Callable[[Array], object]  # a true answer ends the search
-Errors = Callable[[Array], Array]  # candidates (k, n, P) → errors (k, n, m), 1 where they begin to count linearly
+Errors = Callable[
+    [Array], Array
+]  # candidates (k, n, P) → errors (k, n, m), 1 where they begin to count linearly
 
 
 def descend(
@@ -57,12 +59,21 @@ def descend(
         better = best.sum(axis=1) < best_total.sum(axis=1)
         best_x = np.where(better[:, None, None], x, best_x)
         best_total = np.where(better[:, None], best, best_total)
-        tried = np.stack([step(normal, gradient, low - x, high - x, s * damping) for s in DAMPING_FACTORS]) + x
+        tried = (
+            np.stack(
+                [step(normal, gradient, low - x, high - x, s * damping) for s in DAMPING_FACTORS]
+            )
+            + x
+        )
         costs = soft_l1(_evaluated(errors, tried))
         choice, least = costs.argmin(axis=0), costs.min(axis=0)
         lower = least < best
-        x = np.where(lower[..., None], np.take_along_axis(tried, choice[None, ..., None], axis=0)[0], x)
-        damping = np.clip(damping * np.where(lower, DAMPING_FACTORS[choice], DAMPING_FACTORS[-1]), 1e-6, 1e3)
+        x = np.where(
+            lower[..., None], np.take_along_axis(tried, choice[None, ..., None], axis=0)[0], x
+        )
+        damping = np.clip(
+            damping * np.where(lower, DAMPING_FACTORS[choice], DAMPING_FACTORS[-1]), 1e-6, 1e3
+        )
         decrease = np.where(lower, 1 - least / np.maximum(best, 1e-300), 0.0)
         best = np.minimum(least, best)
         if progress(best.min(axis=0)) or (decrease < min_decrease).all():
@@ -75,7 +86,9 @@ def descend(
 def slopes(x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
     """Return errors (S, n, m) at x (S, n, P), and their forward differences over x, (S, n, m, P)."""
     steps = np.where(x + DIFFERENCE_STEP > high, -DIFFERENCE_STEP, DIFFERENCE_STEP)
-    tried = np.concatenate([x[None], x + np.moveaxis(steps[..., None] * np.eye(x.shape[-1]), -1, 0)])
+    tried = np.concatenate(
+        [x[None], x + np.moveaxis(steps[..., None] * np.eye(x.shape[-1]), -1, 0)]
+    )
     values = _evaluated(errors, tried)
     jac = (values[1:] - values[0]) / np.moveaxis(steps, -1, 0)[..., None].astype(values.dtype)
     return values[0], np.moveaxis(jac, 0, -1)
@@ -88,7 +101,9 @@ def agreed_slopes(x: Array, low: Array, high: Array, errors: Errors) -> tuple[Ar
     """
     ends = (high, np.where(x - DIFFERENCE_STEP < low, high, x))
     (here, ahead), (_, behind) = (slopes(x, end, errors) for end in ends)
-    return here, np.where(ahead * behind > 0, np.sign(ahead) * np.minimum(abs(ahead), abs(behind)), 0)
+    return here, np.where(
+        ahead * behind > 0, np.sign(ahead) * np.minimum(abs(ahead), abs(behind)), 0
+    )
 
 
 def step(normal: Array, gradient: Array, low: Array, high: Array, damping: Array) -> Array:

@@ -23,12 +23,21 @@ from gaponet.sysid.least_squares import DIFFERENCE_STEP, Progress
 from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
 
 ROWS = 400  # of recordings, whose torques choose directions
-MIN_INFORMATION, MAX_DIRECTIONS = 1.0, 12  # of a direction over the prior's, and how many are fitted
+MIN_INFORMATION, MAX_DIRECTIONS = (
+    1.0,
+    12,
+)  # of a direction over the prior's, and how many are fitted
 MIN_KP_LOG_STD = 0.05  # of a kp from recorded torque, whose scale is a motor constant
 ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
 FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
-MAX_SERVO_NUMBERS, FEW_FIELDS = 36, ("kp", "armature")  # fitted with the links; of robots with more, these fields
-MIN_CHANGE, MAX_CHANGE = 0.1, 6.0  # of a link's coordinates, in standard deviations of the prior; less is none
+MAX_SERVO_NUMBERS, FEW_FIELDS = (
+    36,
+    ("kp", "armature"),
+)  # fitted with the links; of robots with more, these fields
+MIN_CHANGE, MAX_CHANGE = (
+    0.1,
+    6.0,
+)  # of a link's coordinates, in standard deviations of the prior; less is none
 ENCODER_ZERO_STD_RAD = 0.006  # a third of a degree, as a joint's zero at its stop is set by hand
 MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
 
@@ -36,7 +45,9 @@ MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; e
 class LinkFit:
     """Fit of links and servos; `directions` are orthonormal columns (L · COORDINATES, K) that recordings determine."""
 
-    def __init__(self, whole: RobotFit, values: Values, torque_kp: dict[str, tuple[float, float]]) -> None:
+    def __init__(
+        self, whole: RobotFit, values: Values, torque_kp: dict[str, tuple[float, float]]
+    ) -> None:
         """Take a fit of servos, its values (n,), and joint → kp from torque and its standard error."""
         fields = CLASSIC if whole.bounds.n * len(CLASSIC) <= MAX_SERVO_NUMBERS else FEW_FIELDS
         self.whole, self._servos = whole, Axes(whole.bounds, fields, values)
@@ -64,7 +75,11 @@ class LinkFit:
         damping, friction and armature of the joint explain as well does not count, so without payloads or recorded
         torque all masses do not change together.
         """
-        robot, parts, op = replace(self.whole.robot, table=None), self.whole.rollouts.parts, self.whole.rollouts.op
+        robot, parts, op = (
+            replace(self.whole.robot, table=None),
+            self.whole.rollouts.parts,
+            self.whole.rollouts.op,
+        )
         every, size = max(1, sum(map(len, parts)) // ROWS), self.axes.scale.size
         motions, torques, slopes = list[Array](), list[Array](), list[Array]()
         for payload in dict.fromkeys((s.meta.payload_mass, s.meta.payload_side) for s in parts):
@@ -84,11 +99,20 @@ class LinkFit:
         torque, (_, v, a) = np.concatenate(torques), np.concatenate(motions, axis=1)
         kp = self._first["kp"]
         moved = np.concatenate(slopes, axis=1) / DIFFERENCE_STEP / kp  # (10 L, rows, n) rad
-        count = sum(s.duration for s in parts) / self._prior.correlation_time  # independent measurements, (n,)
+        count = (
+            sum(s.duration for s in parts) / self._prior.correlation_time
+        )  # independent measurements, (n,)
         information = np.zeros((size, size))
         for i, j in enumerate(op):
             servo = np.stack(
-                [torque[:, i] / kp[i], np.ones(len(v)), v[:, j], a[:, j], np.tanh(v[:, j] / SLIP_SPEED)], axis=1
+                [
+                    torque[:, i] / kp[i],
+                    np.ones(len(v)),
+                    v[:, j],
+                    a[:, j],
+                    np.tanh(v[:, j] / SLIP_SPEED),
+                ],
+                axis=1,
             )
             weight = np.sqrt(count[i] / len(v)) / self._prior.residual[i]
             d, s = weight * moved[:, :, i].T, weight * servo
@@ -107,34 +131,53 @@ class LinkFit:
     def errors(self, x: Array, **other: Array) -> Array:
         """Return errors of candidates (k, 1, P), (k, 1, n · (rows + PRIORS) + K) in ERROR_SCALE_RAD."""
         values, links = self._unpacked(x)
-        errors = self.whole.rollouts.flat_errors(values | other, [self.axes.links(c) for c in links]) / ERROR_SCALE_RAD
+        errors = (
+            self.whole.rollouts.flat_errors(values | other, [self.axes.links(c) for c in links])
+            / ERROR_SCALE_RAD
+        )
         own = np.concatenate([errors, self._prior.errors(values)], axis=2) * self._weight[:, None]
         z = x[:, 0, self._n * len(self._servos.names) :]
         return np.concatenate([own.reshape(len(x), -1), self._level * z], axis=1)[:, None]
 
     def descend(self, report: Progress) -> LinkResult:
         """Fit links and servos together; return them with the links' covariance."""
-        first = np.r_[self._servos.normalize(self._first).ravel(), np.zeros(self.directions.shape[1])]
+        first = np.r_[
+            self._servos.normalize(self._first).ravel(), np.zeros(self.directions.shape[1])
+        ]
         if not self.directions.size:
-            return LinkResult(self.axes, np.zeros(self.axes.scale.size), np.eye(self.axes.scale.size), self._first)
+            return LinkResult(
+                self.axes, np.zeros(self.axes.scale.size), np.eye(self.axes.scale.size), self._first
+            )
         x, ends = first[None, None], np.full(self.directions.shape[1], MAX_CHANGE)
-        low, high = np.r_[self._servos.low.ravel(), -ends][None], np.r_[self._servos.high.ravel(), ends][None]
+        low, high = (
+            np.r_[self._servos.low.ravel(), -ends][None],
+            np.r_[self._servos.high.ravel(), ends][None],
+        )
         for i, count in enumerate(ITERATIONS):
             if i:
                 values, coordinates = self._unpacked(x[0][None])
-                errors = self.whole.rollouts.flat_errors(values, [self.axes.links(c) for c in coordinates])
+                errors = self.whole.rollouts.flat_errors(
+                    values, [self.axes.links(c) for c in coordinates]
+                )
                 cost = least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD)
                 self._prior.update_residual(cost, self.whole.rollouts.rows)
                 self._weigh()
-            x, _ = least_squares.descend(x, low, high, self.errors, count, report, MIN_COST_DECREASE)
+            x, _ = least_squares.descend(
+                x, low, high, self.errors, count, report, MIN_COST_DECREASE
+            )
         values, coordinates = self._unpacked(x[0][None])
-        own, (by_noise, by_zeros) = coordinates[0].reshape(-1, COORDINATES), self._covariances(x[0, 0])
+        own, (by_noise, by_zeros) = (
+            coordinates[0].reshape(-1, COORDINATES),
+            self._covariances(x[0, 0]),
+        )
         z = coordinates[0] @ self.directions
         small = np.abs(own).max(axis=1, keepdims=True) < MIN_CHANGE
         none = (np.abs(z) <= MIN_SIGNIFICANCE * np.sqrt(np.diag(by_noise))).all()
         changed = np.where(small | none, 0.0, own).ravel()
         covariance = self.directions @ (by_noise + by_zeros) @ self.directions.T + self._rest
-        return LinkResult(self.axes, changed, covariance, {f: v[0].copy() for f, v in values.items()})
+        return LinkResult(
+            self.axes, changed, covariance, {f: v[0].copy() for f, v in values.items()}
+        )
 
     def _slopes(self, x: Array) -> tuple[Array, Array]:
         """Return errors at x (P,) and their differences over x, (m,) and (m, P)."""
@@ -151,11 +194,16 @@ class LinkFit:
         by_zero = self.errors(np.repeat(x[None, None], n, axis=0), zero=zeros)[:, 0] - here
         weighted = jac / np.sqrt(1 + here**2)[:, None]
         rows = (len(here) - count) // n
-        mine, by_joint = (y[: n * rows].reshape(n, rows, -1) for y in (weighted * here[:, None], jac))
+        mine, by_joint = (
+            y[: n * rows].reshape(n, rows, -1) for y in (weighted * here[:, None], jac)
+        )
         each = cluster_sums(mine[:, :-PRIORS], self.whole.rollouts.window)[0].sum(axis=0)
         each -= each.mean(axis=0)
         held = np.concatenate([*by_joint[:, -PRIORS:], jac[n * rows :]])
-        scatter = each.T @ each * (len(each) / max(len(each) - count, 1)) ** 2 + self._level**2 * held.T @ held
+        scatter = (
+            each.T @ each * (len(each) / max(len(each) - count, 1)) ** 2
+            + self._level**2 * held.T @ held
+        )
         inverse = np.linalg.pinv(jac.T @ weighted, rcond=1e-10, hermitian=True)
         shifted = (inverse @ weighted.T @ by_zero.T)[-count:]
         return (inverse @ scatter @ inverse)[-count:, -count:], shifted @ shifted.T
@@ -166,9 +214,16 @@ class LinkFit:
         whole.directions = np.eye(len(result.x))
         here, jac = whole._slopes(np.r_[self._servos.normalize(result.values).ravel(), result.x])
         normal = jac.T @ (jac / np.sqrt(1 + here**2)[:, None])
-        slopes = -np.linalg.pinv(normal[:count, :count], rcond=1e-10, hermitian=True) @ normal[:count, count:]
+        slopes = (
+            -np.linalg.pinv(normal[:count, :count], rcond=1e-10, hermitian=True)
+            @ normal[:count, count:]
+        )
         slopes = slopes.reshape(*self._servos.unit.shape, -1) * self._servos.unit[..., None]
         by_field = dict(zip(self._servos.names, np.moveaxis(slopes, 1, 0), strict=True))
-        if "damping" in by_field:  # the fitted sum with kd over kp keeps its value, and kd does not change with kp
-            by_field["damping"] += (self.whole.bounds.kd / result.values["kp"])[:, None] * by_field["kp"]
+        if (
+            "damping" in by_field
+        ):  # the fitted sum with kd over kp keeps its value, and kd does not change with kp
+            by_field["damping"] += (self.whole.bounds.kd / result.values["kp"])[:, None] * by_field[
+                "kp"
+            ]
         return by_field

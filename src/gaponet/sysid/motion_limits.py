@@ -30,12 +30,21 @@ GREATEST_SPEED_QUANTILE = 0.995
 SPEED_SPAN_S = 0.06  # over which a speed is measured
 LAG_TIME_CONSTANTS_S = (0.0, 0.02, 0.04, 0.08, 0.16, 0.32)  # of a servo without a ramp
 MAX_ERROR_RATIO = 0.8  # of a ramp over the best lag, in both halves of the recordings
-MIN_RAMP_ERROR_RAD, MIN_RAMP_DELAY_S = 0.02, 0.3  # RMS and time by which a ramp must be behind its command
-MIN_BEYOND_STOP_RAD, MIN_STOP_ROWS = 0.1, 50  # that commands go beyond a stop, and further there; rows that show it
+MIN_RAMP_ERROR_RAD, MIN_RAMP_DELAY_S = (
+    0.02,
+    0.3,
+)  # RMS and time by which a ramp must be behind its command
+MIN_BEYOND_STOP_RAD, MIN_STOP_ROWS = (
+    0.1,
+    50,
+)  # that commands go beyond a stop, and further there; rows that show it
 AT_STOP_RAD = 0.005  # from the end of a joint's path
 MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
 AT_TORQUE_LIMIT, MIN_LIMITED_SHARE = 0.9, 0.01  # of the robot's limit; of a joint's rows
-FAST, DRIVEN_FAST = 0.5, 0.8  # of a joint's greatest speed; of the robot's limit, in the direction of motion
+FAST, DRIVEN_FAST = (
+    0.5,
+    0.8,
+)  # of a joint's greatest speed; of the robot's limit, in the direction of motion
 MIN_FAST_SHARE = 0.003  # of a joint's rows
 
 
@@ -112,22 +121,33 @@ def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
         if s.duration < 2 * MAX_LAG_S:
             continue
         every = max(1, round(MIN_PERIOD_S / s.dt))
-        ctrl, qpos = np.clip(s.ctrl[::every, op], low, high).astype(float), s.qpos[::every, op].astype(float)
+        ctrl, qpos = (
+            np.clip(s.ctrl[::every, op], low, high).astype(float),
+            s.qpos[::every, op].astype(float),
+        )
         parts.append((ctrl, qpos, every * s.dt))
     if len(parts) < 2:
         return np.zeros(len(op))
     span = [max(1, round(SPEED_SPAN_S / dt)) for _, _, dt in parts]
-    speeds = [np.abs(q[k:] - q[:-k]) / (k * dt) for (_, q, dt), k in zip(parts, span, strict=True) if len(q) > k]
+    speeds = [
+        np.abs(q[k:] - q[:-k]) / (k * dt)
+        for (_, q, dt), k in zip(parts, span, strict=True)
+        if len(q) > k
+    ]
     greatest = np.quantile(np.concatenate(speeds), GREATEST_SPEED_QUANTILE, axis=0)  # (n,)
     tried = np.maximum(SPEED_RATIOS[:, None] * greatest, 1e-6)  # (k, n)
     # Squared errors of odd and even recordings; squares and maxima of how far ramps are behind their commands.
     error = np.zeros((2, len(SPEED_RATIOS) + len(LAG_TIME_CONSTANTS_S), len(op), LAGS))
     behind_command, rows = np.zeros((2, *tried.shape)), np.zeros(2)
     for i, (ctrl, qpos, dt) in enumerate(parts):
-        ramps = speed_limited(np.broadcast_to(ctrl[:, None], (len(ctrl), *tried.shape)), qpos[0], tried, dt)
+        ramps = speed_limited(
+            np.broadcast_to(ctrl[:, None], (len(ctrl), *tried.shape)), qpos[0], tried, dt
+        )
         behind = np.abs(ramps - ctrl[:, None])
         squares, most = behind_command
-        behind_command = np.stack([squares + (behind**2).sum(axis=0), np.maximum(most, behind.max(axis=0))])
+        behind_command = np.stack(
+            [squares + (behind**2).sum(axis=0), np.maximum(most, behind.max(axis=0))]
+        )
         aims = np.concatenate([ramps, _lagged(ctrl, dt)], axis=1)  # (T, k and lags, n)
         for j, lag in enumerate(np.linspace(0, MAX_LAG_S, LAGS)):
             late = round(lag / dt)
@@ -141,11 +161,15 @@ def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     ratio = lowest / np.maximum(lag_rms.min(axis=1), 1e-9)  # (2, n)
     joints = np.arange(len(op))
     speed, (squares, most) = tried[best, joints], behind_command[:, best, joints]
-    limited = (ratio < MAX_ERROR_RATIO).all(axis=0) & (np.sqrt(squares / rows.sum()) > MIN_RAMP_ERROR_RAD)
+    limited = (ratio < MAX_ERROR_RATIO).all(axis=0) & (
+        np.sqrt(squares / rows.sum()) > MIN_RAMP_ERROR_RAD
+    )
     limited &= most > MIN_RAMP_DELAY_S * speed
     speed[~limited] = 0.0
     if limited.any():
-        speed[limited] = _speed_behind([(c[:, limited], q[:, limited], dt) for c, q, dt in parts], speed[limited])
+        speed[limited] = _speed_behind(
+            [(c[:, limited], q[:, limited], dt) for c, q, dt in parts], speed[limited]
+        )
     return np.asarray(speed)
 
 
@@ -154,7 +178,10 @@ def _speed_behind(parts: list[tuple[Array, Array, float]], speed: Array) -> Arra
     seen = []
     for ctrl, qpos, dt in parts:
         behind = np.abs(speed_limited(ctrl, qpos[0], speed, dt) - ctrl)
-        k, late = max(1, round(SPEED_SPAN_S / dt)), round(MIN_RAMP_DELAY_S / 2 / dt)  # then it is as fast as its ramp
+        k, late = (
+            max(1, round(SPEED_SPAN_S / dt)),
+            round(MIN_RAMP_DELAY_S / 2 / dt),
+        )  # then it is as fast as its ramp
         moved = np.abs(qpos[late + k :] - qpos[late:-k]) / (k * dt)
         seen.append(np.where(behind[: len(moved)] > MIN_RAMP_DELAY_S / 2 * speed, moved, np.nan))
     return np.asarray(np.nanmedian(np.concatenate([*seen, speed[None]]), axis=0))
@@ -184,7 +211,11 @@ def with_speed_limits(
         fit: Function of the robot to start from and of the time that it may take, s.
         budget: Time of all fits together, s; None for no limit.
     """
-    speeds = {} if robot.target_speed.any() else dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
+    speeds = (
+        {}
+        if robot.target_speed.any()
+        else dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
+    )
     limits = {j: {"target_speed": float(f"{v:.3g}")} for j, v in speeds.items() if v}
     if not limits:
         return fit(robot, budget)

@@ -23,13 +23,24 @@ from gaponet.sysid.robot_rollouts import RobotRollouts
 ROBOT_WINDOWS = 8  # windows of the fit in the robot's simulator
 STARTS, START_STD = 4, 2.0  # of each joint's search, and their standard deviation in large changes
 SHORT_WINDOW_S = 0.5  # a search begins with windows this short
-SEARCH_ITERATIONS = (10, 8, 15)  # of all starts on short windows, of all on whole windows, of the better half
+SEARCH_ITERATIONS = (
+    10,
+    8,
+    15,
+)  # of all starts on short windows, of all on whole windows, of the better half
 CHAIN_ITERATIONS, CHAIN_CANDIDATES = 8, 160  # at most
-MIN_COST_DECREASE, MIN_CHAIN_COST_DECREASE = 2e-3, 2e-4  # relative, for another iteration in the robot's simulator
+MIN_COST_DECREASE, MIN_CHAIN_COST_DECREASE = (
+    2e-3,
+    2e-4,
+)  # relative, for another iteration in the robot's simulator
 MIN_CLUSTERS = 24  # parts of the recordings that count as independent of each other
 CORRELATION_TIME_BOUNDS_S = (1.0, 4.0)  # least, and the value before it is estimated
 MIN_CORRELATION = 0.05  # of an error with itself later; less counts as none
-PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5, "damping": 1.0}  # of the robot file's values; damping with kd
+PRIOR_LOG_STD = {
+    "kp": 0.5,
+    "armature": 1.5,
+    "damping": 1.0,
+}  # of the robot file's values; damping with kd
 PRIORS = len(PRIOR_LOG_STD)
 MIN_SHARE = 1e-3  # of the file's value; less counts as this
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
@@ -62,13 +73,17 @@ class _GainPrior:
 
     def error_std(self) -> Array:
         """Return the standard deviation that one row's error has beside the prior, (n,) in ERROR_SCALE_RAD."""
-        return np.asarray(self.residual / ERROR_SCALE_RAD * np.sqrt(self.correlation_time / self._row_period))
+        return np.asarray(
+            self.residual / ERROR_SCALE_RAD * np.sqrt(self.correlation_time / self._row_period)
+        )
 
     def errors(self, values: Values) -> Array:
         """Return the prior's errors of candidates (k, n), (k, n, PRIORS) in ERROR_SCALE_RAD."""
         own = {f: values[f] + self._servo_damping.get(f, 0.0) for f in self._given}
         far = [
-            np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given)) * self.error_std() / self.log_std[f]
+            np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given))
+            * self.error_std()
+            / self.log_std[f]
             for f, given in self._given.items()
         ]
         return np.stack(far, axis=-1)
@@ -108,7 +123,9 @@ class FitProblem:
         """Return errors of candidates (k, n), (k, n, rows + PRIORS) in ERROR_SCALE_RAD; the last are the prior's."""
         errors = (rollouts or self.rollouts).flat_errors(values)
         return np.concatenate(
-            [errors / np.float32(ERROR_SCALE_RAD), self.prior.errors(values)], axis=2, dtype=np.float32
+            [errors / np.float32(ERROR_SCALE_RAD), self.prior.errors(values)],
+            axis=2,
+            dtype=np.float32,
         )
 
     def of_axes(self, axes: Axes, rollouts: JointRollouts | None = None) -> Errors:
@@ -132,7 +149,10 @@ class JointFit(FitProblem):
         ratio = np.divide(first, balanced["kp"], out=np.ones(self.bounds.n), where=valid)
         scaled = {f: x if f in ("offset", "delay") else x * ratio for f, x in balanced.items()}
         return [
-            {f: np.where(valid, x - self.bounds.kd * (f == "damping"), own[f]) for f, x in values.items()}
+            {
+                f: np.where(valid, x - self.bounds.kd * (f == "damping"), own[f])
+                for f, x in values.items()
+            }
             for values in (balanced, scaled)
         ]
 
@@ -169,7 +189,9 @@ class JointFit(FitProblem):
         """Return the fit of the same robot in its simulator, with fewer windows; its prior begins as this one's."""
         parts = self.rollouts.parts
         some = np.unique(np.arange(ROBOT_WINDOWS) * len(parts) // ROBOT_WINDOWS)
-        rollouts = RobotRollouts([parts[i] for i in some], self.robot, nthread, touch=self.rollouts.touch[some])
+        rollouts = RobotRollouts(
+            [parts[i] for i in some], self.robot, nthread, touch=self.rollouts.touch[some]
+        )
         return RobotFit(rollouts, self.robot, self.bounds, copy.copy(self.prior), self.physics_step)
 
 
@@ -187,7 +209,10 @@ class RobotFit(FitProblem):
         A joint's parameters are judged by the joint's own error. Fields of `rest` that are not fitted stay.
         """
         axes = Axes(self.bounds, fields, rest)
-        x, cost = np.stack([axes.normalize(v) for v in starts]), np.zeros((len(starts), self.bounds.n))
+        x, cost = (
+            np.stack([axes.normalize(v) for v in starts]),
+            np.zeros((len(starts), self.bounds.n)),
+        )
         for i, count in enumerate(iterations):
             errors = self.of_axes(axes)
             x, cost = descend(x, axes.low, axes.high, errors, count, report, MIN_COST_DECREASE)
@@ -198,7 +223,9 @@ class RobotFit(FitProblem):
                 x = x[:1] if np.array_equal(x[0], x[1]) else x
         return {f: v[0].copy() for f, v in axes.values(x[[cost.sum(axis=1).argmin()]]).items()}
 
-    def descend_chains(self, values: Values, report: Callable[[tuple[str, ...], Array], Progress]) -> Values:
+    def descend_chains(
+        self, values: Values, report: Callable[[tuple[str, ...], Array], Progress]
+    ) -> Values:
         """Fit values (n,) once more, with a joint's parameters judged by all joints of its kinematic chain.
 
         `report` makes the function that is called in each iteration, from names and row counts of the chains.
@@ -210,9 +237,15 @@ class RobotFit(FitProblem):
 
         rows = chains.pack(self.rollouts.rows[:, None]).sum(axis=1)
         names = tuple(self.robot.operated[i] for i in chains.joints[:, 0])
-        x, low, high = chains.pack(axes.normalize(values)[None]), chains.pack(axes.low), chains.pack(axes.high)
+        x, low, high = (
+            chains.pack(axes.normalize(values)[None]),
+            chains.pack(axes.low),
+            chains.pack(axes.high),
+        )
         iterations = max(1, min(CHAIN_ITERATIONS, CHAIN_CANDIDATES // (x.shape[-1] + 5)))
-        x, _ = descend(x, low, high, errors, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE)
+        x, _ = descend(
+            x, low, high, errors, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE
+        )
         return {f: v[0].copy() for f, v in axes.values(chains.unpack(x)).items()}
 
 
@@ -238,7 +271,9 @@ class KinematicChains:
     def unpack(self, x: Array) -> Array:
         """Return values of chains as values of joints."""
         split = x.reshape(*x.shape[:-2], self.joints.size, -1)
-        return np.asarray(split[..., np.argsort(self.joints.ravel(), kind="stable")[(self.joints < 0).sum() :], :])
+        return np.asarray(
+            split[..., np.argsort(self.joints.ravel(), kind="stable")[(self.joints < 0).sum() :], :]
+        )
 
 
 def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:
@@ -249,7 +284,11 @@ def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> 
 
 def robot_fields(values: Values) -> list[str]:
     """Return the fields among values that the fit in the robot's simulator changes."""
-    return [f for f in (*CLASSIC, *SERVO_TERMS, *WARM[:2]) if f in values and not SERVO_FIELDS[f].single_joint]
+    return [
+        f
+        for f in (*CLASSIC, *SERVO_TERMS, *WARM[:2])
+        if f in values and not SERVO_FIELDS[f].single_joint
+    ]
 
 
 @dataclass
@@ -287,7 +326,9 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     clusters = each.shape[1]
     prior_jac = jac[:, -PRIORS:] * prior.error_std()[:, None, None]
     normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
-    few = clusters / max(clusters - len(names), 1)  # squared, as a jackknife of so few clusters has it
+    few = clusters / max(
+        clusters - len(names), 1
+    )  # squared, as a jackknife of so few clusters has it
     scatter = np.swapaxes(each, -1, -2) @ each * few**2
     scatter += np.swapaxes(prior_jac, -1, -2) @ prior_jac
     # A parameter that no row depends on is as unknown as before.
@@ -299,7 +340,10 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     width = np.sqrt(np.einsum("...ii->...i", cov)) + np.where(lost & (axes.low < axes.high), 1e3, 0)
     ahead = [axes.values(x + 1e-3 * row) for row in np.eye(len(names))]
     by = {f: np.stack([(a[f] - values[f]) / 1e-3 for a in ahead], axis=-1) for f in names}
-    std = {f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + (np.abs(g) * lost).max(axis=1) for f, g in by.items()}
+    std = {
+        f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + (np.abs(g) * lost).max(axis=1)
+        for f, g in by.items()
+    }
     std |= {f: np.hypot(std[f], error) for f, error in _discretisation_std(problem, values).items()}
     if "no_load_speed" in std:  # a joint without a line: on its axis zero, but infinite in SI units
         std["no_load_speed"] *= values["no_load_speed"] > 0
@@ -321,7 +365,9 @@ def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
     count = int(window.max()) + 1
     parts = max(1, -(-MIN_CLUSTERS // count))
     order, turn = np.argsort(window, kind="stable"), np.zeros(len(window), int)
-    turn[order] = np.concatenate([np.arange(c) * parts // c for c in np.unique(window, return_counts=True)[1]])
+    turn[order] = np.concatenate(
+        [np.arange(c) * parts // c for c in np.unique(window, return_counts=True)[1]]
+    )
     cluster = window * parts + turn
     sums = np.zeros((len(x), int(cluster.max()) + 1, *x.shape[2:]))
     np.add.at(sums, (slice(None), cluster), x)  # type: ignore[arg-type]
@@ -335,8 +381,12 @@ def _discretisation_std(problem: FitProblem, values: Values) -> Values:
     std = {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
     if "no_load_speed" in values:  # the limit follows the speed a step late, half a step on average
         limit = values.get("effort_limit", problem.bounds.first["effort_limit"])
-        std["no_load_speed"] = problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
-    return std | {"backlash": RELATIVE_GAP_STD * values["backlash"]} if "backlash" in values else std
+        std["no_load_speed"] = (
+            problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
+        )
+    return (
+        std | {"backlash": RELATIVE_GAP_STD * values["backlash"]} if "backlash" in values else std
+    )
 
 
 def _inverse(normal: Array, size: Array) -> Array:
@@ -366,15 +416,22 @@ def _undetermined(
             continue
         wide, also_over_kp = dict[str, str](), list[str]()
         for k, f in enumerate(names):
-            if (f == "stribeck_speed" and not values["stribeck"][i]) or (f == "no_load_speed" and not values[f][i]):
+            if (f == "stribeck_speed" and not values["stribeck"][i]) or (
+                f == "no_load_speed" and not values[f][i]
+            ):
                 continue
             value, error = values[f][i], std[f][i]
             if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):
                 wide[f] = f"{f} {format_uncertainty(value, error)}"
-                if SERVO_FIELDS[f].axis != "over kp" or width[i, k] > MAX_RELATIVE_STD * max(abs(x[i, k]), 1.0):
+                if SERVO_FIELDS[f].axis != "over kp" or width[i, k] > MAX_RELATIVE_STD * max(
+                    abs(x[i, k]), 1.0
+                ):
                     also_over_kp.append(f)
         if wide:
             as_set = set(also_over_kp) == {"kp"} and len(wide) > 1
             advice = "; known as multiples of kp: take the values as a set" if as_set else ""
-            unknown[joint] = tuple(wide), f"{joint}: not determined by these logs: {', '.join(wide.values())}{advice}"
+            unknown[joint] = (
+                tuple(wide),
+                f"{joint}: not determined by these logs: {', '.join(wide.values())}{advice}",
+            )
     return unknown

@@ -35,7 +35,9 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
         parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
     parts = [p for p in parts if p.duration >= MIN_WINDOW_S]
     if not parts:
-        raise UsageError(f"no recording is as long as {MIN_WINDOW_S:g} s; identification needs longer ones")
+        raise UsageError(
+            f"no recording is as long as {MIN_WINDOW_S:g} s; identification needs longer ones"
+        )
     count = min(count, len(parts))
     return [parts[i * len(parts) // count] for i in range(count)]
 
@@ -58,7 +60,11 @@ class RobotRollouts:
         Rollouts go on from the recording in the rows of `touch`, (windows, rows), in which a tip may touch something.
         """
         self.parts, self.robot, self.nthread, self.corrector = parts, robot, nthread, corrector
-        self.locked, self.op, self.n = idle_limbs(parts, robot), robot.operated_index, len(robot.operated)
+        self.locked, self.op, self.n = (
+            idle_limbs(parts, robot),
+            robot.operated_index,
+            len(robot.operated),
+        )
         free = [j for j in robot.joint_names if j not in self.locked]
         rows = max(map(len, parts))
         self.real = np.zeros((rows, len(parts), self.n))
@@ -74,8 +80,15 @@ class RobotRollouts:
         ])  # fmt: skip
         self.window = np.broadcast_to(np.arange(len(parts)), self.counted.shape)[self.counted]
         # Joints that a window does not hold stand where it says.
-        self.recorded = np.array([[j not in p.meta.unrecorded for p in parts] for j in robot.operated])[:, self.window]
-        self.standing = [(w, i) for w, p in enumerate(parts) for i, j in enumerate(free) if j in p.meta.unrecorded]
+        self.recorded = np.array(
+            [[j not in p.meta.unrecorded for p in parts] for j in robot.operated]
+        )[:, self.window]
+        self.standing = [
+            (w, i)
+            for w, p in enumerate(parts)
+            for i, j in enumerate(free)
+            if j in p.meta.unrecorded
+        ]
         self.rows = self.recorded.sum(axis=1)
 
     def flat_errors(self, values: dict[str, Array], links: ListOf[dict[str, Link]] = ()) -> Array:
@@ -91,16 +104,27 @@ class RobotRollouts:
         each = {f: np.repeat(x, m, axis=0) for f, x in values.items()}
         warm = warm_values(values, recorded_temperatures(self.parts, self.op).T)
         each |= {
-            f: x.swapaxes(1, 2).reshape(-1, self.n) for f, x in zip(("damping", "frictionloss"), warm, strict=True)
+            f: x.swapaxes(1, 2).reshape(-1, self.n)
+            for f, x in zip(("damping", "frictionloss"), warm, strict=True)
         }
         sim.set_servos(self.robot.operated, each)
-        for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
+        for (
+            w,
+            i,
+        ) in (
+            self.standing
+        ):  # n joints of a robot that is not locked have as many degrees of freedom
             sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
             if sim.servo_model is not None:
-                sim.servo_model.armature[w::m, i], sim.servo_model.values["backlash"][w::m, i] = IMMOVABLE_ARMATURE, 0.0
+                sim.servo_model.armature[w::m, i], sim.servo_model.values["backlash"][w::m, i] = (
+                    IMMOVABLE_ARMATURE,
+                    0.0,
+                )
         if links:
             robots = [replace(self.robot, links=one) for one in links]
-            models = [{c: with_links(model, robot) for c, model in sim.models.items()} for robot in robots]
+            models = [
+                {c: with_links(model, robot) for c, model in sim.models.items()} for robot in robots
+            ]
             for name in LINK_FIELDS:
                 rows = np.array([getattr(each[c], name) for each in models for c in conditions])
                 if rows.size:
@@ -110,7 +134,12 @@ class RobotRollouts:
     def simulated_errors(self, sim: BatchSim) -> Array:
         """Return q_sim − q_real in the rows that count, (k, n, rows) rad, of simulations of k times the windows."""
         k, m = sim.num_envs // len(self.parts), len(self.parts)
-        qpos = rollout(sim, self.parts * k, self.corrector, touch=np.tile(self.touch, k))[0, 1:][..., self.op]
+        qpos = rollout(sim, self.parts * k, self.corrector, touch=np.tile(self.touch, k))[0, 1:][
+            ..., self.op
+        ]
         error = (qpos.reshape(len(qpos), k, m, self.n) - self.real[1:, None]).astype(np.float32)
         errors = error.transpose(1, 3, 0, 2)[:, :, self.counted]
-        return np.clip(np.nan_to_num(errors, nan=MAX_ERROR_RAD), -MAX_ERROR_RAD, MAX_ERROR_RAD) * self.recorded
+        return (
+            np.clip(np.nan_to_num(errors, nan=MAX_ERROR_RAD), -MAX_ERROR_RAD, MAX_ERROR_RAD)
+            * self.recorded
+        )

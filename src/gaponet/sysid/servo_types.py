@@ -38,7 +38,9 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
     sources: dict[str, str] = {}
     for i, joint in zip(robot.operated_index, robot.operated, strict=True):
         servo, types = robot.servos[i], dict(zip(like.joint_names, like.servos, strict=True))
-        same_type = [j for j, other in types.items() if servo and other and other.name == servo.name]
+        same_type = [
+            j for j, other in types.items() if servo and other and other.name == servo.name
+        ]
         source = next((j for j in (joint, mirrored(joint), *same_type) if j in changed), None)
         if source:
             sources[joint] = source
@@ -47,7 +49,11 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
             f"{like.folder}: no identified joint of it has the name, the mirrored name or the type of servo of a joint "
             f"of {robot.name}"
         )
-    taken = [f.name for f in SERVO_FIELDS.values() if (f.shared or f.name == "delay") and f.name != "effort_limit"]
+    taken = [
+        f.name
+        for f in SERVO_FIELDS.values()
+        if (f.shared or f.name == "delay") and f.name != "effort_limit"
+    ]
     servos: dict[str, dict[str, float]] = {}
     for joint, source in sources.items():
         i, k = robot.joint_names.index(joint), like.joint_names.index(source)
@@ -56,7 +62,9 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
             own, theirs = (float(getattr(r, gain)[at]) for r, at in ((robot, i), (before, k)))
             servos[joint][gain] *= own / theirs if own > 0 and theirs > 0 else 1.0
     same = like if like.name == robot.name else robot
-    return replace(robot.with_servos(servos), payload_mounts=same.payload_mounts, links=same.links), sources
+    return replace(
+        robot.with_servos(servos), payload_mounts=same.payload_mounts, links=same.links
+    ), sources
 
 
 def mirrored(joint: str) -> str:
@@ -64,7 +72,9 @@ def mirrored(joint: str) -> str:
     sides = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "lf": "rf", "lh": "rh"}
     other = sides | {b: a for a, b in sides.items()}
     words = re.split(r"(_)", joint)
-    return "".join((other.get(w.lower(), w).upper() if w.isupper() else other.get(w, w)) for w in words)
+    return "".join(
+        (other.get(w.lower(), w).upper() if w.isupper() else other.get(w, w)) for w in words
+    )
 
 
 def far_from_servo_type(robot: RobotSpec) -> list[str]:
@@ -93,27 +103,47 @@ def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list
     Raises:
         UsageError: No identified joint names a servo type.
     """
-    joints: list[tuple[ServoType, set[tuple[int, str]], dict[str, tuple[float, float]]]] = []  # type, robots, values
+    joints: list[
+        tuple[ServoType, set[tuple[int, str]], dict[str, tuple[float, float]]]
+    ] = []  # type, robots, values
     for number, robot in enumerate(robots):
-        nominal, known, op = robot.before_identification, ParameterUncertainty.load(robot), robot.operated_index
+        nominal, known, op = (
+            robot.before_identification,
+            ParameterUncertainty.load(robot),
+            robot.operated_index,
+        )
         now, then, changed = first_values(robot), first_values(nominal), identified_joints(robot)
         now["damping"] = now["damping"] + robot.kd[op] - nominal.kd[op]
-        units = {(number, u) for s in (known.sources if known else ({"unit": ""},)) for u in s["unit"].split(", ")}
+        units = {
+            (number, u)
+            for s in (known.sources if known else ({"unit": ""},))
+            for u in s["unit"].split(", ")
+        }
         for k, joint in enumerate(robot.operated):
             servo = robot.servos[op[k]]
             errors = summarize(known, joint).errors if known else {}
-            moved = [f for f in MEASURED_FIELDS if abs(now[f][k] - then[f][k]) >= MIN_CHANGE * abs(then[f][k])]
+            moved = [
+                f
+                for f in MEASURED_FIELDS
+                if abs(now[f][k] - then[f][k]) >= MIN_CHANGE * abs(then[f][k])
+            ]
             if servo is not None and joint in changed:
-                joints.append((servo, units, {f: (float(now[f][k]), errors.get(f, 0.0)) for f in moved}))
+                joints.append(
+                    (servo, units, {f: (float(now[f][k]), errors.get(f, 0.0)) for f in moved})
+                )
     if not joints:
-        raise UsageError("no identified joint names a servo type; write servo = into the [[joint]] of its robot.toml")
+        raise UsageError(
+            "no identified joint names a servo type; write servo = into the [[joint]] of its robot.toml"
+        )
     types = []
     for servo in {servo.name: servo for servo, *_ in joints}.values():
         same = [joint for joint in joints if joint[0].name == servo.name]
         estimates = {f: [values[f] for *_, values in same if f in values] for f in MEASURED_FIELDS}
         new: dict[str, Any] = {f: _spread(f, values) for f, values in estimates.items()}
         new |= {"source": source, "licence": licence, "gaponet": __version__, "joints": len(same)}
-        types.append(replace(servo, **new, robots=len(set().union(*(units for _, units, _ in same)))))
+        types.append(
+            replace(servo, **new, robots=len(set().union(*(units for _, units, _ in same))))
+        )
     return types
 
 
@@ -124,7 +154,9 @@ def _spread(field: str, estimates: list[tuple[float, float]]) -> Spread | None:
     values, errors = np.array(estimates).T
     draws = values[:, None] + errors[:, None] * NORMAL_QUANTILES
     draws = draws if field == "damping" else np.maximum(draws, 0.0)
-    return Spread(*(float(f"{x:.3g}") for x in (np.median(values), *np.quantile(draws, (0.05, 0.95)))))
+    return Spread(
+        *(float(f"{x:.3g}") for x in (np.median(values), *np.quantile(draws, (0.05, 0.95))))
+    )
 
 
 def toml_entry(servo: ServoType) -> str:

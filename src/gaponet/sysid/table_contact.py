@@ -25,12 +25,20 @@ from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import soft_l1
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
-CONTACT_CLEARANCE_M = 0.045  # above the lowest tip, or the table, in which a joint's zero may hide a contact
+CONTACT_CLEARANCE_M = (
+    0.045  # above the lowest tip, or the table, in which a joint's zero may hide a contact
+)
 WINDOW_S = 5.0
 MAX_WINDOWS, MAX_WINDOWS_PER_MOTION = 14, 2
 START_HEIGHTS, START_HEIGHT_STEP_M = 10, 0.005  # from below the lowest tip upwards
-CANDIDATES, GENERATIONS, START_STD = 16, 10, 1.5  # of the search; standard deviation of its start in large changes
-FIRST_COMPARISON = 3  # generations after which a start goes on only if no other start cost less by then
+CANDIDATES, GENERATIONS, START_STD = (
+    16,
+    10,
+    1.5,
+)  # of the search; standard deviation of its start in large changes
+FIRST_COMPARISON = (
+    3  # generations after which a start goes on only if no other start cost less by then
+)
 ZERO_STD_RAD, ZERO_PRICE = 0.02, 2e-3  # of a usual zero; cost of a zero that large, per row
 # Table's friction, and logarithm of its stiffness in N/m: lowest, highest, a large change, first guess.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
@@ -71,17 +79,24 @@ def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
         return -np.inf
     rows = np.concatenate(heights)
     return float(
-        min((rows.min() if robot.table is None else robot.table.height) + CONTACT_CLEARANCE_M, np.median(rows))
+        min(
+            (rows.min() if robot.table is None else robot.table.height) + CONTACT_CLEARANCE_M,
+            np.median(rows),
+        )
     )
 
 
-def low_windows(sequences: ListOf[Sequence], heights: ListOf[Array], below: float) -> list[Sequence]:
+def low_windows(
+    sequences: ListOf[Sequence], heights: ListOf[Array], below: float
+) -> list[Sequence]:
     """Return the windows in which a tip comes below a height, m, the longest first."""
     windows = []
     for s, height in zip(sequences, heights, strict=True):
         rows = min(round(WINDOW_S / s.dt), len(s))
         starts = range(0, len(s) - rows + 1, rows)
-        windows += [s.rows(slice(a, a + rows)) for a in starts if (height[a : a + rows] < below).any()]
+        windows += [
+            s.rows(slice(a, a + rows)) for a in starts if (height[a : a + rows] < below).any()
+        ]
     return sorted(windows, key=lambda s: -len(s))
 
 
@@ -111,7 +126,9 @@ def fit_table(
     if not parts:
         return TableFit(robot, False, np.zeros(0), np.zeros(0), ())
     n, measured = len(robot.operated), robot.table
-    with_table = replace(robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3]))))
+    with_table = replace(
+        robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3])))
+    )
     away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
     scene = _TableRollouts(parts, with_table, nthread)
     scene = _TableRollouts(_most_wrong(scene, away), with_table, nthread)
@@ -124,7 +141,9 @@ def fit_table(
     costs = soft_l1(scene.soft_errors(guesses.reshape(-1, 3 + n))).reshape(guesses.shape[:2])
     starts = guesses[np.arange(len(guesses)), costs.argmin(axis=1)]
     pace, best_first = [np.inf], starts[costs.min(axis=1).argsort()]
-    results = [_searched(scene, start, measured is not None, progress, pace) for start in best_first]
+    results = [
+        _searched(scene, start, measured is not None, progress, pace) for start in best_first
+    ]
     tables = [_with_table(robot, x) for x, _ in results]
     errors = [cost for _, cost in results]
     if validation:
@@ -137,7 +156,11 @@ def fit_table(
 
 
 def _searched(
-    scene: _TableRollouts, start: Array, measured: bool, progress: Callable[[float], None], pace: list[float]
+    scene: _TableRollouts,
+    start: Array,
+    measured: bool,
+    progress: Callable[[float], None],
+    pace: list[float],
 ) -> tuple[Array, float]:
     """Return the best table and zeros (3 + n,) near a start, and their cost. A measured height stays.
 
@@ -145,12 +168,23 @@ def _searched(
     """
     n, rows = scene.n, len(scene.window) * scene.n
     unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO_STD_RAD)])
-    low = np.array([start[0] - 0.03 * (not measured), FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO_STD_RAD)])
-    high = np.array([start[0] + 0.03 * (not measured), FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO_STD_RAD)])
+    low = np.array(
+        [
+            start[0] - 0.03 * (not measured),
+            FRICTION[0],
+            STIFFNESS[0],
+            *np.full(n, -5 * ZERO_STD_RAD),
+        ]
+    )
+    high = np.array(
+        [start[0] + 0.03 * (not measured), FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO_STD_RAD)]
+    )
 
     def cost(xs: Array) -> Array:
         """Return the costs of tables and zeros, (3 + n, k)."""
-        return soft_l1(scene.soft_errors(xs.T)) + ZERO_PRICE * rows * np.square(xs[3:] / ZERO_STD_RAD).sum(axis=0)
+        return soft_l1(scene.soft_errors(xs.T)) + ZERO_PRICE * rows * np.square(
+            xs[3:] / ZERO_STD_RAD
+        ).sum(axis=0)
 
     def report(intermediate_result: OptimizeResult) -> None:
         progress(ERROR_SCALE_RAD * float(np.sqrt(2 * intermediate_result.fun / rows)))

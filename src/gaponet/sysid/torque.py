@@ -58,7 +58,9 @@ OPTIONS = (
 )  # fmt: skip
 
 
-def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nthread: int) -> Identified:
+def with_torque(
+    fitted: Identified, splits: ListOf[Split], given: RobotSpec, nthread: int
+) -> Identified:
     """Return the fit from torque if motions that were not fitted accept it, else `fitted`.
 
     An accepted fit is repeated with all recordings. Without cross-validation it is kept only if the validation motions
@@ -69,7 +71,9 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
     if not all(t.known for t in torques):
         return fitted
     tried = {
-        options: [HeldOut(part, t.fit(options)) for t, (_, part) in zip(torques, splits, strict=True)]
+        options: [
+            HeldOut(part, t.fit(options)) for t, (_, part) in zip(torques, splits, strict=True)
+        ]
         for options in OPTIONS
         if all(t.several_payloads for t in torques) or not options.place
     }
@@ -78,16 +82,26 @@ def with_torque(fitted: Identified, splits: ListOf[Split], given: RobotSpec, nth
     comparison = Comparison("torque", *pair, equally_complex=given.nominal is None)
     if not comparison.accepted:
         return replace(fitted, comparisons=(*fitted.comparisons, comparison))
-    robot, folds, after = TorqueFit(every, given).fit(options), tuple(tried[options]), float(comparison.after.mean())
+    robot, folds, after = (
+        TorqueFit(every, given).fit(options),
+        tuple(tried[options]),
+        float(comparison.after.mean()),
+    )
     if len(splits) == 1 and motion_errors(splits[0][1], robot).mean() > after:
         robot = folds[0].robot
     bounds = Bounds(robot, every)
-    whole = JointFit(JointRollouts(cut(every, MAX_WINDOWS), robot, nthread=nthread), robot, bounds).robot_fit(nthread)
+    whole = JointFit(
+        JointRollouts(cut(every, MAX_WINDOWS), robot, nthread=nthread), robot, bounds
+    ).robot_fit(nthread)
     errors = standard_errors(whole, {f: bounds.first[f] for f in CLASSIC})
     part = [
         run
         for sequences, judged in folds
-        for run in runs(sequences, [t.qpos for t in replay(sequences, judged, nthread=nthread, lock_idle=True)], judged)
+        for run in runs(
+            sequences,
+            [t.qpos for t in replay(sequences, judged, nthread=nthread, lock_idle=True)],
+            judged,
+        )
     ]
     by_joint = {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(given.operated)}
     return replace(
@@ -128,7 +142,9 @@ def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gain
         t = np.arange(len(tau) - late)
         past = [ctrl[np.maximum(t - k, 0)] for k in range(INSTRUMENTS)]
         channels = [ctrl[t] - qpos[late:], -qvel[late:], tau[late:], *past]
-        error, speed, torque, *commands = (np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float))
+        error, speed, torque, *commands = (
+            np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float)
+        )
         one = np.ones_like(torque)
         x, z = np.stack([error, speed, one], axis=1), np.stack([*commands, one], axis=1)
         if last:
@@ -162,10 +178,14 @@ class TorqueFit:
     def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec) -> None:
         """Recordings whose gains are stated are left out; the robot's payload masses are taken as true."""
         self.robot = robot
-        self.sequences = [s for s in sequences if s.tau is not None and s.meta.recorded_gains[0] is None]
+        self.sequences = [
+            s for s in sequences if s.tau is not None and s.meta.recorded_gains[0] is None
+        ]
         gains = self.gains() if len(self.sequences) == len(sequences) else {}
         self.known = {joint: g for joint, g in gains.items() if g.trusted}
-        self.robot = robot.with_servos({joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.known.items()})
+        self.robot = robot.with_servos(
+            {joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.known.items()}
+        )
         masses = {s.meta.payload_mass for s in self.sequences}
         self.several_payloads = bool(robot.payload_mounts) and len(masses) > 1
 
@@ -178,7 +198,10 @@ class TorqueFit:
                 rows = np.stack([x[:, j] for x in (s.ctrl, s.qpos, s.qvel, s.tau)])
                 parts.setdefault(self.robot.joint_names[j], []).append(rows)
         return {
-            joint: max((servo_gains(each, late=k) for k in range(1, MAX_LATE + 1)), key=lambda g: g.explained)
+            joint: max(
+                (servo_gains(each, late=k) for k in range(1, MAX_LATE + 1)),
+                key=lambda g: g.explained,
+            )
             for joint, each in parts.items()
         }
 
@@ -195,20 +218,33 @@ class TorqueFit:
         n = 3 * len(joints)
         start = np.r_[mount.pos, mount.mass, np.zeros(n)]
         low, high = (
-            np.r_[np.array(mount.pos) + a, m, np.full(n, z)] for a, m, z in ((-0.3, 0, 0), (0.3, MAX_HAND_MASS, 20))
+            np.r_[np.array(mount.pos) + a, m, np.full(n, z)]
+            for a, m, z in ((-0.3, 0, 0), (0.3, MAX_HAND_MASS, 20))
         )
 
         def residual(x: Array) -> Array:  # a place that torque does not determine stays
             mine = (x[4:].reshape(3, -1)[:, column] * own).sum(axis=0)
             return np.r_[required(x) + mine - tau, MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])]
 
-        scale, first = np.r_[0.1 * np.ones(3), 1.0, np.ones(n)], np.clip(start, low + 1e-6, high - 1e-6)
-        solution = least_squares(residual, first, bounds=(low, high), x_scale=scale, loss="soft_l1").x
+        scale, first = (
+            np.r_[0.1 * np.ones(3), 1.0, np.ones(n)],
+            np.clip(start, low + 1e-6, high - 1e-6),
+        )
+        solution = least_squares(
+            residual, first, bounds=(low, high), x_scale=scale, loss="soft_l1"
+        ).x
         x, y, z, hand = (round(float(v), 3) for v in solution[:4])
-        mounts = tuple(replace(m, pos=_place(i, (x, y, z)), mass=hand) for i, m in enumerate(robot.payload_mounts))
+        mounts = tuple(
+            replace(m, pos=_place(i, (x, y, z)), mass=hand)
+            for i, m in enumerate(robot.payload_mounts)
+        )
         armature = build_model(robot).dof_armature
         servos = {
-            robot.joint_names[j]: {"frictionloss": v[0], "armature": float(armature[j]) + v[1], "damping": v[2]}
+            robot.joint_names[j]: {
+                "frictionloss": v[0],
+                "armature": float(armature[j]) + v[1],
+                "damping": v[2],
+            }
             for j, v in zip(joints, solution[4:].reshape(3, -1).T.round(4).tolist(), strict=True)
         }
         return replace(robot.with_servos(servos if friction else {}), payload_mounts=mounts)
@@ -217,15 +253,22 @@ class TorqueFit:
         """Return the joints; joint, torque, acceleration and speed of each row; and the torque that inverse dynamics
         require for a payload's place and hand x, (4,) m and kg."""
         robot, mounts, rows = self.robot, self.robot.payload_mounts, []
-        model = build_model(replace(robot, payload_mounts=tuple(replace(m, mass=0.0) for m in mounts)))
+        model = build_model(
+            replace(robot, payload_mounts=tuple(replace(m, mass=0.0) for m in mounts))
+        )
         data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
         bodies = [model.body(m.body).id for m in mounts]
         jac = np.empty((len(mounts), 2, 3, model.nv))  # of each mount's body: position and rotation
         every = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
         for s in self.sequences:
             assert s.tau is not None
-            qacc = differentiate(differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ), s.dt), s.dt)
-            moved, carried = _moved(s, robot), [s.meta.payload_side in ("both", m.side) for m in mounts]
+            qacc = differentiate(
+                differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ), s.dt), s.dt
+            )
+            moved, carried = (
+                _moved(s, robot),
+                [s.meta.payload_side in ("both", m.side) for m in mounts],
+            )
             for t in range(every, len(s) - 1, every) if moved else ():
                 data.qpos[:], data.qvel[:] = s.qpos[t], 0.0
                 mujoco.mj_forward(model, data)
@@ -240,12 +283,16 @@ class TorqueFit:
                 ]  # fmt: skip
         joints = sorted({r[0] for r in rows})
         column = np.array([joints.index(r[0]) for r in rows])
-        mass, bias, motion, frame, tau, qacc, qvel = (np.array([r[i] for r in rows]) for i in range(1, 8))
+        mass, bias, motion, frame, tau, qacc, qvel = (
+            np.array([r[i] for r in rows]) for i in range(1, 8)
+        )
 
         def required(x: Array) -> Array:
             place = np.array([_place(i, x[:3]) for i in range(len(mounts))])
             # How far each payload moves for a radian, (k, mounts, 3) m: 0 for a joint that does not carry it.
-            point = motion[:, :, 0] + np.cross(motion[:, :, 1], np.einsum("kmij,mj->kmi", frame, place))
+            point = motion[:, :, 0] + np.cross(
+                motion[:, :, 1], np.einsum("kmij,mj->kmi", frame, place)
+            )
             there = 9.81 * point[..., 2] + np.square(point).sum(axis=-1) * qacc[:, None]
             return np.asarray(bias + ((mass + x[3]) * there).sum(axis=1))
 
@@ -277,4 +324,8 @@ def _place(mount: int, first: ListOf[float] | Array) -> tuple[float, float, floa
 def _moved(sequence: Sequence, robot: RobotSpec) -> list[int]:
     """Return the operated joints that a recording holds and whose command moves."""
     moved = np.ptp(sequence.ctrl, axis=0) > MIN_MOVE_RAD
-    return [int(i) for i in robot.operated_index if moved[i] and robot.joint_names[i] not in sequence.meta.unrecorded]
+    return [
+        int(i)
+        for i in robot.operated_index
+        if moved[i] and robot.joint_names[i] not in sequence.meta.unrecorded
+    ]

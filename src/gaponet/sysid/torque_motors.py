@@ -33,7 +33,10 @@ JACKKNIFE_BLOCKS = 10  # of the rows, each left out once
 HORIZONS_S = (0.1, 0.5, 1.0)
 PART_S = 4.0  # of recordings that fit and judge in turn
 MIN_ROWS = 20  # of a regression
-HUBER_SCALE, HUBER_ROUNDS = 1.345, 10  # in standard deviations, beyond which a row counts less: somebody pushed
+HUBER_SCALE, HUBER_ROUNDS = (
+    1.345,
+    10,
+)  # in standard deviations, beyond which a row counts less: somebody pushed
 
 
 class _Rows(NamedTuple):
@@ -96,14 +99,22 @@ def fit_torque_driven(
         ]
         train, judging = parts[::2], parts[1::2]
         if not judging:
-            raise UsageError(f"less than {2 * PART_S:g} s in all: record more, or other motions to judge by")
+            raise UsageError(
+                f"less than {2 * PART_S:g} s in all: record more, or other motions to judge by"
+            )
     fit, test = ([_rows(s, robot) for s in part] for part in (train, judging))
-    names, servos, std = robot.operated, dict[str, dict[str, float]](), dict[str, dict[str, float]]()
+    names, servos, std = (
+        robot.operated,
+        dict[str, dict[str, float]](),
+        dict[str, dict[str, float]](),
+    )
     factor, bias = np.ones(len(names)), np.zeros(len(names))
     for j, name in enumerate(names):
         x, lag = _joint(fit, j, constant)
         errors = _jackknife(fit, j, constant, lag)
-        servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True)) | {"delay": float(DELAYS_S[lag])}
+        servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True)) | {
+            "delay": float(DELAYS_S[lag])
+        }
         std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), errors.tolist(), strict=True))
         bias[j], factor[j] = x[3], x[4]
     fitted = robot.with_servos(servos)
@@ -112,9 +123,14 @@ def fit_torque_driven(
     old = {f: np.ravel(getattr(given, f"dof_{f}"))[op] for f in PASSIVE_FIELDS}
     new = {f: getattr(fitted, f)[op] for f in PASSIVE_FIELDS}
     lags = np.array([round(servos[n]["delay"] / (DELAYS_S[1] - DELAYS_S[0])) for n in names])
-    residuals = (_residual(test, old, np.ones_like(factor), 0 * lags), _residual(test, new, factor, lags))
+    residuals = (
+        _residual(test, old, np.ones_like(factor), 0 * lags),
+        _residual(test, new, factor, lags),
+    )
     angle = {h: (angles[0][h], angles[1][h]) for h in HORIZONS_S}
-    return TorqueDrivenFit(fitted, factor, bias, std, residuals, angle, sum(len(_starts(s)) for s in judging))
+    return TorqueDrivenFit(
+        fitted, factor, bias, std, residuals, angle, sum(len(_starts(s)) for s in judging)
+    )
 
 
 def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
@@ -127,7 +143,12 @@ def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
     assert s.tau is not None
     time, tau = np.arange(len(s)) * dt, s.tau[:, op].astype(float)
     late = [np.stack([np.interp(time - d, time, x) for x in tau.T], axis=1) for d in DELAYS_S]
-    columns = (inverse_dynamics(model, smooth, v, a)[:, op], a[:, op], v[:, op], np.tanh(v[:, op] / MIN_SPEED))
+    columns = (
+        inverse_dynamics(model, smooth, v, a)[:, op],
+        a[:, op],
+        v[:, op],
+        np.tanh(v[:, op] / MIN_SPEED),
+    )
     required, acceleration, velocity, sign = (lowpass(x, dt, CUTOFF_HZ) for x in columns)
     torque = np.array([lowpass(x, dt, CUTOFF_HZ) for x in late])
     return _Rows(torque, required, acceleration, velocity, sign, np.abs(v[:, op]) > MIN_SPEED)
@@ -186,7 +207,9 @@ def _residual(rows: ListOf[_Rows], terms: dict[str, Array], constant: Array, lag
 
 
 def _starts(s: Sequence) -> Array:
-    return np.arange(0, len(s) - round(HORIZONS_S[-1] / s.dt) - 1, max(1, round(HORIZONS_S[1] / s.dt)))
+    return np.arange(
+        0, len(s) - round(HORIZONS_S[-1] / s.dt) - 1, max(1, round(HORIZONS_S[1] / s.dt))
+    )
 
 
 def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> dict[float, Array]:

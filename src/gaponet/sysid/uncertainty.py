@@ -29,8 +29,14 @@ from gaponet.sim.links import LinkAxes, LinkResult
 from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
 PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
-UNOBSERVED_RELATIVE_ERROR = 1.0, 3.0  # from which no effect was seen: of a value of zero, of another
-MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = 0.9, 0.03  # from which parameters are known only as a set
+UNOBSERVED_RELATIVE_ERROR = (
+    1.0,
+    3.0,
+)  # from which no effect was seen: of a value of zero, of another
+MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = (
+    0.9,
+    0.03,
+)  # from which parameters are known only as a set
 OLD_KEYS = {  # of known.json → of uncertainty.json
     "step": "gauss_newton_step", "step_covariance": "gauss_newton_covariance", "scatter": "overdispersion",
     "predicted": "parameter_rms", "left": "residual_rms", "band": "residual_p90", "held": "validated",
@@ -89,16 +95,28 @@ class LinkUncertainty:
     servo_slopes: dict[str, tuple[tuple[float, ...], ...]]
 
     @classmethod
-    def of(cls, result: LinkResult | None, robot: RobotSpec, fields: ListOf[str]) -> LinkUncertainty | None:
+    def of(
+        cls, result: LinkResult | None, robot: RobotSpec, fields: ListOf[str]
+    ) -> LinkUncertainty | None:
         """Return the uncertainty of a fit that began with the file's links, if the robot has the fitted ones."""
-        if result is None or result.axes.links(0 * result.x) or robot.links != result.axes.links(result.x):
+        if (
+            result is None
+            or result.axes.links(0 * result.x)
+            or robot.links != result.axes.links(result.x)
+        ):
             return None
         none = np.zeros((len(robot.operated), len(result.x)))
         slopes = np.stack([result.servo_slopes.get(f, none) for f in fields], axis=1).tolist()
-        return cls(tuple(result.x.tolist()), result.covariance.tolist(), dict(zip(robot.operated, slopes, strict=True)))
+        return cls(
+            tuple(result.x.tolist()),
+            result.covariance.tolist(),
+            dict(zip(robot.operated, slopes, strict=True)),
+        )
 
 
-ArrayName = Literal["values", "covariance", "gauss_newton_step", "gauss_newton_covariance", "overdispersion"]
+ArrayName = Literal[
+    "values", "covariance", "gauss_newton_step", "gauss_newton_covariance", "overdispersion"
+]
 
 
 @dataclass(frozen=True)
@@ -128,11 +146,15 @@ class ParameterUncertainty:
         for joint, values in to_axes(robot, uncertainty.fields).items():
             stored = uncertainty.joints.get(joint)
             if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
-                raise RobotError(f"{file}: its values are other values than robot.toml's, at {joint}; {hint}")
+                raise RobotError(
+                    f"{file}: its values are other values than robot.toml's, at {joint}; {hint}"
+                )
         if uncertainty.links:
             links = LinkAxes(robot.before_identification).links(np.array(uncertainty.links.values))
             mass = {body: link.mass for body, link in robot.links.items()}
-            if not all(np.isclose(x.mass, mass.get(body, 0.0), rtol=1e-4) for body, x in links.items()):
+            if not all(
+                np.isclose(x.mass, mass.get(body, 0.0), rtol=1e-4) for body, x in links.items()
+            ):
                 raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
         return uncertainty
 
@@ -140,12 +162,17 @@ class ParameterUncertainty:
     def require(cls, robot: RobotSpec) -> ParameterUncertainty:
         """Return `load`; refuse a robot whose folder has no uncertainty."""
         if (uncertainty := cls.load(robot)) is None:
-            raise UsageError(f"{robot.folder}: keeps only values (no {UNCERTAINTY_FILE}); identify or adapt it again")
+            raise UsageError(
+                f"{robot.folder}: keeps only values (no {UNCERTAINTY_FILE}); identify or adapt it again"
+            )
         return uncertainty
 
     def save(self, folder: Path) -> None:
         """Write uncertainty.json into a robot folder."""
-        write_json(folder / UNCERTAINTY_FILE, {name: x for name, x in asdict(self).items() if x is not None})
+        write_json(
+            folder / UNCERTAINTY_FILE,
+            {name: x for name, x in asdict(self).items() if x is not None},
+        )
 
     def array(self, joint: str, name: ArrayName) -> Array:
         """Return an attribute of a joint as an array."""
@@ -169,7 +196,9 @@ def _with_new_keys(table: dict[str, Any]) -> dict[str, Any]:
     renamed = {OLD_KEYS.get(key, key): value for key, value in table.items()}
     joints = renamed.get("joints")
     if isinstance(joints, dict):
-        renamed["joints"] = {j: _with_new_keys(v) if isinstance(v, dict) else v for j, v in joints.items()}
+        renamed["joints"] = {
+            j: _with_new_keys(v) if isinstance(v, dict) else v for j, v in joints.items()
+        }
     return renamed
 
 
@@ -202,11 +231,16 @@ class JointSummary:
 
     def relative_error(self, field: str) -> float:
         """Return the standard error over the value, or over the field's large value."""
-        return self.errors[field] / max(SERVO_FIELDS[field].large_value or abs(self.values[field]), 1e-9)
+        return self.errors[field] / max(
+            SERVO_FIELDS[field].large_value or abs(self.values[field]), 1e-9
+        )
 
     def cell(self, field: str) -> str:
         """Return the value with its uncertainty as text; no uncertainty where the logs say nothing."""
-        value, relative = self.values[field] * SERVO_FIELDS[field].factor, self.relative_error(field)
+        value, relative = (
+            self.values[field] * SERVO_FIELDS[field].factor,
+            self.relative_error(field),
+        )
         if relative > UNOBSERVED_RELATIVE_ERROR[value != 0]:
             return f"{value:.3g} (no log shows it)" if value else "none seen"
         return format_uncertainty(value, self.errors[field] * SERVO_FIELDS[field].factor)
@@ -222,7 +256,9 @@ def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
     correlated = (np.abs(covariance / np.outer(size, size)) > MIN_SET_CORRELATION) & (errors > 0)
     loose = np.array([summary.relative_error(f) > MIN_SET_RELATIVE_ERROR for f in fields])
     _, group = connected_components(correlated & loose[:, None] & loose[None, :])
-    sets = (tuple(f for f, g in zip(fields, group, strict=True) if g == k) for k in dict.fromkeys(group))
+    sets = (
+        tuple(f for f, g in zip(fields, group, strict=True) if g == k) for k in dict.fromkeys(group)
+    )
     return replace(summary, sets=tuple(s for s in sets if len(s) > 1))
 
 
@@ -256,10 +292,14 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
         lines.append(f"{s['made_by']}: {logs} of {s['unit']}, {s['seconds']:.0f} s, {days}")
     for joint in uncertainty.joints:
         for *some, last in summarize(uncertainty, joint).sets:
-            lines.append(f"{joint}: the logs determine only {', '.join(some)} and {last} together; change none alone")
+            lines.append(
+                f"{joint}: the logs determine only {', '.join(some)} and {last} together; change none alone"
+            )
     joints = uncertainty.joints
     worst = max(joints, key=lambda j: joints[j].residual_rms)
-    judges = "were not fitted" if uncertainty.validated else "were fitted, since no others were there"
+    judges = (
+        "were not fitted" if uncertainty.validated else "were fitted, since no others were there"
+    )
     lines.append(
         f"the RMS error of motions that {judges} is {_root_mean_square(j.residual_rms for j in joints.values()):.2f} "
         f"mrad ({worst} {1e3 * joints[worst].residual_rms:.2f}). The standard errors predict "

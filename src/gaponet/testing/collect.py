@@ -34,7 +34,10 @@ from gaponet.testing.play import Job, library, play
 __all__ = ["CollectResult", "Recipe", "collect", "load_recipe"]
 
 COLLECT_FILE = "collect.json"  # fleet, seed and payloads of a collected dataset
-TAKES_PER_JOB = (36, 144)  # least and most; more lose more when killed, fewer spend more time in numpy
+TAKES_PER_JOB = (
+    36,
+    144,
+)  # least and most; more lose more when killed, fewer spend more time in numpy
 
 
 @dataclass(frozen=True)
@@ -83,9 +86,13 @@ def collect(
     """
     start = time.monotonic()
     robot = robot.with_gain_scale(fleet.gain_scale or robot.gain_scale)
-    recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)  # command-line options may have changed it
+    recipe = validated(
+        Recipe, asdict(recipe), "recipe", UsageError
+    )  # command-line options may have changed it
     if not 0 <= nproc <= MAX_WORKERS or not 0 <= seed < 2**63:
-        raise UsageError(f"--nproc {nproc}, --seed {seed}: up to {MAX_WORKERS} processes, 0 for one per core; seed ≥ 0")
+        raise UsageError(
+            f"--nproc {nproc}, --seed {seed}: up to {MAX_WORKERS} processes, 0 for one per core; seed ≥ 0"
+        )
     for unit in recipe.units:
         fleet.unit(unit)
     files = tuple(read_motion(file, robot) for file in recipe.files)
@@ -95,20 +102,34 @@ def collect(
         require_stored_robot(dataset.path, robot, DatasetError, MOVE_STORED_ROBOT)
         _require_same_source(dataset, robot, fleet, recipe, seed)
         present = {
-            _key(e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.dt, e.meta.repetition) for e in dataset.entries
+            _key(e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.dt, e.meta.repetition)
+            for e in dataset.entries
         }
-        missing = [t for t in wanted if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present]
+        missing = [
+            t
+            for t in wanted
+            if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present
+        ]
         written, seconds = 0, 0.0
         jobs = [
-            Job(robot, fleet, recipe, files, seed, tuple(part)) for part in _batches(missing, nproc or Pool.cores(1))
+            Job(robot, fleet, recipe, files, seed, tuple(part))
+            for part in _batches(missing, nproc or Pool.cores(1))
         ]
-        pair_dataset(dataset, robot, lock_idle=True)  # of sequences whose replay a killed run did not store
+        pair_dataset(
+            dataset, robot, lock_idle=True
+        )  # of sequences whose replay a killed run did not store
         for sequence, simulated in _play_jobs(jobs, nproc, executor):
             dataset.write_replay(dataset.append(sequence), simulated)
             written += 1
             seconds += sequence.duration
-            progress(written, len(missing), f"{written} of {len(missing)}, {seconds / 3600:.2f} h recorded")
-    return CollectResult(Path(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start)
+            progress(
+                written,
+                len(missing),
+                f"{written} of {len(missing)}, {seconds / 3600:.2f} h recorded",
+            )
+    return CollectResult(
+        Path(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start
+    )
 
 
 def fleet_name(dataset: Dataset) -> str:
@@ -118,7 +139,9 @@ def fleet_name(dataset: Dataset) -> str:
 
 
 def _read_source(path: Path) -> dict[str, Any]:
-    return read_json(dict[str, Any], path, DatasetError, "restore it or collect into another folder")
+    return read_json(
+        dict[str, Any], path, DatasetError, "restore it or collect into another folder"
+    )
 
 
 def _key(motion: str, unit: str, payload: float, dt: float, repetition: int) -> tuple[object, ...]:
@@ -126,7 +149,9 @@ def _key(motion: str, unit: str, payload: float, dt: float, repetition: int) -> 
     return motion, unit, payload, round(dt * 1e9), repetition
 
 
-def _require_same_source(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, seed: int) -> None:
+def _require_same_source(
+    dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, seed: int
+) -> None:
     """Write fleet, seed and payloads into a new dataset; refuse a dataset that was recorded with others."""
     path = dataset.path / COLLECT_FILE
     source = {
@@ -147,7 +172,9 @@ def _require_same_source(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recip
                     "choose another folder"
                 )
     elif len(dataset):
-        raise DatasetError(f"{dataset.path}: holds sequences that were not collected here; choose another folder")
+        raise DatasetError(
+            f"{dataset.path}: holds sequences that were not collected here; choose another folder"
+        )
     else:
         write_text(path, json.dumps(source, indent=1) + "\n")
 
@@ -168,7 +195,9 @@ def _batches(missing: list[Take], nproc: int) -> Iterator[list[Take]]:
         yield part
 
 
-def _play_jobs(jobs: list[Job], nproc: int, executor: str | Executor) -> Iterator[tuple[Sequence, SimulatedReplay]]:
+def _play_jobs(
+    jobs: list[Job], nproc: int, executor: str | Executor
+) -> Iterator[tuple[Sequence, SimulatedReplay]]:
     """Yield sequences and their replays in the order of the jobs."""
     if executor == LOCAL and (len(jobs) < 2 or (nproc or Pool.cores(1)) == 1):
         for job in jobs:
@@ -182,4 +211,6 @@ def _play_jobs(jobs: list[Job], nproc: int, executor: str | Executor) -> Iterato
 def _play_job(job: Job) -> list[tuple[Sequence, SimulatedReplay]]:
     """Return the takes of a job and their replays with resting joints locked, on one core."""
     sequences = play(job)
-    return list(zip(sequences, replay(sequences, job.robot, nthread=1, lock_idle=True), strict=True))
+    return list(
+        zip(sequences, replay(sequences, job.robot, nthread=1, lock_idle=True), strict=True)
+    )

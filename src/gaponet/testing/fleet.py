@@ -72,12 +72,16 @@ class Fleet:
     seed: int
     distributions: tuple[Distribution, ...]
     units: dict[str, Physics]  # hidden physics by unit id
-    gain_scale: float | None = None  # gain scale of the robot (RobotSpec.gain_scale); None for the robot's own
+    gain_scale: float | None = (
+        None  # gain scale of the robot (RobotSpec.gain_scale); None for the robot's own
+    )
 
     def unit(self, unit_id: str) -> Physics:
         """Return the hidden physics of a unit."""
         if unit_id not in self.units:
-            raise UsageError(f"fleet '{self.name}' has no unit '{unit_id}'; it has {', '.join(self.units)}")
+            raise UsageError(
+                f"fleet '{self.name}' has no unit '{unit_id}'; it has {', '.join(self.units)}"
+            )
         return self.units[unit_id]
 
     def digest(self) -> str:
@@ -100,20 +104,30 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
     if "like" in loaded:
         file = validated(RescaledFleetTable, loaded, path, UsageError)
         name = file.get("name", path.stem)
-        return replace(load_fleet(FLEETS / f"{file['like']}.toml", robot), name=name, gain_scale=file["gain_scale"])
+        return replace(
+            load_fleet(FLEETS / f"{file['like']}.toml", robot),
+            name=name,
+            gain_scale=file["gain_scale"],
+        )
     table = validated(FleetTable, loaded, path, UsageError)
     seed, distributions = table["seed"], table["distribution"]
     parameters, names = [f.name for f in fields(Physics)], [d.name for d in distributions]
     for name in names:
         if name not in parameters or names.count(name) > 1:
-            raise UsageError(f"{path}: [[distribution]] names '{name}' twice, or not one of {', '.join(parameters)}")
-    units = {f"virtual-{k}": sample_unit(robot, distributions, seed, k) for k in range(1, UNITS + 1)}
+            raise UsageError(
+                f"{path}: [[distribution]] names '{name}' twice, or not one of {', '.join(parameters)}"
+            )
+    units = {
+        f"virtual-{k}": sample_unit(robot, distributions, seed, k) for k in range(1, UNITS + 1)
+    }
     for unit_id, unit in units.items():
         _require_possible(unit, f"{path}: unit '{unit_id}'")
     return Fleet(table.get("name", path.stem), seed, distributions, units)
 
 
-def sample_unit(robot: RobotSpec, distributions: tuple[Distribution, ...], seed: int, unit: int) -> Physics:
+def sample_unit(
+    robot: RobotSpec, distributions: tuple[Distribution, ...], seed: int, unit: int
+) -> Physics:
     """Sample unit number `unit`, from 1; the deviations of the type depend on the seed only.
 
     A parameter without a distribution has no effect. Every parameter has its own random stream, so that another
@@ -124,7 +138,10 @@ def sample_unit(robot: RobotSpec, distributions: tuple[Distribution, ...], seed:
     values = {}
     for d in distributions:
         stream = int(hashlib.sha256(d.name.encode()).hexdigest()[:8], 16)
-        kind, own = np.random.default_rng([seed, stream, 0]), np.random.default_rng([seed, stream, unit])
+        kind, own = (
+            np.random.default_rng([seed, stream, 0]),
+            np.random.default_rng([seed, stream, unit]),
+        )
         size = n if scope[d.name] == "joint" else 1
         deviation = (
             d.type_spread * kind.standard_normal(size)

@@ -20,7 +20,12 @@ COPPER_COEFFICIENT = 0.00393  # 1/K, of the resistance, IEC 60028
 
 
 def friction_limit(
-    physics: Physics, nominal: Array, qvel: Array, torque: Array, push: Array, thinning: Array | float = 1.0
+    physics: Physics,
+    nominal: Array,
+    qvel: Array,
+    torque: Array,
+    push: Array,
+    thinning: Array | float = 1.0,
 ) -> Array:
     """Return the largest torque of friction, (N, n), N·m.
 
@@ -39,10 +44,14 @@ def friction_limit(
     stuck = np.abs(qvel) < STUCK_SPEED
     direction = np.sign(np.where(stuck, push, qvel))
     slip = qvel / physics.stribeck_speed
-    dry = physics.friction * (1.0 + physics.friction_asymmetry * direction + physics.stribeck / (1.0 + slip * slip))
+    dry = physics.friction * (
+        1.0 + physics.friction_asymmetry * direction + physics.stribeck / (1.0 + slip * slip)
+    )
     loss = 1.0 - physics.efficiency
     backdriven = torque * direction < 0
-    return (nominal + dry) * thinning + loss * np.abs(torque) / np.where(backdriven, physics.efficiency, 1.0)
+    return (nominal + dry) * thinning + loss * np.abs(torque) / np.where(
+        backdriven, physics.efficiency, 1.0
+    )
 
 
 class Bristles:
@@ -57,7 +66,9 @@ class Bristles:
         self.soft = physics.presliding > 0
         self.any = bool(self.soft.any())
         rest = nominal + physics.friction * (1.0 + physics.stribeck)
-        self.stiffness = np.where(self.soft, rest / np.where(self.soft, physics.presliding, 1.0), 0.0)
+        self.stiffness = np.where(
+            self.soft, rest / np.where(self.soft, physics.presliding, 1.0), 0.0
+        )
         self.torque = np.zeros_like(rest)  # against the motion, N·m
 
     def reset(self, torque: Array, limit: Array) -> None:
@@ -90,7 +101,9 @@ class Couplings:
     links tilts the base with a first-order lag; a tilted base changes the direction of gravity.
     """
 
-    def __init__(self, physics: Physics, model: mujoco.MjModel, batch: Batch, effort: Array) -> None:
+    def __init__(
+        self, physics: Physics, model: mujoco.MjModel, batch: Batch, effort: Array
+    ) -> None:
         """
         Args:
             batch: Simulations in which gravity changes its direction.
@@ -105,7 +118,10 @@ class Couplings:
         self.flexes = bool((physics.flex > 0).any())
         if self.flexes:
             self._gravity, self._com = batch.expand("opt.gravity"), batch.bind("subtree_com")
-            self._level_gravity, self._weight = self._gravity.copy(), batch.expand("body_subtreemass")
+            self._level_gravity, self._weight = (
+                self._gravity.copy(),
+                batch.expand("body_subtreemass"),
+            )
             self._g = np.linalg.norm(self._level_gravity, axis=1, keepdims=True)
         self.tilt = np.zeros((len(physics.flex), 2))
 
@@ -136,7 +152,10 @@ class Firmware:
     """Firmware that rounds targets and smooths them; the filter is faster at a larger lag."""
 
     def __init__(self, physics: Physics) -> None:
-        self.p, self.any = physics, bool((physics.smoothing > 0).any() or (physics.target_step > 0).any())
+        self.p, self.any = (
+            physics,
+            bool((physics.smoothing > 0).any() or (physics.target_step > 0).any()),
+        )
         self.smoothed = np.zeros_like(physics.smoothing)
 
     def reset(self, target: Array) -> None:
@@ -214,7 +233,11 @@ class Thermal:
 
     def heat(self, torque_squared: Array) -> Array:
         """Return the copper loss, (N, n) W."""
-        return torque_squared / self.p.motor_constant**2 * (1.0 + COPPER_COEFFICIENT * (self.winding - KT_TEMPERATURE))
+        return (
+            torque_squared
+            / self.p.motor_constant**2
+            * (1.0 + COPPER_COEFFICIENT * (self.winding - KT_TEMPERATURE))
+        )
 
     def step(self, torque_squared: Array, dt: float) -> None:
         """Advance by dt s with a mean squared motor torque (N, n), (N·m)²."""
@@ -249,9 +272,14 @@ class CommandLink:
             dt: Time between two packets, s.
         """
         self.p = physics
-        self.slots = int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2  # packets under way, one in force
+        self.slots = (
+            int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2
+        )  # packets under way, one in force
         count, n = physics.kp_scale.shape
-        self.packets, self.arrival = np.zeros((count, self.slots, n)), np.full((count, self.slots), -np.inf)
+        self.packets, self.arrival = (
+            np.zeros((count, self.slots, n)),
+            np.full((count, self.slots), -np.inf),
+        )
         self.sent, self.newest = np.full(self.slots, -1), np.full(count, -1)
         self.current, self.count = np.zeros((count, n)), 0
 

@@ -136,7 +136,12 @@ EFFECTS: tuple[str, ...] = tuple(dict.fromkeys(f.metadata["effect"] for f in fie
 def neutral(n: int) -> Physics:
     """Return the physics of the nominal simulator, without any effect, for n joints."""
     size = {"joint": (n,), "unit": (1,)}
-    return Physics(**{f.name: np.full(size[f.metadata["scope"]], f.metadata["neutral"]) for f in fields(Physics)})
+    return Physics(
+        **{
+            f.name: np.full(size[f.metadata["scope"]], f.metadata["neutral"])
+            for f in fields(Physics)
+        }
+    )
 
 
 def stack(units: list[Physics], columns: Array) -> Physics:
@@ -144,5 +149,7 @@ def stack(units: list[Physics], columns: Array) -> Physics:
     rows = {}
     for f in fields(Physics):
         table = np.stack([np.atleast_1d(getattr(u, f.name)) for u in units])
-        rows[f.name] = np.ascontiguousarray(table[:, columns] if f.metadata["scope"] == "joint" else table)
+        rows[f.name] = np.ascontiguousarray(
+            table[:, columns] if f.metadata["scope"] == "joint" else table
+        )
     return Physics(**rows)

@@ -64,19 +64,29 @@ def play(job: Job) -> list[Sequence]:
 def _resting_joints(robot: RobotSpec, motion: Motion) -> tuple[str, ...]:
     """Return the joints of kinematic chains that stay at home during a motion."""
     away = np.abs(motion.ctrl - robot.qpos_home).max(axis=0) > 1e-9
-    return idle_joints(robot, tuple(name for name, a in zip(robot.joint_names, away, strict=True) if a))
+    return idle_joints(
+        robot, tuple(name for name, a in zip(robot.joint_names, away, strict=True) if a)
+    )
 
 
-def _record(job: Job, group: list[Take], motions: dict[str, Motion], locked: tuple[str, ...]) -> list[Sequence]:
+def _record(
+    job: Job, group: list[Take], motions: dict[str, Motion], locked: tuple[str, ...]
+) -> list[Sequence]:
     """Record takes in parallel, longest first, so that the running ones are always the first rows."""
     dt = 1.0 / group[0].rate
     ctrl = [motions[t.motion].sample(dt) for t in group]
     lengths, longest = np.array([len(c) for c in ctrl]), len(ctrl[0])
-    targets = np.stack([np.concatenate([c, np.repeat(c[-1:], longest - len(c), axis=0)]) for c in ctrl], axis=1)
+    targets = np.stack(
+        [np.concatenate([c, np.repeat(c[-1:], longest - len(c), axis=0)]) for c in ctrl], axis=1
+    )
     payloads = [(t.payload, job.recipe.payload_side) for t in group]
-    robots = VirtualRobot(job.robot, [job.fleet.unit(t.unit) for t in group], payloads, dt, locked=locked)
+    robots = VirtualRobot(
+        job.robot, [job.fleet.unit(t.unit) for t in group], payloads, dt, locked=locked
+    )
     seeds = [t.seed(job.seed) for t in group]
-    warmth = np.array([_warmth(job.fleet.unit(t.unit), s) for t, s in zip(group, seeds, strict=True)])
+    warmth = np.array(
+        [_warmth(job.fleet.unit(t.unit), s) for t, s in zip(group, seeds, strict=True)]
+    )
     robots.reset(targets[0], seeds, warmth)
     readings = np.empty((4, *targets.shape), np.float32)
     for t in range(longest):  # row t: the state at t·dt, then the command of [t·dt, (t+1)·dt)
@@ -90,7 +100,9 @@ def _record(job: Job, group: list[Take], motions: dict[str, Motion], locked: tup
         torque, qacc = equivalent_torque(models[payloads[i]], qpos, dt)
         notes = {"rate_hz": take.rate, "warmth_K": round(float(warmth[i]), 2), "seed": job.seed}
         meta = _meta(job, take, motions[take.motion].level, notes)
-        sequences.append(Sequence(meta, job.robot.joint_names, dt, c, qpos, qvel, qacc, tau, torque, temperature))
+        sequences.append(
+            Sequence(meta, job.robot.joint_names, dt, c, qpos, qvel, qacc, tau, torque, temperature)
+        )
     return sequences
 
 
@@ -117,7 +129,9 @@ def _meta(job: Job, take: Take, level: str, notes: dict[str, Any]) -> SequenceMe
     )
 
 
-def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF_HZ) -> tuple[Array, Array]:
+def equivalent_torque(
+    model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF_HZ
+) -> tuple[Array, Array]:
     """Return the torque that the nominal model with the payload needs for a recorded motion.
 
     Args:

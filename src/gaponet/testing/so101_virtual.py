@@ -55,7 +55,9 @@ class VirtualSO101:
             link: Symbolic link to the port; an existing link is replaced.
             frame: Simulated time per goal position, s; default: real time.
         """
-        robot = replace(robot, table=robot.table or Table(height=0.0))  # the arm rests on it while its torque is off
+        robot = replace(
+            robot, table=robot.table or Table(height=0.0)
+        )  # the arm rests on it while its torque is off
         self.robot, self._frame = robot, None if frame is None else round(frame / PERIOD)
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
         self._order = robot.index(JOINTS)  # servo number − 1 → joint
@@ -90,7 +92,9 @@ class VirtualSO101:
         start = began - self.live.steps * PERIOD
         while time.monotonic() - began < seconds:
             due = start + self.live.steps * PERIOD
-            wait = min(max(0.0, due - time.monotonic()), PERIOD) if self._frame is None else MAX_LAG_S
+            wait = (
+                min(max(0.0, due - time.monotonic()), PERIOD) if self._frame is None else MAX_LAG_S
+            )
             readable, _, _ = select.select([self._master], [], [], wait)
             if readable:
                 os.write(self._master, self.receive(os.read(self._master, 4096)))
@@ -154,7 +158,11 @@ class VirtualSO101:
         self._replies += reply[:-1] + bytes([reply[-1] ^ self.damaged])
 
     def _bytes(self, servo: int, address: int, size: int) -> bytes:
-        return bytes(self.memory[servo - 1][address : address + size]) if 1 <= servo <= len(JOINTS) else b""
+        return (
+            bytes(self.memory[servo - 1][address : address + size])
+            if 1 <= servo <= len(JOINTS)
+            else b""
+        )
 
     def _store(self, servo: int, address: int, data: bytes) -> None:
         if 1 <= servo <= len(JOINTS):
@@ -164,7 +172,9 @@ class VirtualSO101:
         """Write readings into the registers."""
         order = self._order
         qpos, qvel, tau, temperature = self.live.read()
-        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[order]  # may pass the limits
+        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[
+            order
+        ]  # may pass the limits
         share = (tau / self.robot.effort_limit)[order]
         values = {
             reg.PRESENT_POSITION: np.clip(steps, 0, STEPS_PER_TURN - 1),
@@ -198,8 +208,12 @@ def _as_calibrated(robot: RobotSpec) -> dict[str, ServoRow]:
     rows = {}
     for number, joint in enumerate(JOINTS, 1):
         low, high = robot.qpos_range[robot.index([joint])[0]]
-        half = (STEPS_PER_TURN - 1) / 2 if joint == CONTINUOUS_JOINT else (high - low) / 2 / STEP_RAD
-        middle = STEPS_PER_TURN / 2 - (0.5 if joint == CONTINUOUS_JOINT else 300 if joint == GRIPPER else 0)
+        half = (
+            (STEPS_PER_TURN - 1) / 2 if joint == CONTINUOUS_JOINT else (high - low) / 2 / STEP_RAD
+        )
+        middle = STEPS_PER_TURN / 2 - (
+            0.5 if joint == CONTINUOUS_JOINT else 300 if joint == GRIPPER else 0
+        )
         ends = {"range_min": int(np.ceil(middle - half)), "range_max": int(np.floor(middle + half))}
         rows[joint] = ServoRow(id=number, drive_mode=0, homing_offset=17 * number, **ends)
     return rows

@@ -63,7 +63,9 @@ class VirtualH12:
         self.robot, self.rate, self.fault, self.fault_at = robot, rate, fault, fault_at
         self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order
         self._writer = bus.writer("rt/lowstate", dds.LowState)
-        self._readers = {name: bus.reader(f"rt/{name}", dds.LowCmd) for name in ("arm_sdk", "lowcmd")}
+        self._readers = {
+            name: bus.reader(f"rt/{name}", dds.LowCmd) for name in ("arm_sdk", "lowcmd")
+        }
         self.live = LiveUnit(robot, physics, payload, seed=seed, period=1.0 / rate)
         self.clock, self.heard = MonotonicClock(), list[dict[str, Any]]()
         self.first_command: float | None = None
@@ -136,7 +138,9 @@ class VirtualH12:
         self._set_status(fault)
         for name, values in zip(("q", "dq", "tau_est", "temperature"), readings, strict=True):
             column = np.zeros((hg.MOTORS, 2) if name == "temperature" else hg.MOTORS)
-            column[: len(MOTOR_NAMES)] = values[self._order, None] if name == "temperature" else values[self._order]
+            column[: len(MOTOR_NAMES)] = (
+                values[self._order, None] if name == "temperature" else values[self._order]
+            )
             message.set_motors(data, name, column)
         message.seal(data)
         if fault == "checksum":
@@ -150,7 +154,9 @@ class VirtualH12:
         message, data = hg.LowState, self._message
         half = 0.5 if fault == "fall" else 0.0  # half of the angle by which it leans forward
         message.view(data, "imu_state.quaternion")[:] = (np.cos(half), 0.0, np.sin(half), 0.0)
-        message.view(data, "wireless_remote")[2:4] = (0x20, 0x02) if fault == "remote" else 0  # L2 + B
+        message.view(data, "wireless_remote")[2:4] = (
+            (0x20, 0x02) if fault == "remote" else 0
+        )  # L2 + B
         message.view(data, "mode_machine")[0] = 5 if fault == "machine" else self.machine
         errors = np.zeros(hg.MOTORS)
         errors[MOTOR_NAMES.index("left_elbow_joint")] = 4 * (fault == "motor")

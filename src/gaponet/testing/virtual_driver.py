@@ -44,7 +44,9 @@ class LiveUnit:
         self._gains = np.array([robot.kp, robot.kd, robot.effort_limit, np.zeros_like(robot.kp)])
         self.steps = 0
 
-    def set_gains(self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0) -> None:
+    def set_gains(
+        self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0
+    ) -> None:
         """Set gains, if they change.
 
         Args:
@@ -101,7 +103,11 @@ class VirtualDriver:
         self.facts: dict[str, Any] = {}
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
-        self.clock, self.period, self._given = clock, period, (robot, physics, payload, seed, period)
+        self.clock, self.period, self._given = (
+            clock,
+            period,
+            (robot, physics, payload, seed, period),
+        )
         locked = idle_joints(robot, robot.operated)
         self.commanded = tuple(joint for joint in robot.joint_names if joint not in locked)
         self._at = robot.index(self.commanded)
@@ -115,7 +121,9 @@ class VirtualDriver:
         """Simulate until now and return the state."""
         due = int((self.clock.now() - self._begun) / self.period + 1e-6)
         if (due - self.live.steps) * self.period > MAX_LAG_S:
-            raise DriverError(f"{self.address}: this machine cannot simulate it in real time; run without real time")
+            raise DriverError(
+                f"{self.address}: this machine cannot simulate it in real time; run without real time"
+            )
         if due > self.live.steps:
             while self.live.steps < due:
                 self.live.step()

@@ -18,7 +18,9 @@ from gaponet.testing import motor
 from gaponet.testing.physics import Physics, stack
 
 MAX_PHYSICS_STEP_S = 0.001
-MAX_EFFECT_PERIOD_S = 0.002  # of the hidden effects; bristles and current loops are evaluated at every physics step
+MAX_EFFECT_PERIOD_S = (
+    0.002  # of the hidden effects; bristles and current loops are evaluated at every physics step
+)
 NOISE_PERIODS = 50  # control periods of noise that are sampled at a time
 REST_STD = 0.1  # of the friction band: a joint that always arrives in the same way stops in nearly the same place
 SETTLING_STEPS = 40  # each reduces the error by gravity stiffness / kp, 0.4 at worst on H1-2
@@ -60,10 +62,14 @@ class VirtualRobot:
         self.robot = robot
         self.dt = robot.dt if dt is None else dt
         self.decimation = (
-            int(np.ceil(self.dt / MAX_PHYSICS_STEP_S - 1e-9)) if timestep is None else round(self.dt / timestep)
+            int(np.ceil(self.dt / MAX_PHYSICS_STEP_S - 1e-9))
+            if timestep is None
+            else round(self.dt / timestep)
         )
         self.timestep = self.dt / self.decimation
-        self.active = np.array([i for i, name in enumerate(robot.joint_names) if name not in locked])
+        self.active = np.array(
+            [i for i, name in enumerate(robot.joint_names) if name not in locked]
+        )
         self.physics = stack(units, self.active)
         stiff = bool((self.physics.presliding > 0).any() or (self.physics.current_time > 0).any())
         self.substeps = 1 if stiff else _substeps(self.decimation, self.timestep)
@@ -77,7 +83,10 @@ class VirtualRobot:
         self._warmstart, self._time = b.bind("qacc_warmstart"), b.bind("time")
         self._constraint = b.bind("qfrc_constraint")
         self._gain, self._bias = b.expand("actuator_gainprm"), b.expand("actuator_biasprm")
-        self._range, self._frictionloss = b.expand("actuator_forcerange"), b.expand("dof_frictionloss")
+        self._range, self._frictionloss = (
+            b.expand("actuator_forcerange"),
+            b.expand("dof_frictionloss"),
+        )
         self._applied, self._force = b.bind("qfrc_applied"), b.bind("actuator_force")
         self._damping = b.expand("dof_damping")
         self._cold_damping, self._thinning = self._damping.copy(), np.ones((1, 1))
@@ -88,7 +97,10 @@ class VirtualRobot:
         self._effort = robot.effort_limit[self.active]
         self._compliance = p.windup / self._effort  # rad per N·m
         # Effects that most fleets lack cost a tenth of the time each step.
-        self._fast, self._lags = bool(np.isfinite(p.no_load_speed).any()), bool((p.current_time > 0).any())
+        self._fast, self._lags = (
+            bool(np.isfinite(p.no_load_speed).any()),
+            bool((p.current_time > 0).any()),
+        )
         self._twists = bool((p.windup > 0).any())
         self._limits = qpos_range(model)
         self.backlash = motor.Backlash(p, model.dof_armature)
@@ -97,12 +109,21 @@ class VirtualRobot:
         self.link, self.firmware = motor.CommandLink(p, self.dt), motor.Firmware(p)
         self.couplings = motor.Couplings(p, model, b, self._effort)
         self._supply = np.ones((self.num_envs, 1))
-        self._chain_gain = self._push = self._passed = self._twist = self._squares = self._max_torque = self._kp * 0.0
+        self._chain_gain = self._push = self._passed = self._twist = self._squares = (
+            self._max_torque
+        ) = self._kp * 0.0
         self._idle_temperature = np.zeros((self.num_envs, self.n))
-        self._noise, self._chance, self._row, self._now = np.zeros(0), np.zeros(0), NOISE_PERIODS, 0.0
+        self._noise, self._chance, self._row, self._now = (
+            np.zeros(0),
+            np.zeros(0),
+            NOISE_PERIODS,
+            0.0,
+        )
         self._rng: list[np.random.Generator] = []
 
-    def reset(self, ctrl: Array, seeds: list[int], warmth: Array | float = 0.0, start: Array | None = None) -> None:
+    def reset(
+        self, ctrl: Array, seeds: list[int], warmth: Array | float = 0.0, start: Array | None = None
+    ) -> None:
         """Put the robots at rest under a command, as before a recording.
 
         Args:
@@ -113,7 +134,10 @@ class VirtualRobot:
         """
         self._rng = [np.random.default_rng(seed) for seed in seeds]
         self._row, self._now = NOISE_PERIODS, 0.0
-        target = np.clip(np.asarray(ctrl, float)[:, self.active], *self._limits.T) - self.physics.zero_offset
+        target = (
+            np.clip(np.asarray(ctrl, float)[:, self.active], *self._limits.T)
+            - self.physics.zero_offset
+        )
         warm = 25.0 + np.broadcast_to(np.asarray(warmth, float), (self.num_envs,))[:, None]
         self.thermal.reset(np.repeat(warm, len(self.active), axis=1))
         self._idle_temperature = np.repeat(warm, self.n, axis=1)
@@ -135,7 +159,9 @@ class VirtualRobot:
         self.backlash.reset(self._motor_torque())
         self._squares = np.zeros_like(target)
 
-    def set_gains(self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0) -> None:
+    def set_gains(
+        self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0
+    ) -> None:
         """Set the drives to other gains than the robot's, (n) or (N, n); each drive delivers its kp_scale and kd_scale.
 
         Zero stiffness damps: only velocity feedback remains. Call it after reset, which uses the gains in force.
@@ -154,7 +180,9 @@ class VirtualRobot:
 
     def _settle(self, target: Array) -> None:
         """Move to the balance of PD and gravity, with a small offset: friction holds a joint where it stopped."""
-        full = self._kp * self.thermal.kt() * motor.derating_factor(self.physics, self.thermal.winding)
+        full = (
+            self._kp * self.thermal.kt() * motor.derating_factor(self.physics, self.thermal.winding)
+        )
         self._qpos[:] = target
         for _ in range(SETTLING_STEPS):
             load = self._load()
@@ -174,7 +202,9 @@ class VirtualRobot:
     def _friction_limit(self, torque: Array) -> Array:
         """Return the present friction limit under a motor torque at the joint, (N, active), N·m."""
         dry = self._nominal_friction + self.couplings.drag(self._qpos)
-        return motor.friction_limit(self.physics, dry, self._qvel, torque, self._push, self._thinning)
+        return motor.friction_limit(
+            self.physics, dry, self._qvel, torque, self._push, self._thinning
+        )
 
     def _motor_torque(self) -> Array:
         """Return the torque that the drive sets, at the rated torque constant, (N, active), N·m."""
@@ -190,7 +220,10 @@ class VirtualRobot:
         """Send targets (N, n) rad and simulate one control period, only for `rows` (k,) if given."""
         if self._row == NOISE_PERIODS:
             self._sample_noise()
-        target = np.clip(np.asarray(ctrl, float)[:, self.active], *self._limits.T) - self.physics.zero_offset
+        target = (
+            np.clip(np.asarray(ctrl, float)[:, self.active], *self._limits.T)
+            - self.physics.zero_offset
+        )
         self.link.send(target, self._now, self._chance[:, self._row])
         count = self.decimation // self.substeps
         period = self.substeps * self.timestep
@@ -228,7 +261,11 @@ class VirtualRobot:
         joint_torque = torque * kt
         if self._lags:
             lag = np.exp(-period / np.maximum(self.physics.current_time, 1e-9))
-            kp, kd, added = kp * (1.0 - lag), kd * (1.0 - lag), added * (1.0 - lag) + lag * self._passed
+            kp, kd, added = (
+                kp * (1.0 - lag),
+                kd * (1.0 - lag),
+                added * (1.0 - lag) + lag * self._passed,
+            )
         if self.backlash.any:
             engaged = self.backlash.step(joint_torque, period)
             kp, kd, added = kp * engaged, kd * engaged, added * engaged
@@ -253,11 +290,15 @@ class VirtualRobot:
         self.thermal.step(squares, self.dt)
         work = np.maximum(self._motor_torque() * self._qvel, 0.0)
         self._chain_gain = self.couplings.gain_factor(self._motor_torque())
-        self._supply = motor.supply_factor(self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True))
+        self._supply = motor.supply_factor(
+            self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True)
+        )
 
     def _sample_noise(self) -> None:
         """Sample noise (N, periods, 3, n) and chances of jitter and loss (N, periods, 2)."""
-        self._noise = np.stack([rng.standard_normal((NOISE_PERIODS, 3, self.n)) for rng in self._rng])
+        self._noise = np.stack(
+            [rng.standard_normal((NOISE_PERIODS, 3, self.n)) for rng in self._rng]
+        )
         self._chance = np.stack([rng.random((NOISE_PERIODS, 2)) for rng in self._rng])
         self._row = 0
 
@@ -266,10 +307,14 @@ class VirtualRobot:
         if self._row == NOISE_PERIODS:
             self._sample_noise()
         p, noise = self.all_joints, self._noise[:, self._row]
-        true = self._full(self._qpos + self._twist, self.robot.qpos_home)  # the encoder is on the motor's side
+        true = self._full(
+            self._qpos + self._twist, self.robot.qpos_home
+        )  # the encoder is on the motor's side
         qpos = motor.quantised(true + p.zero_offset + p.encoder_noise * noise[:, 0], p.encoder_step)
         qvel = self._full(self._qvel, 0.0) + p.velocity_noise * noise[:, 1]
-        tau = self._full(self._motor_torque(), 0.0) + p.current_offset + p.current_noise * noise[:, 2]
+        tau = (
+            self._full(self._motor_torque(), 0.0) + p.current_offset + p.current_noise * noise[:, 2]
+        )
         temperature = self._idle_temperature.copy()
         temperature[:, self.active] = self.thermal.winding
         return Reading(qpos, qvel, tau, temperature)
@@ -330,6 +375,8 @@ def _edit(model: mujoco.MjModel, robot: RobotSpec, unit: Physics, locked: tuple[
     roll, pitch = float(unit.tilt_roll[0]), float(unit.tilt_pitch[0])
     g = np.linalg.norm(model.opt.gravity)
     if roll or pitch:  # gravity as seen from a tilted base
-        model.opt.gravity = g * np.array([np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)])
+        model.opt.gravity = g * np.array(
+            [np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)]
+        )
     mujoco.mj_setConst(model, mujoco.MjData(model))
     stiffen_friction(model)

@@ -24,7 +24,13 @@ WRITERS = {
 
 
 PAGE = (Path(__file__).parents[3] / "docs" / "logs.md").read_text(encoding="utf-8")
-HEADINGS = {"hdf5": "### HDF5", "npz": "### NumPy", "mat": "### MATLAB", "pace": "### PACE", "asap": "### ASAP"}
+HEADINGS = {
+    "hdf5": "### HDF5",
+    "npz": "### NumPy",
+    "mat": "### MATLAB",
+    "pace": "### PACE",
+    "asap": "### ASAP",
+}
 
 
 def documented(heading):
@@ -42,7 +48,9 @@ def test_the_same_motion_comes_out_of_each_also_by_the_lines_of_the_docs(tmp_pat
     assert log.joint_names == ("shoulder", "elbow")
     assert np.allclose(log.channels["qpos"].values, qpos)
     assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(len(qpos)), atol=1e-6)
-    assert (log.meta.get("kp"), log.meta.get("kd")) == (([20.0, 30.0], [1.0, 1.5]) if fmt == "pace" else (None, None))
+    assert (log.meta.get("kp"), log.meta.get("kd")) == (
+        ([20.0, 30.0], [1.0, 1.5]) if fmt == "pace" else (None, None)
+    )
     (tmp_path / "logs.toml").write_text(documented(HEADINGS[fmt]))
     for by in (log, next(read_logs(tmp_path, arm, allow_pickle=True))[1]):
         assert np.allclose(by.channels["ctrl"].values, ctrl)
@@ -50,7 +58,11 @@ def test_the_same_motion_comes_out_of_each_also_by_the_lines_of_the_docs(tmp_pat
 
 def test_the_lines_that_the_docs_give_for_tables_and_bags_work(tmp_path, arm):
     columns = dict(
-        zip(["t", "shoulder_des", "elbow_des", "shoulder_pos", "elbow_pos"], arm_columns().values(), strict=True)
+        zip(
+            ["t", "shoulder_des", "elbow_des", "shoulder_pos", "elbow_pos"],
+            arm_columns().values(),
+            strict=True,
+        )
     )
     write_bag(tmp_path / "bag" / "wave", command="array")
     (tmp_path / "table").mkdir()
@@ -82,7 +94,9 @@ def test_gains_of_another_number_of_joints_are_one_clear_error(tmp_path, arm):
     WRITERS["pace"](tmp_path)
     file = tmp_path / "a.pt"
     torch.save(torch.load(file, weights_only=False) | {"kp": np.array([20.0, 30.0, 40.0])}, file)
-    with pytest.raises(LogError, match=r"a\.pt: kp has 3 values; give 1 or one for each of 2 joints"):
+    with pytest.raises(
+        LogError, match=r"a\.pt: kp has 3 values; give 1 or one for each of 2 joints"
+    ):
         list(read_logs(tmp_path, arm))
 
 
@@ -91,7 +105,9 @@ def test_an_array_without_names_asks_for_them(tmp_path, arm, fmt):
     WRITERS[fmt](tmp_path)
     toml = tmp_path / "logs.toml"
     toml.write_text(toml.read_text().replace('joints = ["shoulder", "elbow"]\n', ""))
-    with pytest.raises(LogError, match=r"has 2 columns and nothing names them; write joints = \[2 names"):
+    with pytest.raises(
+        LogError, match=r"has 2 columns and nothing names them; write joints = \[2 names"
+    ):
         list(read_logs(tmp_path, arm))
     toml.write_text('joints = ["shoulder"]\n' + toml.read_text())
     with pytest.raises(LogError, match="has 2 columns and joints has 1"):
@@ -111,14 +127,23 @@ def test_gaponets_motion_file_holds_several_with_their_payloads(tmp_path, arm, o
 def test_windows_in_which_one_joint_moves_are_recordings_of_that_joint(tmp_path, arm):
     """The others stand where logs.toml says, or at home, and both is noted."""
     ctrl, qpos = motion()
-    columns = {"positions": qpos, "positions_cmd": ctrl, "velocities": 0 * qpos, "torques": 0 * qpos}
+    columns = {
+        "positions": qpos,
+        "positions_cmd": ctrl,
+        "velocities": 0 * qpos,
+        "torques": 0 * qpos,
+    }
     np.savez(tmp_path / "motor.npz", joint_sequence=np.array(["elbow", "shoulder"]),
              **{f"real_dof_{name}": x.T[::-1] for name, x in columns.items()})  # fmt: skip
     with pytest.raises(LogError, match=r"or rate = 50\.0 \(Hz\)"):
         list(read_logs(tmp_path, arm))
     (tmp_path / "logs.toml").write_text("[posture]\nshoulder = 0.3\n")
     (_, elbow), (name, shoulder) = read_logs(tmp_path, arm, rate=50.0)
-    assert (name, elbow.joint_names, shoulder.joint_names) == ("motor-0001", ("elbow",), ("shoulder",))
+    assert (name, elbow.joint_names, shoulder.joint_names) == (
+        "motor-0001",
+        ("elbow",),
+        ("shoulder",),
+    )
     assert np.allclose(elbow.channels["ctrl"].values[:, 0], ctrl[:, 1])
     made = [to_sequence(log, arm, SequenceMeta("arm", "a", "m", 0.0)) for log in (elbow, shoulder)]
     assert [s.meta.unrecorded for s in made] == [("shoulder",), ("elbow",)]
@@ -135,7 +160,9 @@ def test_every_demonstration_of_robomimic_is_a_recording(tmp_path, arm):
             file[f"data/demo_{i}/obs/robot0_joint_pos"] = qpos
             file[f"data/demo_{i}/targets"] = ctrl + 0.01 * i
             file[f"data/demo_{i}/actions"] = np.zeros((40, 7))
-    with pytest.raises(LogError, match=r"no column holds ctrl.* there are: actions\[7\], obs/robot0_joint_pos\[2\]"):
+    with pytest.raises(
+        LogError, match=r"no column holds ctrl.* there are: actions\[7\], obs/robot0_joint_pos\[2\]"
+    ):
         list(read_logs(tmp_path, arm))
     (tmp_path / "logs.toml").write_text(
         strange_logs.sheet(ctrl="targets", qpos="obs/robot0_joint_pos", joints=arm.joint_names, rate=20.0,
@@ -154,16 +181,28 @@ def test_links_in_an_hdf5_file_are_not_followed(tmp_path, arm):
         file["action"] = h5py.ExternalLink(str(tmp_path / "other.hdf5"), "/action")
         file["observations/loop"] = h5py.SoftLink("/observations")
     with pytest.raises(
-        LogError, match=r"no column holds ctrl.* there are: observations/qpos\[2\], observations/qvel\[2\]\."
+        LogError,
+        match=r"no column holds ctrl.* there are: observations/qpos\[2\], observations/qvel\[2\]\.",
     ):
         list(read_logs(tmp_path, arm))
 
 
 def test_a_pickle_is_opened_only_where_that_was_allowed(tmp_path, arm, capsys):
     strange_logs.write_asap(tmp_path)
-    with pytest.raises(UsageError, match="are Python pickles, which can hold anything; add --allow-pickle"):
+    with pytest.raises(
+        UsageError, match="are Python pickles, which can hold anything; add --allow-pickle"
+    ):
         list(read_logs(tmp_path, arm))
-    told = ["import", str(tmp_path), "--robot", str(arm.mjcf.parent), "--unit-id", "a", "--payload-mass", "0"]
+    told = [
+        "import",
+        str(tmp_path),
+        "--robot",
+        str(arm.mjcf.parent),
+        "--unit-id",
+        "a",
+        "--payload-mass",
+        "0",
+    ]
     assert main([*told, "--out", str(tmp_path / "data")]) == 2
     assert main([*told, "--out", str(tmp_path / "data"), "--allow-pickle"]) == 0
 
@@ -182,11 +221,19 @@ def evil(mark):
     """Objects that make the file `mark` or ask for terabytes when they are unpickled as usual."""
     yield from (Evil(os.system, (f"touch {mark}",)), Evil(subprocess.call, (["touch", mark],)))
     yield from (Evil(eval, (f"open({mark!r}, 'w')",)), Evil(np.load, (mark,)))
-    yield from (Evil(np.fromfile, (mark,)), Evil(np.ndarray, ((1 << 40,),)), Evil(bytearray, (1 << 60,)))
+    yield from (
+        Evil(np.fromfile, (mark,)),
+        Evil(np.ndarray, ((1 << 40,),)),
+        Evil(bytearray, (1 << 60,)),
+    )
 
 
 def write_evil_npz(folder, thing):
-    np.savez(folder / "a.npz", real_dof_positions=np.array([thing], object), real_dof_positions_cmd=np.zeros(1))
+    np.savez(
+        folder / "a.npz",
+        real_dof_positions=np.array([thing], object),
+        real_dof_positions_cmd=np.zeros(1),
+    )
 
 
 def write_evil_pt(folder, thing):
@@ -196,7 +243,9 @@ def write_evil_pt(folder, thing):
 
 
 def write_evil_pickle(folder, thing):
-    (folder / "a.pkl").write_bytes(pickle.dumps({"walk": {"dof": np.array([thing], object), "fps": 50}}))
+    (folder / "a.pkl").write_bytes(
+        pickle.dumps({"walk": {"dof": np.array([thing], object), "fps": 50}})
+    )
 
 
 @pytest.mark.parametrize("write", [write_evil_npz, write_evil_pt, write_evil_pickle])
@@ -215,7 +264,9 @@ def test_a_hostile_pickle_runs_nothing_and_a_good_one_of_any_protocol_is_read(tm
                 pickles.load(pickle.dumps(data), "x")
     assert not (tmp_path / "ran").exists()
     for protocol in range(6):
-        found = pickles.load(pickle.dumps({"a": np.arange(6.0).reshape(2, 3), "b": [1, "x", None]}, protocol), "x")
+        found = pickles.load(
+            pickle.dumps({"a": np.arange(6.0).reshape(2, 3), "b": [1, "x", None]}, protocol), "x"
+        )
         assert np.array_equal(found["a"], np.arange(6.0).reshape(2, 3))
         assert found["b"] == [1, "x", None]
 

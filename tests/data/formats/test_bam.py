@@ -28,7 +28,9 @@ def test_a_recording_says_its_gain_and_its_load(tmp_path, bench):
     first, second = report.dataset.sequences(report.entries)
     assert first.meta.motion == "sin_sin"
     assert (first.meta.payload_mass, first.meta.payload_side) == (0.49, "100mm")
-    np.testing.assert_allclose(first.meta.kp, bench.kp, rtol=1e-3)  # robot.toml is at the factory's gain and 7.4 V
+    np.testing.assert_allclose(
+        first.meta.kp, bench.kp, rtol=1e-3
+    )  # robot.toml is at the factory's gain and 7.4 V
     assert Condition.of(first, bench).kp is None
     assert (second.meta.payload_mass, second.meta.payload_side) == (0.5, "150mm")
     np.testing.assert_allclose(second.meta.kp, bench.kp / 4 * 5.0 / 7.4, rtol=1e-3)
@@ -49,8 +51,13 @@ def test_a_supply_voltage_that_the_servo_contradicts_is_named(tmp_path, bench, c
 
 
 def test_a_recording_ends_where_torque_is_switched_off(tmp_path, bench):
-    report = import_logs(write_bam(tmp_path / "a.json", off=40), bench, "mine", None, tmp_path / "data")
-    assert (report.entries[0].rows, report.entries[0].meta.notes["cut"]) == (40, "torque is off from 0.22 s on")
+    report = import_logs(
+        write_bam(tmp_path / "a.json", off=40), bench, "mine", None, tmp_path / "data"
+    )
+    assert (report.entries[0].rows, report.entries[0].meta.notes["cut"]) == (
+        40,
+        "torque is off from 0.22 s on",
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,19 +76,30 @@ def test_what_cannot_be_a_recording_is_refused(tmp_path, bench, changes, message
 
 
 def test_any_servo_comes_in_whose_gain_law_robot_toml_states(tmp_path, bench):
-    servo = replace(bench.servos[0], gain=0.02, gain_volts=None)  # one whose current follows the error
+    servo = replace(
+        bench.servos[0], gain=0.02, gain_volts=None
+    )  # one whose current follows the error
     mine = replace(bench, servos=(servo,), aliases={"mx64": "motor"})
     ((_, log),) = read_logs(write_bam(tmp_path / "a.json", motor="mx64", kp=50, vin=12.0), mine)
     assert log.meta["kp"] == [pytest.approx(1.0)]
-    with pytest.raises(JointMismatchError, match=r"names joint 'mx64', which .* does not have; nearest: motor\."):
+    with pytest.raises(
+        JointMismatchError, match=r"names joint 'mx64', which .* does not have; nearest: motor\."
+    ):
         list(read_logs(tmp_path, bench))
-    with pytest.raises(LogError, match=r"what its kp 50 means .* write gain \(and gain_volts\) into the \[\[servo\]\]"):
+    with pytest.raises(
+        LogError,
+        match=r"what its kp 50 means .* write gain \(and gain_volts\) into the \[\[servo\]\]",
+    ):
         list(read_logs(tmp_path, replace(mine, servos=(replace(servo, gain=None),))))
 
 
 def test_an_arm_of_another_length_is_named(tmp_path, bench):
-    with pytest.raises(UsageError, match="'123mm' is unknown to xl330_bench; use one of both, 100mm"):
-        import_logs(write_bam(tmp_path / "a.json", length=0.123), bench, "mine", None, tmp_path / "data")
+    with pytest.raises(
+        UsageError, match="'123mm' is unknown to xl330_bench; use one of both, 100mm"
+    ):
+        import_logs(
+            write_bam(tmp_path / "a.json", length=0.123), bench, "mine", None, tmp_path / "data"
+        )
 
 
 def test_a_folder_that_is_called_like_a_recording_is_none(tmp_path):

@@ -46,18 +46,29 @@ def test_the_name_of_a_file_says_motion_payload_repetition_and_gain(tmp_path, ar
     assert log.meta["stated"] == {"payload_mass": 0.5, "repetition": 3}
     assert log.meta["kp"] == [12.0, 12.0]
     (tmp_path / "logs" / "other.csv").write_text(table_text(theirs()))
-    with pytest.raises(LogError, match=r"other: its name does not look like motion = .*; rename it, or list"):
+    with pytest.raises(
+        LogError, match=r"other: its name does not look like motion = .*; rename it, or list"
+    ):
         list(read_logs(tmp_path / "logs", arm))
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("file,motion,payload_mass\nrun_7,lift,0.2\n", "column 'payload_mass': write payload, once"),
+        (
+            "file,motion,payload_mass\nrun_7,lift,0.2\n",
+            "column 'payload_mass': write payload, once",
+        ),
         ("file,motion,Payload\nrun_7,lift,0.2\n", "column 'Payload': write payload, once"),
-        ("file,motion,payload (kg)\nrun_7,lift,0.2\n", r"column 'payload \(kg\)': write payload, once"),
+        (
+            "file,motion,payload (kg)\nrun_7,lift,0.2\n",
+            r"column 'payload \(kg\)': write payload, once",
+        ),
         ("file,kp.elbow,kp.elbow\nrun_7,9,8\n", r"column 'kp\.elbow': write kp\.elbow, once"),
-        ("file,motion,payload,unit\nrun_7,lift,0,2,b\n", "row of run_7 has more cells .* decimal comma"),
+        (
+            "file,motion,payload,unit\nrun_7,lift,0,2,b\n",
+            "row of run_7 has more cells .* decimal comma",
+        ),
     ],
 )
 def test_a_sheet_that_would_be_read_in_part_is_refused(tmp_path, arm, text, message):
@@ -80,16 +91,22 @@ def test_a_rate_that_the_clock_contradicts_is_refused(tmp_path, arm):
 def test_a_sheet_says_what_names_do_not_and_every_recording_stands_in_it_once(tmp_path, arm):
     folder = write(tmp_path / "logs", NAMES + 'manifest = "sheet.csv"\n', "run_7.csv")
     sheet = folder / "sheet.csv"
-    sheet.write_text("file,motion,payload,unit,rep,kp,kp.elbow,who\nrun_7.csv,lift,0.2,b,1,15,9,Ann\n")
+    sheet.write_text(
+        "file,motion,payload,unit,rep,kp,kp.elbow,who\nrun_7.csv,lift,0.2,b,1,15,9,Ann\n"
+    )
     ((name, log),) = read_logs(folder, arm)
     assert (name, log.meta["kp"]) == ("lift", [15.0, 9.0])
     assert log.meta["stated"] == {"payload_mass": 0.2, "unit_id": "b", "repetition": 1}
     write(tmp_path / "logs", NAMES + 'manifest = "sheet.csv"\nkp = 20.0\n', "run_7.csv")
     sheet.write_text("file,kp\nrun_7.csv,15\n")
-    with pytest.raises(LogError, match=r"run_7: logs.toml .* and the manifest contradict: kp 20.0 and 15.0"):
+    with pytest.raises(
+        LogError, match=r"run_7: logs.toml .* and the manifest contradict: kp 20.0 and 15.0"
+    ):
         list(read_logs(folder, arm))
     sheet.write_text("file,kp.elbow\nrun_7.csv,9\n")
-    assert [log.meta["kp"] for _, log in read_logs(folder, arm)] == [[20.0, 9.0]]  # of one joint beside that of all
+    assert [log.meta["kp"] for _, log in read_logs(folder, arm)] == [
+        [20.0, 9.0]
+    ]  # of one joint beside that of all
     sheet.write_text("file,motion\nrun_8.csv,lift\n")
     with pytest.raises(LogError, match="run_7: no rows of the manifest"):
         list(read_logs(folder, arm))
@@ -113,7 +130,8 @@ def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp
     columns = theirs() | {f"{j}_{w}": np.zeros(60) for j in ("hip", "knee") for w in ("des", "pos")}
     folder = write(tmp_path / "logs", NAMES, columns=columns)
     with pytest.raises(
-        JointMismatchError, match=r"names joints hip, knee, which .* Map them with --map hip=\S+ --map knee="
+        JointMismatchError,
+        match=r"names joints hip, knee, which .* Map them with --map hip=\S+ --map knee=",
     ):
         list(read_logs(folder, arm))
     write(tmp_path / "logs", NAMES + 'ignore = ["hip", "kn*"]\n', columns=columns)
@@ -121,13 +139,17 @@ def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp
 
 
 def test_names_that_are_all_another_robots_say_whose(arm, so101):
-    with pytest.raises(JointMismatchError, match="no joint of robot 'arm', all of robot 'so101': give that one"):
+    with pytest.raises(
+        JointMismatchError, match="no joint of robot 'arm', all of robot 'so101': give that one"
+    ):
         resolve_all(so101.operated, arm, "a.csv", None)
 
 
 @pytest.mark.parametrize("delimiter", [",", "\t", "   ", ";"])
 def test_a_table_without_header(tmp_path, arm, delimiter):
-    told = UNITS + NAMES + 'header = ["t", "shoulder_des", "elbow_des", "shoulder_pos", "elbow_pos"]\n'
+    told = (
+        UNITS + NAMES + 'header = ["t", "shoulder_des", "elbow_des", "shoulder_pos", "elbow_pos"]\n'
+    )
     body = table_text(theirs()).split("\n", 1)[1].replace(",", delimiter)
     (tmp_path / "wave.txt").write_text(body)
     (tmp_path / "logs.toml").write_text(told)
@@ -165,14 +187,26 @@ def test_a_log_without_a_clock_has_the_rate_that_was_said(tmp_path, arm):
 
 
 def test_a_log_without_commands_says_what_can_still_be_done(tmp_path, arm):
-    folder = write(tmp_path / "logs", NAMES, columns={k: v for k, v in theirs().items() if not k.endswith("_des")})
-    with pytest.raises(LogError, match=r"no column holds ctrl.<joint> .* Record the position controller"):
+    folder = write(
+        tmp_path / "logs",
+        NAMES,
+        columns={k: v for k, v in theirs().items() if not k.endswith("_des")},
+    )
+    with pytest.raises(
+        LogError, match=r"no column holds ctrl.<joint> .* Record the position controller"
+    ):
         list(read_logs(folder, arm))
 
 
 def test_a_robot_driven_by_torques_is_refused_in_a_sentence(tmp_path, arm):
-    columns = theirs() | {"shoulder_des": np.zeros(60), "elbow_des": np.zeros(60), "elbow_pos": np.linspace(0, 1.4, 60)}
-    with pytest.raises(LogError, match="every commanded position stands still while the joints move by up to"):
+    columns = theirs() | {
+        "shoulder_des": np.zeros(60),
+        "elbow_des": np.zeros(60),
+        "elbow_pos": np.linspace(0, 1.4, 60),
+    }
+    with pytest.raises(
+        LogError, match="every commanded position stands still while the joints move by up to"
+    ):
         list(read_logs(write(tmp_path / "logs", NAMES, columns=columns), arm))
 
 
@@ -186,11 +220,24 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
     (folder / "short.csv").write_text("t,shoulder_des\n0,1\n")
     with skip_bad_rows() as bad:
         ((_, log),) = read_logs(folder, arm)
-    assert [line.rpartition("/")[2].split(":")[1] for line in bad if line.endswith("cut")] == ["6", "10", "21"]
+    assert [line.rpartition("/")[2].split(":")[1] for line in bad if line.endswith("cut")] == [
+        "6",
+        "10",
+        "21",
+    ]
     assert any(line.startswith("left out: ") and "short.csv" in line for line in bad)
     assert len(log.channels["qpos"].time) == 57
     assert log.meta["notes"]["rows_cut"] == 3
-    told = ["--robot", str(arm.mjcf.parent), "--unit-id", "lab", "--payload-mass", "0", "--out", str(tmp_path / "data")]
+    told = [
+        "--robot",
+        str(arm.mjcf.parent),
+        "--unit-id",
+        "lab",
+        "--payload-mass",
+        "0",
+        "--out",
+        str(tmp_path / "data"),
+    ]
     assert main(["import", str(folder), *told]) == 2
     assert main(["import", str(folder), *told, "--skip-bad", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["cut"]) == 4
@@ -212,7 +259,10 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
         ("kp = -1.0", "kp"),
         ("rate = 0.0", "rate: should be greater than or equal to 1"),
         ('[columns]\n"speed.elbow" = "t"', "'speed.elbow' is neither time nor ctrl"),
-        ('[columns]\n"ctrl.elbow" = "x"', r"column 'x' \(for ctrl.elbow\) is missing; there are: t, shoulder_des"),
+        (
+            '[columns]\n"ctrl.elbow" = "x"',
+            r"column 'x' \(for ctrl.elbow\) is missing; there are: t, shoulder_des",
+        ),
         ('[joint_units]\nelbow = "grad"', "unit of elbow 'grad' is not one of rad, deg, fraction"),
         ('[joint_units]\nelbow = ["deg"]', r"logs\.toml: joint_units"),
         ('tme = "t"', r"logs\.toml: tme: is not a known field; docs/logs.md lists the fields"),
@@ -227,7 +277,9 @@ def test_a_wrong_logs_toml_is_refused(tmp_path, arm, toml, message):
 def test_a_folder_of_two_formats_asks_which(tmp_path, arm):
     folder = write(tmp_path / "logs", NAMES)
     np.savez(folder / "a.npz", q=np.zeros((3, 2)))
-    with pytest.raises(LogError, match=r"could be table \(.*\) and npz \(.*\); say --format table or --format npz"):
+    with pytest.raises(
+        LogError, match=r"could be table \(.*\) and npz \(.*\); say --format table or --format npz"
+    ):
         detect(folder)
 
 
@@ -255,7 +307,9 @@ def test_the_guess_for_a_strange_table_reads_it(tmp_path, arm, capsys):
     ],
 )
 def test_the_guess_knows_how_others_call_things(tmp_path, arm, names):
-    folder = write(tmp_path / "logs", "", columns=dict(zip(names, arm_columns().values(), strict=True)))
+    folder = write(
+        tmp_path / "logs", "", columns=dict(zip(names, arm_columns().values(), strict=True))
+    )
     (folder / "logs.toml").unlink()
     fmt, logs, recordings = look(folder)
     (folder / "logs.toml").write_text(guess_logs(recordings, arm, fmt, dict(logs)))
@@ -271,7 +325,9 @@ def test_a_channel_may_have_a_clock_of_its_own(tmp_path, arm):
     assert log.channels["ctrl"].time[0] - log.channels["qpos"].time[0] == pytest.approx(0.007)
 
 
-TORQUES = np.stack([np.linspace(0, 3, 60), np.full(60, -1.0)], axis=1)  # N·m fed forward to shoulder and elbow
+TORQUES = np.stack(
+    [np.linspace(0, 3, 60), np.full(60, -1.0)], axis=1
+)  # N·m fed forward to shoulder and elbow
 FED = theirs() | {"tau_ff_shoulder": TORQUES[:, 0], "tau_ff_elbow": TORQUES[:, 1]}
 
 
@@ -279,20 +335,28 @@ def fed_command(folder, arm, toml, **stated):
     """The command of a recording with TORQUES, (60, 2)."""
     folder = write(folder, NAMES + toml, columns=FED)
     made = import_logs(folder, arm, "a", 0.0, folder.parent / f"{folder.name}_data", **stated)
-    return made.dataset.read(made.dataset.entries[0]), np.stack([FED["shoulder_des"], FED["elbow_des"]], axis=1)
+    return made.dataset.read(made.dataset.entries[0]), np.stack(
+        [FED["shoulder_des"], FED["elbow_des"]], axis=1
+    )
 
 
 @pytest.mark.parametrize(
     "toml",
     [
         'feedforward_torque = "tau_ff_{joint}"\n',
-        "[columns]\n" + "".join(f'"feedforward_torque.{j}" = "tau_ff_{j}"\n' for j in ("shoulder", "elbow")),
+        "[columns]\n"
+        + "".join(f'"feedforward_torque.{j}" = "tau_ff_{j}"\n' for j in ("shoulder", "elbow")),
     ],
 )
-def test_a_feedforward_torque_is_the_position_command_by_which_a_pd_servo_gives_it(tmp_path, arm, toml):
+def test_a_feedforward_torque_is_the_position_command_by_which_a_pd_servo_gives_it(
+    tmp_path, arm, toml
+):
     sequence, command = fed_command(tmp_path / "logs", arm, "kp = 10.0\n" + toml)
     assert np.allclose(sequence.ctrl, command + TORQUES / 10, atol=1e-6)
-    assert sequence.meta.notes["feedforward_torque"]["largest_rad"] == {"shoulder": 0.3, "elbow": 0.1}
+    assert sequence.meta.notes["feedforward_torque"]["largest_rad"] == {
+        "shoulder": 0.3,
+        "elbow": 0.1,
+    }
     sequence, _ = fed_command(tmp_path / "unused", arm, "kp = 10.0\n")
     assert np.allclose(sequence.ctrl, command, atol=1e-6)
     assert "feedforward_torque" not in sequence.meta.notes
@@ -315,12 +379,18 @@ def test_a_simulated_pd_servo_does_the_same_with_the_torque_as_with_the_equivale
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        ('feedforward_torque = "tau_ff_{joint}"\n', "kp of shoulder, elbow is not stated; give it in logs.toml"),
+        (
+            'feedforward_torque = "tau_ff_{joint}"\n',
+            "kp of shoulder, elbow is not stated; give it in logs.toml",
+        ),
         (
             'feedforward_torque = "tau_ff_{joint}"\nkp = { shoulder = 5.0, elbow = 0.0 }\n',
             "kp of elbow is 0; give it in logs.toml",
         ),
-        ('feedforward_torque = "tau_{joint}_ff"\nkp = 5.0\n', "no column holds feedforward_torque; there are: t, "),
+        (
+            'feedforward_torque = "tau_{joint}_ff"\nkp = 5.0\n',
+            "no column holds feedforward_torque; there are: t, ",
+        ),
     ],
 )
 def test_a_feedforward_torque_without_gain_or_column_is_refused(tmp_path, arm, toml, message):
@@ -330,12 +400,20 @@ def test_a_feedforward_torque_without_gain_or_column_is_refused(tmp_path, arm, t
 
 def test_a_feedforward_torque_of_zero_needs_no_gain(tmp_path, arm):
     columns = theirs() | {f"feedforward_torque.{j}": np.zeros(60) for j in arm.joint_names}
-    made = import_logs(write(tmp_path / "logs", NAMES, columns=columns), arm, "a", 0.0, tmp_path / "data")
-    assert np.allclose(made.dataset.read(made.dataset.entries[0]).ctrl[:, 1], columns["elbow_des"], atol=1e-6)
+    made = import_logs(
+        write(tmp_path / "logs", NAMES, columns=columns), arm, "a", 0.0, tmp_path / "data"
+    )
+    assert np.allclose(
+        made.dataset.read(made.dataset.entries[0]).ctrl[:, 1], columns["elbow_des"], atol=1e-6
+    )
 
 
 def test_the_guess_sees_a_feedforward_torque_and_not_the_measured_one(tmp_path, arm):
-    folder = write(tmp_path / "logs", "", columns=FED | {"tau_shoulder": TORQUES[:, 0], "tau_elbow": TORQUES[:, 1]})
+    folder = write(
+        tmp_path / "logs",
+        "",
+        columns=FED | {"tau_shoulder": TORQUES[:, 0], "tau_elbow": TORQUES[:, 1]},
+    )
     (folder / "logs.toml").unlink()
     fmt, logs, recordings = look(folder)
     text = guess_logs(recordings, arm, fmt, dict(logs))
@@ -349,7 +427,9 @@ def test_the_guess_sees_a_feedforward_torque_and_not_the_measured_one(tmp_path, 
 def test_a_feedforward_torque_in_the_file_of_the_commands_has_their_clock(tmp_path, arm):
     columns = theirs()
     states = {name: columns[name] for name in ("t", "shoulder_pos", "elbow_pos")}
-    commands = {"t": columns["t"] + 0.01} | {name: FED[name] for name in FED if "_des" in name or "_ff_" in name}
+    commands = {"t": columns["t"] + 0.01} | {
+        name: FED[name] for name in FED if "_des" in name or "_ff_" in name
+    }
     folder = write(
         tmp_path / "logs",
         NAMES + 'command_file = "{name}_cmd.csv"\nfeedforward_torque = "tau_ff_{joint}"\n',

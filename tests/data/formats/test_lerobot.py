@@ -28,12 +28,18 @@ def dataset(arm, tmp_path):
     data, rng = Dataset.create(tmp_path / "data", arm), np.random.default_rng(0)
     for i, (unit, payload) in enumerate((("one", 0.0), ("two", 0.2), ("two", 0.2))):
         ctrl = wave(50 + 7 * i, 2, hertz=0.4 + 0.1 * i)
-        extra = {c: rng.standard_normal(ctrl.shape) for c in ("qacc", "tau", "tau_eq", "temperature")}
+        extra = {
+            c: rng.standard_normal(ctrl.shape) for c in ("qacc", "tau", "tau_eq", "temperature")
+        }
         notes = {"rate_hz": 50.0, "warmth_K": 3.25, "events": [["0", "START"]]}
-        sequence = arm_sequence(arm, ctrl, late(ctrl, 2), f"m{i}", payload, unit=unit, notes=notes, **extra)
+        sequence = arm_sequence(
+            arm, ctrl, late(ctrl, 2), f"m{i}", payload, unit=unit, notes=notes, **extra
+        )
         fields = {"repetition": 2 * i, "virtual": True, "level": "joint", "source": "somewhere/else.csv",
                   "source_sha256": "ab" * 32, "recorded_at": "2026-01-02T03:04:05Z"}  # fmt: skip
-        fields |= {"kp": (5.0 + i, 6.0), "kd": (0.1, 0.2)} if i else {}  # the first from before gains were kept
+        fields |= (
+            {"kp": (5.0 + i, 6.0), "kd": (0.1, 0.2)} if i else {}
+        )  # the first from before gains were kept
         data.append(replace(sequence, meta=replace(sequence.meta, **fields)))
     data.set_provenance(licence="CC0-1.0")
     return data
@@ -56,7 +62,12 @@ def same(one, other):
 
 def test_a_round_trip_loses_nothing(dataset, arm, tmp_path):
     (written,) = export_lerobot(dataset, tmp_path / "out")
-    assert (written.path, written.episodes, written.frames, written.fps) == (tmp_path / "out", 3, 171, 50)
+    assert (written.path, written.episodes, written.frames, written.fps) == (
+        tmp_path / "out",
+        3,
+        171,
+        50,
+    )
     again = back(tmp_path / "out", arm, tmp_path / "again")
     same(dataset, again)
     assert again.header == dataset.header
@@ -66,7 +77,12 @@ def test_several_rates_become_several_sets_and_come_back(dataset, arm, tmp_path)
     fast = replace(dataset.read(dataset.entries[0]), dt=1 / 60)  # no whole number of 10 µs
     odd = replace(dataset.read(dataset.entries[1]), dt=0.02006)
     bare = replace(
-        dataset.read(dataset.entries[2]), tau=None, tau_eq=None, qacc=None, temperature=None, ctrl=wave(64, 2)
+        dataset.read(dataset.entries[2]),
+        tau=None,
+        tau_eq=None,
+        qacc=None,
+        temperature=None,
+        ctrl=wave(64, 2),
     )
     for sequence in (fast, odd, bare):
         dataset.append(sequence)
@@ -81,16 +97,36 @@ def test_the_layout_is_the_standards(dataset, tmp_path):
     out = export_lerobot(dataset, tmp_path / "out")[0].path
     info = json.loads((out / "meta" / "info.json").read_text())
     assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", 50, "arm")
-    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (3, 171, {"train": "0:3"})
+    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (
+        3,
+        171,
+        {"train": "0:3"},
+    )
     assert info["features"]["action"]["names"] == ["shoulder", "elbow"]
     assert info["features"]["observation.torque"]["info"] == {"unit": "N·m"}
     frames = pq.read_table(out / "data" / "chunk-000" / "file-000.parquet")
-    assert frames.column_names[-5:] == ["timestamp", "frame_index", "episode_index", "index", "task_index"]
+    assert frames.column_names[-5:] == [
+        "timestamp",
+        "frame_index",
+        "episode_index",
+        "index",
+        "task_index",
+    ]
     assert frames["index"].to_pylist() == list(range(171))
     assert frames["frame_index"].to_pylist()[50:53] == [0, 1, 2]
-    episodes = pq.read_table(out / "meta" / "episodes" / "chunk-000" / "file-000.parquet").to_pylist()
-    assert [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes] == [(0, 50), (50, 107), (107, 171)]
-    assert (episodes[1]["unit_id"], episodes[1]["payload_mass"], episodes[1]["virtual"]) == ("two", 0.2, True)
+    episodes = pq.read_table(
+        out / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    ).to_pylist()
+    assert [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes] == [
+        (0, 50),
+        (50, 107),
+        (107, 171),
+    ]
+    assert (episodes[1]["unit_id"], episodes[1]["payload_mass"], episodes[1]["virtual"]) == (
+        "two",
+        0.2,
+        True,
+    )
     assert episodes[2]["tasks"] == ["m2"]
     tasks = pq.read_table(out / "meta" / "tasks.parquet")
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
@@ -100,7 +136,12 @@ def test_statistics_are_those_of_all_frames(dataset, tmp_path):
     out = export_lerobot(dataset, tmp_path / "out")[0].path
     stats = json.loads((out / "meta" / "stats.json").read_text())["observation.state"]
     every = np.concatenate([s.qpos for s in dataset.sequences()]).astype(float)
-    for name, value in (("min", every.min(0)), ("max", every.max(0)), ("mean", every.mean(0)), ("std", every.std(0))):
+    for name, value in (
+        ("min", every.min(0)),
+        ("max", every.max(0)),
+        ("mean", every.mean(0)),
+        ("std", every.std(0)),
+    ):
         assert np.allclose(stats[name], value)
     assert stats["count"] == [171]
 
@@ -110,7 +151,10 @@ def test_many_episodes_are_spread_over_files(dataset, arm, tmp_path, monkeypatch
     monkeypatch.setattr(lerobot_export, "CHUNK_FILES", 2)
     monkeypatch.setattr(lerobot_export, "BLOCK_EPISODES", 2)
     export_lerobot(dataset, tmp_path / "out")
-    files = sorted(f.relative_to(tmp_path / "out").as_posix() for f in (tmp_path / "out" / "data").rglob("*.parquet"))
+    files = sorted(
+        f.relative_to(tmp_path / "out").as_posix()
+        for f in (tmp_path / "out" / "data").rglob("*.parquet")
+    )
     assert files == ["data/chunk-000/file-000.parquet", "data/chunk-000/file-001.parquet",
                      "data/chunk-001/file-000.parquet"]  # fmt: skip
     same(dataset, back(tmp_path / "out", arm, tmp_path / "again"))
@@ -125,7 +169,9 @@ def test_of_a_dataset_that_grew_all_files_but_the_last_are_the_same(arm, tmp_pat
             ctrl = wave(50, 2) + 0.001 * len(data)
             data.append(arm_sequence(arm, ctrl, late(ctrl, 1), motion, 0.0))
         export_lerobot(data, tmp_path / name)
-        return {f.name: f.read_bytes() for f in sorted((tmp_path / name / "data").rglob("*.parquet"))}
+        return {
+            f.name: f.read_bytes() for f in sorted((tmp_path / name / "data").rglob("*.parquet"))
+        }
 
     before = exported("first", [f"walk {i}" for i in range(30)])
     after = exported("second", ["one more"])
@@ -184,8 +230,12 @@ def test_a_stock_set_in_degrees_becomes_radians(so101, tmp_path):
     assert entry.meta.notes["converted_from"]["gripper"] == "percent"
     older = read_stock(tmp_path / "set", so101, tmp_path / "older", position_unit="signed_percent")
     low, high = so101.qpos_range[0]
-    assert older.read(older.entries[0]).ctrl[0, 0] == pytest.approx((low + high) / 2 + 0.05 * (high - low))
-    with pytest.raises(UsageError, match=r"unit of positions is not written in the set; say --position-unit deg"):
+    assert older.read(older.entries[0]).ctrl[0, 0] == pytest.approx(
+        (low + high) / 2 + 0.05 * (high - low)
+    )
+    with pytest.raises(
+        UsageError, match=r"unit of positions is not written in the set; say --position-unit deg"
+    ):
         read_stock(tmp_path / "set", so101, tmp_path / "none", position_unit=None)
 
 
@@ -214,10 +264,14 @@ def test_a_file_cut_short_and_missing_frames_are_named(so101, tmp_path):
     file = folder / "data" / "chunk-000" / "file-000.parquet"
     whole = pq.read_table(file)
     pq.write_table(whole.slice(0, 80), file)
-    with pytest.raises(LogError, match=r"file-000\.parquet: episode 1 has 40 frames here, meta/episodes says 50"):
+    with pytest.raises(
+        LogError, match=r"file-000\.parquet: episode 1 has 40 frames here, meta/episodes says 50"
+    ):
         read_stock(folder, so101, tmp_path / "data")
     file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(LogError, match=r"file-000\.parquet: not a readable Parquet file .*; it is cut short"):
+    with pytest.raises(
+        LogError, match=r"file-000\.parquet: not a readable Parquet file .*; it is cut short"
+    ):
         read_stock(folder, so101, tmp_path / "data")
 
 
@@ -241,11 +295,18 @@ def test_a_data_path_cannot_leave_the_set_or_fill_the_memory(so101, tmp_path, pl
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"codebase_version": "v1.6"}, r"codebase_version is v1\.6, this reads v3 and v2; convert the set with"),
+        (
+            {"codebase_version": "v1.6"},
+            r"codebase_version is v1\.6, this reads v3 and v2; convert the set with",
+        ),
         ({"features": {}}, "no feature 'action'"),
         ({"features": {"action": 3}}, r"features\.action: should be an object"),
         (
-            {"features": {f: {"shape": [6], "names": None} for f in ("action", "observation.state")}},
+            {
+                "features": {
+                    f: {"shape": [6], "names": None} for f in ("action", "observation.state")
+                }
+            },
             r"action does not name its \[6\] values; write joints = \[their names",
         ),
         ({"fps": 0}, "fps: should be greater than or equal to 1, not 0; download or"),
@@ -270,8 +331,14 @@ def rewrite(file, **columns):
 @pytest.mark.parametrize(
     ("columns", "complaint"),
     [
-        ({"length": pa.array([-1, 50])}, r"\[0\]\.length: should be greater than or equal to 1, not -1"),
-        ({"data/file_index": pa.array([None, 0])}, r"\[0\]\.data/file_index: should be a valid integer, not None"),
+        (
+            {"length": pa.array([-1, 50])},
+            r"\[0\]\.length: should be greater than or equal to 1, not -1",
+        ),
+        (
+            {"data/file_index": pa.array([None, 0])},
+            r"\[0\]\.data/file_index: should be a valid integer, not None",
+        ),
         ({"episode_index": None}, "column 'episode_index' is missing"),
         ({"tasks": pa.array([1, 2])}, r"\[0\]\.tasks: should be a valid (array|list), not 1"),
         ({"length": pa.array([1, 2], pa.timestamp("ns"))}, r"not readable"),
@@ -310,10 +377,13 @@ def test_frames_of_other_types_are_refused_by_feature(so101, tmp_path, columns, 
         ("kp", '["x"]', r"kp: \[0\]: should be a valid number"),
     ],
 )
-def test_what_an_export_says_of_a_recording_is_checked(dataset, arm, tmp_path, column, value, complaint):
+def test_what_an_export_says_of_a_recording_is_checked(
+    dataset, arm, tmp_path, column, value, complaint
+):
     export_lerobot(dataset, tmp_path / "out")
     rewrite(
-        tmp_path / "out" / "meta" / "episodes" / "chunk-000" / "file-000.parquet", **{column: pa.array([value] * 3)}
+        tmp_path / "out" / "meta" / "episodes" / "chunk-000" / "file-000.parquet",
+        **{column: pa.array([value] * 3)},
     )
     with pytest.raises(LogError, match=rf"episode 0: .*{complaint}"):
         back(tmp_path / "out", arm, tmp_path / "again")
@@ -338,7 +408,17 @@ def test_tasks_of_another_type_are_refused(so101, tmp_path):
 
 def test_a_set_of_version_2_1_is_read_as_far_as_its_episodes_are_there(so101, tmp_path, caplog):
     """Names inside a list, in the style of C; one file an episode, of which some were not downloaded."""
-    names = [["kShoulderPan", "kShoulderLift", "kElbowFlex", "kWristFlex", "kWristRoll", "kGripper", "kCameraTilt"]]
+    names = [
+        [
+            "kShoulderPan",
+            "kShoulderLift",
+            "kElbowFlex",
+            "kWristFlex",
+            "kWristRoll",
+            "kGripper",
+            "kCameraTilt",
+        ]
+    ]
     feature = {"dtype": "float32", "shape": [7], "names": names}
     info = {"codebase_version": "v2.1", "fps": 30, "chunks_size": 2, "features": dict.fromkeys(
         ("action", "observation.state"), feature),

@@ -97,7 +97,9 @@ def test_messages_recorded_twice_count_once(tmp_path, arm):
 
 def test_a_bag_without_commands_says_so_and_what_can_still_be_done(tmp_path, arm):
     write_bag(tmp_path / "wave", with_command=False)
-    with pytest.raises(LogError, match=r"no column holds ctrl.*/joint_states.position\[2\].* play the recorded"):
+    with pytest.raises(
+        LogError, match=r"no column holds ctrl.*/joint_states.position\[2\].* play the recorded"
+    ):
         only(tmp_path, arm)
 
 

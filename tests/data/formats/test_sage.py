@@ -32,7 +32,9 @@ def test_numbers_and_joints_come_back_as_written(tmp_path, so101):
     assert np.array_equal(log.channels["qpos"].values[:, :5], late(ctrl, 1)[:, :5])
     assert np.array_equal(log.channels["tau"].values, tau)
     low, high = so101.qpos_range[5]
-    assert np.allclose(log.channels["ctrl"].values[:, 5], low + ctrl[:, 5] * (high - low))  # a share of its range
+    assert np.allclose(
+        log.channels["ctrl"].values[:, 5], low + ctrl[:, 5] * (high - low)
+    )  # a share of its range
     assert log.meta["converted_from"] == {"gripper": "fraction"}
     with pytest.raises(UsageError, match="--time-unit means nothing to the sage format"):
         list(read_logs(tmp_path, so101, time_unit="s"))
@@ -54,7 +56,9 @@ def test_neither_case_nor_line_ends_matter(motion, so101, old, new):
     before = next(read_logs(motion, so101))[1]
     control = motion / "control.csv"
     control.write_bytes(control.read_bytes().replace(old, new))
-    assert np.array_equal(next(read_logs(motion, so101))[1].channels["ctrl"].values, before.channels["ctrl"].values)
+    assert np.array_equal(
+        next(read_logs(motion, so101))[1].channels["ctrl"].values, before.channels["ctrl"].values
+    )
 
 
 def test_simulated_motions_are_left_out(tmp_path, so101):
@@ -83,7 +87,9 @@ def test_simulated_motions_are_left_out(tmp_path, so101):
 )
 def test_a_row_that_is_none_is_refused_by_file_and_line(motion, so101, old, new):
     edit(motion / "control.csv", 7, old, new)
-    with pytest.raises(LogError, match=r"control\.csv:7: expected TYPE,timestamp and 1 list\(s\) of 6 numbers, got"):
+    with pytest.raises(
+        LogError, match=r"control\.csv:7: expected TYPE,timestamp and 1 list\(s\) of 6 numbers, got"
+    ):
         list(read_logs(motion, so101))
 
 
@@ -112,7 +118,11 @@ def test_a_row_that_is_none_is_refused_by_file_and_line(motion, so101, old, new)
         ("control.csv", b"\xff\xfe\x00\x01", r"control\.csv:1: header is"),
         ("joint_list.txt", b"", r"joint_list\.txt: empty; one joint name a line"),
         ("joint_list.txt", b"\xff\xfe", r"joint_list\.txt: not UTF-8 text"),
-        ("joint_list.txt", b"Rotation\nRotation\nElbow\nWrist_Pitch\nWrist_Roll\nJaw\n", "two names map to one joint"),
+        (
+            "joint_list.txt",
+            b"Rotation\nRotation\nElbow\nWrist_Pitch\nWrist_Roll\nJaw\n",
+            "two names map to one joint",
+        ),
     ],
 )
 def test_a_broken_file_is_named(motion, so101, file, content, message):
@@ -122,8 +132,12 @@ def test_a_broken_file_is_named(motion, so101, file, content, message):
 
 
 def test_a_joint_of_another_robot_says_how_to_map_it(motion, so101):
-    (motion / "joint_list.txt").write_text("\n".join([*SERVO_NAMES[:2], "forearm", *SERVO_NAMES[3:]]))
-    with pytest.raises(JointMismatchError, match=r"joint_list\.txt names joint 'forearm', which robot 'so101'"):
+    (motion / "joint_list.txt").write_text(
+        "\n".join([*SERVO_NAMES[:2], "forearm", *SERVO_NAMES[3:]])
+    )
+    with pytest.raises(
+        JointMismatchError, match=r"joint_list\.txt names joint 'forearm', which robot 'so101'"
+    ):
         list(read_logs(motion, so101))
     ((_, log),) = read_logs(motion, so101, joint_map={"forearm": "elbow_flex"})
     assert log.joint_names == so101.joint_names
@@ -135,7 +149,8 @@ def test_swapped_files_are_known_by_the_type_of_their_rows(motion, so101):
     control.write_text(texts[1])
     state.write_text(texts[0])
     with pytest.raises(
-        LogError, match=r"control\.csv:2: a row of type 'STATE_MOTOR', not CONTROL: are the files swapped"
+        LogError,
+        match=r"control\.csv:2: a row of type 'STATE_MOTOR', not CONTROL: are the files swapped",
     ):
         list(read_logs(motion, so101))
 
@@ -149,7 +164,10 @@ def test_what_no_joint_does_costs_that_channel_there_and_is_said(tmp_path, so101
     cells[column] = cells[column].replace("0.0", "1e30", 1)
     lines[8] = '","'.join(cells)
     state.write_text("\n".join(lines))
-    with pytest.raises(LogError, match=rf"state_motor\.csv:9: .* of shoulder_pan is 1e\+30 {unit}: no joint does that"):
+    with pytest.raises(
+        LogError,
+        match=rf"state_motor\.csv:9: .* of shoulder_pan is 1e\+30 {unit}: no joint does that",
+    ):
         list(read_logs(folder, so101, strict=True))
     ((_, log),) = read_logs(folder, so101)
     channel = ("", "qvel", "tau")[column]

@@ -29,7 +29,11 @@ def only(path, robot, **options):
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_numbers_come_back_as_written(tmp_path, arm, kind):
-    columns = arm_columns() | {"tau.shoulder": np.arange(60.0), "tau.elbow": np.zeros(60), "note": np.ones(60)}
+    columns = arm_columns() | {
+        "tau.shoulder": np.arange(60.0),
+        "tau.elbow": np.zeros(60),
+        "note": np.ones(60),
+    }
     file = tmp_path / f"wave.{kind}"
     (write if kind == "csv" else write_parquet)(file, columns)
     log = only(file, arm)
@@ -48,7 +52,8 @@ def by_joint(columns, path):
     rows = ["t,joint,command,position,phase"]
     for i, time in enumerate(columns["time"]):
         rows += [
-            f"{time!r},{j},{columns[f'ctrl.{j}'][i]!r},{columns[f'qpos.{j}'][i]!r},run" for j in ("elbow", "shoulder")
+            f"{time!r},{j},{columns[f'ctrl.{j}'][i]!r},{columns[f'qpos.{j}'][i]!r},run"
+            for j in ("elbow", "shoulder")
         ]
     path.write_text("\n".join(map(str, rows)) + "\n")
     return path
@@ -64,11 +69,15 @@ def test_rows_per_joint_give_the_same_log_as_columns_per_joint(tmp_path, arm):
         assert np.array_equal(log.channels["ctrl"].values[:, k], columns[f"ctrl.{joint}"])
     text = (tmp_path / "long.csv").read_text().splitlines()
     (tmp_path / "long.csv").write_text("\n".join(text[:-1]) + "\n")
-    with pytest.raises(LogError, match=r"joints have different times \(elbow 60, shoulder 59 rows\)"):
+    with pytest.raises(
+        LogError, match=r"joints have different times \(elbow 60, shoulder 59 rows\)"
+    ):
         next(read_logs(tmp_path / "long.csv", arm, logs=logs))[1]()
 
 
-def test_a_column_called_joint_beside_a_column_per_joint_is_no_table_with_a_row_per_joint(tmp_path, arm):
+def test_a_column_called_joint_beside_a_column_per_joint_is_no_table_with_a_row_per_joint(
+    tmp_path, arm
+):
     log = only(write(tmp_path / "wave.csv", arm_columns() | {"joint": np.zeros(60)}), arm)
     assert log.joint_names == ("shoulder", "elbow")
 
@@ -89,25 +98,36 @@ def test_a_folder_holds_one_motion_per_file(tmp_path, arm):
 def test_a_unit_that_was_not_said_is_asked_for(tmp_path, arm, given):
     file = write(tmp_path / "wave.csv", arm_columns())
     missing = "position" if "time_unit" in given else "time"
-    with pytest.raises(UsageError, match=f"the table's {missing} unit is not given; say it with --position-unit rad"):
+    with pytest.raises(
+        UsageError,
+        match=f"the table's {missing} unit is not given; say it with --position-unit rad",
+    ):
         list(read_logs(file, arm, **given))
 
 
 def test_90_degrees_are_half_pi_and_1500_ms_are_one_and_a_half_seconds(tmp_path, arm):
-    columns = {name: np.full(4, 90.0) for name in arm_columns()} | {"time": np.array([0.0, 500.0, 1000.0, 1500.0])}
+    columns = {name: np.full(4, 90.0) for name in arm_columns()} | {
+        "time": np.array([0.0, 500.0, 1000.0, 1500.0])
+    }
     columns |= {"qvel.shoulder": np.full(4, 180.0), "qvel.elbow": np.zeros(4)}
     log = only(write(tmp_path / "wave.csv", columns), arm, position_unit="deg", time_unit="ms")
     assert log.channels["ctrl"].values[0] == pytest.approx([np.pi / 2] * 2)
     assert log.channels["qvel"].values[0] == pytest.approx([np.pi, 0])
     assert log.channels["qpos"].time[-1] == pytest.approx(1.5)
-    columns = {name: np.full(4, 0.75) for name in arm_columns()} | {"time": 1.7e18 + 2e7 * np.arange(4)}
+    columns = {name: np.full(4, 0.75) for name in arm_columns()} | {
+        "time": 1.7e18 + 2e7 * np.arange(4)
+    }
     log = only(write(tmp_path / "wave.csv", columns), arm, position_unit="fraction", time_unit="ns")
     assert log.channels["qpos"].values[0] == pytest.approx([0.75, 0.75])  # −1.5 + 0.75 · 3 rad
-    assert log.channels["qpos"].time == pytest.approx(0.02 * np.arange(4), abs=1e-6)  # from any start
+    assert log.channels["qpos"].time == pytest.approx(
+        0.02 * np.arange(4), abs=1e-6
+    )  # from any start
 
 
 def test_a_column_map_names_columns_and_units(tmp_path, arm):
-    theirs = dict(zip(["t", "cmd_1", "cmd_2", "pos_1", "pos_2"], arm_columns().values(), strict=True))
+    theirs = dict(
+        zip(["t", "cmd_1", "cmd_2", "pos_1", "pos_2"], arm_columns().values(), strict=True)
+    )
     theirs["t"] = theirs["t"] * 1000
     file = write(tmp_path / "wave.csv", theirs)
     toml = tmp_path / "map.toml"
@@ -130,10 +150,22 @@ def test_a_column_map_names_columns_and_units(tmp_path, arm):
             "clock",
             r":1: column 'time' \(the clock of ctrl\) is missing; there are: clock, .*logs.toml",
         ),
-        ("qpos.elbow", "elbow", r":1: column 'qpos.elbow' is missing: every channel needs the same joints"),
-        ("ctrl.elbow", "note", r":1: column 'ctrl.elbow' is missing: every channel needs the same joints"),
+        (
+            "qpos.elbow",
+            "elbow",
+            r":1: column 'qpos.elbow' is missing: every channel needs the same joints",
+        ),
+        (
+            "ctrl.elbow",
+            "note",
+            r":1: column 'ctrl.elbow' is missing: every channel needs the same joints",
+        ),
         ("qpos.elbow", "qpos.shoulder", r":1: column 'qpos.shoulder' stands twice; rename one"),
-        ("\n0.04,", "\n0.04,x", r":4: column 'ctrl.shoulder' is 'x.*', not a number; repair or cut the row"),
+        (
+            "\n0.04,",
+            "\n0.04,x",
+            r":4: column 'ctrl.shoulder' is 'x.*', not a number; repair or cut the row",
+        ),
         ("\n0.04,", "\n0.04,,", r":4: 6 cells, the header has 5; the file may be cut short"),
         ("\n0.04,", "\n\n0.04,", r":4: 0 cells, the header has 5"),
         ("\n0.04,", "\n,", r":4: column 'time' is '', not a number"),
@@ -163,7 +195,9 @@ def test_an_empty_table_is_refused(tmp_path, arm, text, message):
 def test_a_half_written_parquet_file_is_refused(tmp_path, arm):
     file = write_parquet(tmp_path / "wave.parquet", arm_columns())
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file \(.*\); it is cut short"):
+    with pytest.raises(
+        LogError, match=r"wave\.parquet: not a readable Parquet file \(.*\); it is cut short"
+    ):
         only(file, arm)
 
 
@@ -173,14 +207,20 @@ def test_a_parquet_cell_that_is_empty_or_no_number_is_refused(tmp_path, arm):
     pq.write_table(pa.table(columns | {"ctrl.elbow": hole}), tmp_path / "hole.parquet")
     with pytest.raises(LogError, match=r"hole\.parquet:4: column 'ctrl.elbow' is empty"):
         only(tmp_path / "hole.parquet", arm)
-    pq.write_table(pa.table(columns | {"ctrl.elbow": pa.array(["1.0"] * 60)}), tmp_path / "text.parquet")
-    with pytest.raises(LogError, match=r"text\.parquet: column 'ctrl.elbow' is string, not numbers"):
+    pq.write_table(
+        pa.table(columns | {"ctrl.elbow": pa.array(["1.0"] * 60)}), tmp_path / "text.parquet"
+    )
+    with pytest.raises(
+        LogError, match=r"text\.parquet: column 'ctrl.elbow' is string, not numbers"
+    ):
         only(tmp_path / "text.parquet", arm)
 
 
 def test_a_folder_without_logs_names_the_known_formats(tmp_path, arm):
     (tmp_path / "readme.txt").touch()
-    with pytest.raises(LogError, match=r"no log of sage, table, .* \(gaponet import --formats explains them"):
+    with pytest.raises(
+        LogError, match=r"no log of sage, table, .* \(gaponet import --formats explains them"
+    ):
         list(read_logs(tmp_path, arm))
     with pytest.raises(LogError, match="nowhere: does not exist"):
         list(read_logs(tmp_path / "nowhere", arm))
@@ -190,7 +230,10 @@ def test_a_folder_without_logs_names_the_known_formats(tmp_path, arm):
 
 def test_a_cell_longer_than_the_csv_module_takes_is_refused_by_line(tmp_path, arm):
     file = write(tmp_path / "wave.csv", arm_columns(), "\n0.04,", "\n" + "9" * 140_000 + "x,")
-    with pytest.raises(LogError, match=r"wave\.csv:4: field larger than field limit \(131072\); repair or cut the row"):
+    with pytest.raises(
+        LogError,
+        match=r"wave\.csv:4: field larger than field limit \(131072\); repair or cut the row",
+    ):
         only(file, arm)
     file.write_text("x" * 140_000 + "\n1\n2\n")
     with pytest.raises(LogError, match=r"wave\.csv:1: not a header of a table"):

@@ -28,15 +28,22 @@ def played(arm, tmp_path):
 
 
 def test_every_card_has_an_existing_robot_and_a_row_on_the_page():
-    cards, page = read_cards(CARDS), (DOCS / "reference" / "recordings.md").read_text(encoding="utf-8")
+    cards, page = (
+        read_cards(CARDS),
+        (DOCS / "reference" / "recordings.md").read_text(encoding="utf-8"),
+    )
     for card in cards.set:
-        robot = load_robot(ROBOTS / card.robot if card.robot not in packaged_robots() else card.robot)
+        robot = load_robot(
+            ROBOTS / card.robot if card.robot not in packaged_robots() else card.robot
+        )
         assert set(card.joints) <= set(robot.joint_names)
         assert f"| {card.name} | {card.title} |" in page
         assert card.elsewhere in {"", *(c.name for c in cards.set)}
 
 
-def test_only_adaptation_uses_recordings_of_a_unit_left_out_and_none_of_the_tested_motions(arm, played):
+def test_only_adaptation_uses_recordings_of_a_unit_left_out_and_none_of_the_tested_motions(
+    arm, played
+):
     for question in questions("a unit left out", played, arm, None):
         (unit,) = {s.meta.unit_id for s in question.test}
         assert unit not in {s.meta.unit_id for s in question.train}
@@ -46,9 +53,13 @@ def test_only_adaptation_uses_recordings_of_a_unit_left_out_and_none_of_the_test
         list(questions("of life", played, arm, None))
 
 
-def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(arm, played, tmp_path):
+def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(
+    arm, played, tmp_path
+):
     (question,) = questions("new motions", played, arm, None)
-    assert repeatability(question) == pytest.approx(0.002 * 4 / 3, rel=1e-3)  # 1, 1 and 2 steps of 2 mrad
+    assert repeatability(question) == pytest.approx(
+        0.002 * 4 / 3, rel=1e-3
+    )  # 1, 1 and 2 steps of 2 mrad
     methods = {k: METHODS[k] for k in ("nominal", "delay_offset")}
     card = next(c for c in read_cards().set if c.name == "so101")
     bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=lambda text: None)
@@ -57,7 +68,11 @@ def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(ar
     assert rows[0]["standard_error"] is None
     assert rows[1]["of_nominal"] < 1.0
     stopped = Bench(
-        read_cards(), tmp_path, tmp_path / "work", dict.fromkeys(methods, ("", None)), say=lambda text: None
+        read_cards(),
+        tmp_path,
+        tmp_path / "work",
+        dict.fromkeys(methods, ("", None)),
+        say=lambda text: None,
     )
     again = stopped.evaluate(card, "new motions", [question])
     assert [r["mrad"] for r in again] == [r["mrad"] for r in rows]
@@ -66,18 +81,37 @@ def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(ar
 def test_the_table_has_paired_differences_to_identification_over_motions():
     common = {"set": "a", "question": "b", "standard_error": 0.5, "of_nominal": 0.5, "less_than_nominal": 0.0,
               "floor_mrad": None, "motions": 3}  # fmt: skip
-    by_motion = {"identification": [1.0, 2.0, 9.0], "rival": [2.0, 3.0, 10.0], "another": [1.0, 2.0, 12.0]}
+    by_motion = {
+        "identification": [1.0, 2.0, 9.0],
+        "rival": [2.0, 3.0, 10.0],
+        "another": [1.0, 2.0, 12.0],
+    }
     rows = [
-        common | {"method": name, "mrad": np.mean(mrad), "by_motion_mrad": dict(zip("xyz", mrad, strict=True))}
+        common
+        | {
+            "method": name,
+            "mrad": np.mean(mrad),
+            "by_motion_mrad": dict(zip("xyz", mrad, strict=True)),
+        }
         for name, mrad in by_motion.items()
     ]
     assert [row[6] for row in result_table(rows).rows] == ["", "1.00 ± 0.00", "1.00 ± 1.00"]
 
 
-def test_networks_are_trained_once_and_rejected_without_a_gain_over_identification(arm, played, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "ONE_ROUND", replace(module.ONE_ROUND, num_envs=12, gradient_steps=0, sensor_states=16))
+def test_networks_are_trained_once_and_rejected_without_a_gain_over_identification(
+    arm, played, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(
+        module,
+        "ONE_ROUND",
+        replace(module.ONE_ROUND, num_envs=12, gradient_steps=0, sensor_states=16),
+    )
     (question,) = questions("new motions", played, arm, None)
-    methods = {title: method for title, method in module.network_methods(240).values() if title.endswith("GAPONet")}
+    methods = {
+        title: method
+        for title, method in module.network_methods(240).values()
+        if title.endswith("GAPONet")
+    }
     with pytest.raises(UsageError, match="networks need a folder"):
         methods["GAPONet"](question)
     question = replace(question, work=tmp_path)
@@ -95,14 +129,19 @@ def test_networks_are_trained_once_and_rejected_without_a_gain_over_identificati
 
 def test_unknown_sets_and_questions_are_refused_and_absent_sets_skipped(tmp_path):
     bench = Bench(read_cards(), tmp_path, tmp_path / "work", METHODS, say=lambda text: None)
-    for only, asked, told in ((("a robot",), (), "no set 'a robot'"), ((), ("why",), "no question 'why'")):
+    for only, asked, told in (
+        (("a robot",), (), "no set 'a robot'"),
+        ((), ("why",), "no question 'why'"),
+    ):
         with pytest.raises(UsageError, match=told):
             bench.run(only, asked)
     assert bench.run()["rows"] == []
 
 
 def test_the_method_on_the_page_runs(arm, played, tmp_path):
-    code = re.search(r"```python\n(.*?)```", (DOCS / "benchmark.md").read_text(encoding="utf-8"), re.DOTALL)[1]
+    code = re.search(
+        r"```python\n(.*?)```", (DOCS / "benchmark.md").read_text(encoding="utf-8"), re.DOTALL
+    )[1]
     (tmp_path / "mine.py").write_text(code)
     name, method = load_method(f"{tmp_path / 'mine.py'}:late_targets")
     (question,) = questions("new motions", played, arm, None)
@@ -113,11 +152,15 @@ def test_the_method_on_the_page_runs(arm, played, tmp_path):
         load_method("nothing.py:f")
 
 
-def test_a_failing_method_loses_its_own_row_and_single_joints_have_errors_by_payload(arm, played, tmp_path):
+def test_a_failing_method_loses_its_own_row_and_single_joints_have_errors_by_payload(
+    arm, played, tmp_path
+):
     alone = Dataset.create(tmp_path / "alone", arm)
     for e in played.entries:
         one = played.read(e)
-        alone.append(replace(one, meta=replace(one.meta, notes={"held_at_home": [arm.operated[1]]})))
+        alone.append(
+            replace(one, meta=replace(one.meta, notes={"held_at_home": [arm.operated[1]]}))
+        )
     (question,) = questions("0.5 kg left out", alone, arm, None)
     said, methods = [], {"nominal": METHODS["nominal"], "mine": ("mine", lambda question: 1 / 0)}
     bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=said.append)

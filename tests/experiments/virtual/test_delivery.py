@@ -40,7 +40,10 @@ def test_a_loaded_hand_comes_nearer_to_its_goal(delivered):
 
 def test_a_fleet_driven_with_other_gains_than_the_dataset_is_refused(robot):
     session = Session(Delivery(fleet="firm"), None, robot, [])
-    with pytest.raises(UsageError, match=r"fleet 'firm' is driven with gain_scale 9, the robot of the dataset with 1:"):
+    with pytest.raises(
+        UsageError,
+        match=r"fleet 'firm' is driven with gain_scale 9, the robot of the dataset with 1:",
+    ):
         session.unit  # noqa: B018
 
 
@@ -82,4 +85,8 @@ def test_sentences_name_improvements_and_deteriorations():
 def test_figures_are_drawn(robot, delivered):
     made = result(session(robot), delivered, {})
     assert list(made.figures) == ["offsets"]
-    assert [ax.get_title(loc="left") for ax in made.figures["offsets"].axes] == ["X, forward", "Y, left", "Z, up"]
+    assert [ax.get_title(loc="left") for ax in made.figures["offsets"].axes] == [
+        "X, forward",
+        "Y, left",
+        "Z, up",
+    ]

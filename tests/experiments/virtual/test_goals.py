@@ -6,7 +6,12 @@ from arm import TOML, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.experiments.virtual import goals
-from gaponet.experiments.virtual.goals import GOALS_PER_TRAJECTORY, IK_TOLERANCE_M, MIN_FRONT_M, GoalPlanner
+from gaponet.experiments.virtual.goals import (
+    GOALS_PER_TRAJECTORY,
+    IK_TOLERANCE_M,
+    MIN_FRONT_M,
+    GoalPlanner,
+)
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,9 @@ def runs(arm, tmp_path, monkeypatch):
     """A writer of run folders whose models are read without their networks."""
     fitted = arm.with_servos({"elbow": {"kp": 18.0}})
     monkeypatch.setattr(module.GapModel, "load", Model)
-    monkeypatch.setattr(module, "corrected_robot", lambda run, robot: fitted if "identified" in run.name else robot)
+    monkeypatch.setattr(
+        module, "corrected_robot", lambda run, robot: fitted if "identified" in run.name else robot
+    )
 
     def write(name, kind, seed, changes=None):
         folder = tmp_path / "cells" / name

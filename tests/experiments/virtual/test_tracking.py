@@ -5,7 +5,14 @@ import pytest
 from arm import commands, write_arm
 from weak_arm import session, trained, weak_unit
 
-from gaponet.experiments.virtual.tracking import Score, by_payload, conclusion, joint_sets, result, track
+from gaponet.experiments.virtual.tracking import (
+    Score,
+    by_payload,
+    conclusion,
+    joint_sets,
+    result,
+    track,
+)
 from gaponet.experiments.virtual.unseen_motions import UnseenMotion
 
 
@@ -21,14 +28,19 @@ def tracked(robot):
 
 
 def mean(scores, part, method, payload):
-    return np.mean([s.q_dis for s in scores if (s.part, s.method, s.payload) == (part, method, payload)])
+    return np.mean(
+        [s.q_dis for s in scores if (s.part, s.method, s.payload) == (part, method, payload)]
+    )
 
 
 def test_a_model_of_the_robot_reduces_both_alignment_and_compensation_errors(tracked):
     for payload in (0.0, 0.4):
         q = {m: mean(tracked, "alignment", m, payload) for m in ("nominal", "mlp", "gaponet")}
         assert q["gaponet"] < q["mlp"] < q["nominal"]
-        q = {m: mean(tracked, "compensation", m, payload) for m in ("raw", "feedforward", "mlp", "gaponet")}
+        q = {
+            m: mean(tracked, "compensation", m, payload)
+            for m in ("raw", "feedforward", "mlp", "gaponet")
+        }
         assert q["gaponet"] < 0.25 * q["raw"]
         assert max(q["mlp"], q["feedforward"]) < 0.5 * q["raw"]
     assert mean(tracked, "compensation", "gaponet", 0.0) < mean(tracked, "compensation", "mlp", 0.0)
@@ -46,7 +58,11 @@ def score(method, seed, payload, value, part="alignment"):
 def test_the_table_holds_means_deviations_and_reductions_worked_by_hand(robot):
     scores = [score("nominal", None, 0.0, 0.1), score("nominal", None, 0.4, 0.3)]
     scores += [score("mlp", 0, p, v) for p, v in ((0.0, 0.1), (0.4, 0.15))]
-    scores += [score("gaponet", seed, p, v) for seed in (0, 1) for p, v in ((0.0, 0.03 + 0.02 * seed), (0.4, 0.06))]
+    scores += [
+        score("gaponet", seed, p, v)
+        for seed in (0, 1)
+        for p, v in ((0.0, 0.03 + 0.02 * seed), (0.4, 0.06))
+    ]
     rows = by_payload(scores, "alignment", joint_sets(robot)).texts()
     assert rows[0] == ["2 joints, 0 kg", "0.1000", "0.1000", "0.0400 ± 0.0141", "0 %", "60 %"]
     assert rows[1][4:] == ["50 %", "80 %"]

@@ -16,7 +16,11 @@ def used(arm, tmp_path):
     """A dataset of three motions, and runs that trained on the first two."""
     data = Dataset.create(tmp_path / "data", arm)
     entries = [data.append(record(arm, commands(100, i), f"m{i}")) for i in range(3)]
-    split = {"train": {"m0": entries[0].hash}, "val": {"m1": entries[1].hash}, "test": {"m2": entries[2].hash}}
+    split = {
+        "train": {"m0": entries[0].hash},
+        "val": {"m1": entries[1].hash},
+        "test": {"m2": entries[2].hash},
+    }
     run = tmp_path / "run"
     run.mkdir()
     (run / "split.json").write_text(json.dumps(split))

@@ -33,7 +33,9 @@ from gaponet.robot.spec import RobotSpec
 
 Array = np.ndarray
 SAFETY = SafetyConfig()
-FIRST = 0.05 + 0.02 * SAFETY.delta_rate  # rad by which the first command may be off: a step of blend and correction
+FIRST = (
+    0.05 + 0.02 * SAFETY.delta_rate
+)  # rad by which the first command may be off: a step of blend and correction
 STOP = 0.0005  # chance of a stop at each look at the clock
 
 
@@ -74,16 +76,26 @@ class Adversary:
     """A `Driver` whose joints go where they want."""
 
     reads_back = True
-    virtual, noisy, at_end, qpos_range, address = True, True, "hand_over", None, f"adversary in process {os.getpid()}"
+    virtual, noisy, at_end, qpos_range, address = (
+        True,
+        True,
+        "hand_over",
+        None,
+        f"adversary in process {os.getpid()}",
+    )
 
-    def __init__(self, robot: RobotSpec, clock: Stopping, rng: np.random.Generator, count: Count) -> None:
+    def __init__(
+        self, robot: RobotSpec, clock: Stopping, rng: np.random.Generator, count: Count
+    ) -> None:
         self.robot, self.clock, self.rng, self.count = robot, clock, rng, count
         self.joint_names, self.kp, self.kd, self.facts = robot.joint_names, robot.kp, robot.kd, {}
         self.commanded = MOTOR_NAMES[13:]
         self.at = robot.index(self.commanded)
         self.limits = Limits.from_robot(robot, self.commanded, SAFETY)
         n = len(robot.joint_names)
-        self.obeys = rng.choice([0.0, 100.0, 300.0])  # 1/s², how the joints are drawn to their commands
+        self.obeys = rng.choice(
+            [0.0, 100.0, 300.0]
+        )  # 1/s², how the joints are drawn to their commands
         self.goal = np.clip(robot.qpos_home + 0.3 * rng.standard_normal(n), *robot.qpos_range.T)
         # Time, position, speed, and the acceleration from then on.
         self.knots = [(0.0, self.goal.copy(), np.zeros(n), np.zeros(n))]
@@ -107,9 +119,14 @@ class Adversary:
         push = rng.uniform(-1, 1, len(q)) if rng.random() < 0.7 else rng.choice([-1.0, 1.0], len(q))
         strength = SAFETY.acceleration * rng.choice([0.02, 0.2, 1.0], p=[0.6, 0.3, 0.1])
         a = self.obeys * (self.goal - q) - 25.0 * v + push * strength
-        self.knots = [*self.knots[-4:], (now, q, v, np.clip(a, -SAFETY.acceleration, SAFETY.acceleration))]
+        self.knots = [
+            *self.knots[-4:],
+            (now, q, v, np.clip(a, -SAFETY.acceleration, SAFETY.acceleration)),
+        ]
         oldest = max(self.knots[0][0], self.last.time if self.last else 0.0)
-        when = max(now - rng.choice([0.0, 0.002, 0.01, 0.03, 0.05], p=[0.5, 0.3, 0.15, 0.04, 0.01]), oldest)
+        when = max(
+            now - rng.choice([0.0, 0.002, 0.01, 0.03, 0.05], p=[0.5, 0.3, 0.15, 0.04, 0.01]), oldest
+        )
         q, v = self.truth(when)
         tau, hot = rng.standard_normal(len(q)), np.full(len(q), 40.0)
         self.count.states += 1
@@ -139,7 +156,9 @@ class Adversary:
         q, v = (x[self.at] for x in self.truth(self.clock.true))
         u, limits, count = ctrl[self.at], self.limits, self.count
         torque = np.abs(limits.kp * (u - q) - limits.kd * v)
-        if self.before is None:  # the first goal is the measured place, also where that is beyond the margin
+        if (
+            self.before is None
+        ):  # the first goal is the measured place, also where that is beyond the margin
             found = self.last.qpos[self.at]
             self.low, self.high = np.minimum(limits.low, found), np.maximum(limits.high, found)
             if np.abs(u - found).max() > FIRST:
@@ -151,13 +170,16 @@ class Adversary:
         wrong = {
             "nan": not np.isfinite(ctrl[self.at]).all() or not 0 <= weight <= 1,
             "range": bool(((u < self.low) | (u > self.high)).any()),
-            "rate": self.before is not None and bool((np.abs(u - self.before) > limits.speed * DT).any()),
+            "rate": self.before is not None
+            and bool((np.abs(u - self.before) > limits.speed * DT).any()),
             "torque": bool((torque > limits.effort * (1 + 1e-9)).any()),
             "after damping": self.damped or self.closed,
         }
         for kind in (kind for kind, is_so in wrong.items() if is_so):
             count.wrong[kind] += 1
-            count.example = count.example or f"{kind} at {self.clock.true:.6f} s, torque {torque.max():.3f}"
+            count.example = (
+                count.example or f"{kind} at {self.clock.true:.6f} s, torque {torque.max():.3f}"
+            )
         self.before = u.copy()
         self.goal[self.at] = u
 
@@ -214,7 +236,13 @@ def episode(robot: RobotSpec, rng: np.random.Generator, count: Count) -> None:
         return target if k < length else None
 
     controller = Controller(
-        driver, robot, config=QUICK, safety=SAFETY, compensator=Wild(rng, clock), clock=clock, unchecked=True
+        driver,
+        robot,
+        config=QUICK,
+        safety=SAFETY,
+        compensator=Wild(rng, clock),
+        clock=clock,
+        unchecked=True,
     )
     with contextlib.suppress(RuntimeError):
         controller.run(policy)

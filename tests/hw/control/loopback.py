@@ -39,7 +39,9 @@ class Loopback:
         return SimpleNamespace(receive=lambda: [queue.popleft() for _ in range(len(queue))])
 
     def writer(self, topic: str, kind: str) -> SimpleNamespace:
-        return SimpleNamespace(send=lambda data: [queue.append(np.array(data)) for queue in self.queues[topic]])
+        return SimpleNamespace(
+            send=lambda data: [queue.append(np.array(data)) for queue in self.queues[topic]]
+        )
 
     def publishers(self) -> dict[str, list[str]]:
         return defaultdict(list)
@@ -72,11 +74,17 @@ class Disobedient(VirtualH12):
                 damping[:, self.live.unit.batch.model.joint("left_elbow_joint").dofadr[0]] = 1000.0
         if wrong and self.way == "weak":
             kp, kd, effort, torque = self.live._gains
-            self.live.set_gains(kp, kd, np.where(np.arange(len(kp)) == self._order[left], 0.5, effort), torque)
+            self.live.set_gains(
+                kp, kd, np.where(np.arange(len(kp)) == self._order[left], 0.5, effort), torque
+            )
 
     def _readings(self, fault: str) -> tuple[np.ndarray, ...]:
         qpos, *more = super()._readings(fault)
-        if self.way == "zero" and self.first_command and self.clock.now() - self.first_command >= self.at:
+        if (
+            self.way == "zero"
+            and self.first_command
+            and self.clock.now() - self.first_command >= self.at
+        ):
             qpos = qpos + 0.31 * (np.arange(len(qpos)) == self._order[16])
         return qpos, *more
 
@@ -84,7 +92,9 @@ class Disobedient(VirtualH12):
 class RobotClock(SimulatedClock):
     """While it waits, the robot lives."""
 
-    def __init__(self, robot: RobotSpec, bus: Loopback, unit: str, payload: float, fleet: str) -> None:
+    def __init__(
+        self, robot: RobotSpec, bus: Loopback, unit: str, payload: float, fleet: str
+    ) -> None:
         super().__init__(100.0)
         physics = load_fleet(fleet, robot).unit(unit)
         self.robot = Disobedient(robot, physics, (payload, "both"), rate=RATE)
@@ -102,7 +112,11 @@ class RobotClock(SimulatedClock):
 
 
 def living(
-    monkeypatch, robot: RobotSpec, unit: str = "virtual-4", payload: float = 0.0, fleet: str = "easy"
+    monkeypatch,
+    robot: RobotSpec,
+    unit: str = "virtual-4",
+    payload: float = 0.0,
+    fleet: str = "easy",
 ) -> RobotClock:
     """A clock by which such a robot lives, and to which the driver's time belongs."""
     import gaponet.hw.drivers as drivers
@@ -121,7 +135,9 @@ def received(robot: VirtualH12) -> dict[str, list]:
     return {name: [row[name] for row in robot.heard] for name in robot.heard[0]}
 
 
-def judge(recording: Recording, received: dict[str, list], robot: RobotSpec, safety: SafetyConfig) -> None:
+def judge(
+    recording: Recording, received: dict[str, list], robot: RobotSpec, safety: SafetyConfig
+) -> None:
     """Assert that commands stayed within the limits, and that damping was for good; `received` is in motor order.
 
     Args:
@@ -133,7 +149,9 @@ def judge(recording: Recording, received: dict[str, list], robot: RobotSpec, saf
     stiff = (kp[:, joints] > 0).all(axis=1)
     assert (stiff | (kp[:, joints] == 0).all(axis=1)).all()
     assert (np.diff(stiff.astype(int)) <= 0).all(), "a position command after damping"
-    let_go = recording.fault is not None and recording.fault.kind == "obedience"  # held while the weight goes to 0
+    let_go = (
+        recording.fault is not None and recording.fault.kind == "obedience"
+    )  # held while the weight goes to 0
     assert received["weight"][-1] == 0 if let_go else not stiff[-1]
     sent = ctrl[:, joints][stiff]
     assert (sent >= limits.low - 1e-6).all()
@@ -144,5 +162,7 @@ def judge(recording: Recording, received: dict[str, list], robot: RobotSpec, saf
     assert np.ptp(ctrl[:, torso]) == 0, "where it was found"
     for row in recording.rows:
         if row.ctrl is not None:
-            torque = limits.kp * (row.ctrl - row.state.qpos)[joints] - limits.kd * row.state.qvel[joints]
+            torque = (
+                limits.kp * (row.ctrl - row.state.qpos)[joints] - limits.kd * row.state.qvel[joints]
+            )
             assert (np.abs(torque) <= limits.effort + 1e-6).all()

@@ -117,7 +117,9 @@ def numbers(value: object) -> list:
     """All numbers of a message in turn."""
     if isinstance(value, (list, tuple)):
         return [n for part in value for n in numbers(part)]
-    return numbers([getattr(value, f.name) for f in fields(value)]) if is_dataclass(value) else [value]
+    return (
+        numbers([getattr(value, f.name) for f in fields(value)]) if is_dataclass(value) else [value]
+    )
 
 
 def packed(message: LowState | LowCmd) -> bytes:
@@ -150,7 +152,13 @@ def robot(part: DomainParticipant, seconds: float) -> dict:
         state.tick = int(now * 1000)
         for k in range(MOTORS):
             m, noise = state.motor_state[k], random.gauss(0, 1)
-            m.mode, m.q, m.dq, m.tau_est, m.temperature = 1, q[k] + 1e-5 * noise, 1e-3 * noise, 0.1 * noise, [35, 36]
+            m.mode, m.q, m.dq, m.tau_est, m.temperature = (
+                1,
+                q[k] + 1e-5 * noise,
+                1e-3 * noise,
+                0.1 * noise,
+                [35, 36],
+            )
         state.crc = crc(packed(state))
         writer.write(state)
         time.sleep(max(0.0, 0.01 - (time.monotonic() - start - now)))
@@ -171,7 +179,13 @@ def client(part: DomainParticipant, seconds: float) -> dict:
             wrong += newest.crc != crc(packed(newest))
             home = home or ([m.q for m in newest.motor_state], now)
             moved = max(moved, abs(newest.motor_state[ELBOW].q - home[0][ELBOW]))
-            command = LowCmd(0, newest.mode_machine, [MotorCmd(0, 0, 0, 0, 0, 0, 0) for _ in range(35)], [0] * 4, 0)
+            command = LowCmd(
+                0,
+                newest.mode_machine,
+                [MotorCmd(0, 0, 0, 0, 0, 0, 0) for _ in range(35)],
+                [0] * 4,
+                0,
+            )
             for k in range(13, MOTORS):
                 command.motor_cmd[k] = MotorCmd(1, home[0][k], 0.0, 0.0, 60.0, 2.0, 0)
             command.motor_cmd[ELBOW].q += 0.3 * math.sin(now - home[1])

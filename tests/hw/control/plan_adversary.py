@@ -37,7 +37,11 @@ DT = 0.02
 
 def found_pose(robot: RobotSpec, judge: Contacts, rng: np.random.Generator) -> Array:
     """A pose anywhere in the ranges that touches nothing; legs at home."""
-    arms = [i for i, n in enumerate(robot.joint_names) if "hip" not in n and "knee" not in n and "ankle" not in n]
+    arms = [
+        i
+        for i, n in enumerate(robot.joint_names)
+        if "hip" not in n and "knee" not in n and "ankle" not in n
+    ]
     while True:
         qpos = robot.qpos_home.copy()
         qpos[arms] = rng.uniform(*robot.qpos_range[arms].T)
@@ -50,7 +54,11 @@ def plans(robot: RobotSpec, poses: int, seed: int, motions: int | None = None) -
     rng, judge = np.random.default_rng(seed), Contacts(robot)
     library = Library(robot, max_payload=ROBOTS[robot.name])
     moved = tuple(n for n in robot.joint_names if n in robot.operated or robot.name == "so101")
-    names = [n for n in library.names() if not n.startswith(("squat", "march", "sway")) and "-all-" not in n]
+    names = [
+        n
+        for n in library.names()
+        if not n.startswith(("squat", "march", "sway")) and "-all-" not in n
+    ]
     names += ["tour-all-0", "limber-all-0"] if robot.name == "so101" else []
     names = names if motions is None else rng.choice(names, motions, replace=False).tolist()
     planner = Planner(robot, moved, limits=library.limits)
@@ -83,7 +91,9 @@ def plans(robot: RobotSpec, poses: int, seed: int, motions: int | None = None) -
 class Hostile:
     """Targets that go for the plane, for the body and for the ends of the ranges, at the fastest that is taken."""
 
-    def __init__(self, robot: RobotSpec, judge: Contacts, rng: np.random.Generator, seconds: float) -> None:
+    def __init__(
+        self, robot: RobotSpec, judge: Contacts, rng: np.random.Generator, seconds: float
+    ) -> None:
         self.robot, self.rng, self.judge, self.periods = robot, rng, judge, round(seconds / DT)
         self.touching = 0
         self.low, self.high = robot.qpos_range.T
@@ -105,7 +115,9 @@ class Hostile:
             self.speed = self.rng.choice([0.3, 1.0, 3.0, 5.0])
         if self.rng.random() < 0.02:
             self.target = np.where(
-                self.still, self.target, self.target + 0.1 * self.rng.standard_normal(len(self.still))
+                self.still,
+                self.target,
+                self.target + 0.1 * self.rng.standard_normal(len(self.still)),
             )
         step = self.speed * DT
         self.target = self.target + np.clip(self.goal - self.target, -step, step)
@@ -144,7 +156,11 @@ def main() -> None:
         result = {"robot": name, "plans": plans(robot, args.poses, args.seed)}
         result["live"] = live(robot, args.seconds, args.seed)
         result["minutes"] = round((time.monotonic() - began) / 60, 1)
-        bad += result["plans"]["touching"] + result["live"]["commands that touch"] + result["live"]["states that touch"]
+        bad += (
+            result["plans"]["touching"]
+            + result["live"]["commands that touch"]
+            + result["live"]["states that touch"]
+        )
         print(json.dumps(result, indent=1), flush=True)
     sys.exit(bool(bad))
 

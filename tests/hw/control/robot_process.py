@@ -21,7 +21,9 @@ class RobotProcess:
 
     def __init__(self, domain: int) -> None:
         command = [sys.executable, __file__, str(domain)]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         assert self.ask("clear") == "ok"
 
     def ask(self, line: str) -> Any:
@@ -44,7 +46,9 @@ def main(domain: int) -> None:
     from gaponet.testing.unitree_virtual import VirtualH12
 
     robot = load_robot("h1_2")
-    served = VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE)
+    served = VirtualH12(
+        robot, load_fleet("easy", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE
+    )
     threading.Thread(target=served.run, daemon=True).start()
     for line in sys.stdin:
         answer: Any = "ok"

@@ -82,12 +82,24 @@ def test_no_garbage_is_collected_while_it_runs_and_none_piles_up(arm):
 
 def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
     recording = run(NotedArm(arm), metadata={"unit_id": "virtual-1"}, payload_mass=0.0)
-    sequence = to_sequence(recording.log(), arm, SequenceMeta(arm.name, "virtual-1", "sway", 0.0, virtual=True))
+    sequence = to_sequence(
+        recording.log(), arm, SequenceMeta(arm.name, "virtual-1", "sway", 0.0, virtual=True)
+    )
     assert (sequence.meta.notes["rows"], sequence.dt) == ("as recorded", DT)
     recording.save(tmp_path / "logs", "sway")
-    report = import_logs(tmp_path / "logs", arm, "virtual-1", 0.0, tmp_path / "set", position_unit="rad", time_unit="s")
+    report = import_logs(
+        tmp_path / "logs",
+        arm,
+        "virtual-1",
+        0.0,
+        tmp_path / "set",
+        position_unit="rad",
+        time_unit="s",
+    )
     stored = report.dataset.read(report.entries[0])
-    np.testing.assert_allclose([stored.ctrl, stored.qpos], [sequence.ctrl, sequence.qpos], atol=1e-6)
+    np.testing.assert_allclose(
+        [stored.ctrl, stored.qpos], [sequence.ctrl, sequence.qpos], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -97,7 +109,9 @@ def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
         ("error", "robot", 1), ("remote", "stop", 1),
     ],
 )  # fmt: skip
-def test_a_fault_of_state_driver_or_operator_ends_in_damp_with_its_reason(arm, kind, reason, periods):
+def test_a_fault_of_state_driver_or_operator_ends_in_damp_with_its_reason(
+    arm, kind, reason, periods
+):
     driver = FaultyArm(arm, FAULT_S, kind)
     recording = run(driver)
     assert phases(recording) == ["idle", "blend_in", "run", "damp", "stopped"]
@@ -105,7 +119,9 @@ def test_a_fault_of_state_driver_or_operator_ends_in_damp_with_its_reason(arm, k
     assert 0 < driver.damped - FAULT_S <= periods * DT
     assert all(t < driver.damped for t, _ in driver.commands), "a position command after the fault"
     assert driver.closed == [False], "it is not left with its last command"
-    assert (max(driver.shares) > 0.9) == (reason in ("stale", "driver", "stop")), "lowered, or let go at once"
+    assert (max(driver.shares) > 0.9) == (reason in ("stale", "driver", "stop")), (
+        "lowered, or let go at once"
+    )
 
 
 @pytest.mark.parametrize(("kind", "seconds"), [("hot", 0.3), ("remote", 0.0)])
@@ -117,20 +133,28 @@ def test_a_robot_that_is_never_well_is_never_commanded(arm, monkeypatch, kind, s
     assert driver.sent == []
     waited = recording.events[-1].time - recording.events[0].time
     assert seconds <= waited <= seconds + 2 * DT, "a stop is not waited out"
-    with pytest.raises(LogError, match="0 periods of phase 'run', nothing to learn from; it ended with: "):
+    with pytest.raises(
+        LogError, match="0 periods of phase 'run', nothing to learn from; it ended with: "
+    ):
         recording.log()
 
 
 def test_a_robot_is_commanded_after_five_good_states_in_a_row(arm):
     reads = iter(range(10**6))
-    recording = run(NotedArm(arm, change=lambda state: replace(state, tilt=0.8) if next(reads) == 3 else state))
+    recording = run(
+        NotedArm(arm, change=lambda state: replace(state, tilt=0.8) if next(reads) == 3 else state)
+    )
     assert recording.fault is None
-    assert sum(r.phase == "idle" for r in recording.rows) == 4 + 5 - 1, "the fifth one is commanded already"
+    assert sum(r.phase == "idle" for r in recording.rows) == 4 + 5 - 1, (
+        "the fifth one is commanded already"
+    )
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP"])
 def test_a_signal_takes_effect_in_the_next_period(arm, name):
-    recording = control(NotedArm(arm)).run(acting(lambda: os.kill(os.getpid(), signal.Signals[name])))
+    recording = control(NotedArm(arm)).run(
+        acting(lambda: os.kill(os.getpid(), signal.Signals[name]))
+    )
     assert (recording.fault.kind, recording.fault.text) == ("stop", f"asked to stop: {name}")
     assert sum(r.phase == "run" for r in recording.rows) == 21
 
@@ -147,12 +171,16 @@ def test_a_stop_in_any_phase_damps_a_robot_that_was_commanded(arm, phase):
     controller = control(driver)
     recording = controller.run(motion_policy(MOTION, DT))
     assert "asked to stop: the operator" in recording.fault.text
-    assert phases(recording)[-3:] == (["idle", "stopped"] if phase == "idle" else [phase, "damp", "stopped"])
+    assert phases(recording)[-3:] == (
+        ["idle", "stopped"] if phase == "idle" else [phase, "damp", "stopped"]
+    )
     assert [t for t, _ in driver.commands if t >= recording.fault.time] == []
     assert bool(driver.sent) == (phase != "idle"), "nothing was commanded, so nothing is sent"
 
 
-def test_a_robot_is_damped_for_two_seconds_while_its_weight_goes_to_zero_and_the_watchdog_is_fed(arm):
+def test_a_robot_is_damped_for_two_seconds_while_its_weight_goes_to_zero_and_the_watchdog_is_fed(
+    arm,
+):
     beats: list[float] = []
     driver = FaultyArm(arm, FAULT_S, "hot")
     controller = control(driver, config=ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1))
@@ -160,11 +188,16 @@ def test_a_robot_is_damped_for_two_seconds_while_its_weight_goes_to_zero_and_the
     recording = controller.run(motion_policy(MOTION, DT))
     damping = [t for t, ctrl in driver.sent if ctrl is None]
     assert 2.0 <= damping[-1] - damping[0] <= 2.02
-    assert (recording.events[-1].phase, recording.events[-1].time) == ("stopped", pytest.approx(damping[-1]))
+    assert (recording.events[-1].phase, recording.events[-1].time) == (
+        "stopped",
+        pytest.approx(damping[-1]),
+    )
     weights = [weight for t, weight in driver.weights if t >= driver.damped]
     assert (weights[0], weights[-1]) == (1.0, 0.0)
     assert (np.diff(weights) < 0).all()
-    assert beats == [weight for _, weight in driver.weights], "else it would damp with an old weight"
+    assert beats == [weight for _, weight in driver.weights], (
+        "else it would damp with an old weight"
+    )
 
 
 def test_a_stop_is_latched(arm):
@@ -200,7 +233,9 @@ def test_a_policy_that_gives_nan_leaves_the_robot_damped(arm):
     driver = NotedArm(arm)
     recording = control(driver).run(lambda k, state: np.full(2, np.nan if k == 10 else 0.0))
     assert recording.fault.kind == "target"
-    assert sum(r.phase == "run" for r in recording.rows) == 10, "damped in the period in which it is seen"
+    assert sum(r.phase == "run" for r in recording.rows) == 10, (
+        "damped in the period in which it is seen"
+    )
     assert driver.sent[-1][1] is None
 
 
@@ -211,7 +246,9 @@ def test_a_policy_that_gives_nan_leaves_the_robot_damped(arm):
         ("listener", BrokenPipeError), ("damp", ZeroDivisionError),
     ],
 )  # fmt: skip
-def test_an_error_of_other_code_is_raised_after_the_robot_has_damped_for_the_whole_time(arm, where, error):
+def test_an_error_of_other_code_is_raised_after_the_robot_has_damped_for_the_whole_time(
+    arm, where, error
+):
     class Broken(NotedArm):
         def damp(self, weight=1.0, share=0.0):
             super().damp(weight, share)
@@ -245,9 +282,16 @@ def test_a_period_that_stood_still_sends_nothing(arm, where):
             driver.clock.wait_until(driver.clock.now() + 0.7)
         return value
 
-    driver, motion = NotedArm(arm, change=lambda state: stand("read", state)), motion_policy(MOTION, DT)
-    model = SimpleNamespace(reset=lambda *_: None, step=lambda target, *_: stand("compensator", target))
-    recording = control(driver, compensator=model).run(lambda k, state: stand("policy", motion(k, state)))
+    driver, motion = (
+        NotedArm(arm, change=lambda state: stand("read", state)),
+        motion_policy(MOTION, DT),
+    )
+    model = SimpleNamespace(
+        reset=lambda *_: None, step=lambda target, *_: stand("compensator", target)
+    )
+    recording = control(driver, compensator=model).run(
+        lambda k, state: stand("policy", motion(k, state))
+    )
     assert recording.fault.kind == "overrun"
     assert recording.missed == round(0.7 / DT) - 1
     assert all(t <= stood[0] for t, _ in driver.commands)
@@ -258,7 +302,9 @@ def test_handing_over_holds_the_arms_while_the_weight_goes_to_zero(arm):
     driver.at_end = "hand_over"
     recording = run(driver)
     assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "release", "stopped"]
-    assert QUICK.damp <= recording.events[-1].time - recording.events[-2].time <= QUICK.damp + 2 * DT
+    assert (
+        QUICK.damp <= recording.events[-1].time - recording.events[-2].time <= QUICK.damp + 2 * DT
+    )
     released = [w for t, w in driver.weights if t >= recording.events[-2].time]
     assert (released[0], released[-1]) == (1.0, 0.0)
     assert np.diff(released).max() <= 0
@@ -289,7 +335,9 @@ def test_a_policy_that_ends_at_its_first_step_goes_back(arm, rows):
     driver = NotedArm(arm)
     controller = control(driver)
     given = ("idle", "blend_in")[: 1 + rows]
-    recording = controller.run(lambda k, state: np.full(2, 0.2) if controller.phase.value in given else None)
+    recording = controller.run(
+        lambda k, state: np.full(2, 0.2) if controller.phase.value in given else None
+    )
     assert recording.fault is None
     assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "stopped"]
     furthest = max(ctrl[0] for _, ctrl in driver.commands)
@@ -314,7 +362,10 @@ def test_a_computer_that_was_suspended_sends_no_command_afterwards(arm, at, slep
             driver.clock.suspended_s = slept
         return value
 
-    driver, motion = NotedArm(arm, change=lambda state: suspend("read", state)), motion_policy(MOTION, DT)
+    driver, motion = (
+        NotedArm(arm, change=lambda state: suspend("read", state)),
+        motion_policy(MOTION, DT),
+    )
     recording = control(driver).run(lambda k, state: suspend("policy", motion(k, state)))
     assert recording.fault.kind == "suspend"
     assert f"the computer was suspended for {slept:.1f} s" in recording.fault.text
@@ -341,7 +392,9 @@ def test_time_that_the_computer_was_suspended_is_the_difference_of_two_clocks(mo
         assert clock.suspended() == 0.0
         return
     before, read = clock.suspended(), time.clock_gettime
-    monkeypatch.setattr(time, "clock_gettime", lambda number: read(number) + slept * (number == time.CLOCK_BOOTTIME))
+    monkeypatch.setattr(
+        time, "clock_gettime", lambda number: read(number) + slept * (number == time.CLOCK_BOOTTIME)
+    )
     assert clock.suspended() - before == pytest.approx(slept, abs=0.01)
 
 
@@ -359,7 +412,11 @@ def test_time_that_the_computer_was_suspended_is_the_difference_of_two_clocks(mo
 def test_no_command_leaves_that_the_watchdog_does_not_guard(arm, part, text):
     driver = NotedArm(arm)
     late = lambda: driver.clock.now() >= 0.9  # noqa: E731
-    parts = {"problem": lambda: "it hangs" * late(), "beat": lambda weight: not late(), "fired": late}
+    parts = {
+        "problem": lambda: "it hangs" * late(),
+        "beat": lambda weight: not late(),
+        "fired": late,
+    }
     controller = control(driver)
     controller.output.watchdog = fake_watchdog(**{part: parts[part]})
     recording = controller.run(motion_policy(MOTION, DT))
@@ -389,7 +446,8 @@ def test_a_watchdog_damps_after_five_periods_for_as_long_as_the_controller_would
 def test_a_compensator_acts_within_its_bounds(arm):
     masses: list[float] = []
     greedy = SimpleNamespace(
-        reset=lambda target, mass: masses.append(mass), step=lambda target, *_: target + np.array([5.0, -0.01])
+        reset=lambda target, mass: masses.append(mass),
+        step=lambda target, *_: target + np.array([5.0, -0.01]),
     )
     recording = run(NotedArm(arm), compensator=greedy, payload_mass=0.7)
     delta = np.array([r.ctrl - r.target for r in recording.rows if r.phase == "run"])
@@ -400,7 +458,9 @@ def test_a_compensator_acts_within_its_bounds(arm):
 
 def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
     def reset(*_):
-        assert not beats, "from the first beat on, the watchdog damps a robot that it hears nothing of"
+        assert not beats, (
+            "from the first beat on, the watchdog damps a robot that it hears nothing of"
+        )
         driver.clock.wait_until(driver.clock.now() + 0.4)
 
     def beat(weight):
@@ -410,17 +470,27 @@ def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
 
     beats: list[float] = []
     driver = NotedArm(arm)
-    controller = control(driver, compensator=SimpleNamespace(reset=reset, step=lambda target, *_: target))
+    controller = control(
+        driver, compensator=SimpleNamespace(reset=reset, step=lambda target, *_: target)
+    )
     controller.output.watchdog = fake_watchdog(beat=beat)
     assert controller.run(motion_policy(MOTION, DT)).fault is None
     assert len(beats) > 40
 
 
 def test_a_payload_that_torques_contradict_is_noted_two_seconds_into_the_run(arm):
-    compensator = SimpleNamespace(reset=lambda *_: None, step=lambda target, *_: target, doubt="0.4 kg were stated")
-    recording = run(NotedArm(arm), Motion("sway", "whole_body", DT, commands(120, seed=1)), compensator=compensator)
+    compensator = SimpleNamespace(
+        reset=lambda *_: None, step=lambda target, *_: target, doubt="0.4 kg were stated"
+    )
+    recording = run(
+        NotedArm(arm),
+        Motion("sway", "whole_body", DT, commands(120, seed=1)),
+        compensator=compensator,
+    )
     started = next(event.time for event in recording.events if event.phase == "run")
-    noted = [event.time for event in recording.events if event.text == "compensation: 0.4 kg were stated"]
+    noted = [
+        event.time for event in recording.events if event.text == "compensation: 0.4 kg were stated"
+    ]
     assert noted == [pytest.approx(started + 2.0, abs=0.021)]
 
 
@@ -443,7 +513,9 @@ def test_a_plan_counts_only_if_the_robot_still_is_at_its_start(arm, moved, kind)
     driver.connect()
     controller = control(driver)
     start = driver.read().qpos + np.array([0.0, moved])
-    controller.plan = Plan(start, Trajectory.minimum_jerk(np.stack([start, MOTION.ctrl[0]]), 4.0, 50.0, 0.3), MOTION)
+    controller.plan = Plan(
+        start, Trajectory.minimum_jerk(np.stack([start, MOTION.ctrl[0]]), 4.0, 50.0, 0.3), MOTION
+    )
     recording = controller.run()
     assert (recording.fault.kind if recording.fault else None) == kind, recording.fault
     if kind:

@@ -36,7 +36,9 @@ ROBOT = load_robot("h1_2")
 TORSO = ROBOT.index(["torso_joint"])[0]
 BUSY_S = 0.4  # by which what happens on a machine that runs tests may be later than promised
 ENDS = pytest.mark.parametrize(
-    ("how", "periods"), [(signal.SIGKILL, 0), (signal.SIGSTOP, 5), (signal.SIGTERM, 1)], ids=["KILL", "STOP", "TERM"]
+    ("how", "periods"),
+    [(signal.SIGKILL, 0), (signal.SIGSTOP, 5), (signal.SIGTERM, 1)],
+    ids=["KILL", "STOP", "TERM"],
 )
 
 
@@ -116,8 +118,12 @@ def test_a_controller_that_dies_or_hangs_leaves_a_damped_robot(served, how, peri
         process = started(H1_2, DOMAIN)
         try:
             wait(lambda process=process: len(arms(heard())) > 10 or process.poll() is not None)
-            with contextlib.suppress(UsageError):  # another process commands this robot; if not, that process has ended
-                Controller(driver, ROBOT, config=slow(10), watchdog=False).run(lambda k, state: None)
+            with contextlib.suppress(
+                UsageError
+            ):  # another process commands this robot; if not, that process has ended
+                Controller(driver, ROBOT, config=slow(10), watchdog=False).run(
+                    lambda k, state: None
+                )
                 wait(lambda process=process: process.poll() is not None)
             if process.poll() is not None or not arms(heard())[-1].any():
                 continue  # a late period has ended it
@@ -126,14 +132,22 @@ def test_a_controller_that_dies_or_hangs_leaves_a_damped_robot(served, how, peri
             wait(lambda: not arms(heard())[-1].any())
             wait(lambda: heard()["weight"][-1] < 0.05)  # in the end the arms are handed back
             said = heard()
-            stiff, at, weight = arms(said).any(axis=1), np.array(said["time"]), np.array(said["weight"])
+            stiff, at, weight = (
+                arms(said).any(axis=1),
+                np.array(said["time"]),
+                np.array(said["weight"]),
+            )
             assert (np.diff(stiff.astype(int)) <= 0).all()
             damped = int(stiff.sum())
             assert at[damped] - ended < periods / 10 + BUSY_S
-            assert weight[damped] == pytest.approx(weight[damped - 1], abs=0.01), "they are not handed back at once"
+            assert weight[damped] == pytest.approx(weight[damped - 1], abs=0.01), (
+                "they are not handed back at once"
+            )
             handed = at[damped:][weight[damped:] < 0.05][0] - at[damped]
             assert 0.5 * 0.3 < handed < 0.3 + BUSY_S
-            process.send_signal(signal.SIGCONT)  # who comes back from standing still has nothing more to say
+            process.send_signal(
+                signal.SIGCONT
+            )  # who comes back from standing still has nothing more to say
             process.wait(20)
             time.sleep(0.3)
             assert not arms(heard())[-1].any()
@@ -154,24 +168,50 @@ def test_the_watchdog_switches_the_torque_off_when_the_controller_is_no_more(how
         try:
             wait(lambda: torque() == [1] * 6 or process.poll() is not None)
             process.send_signal(how)
-            wait(lambda: torque() == [0] * 6, periods / 4 + 0.3 + 2.0)  # the damping, and opening the port
+            wait(
+                lambda: torque() == [0] * 6, periods / 4 + 0.3 + 2.0
+            )  # the damping, and opening the port
         finally:
             process.kill()
             process.wait()
             wait(lambda: is_free(port), 30)
 
 
-def test_live_targets_are_followed_until_their_sender_dies_and_then_the_robot_damps(served, tmp_path):
+def test_live_targets_are_followed_until_their_sender_dies_and_then_the_robot_damps(
+    served, tmp_path
+):
     pytest.importorskip("zmq", reason="pip install 'gaponet[zmq]'")
     from gaponet.hw.targets.client import RemoteRobot
 
     address, hold = f"ipc://{tmp_path}/targets", 0.5
-    bus = ["--driver", "unitree", "--domain", str(DOMAIN), "--rate", "10", "--safety.acceleration", "2"]
-    words = ["run", *bus, "--targets", "zmq", "--live.address", address, "--live.hold", str(hold), "--yes", "--json"]
+    bus = [
+        "--driver",
+        "unitree",
+        "--domain",
+        str(DOMAIN),
+        "--rate",
+        "10",
+        "--safety.acceleration",
+        "2",
+    ]
+    words = [
+        "run",
+        *bus,
+        "--targets",
+        "zmq",
+        "--live.address",
+        address,
+        "--live.hold",
+        str(hold),
+        "--yes",
+        "--json",
+    ]
     for _ in range(8):
         wait(lambda: is_free(UnitreeDriver(ROBOT, domain=DOMAIN).address))
         served.ask("clear")
-        control = subprocess.Popen([sys.executable, "-m", "gaponet", *words], stdout=subprocess.PIPE, text=True)
+        control = subprocess.Popen(
+            [sys.executable, "-m", "gaponet", *words], stdout=subprocess.PIPE, text=True
+        )
         sender = RemoteRobot(address, patience=60.0)
         for k, _ in zip(range(80), sender, strict=False):
             sender.send({"left_elbow_joint": 0.2 * np.sin(0.1 * k)})
@@ -190,7 +230,9 @@ def test_live_targets_are_followed_until_their_sender_dies_and_then_the_robot_da
 
 
 def test_two_publishers_on_the_bus_are_refused(served):
-    first = UnitreeDriver(ROBOT, domain=DOMAIN + 2)  # elsewhere DDS remembers killed controllers for 10 s
+    first = UnitreeDriver(
+        ROBOT, domain=DOMAIN + 2
+    )  # elsewhere DDS remembers killed controllers for 10 s
     robot = RobotProcess(DOMAIN + 2)
     try:
         first.connect()

@@ -134,7 +134,9 @@ def rows(joint: str) -> str:
 def test_an_so101_from_the_rehearsal_to_the_command_of_the_readme(at, tmp_path):
     (tmp_path / "first.csv").write_text(rows("wrist_roll"))
     link, file = str(tmp_path / "so101"), str(tmp_path / "calibration.json")
-    served = at("gaponet virtual serve --robot so101 --link /tmp/so101", "--calibration", file, link=link)
+    served = at(
+        "gaponet virtual serve --robot so101 --link /tmp/so101", "--calibration", file, link=link
+    )
     served.until("Ctrl-C ends it")
     time.sleep(2.0)  # it lies down
 
@@ -145,7 +147,10 @@ def test_an_so101_from_the_rehearsal_to_the_command_of_the_readme(at, tmp_path):
     said = kept(lambda: answered(at(first, *BUSY, link=link)))
     assert "held where found: shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, gripper" in said
     assert "is held; a stop lowers it" in said
-    assert all(phase in said for phase in ("blend_in to the first target", "run motion", "blend_out end", "stopped"))
+    assert all(
+        phase in said
+        for phase in ("blend_in to the first target", "run motion", "blend_out end", "stopped")
+    )
 
     said = kept(lambda: answered(at(first, *BUSY, link=link), "x", 3))
     assert "stop: asked to stop: key 'x'" in said
@@ -157,7 +162,9 @@ def test_an_so101_from_the_rehearsal_to_the_command_of_the_readme(at, tmp_path):
 
     readme = "gaponet run --motion FILE --robot ./my_so101 --driver so101 --compensate"
     assert readme in (ROOT / "README.md").read_text(encoding="utf-8")
-    words = readme.replace("FILE", "first.csv").replace("./my_so101", "so101").split()[2:]  # not an identified one
+    words = (
+        readme.replace("FILE", "first.csv").replace("./my_so101", "so101").split()[2:]
+    )  # not an identified one
     said = kept(lambda: at("gaponet run", *words, *so101, "--yes").end())
     assert "stopped end: back where it was found; hold" in said
 
@@ -173,8 +180,20 @@ def test_an_h1_2_from_the_rehearsal_to_the_stop(at, tmp_path):
     said = kept(lambda: answered(at(first, *bus, *BUSY)))
     assert "torso" in said
     assert "stopped handed over" in said
-    assert r"stop: asked to stop: key '\x1a'" in kept(lambda: answered(at(first, *bus, *BUSY), "\x1a", 3))
+    assert r"stop: asked to stop: key '\x1a'" in kept(
+        lambda: answered(at(first, *bus, *BUSY), "\x1a", 3)
+    )
 
-    words = ["--motion", "sweep-left_elbow", "--unit-id", "lab", "--payload-mass", "0", "--out", "set", "--yes"]
+    words = [
+        "--motion",
+        "sweep-left_elbow",
+        "--unit-id",
+        "lab",
+        "--payload-mass",
+        "0",
+        "--out",
+        "set",
+        "--yes",
+    ]
     words = ["--driver", "unitree", *words, *bus, *BUSY]
     assert "added to set" in kept(lambda: at("gaponet record", *words).end())

@@ -44,11 +44,31 @@ def tampered(robot: RobotSpec, folder: Path, file: str, pattern: str, new: str) 
 @pytest.mark.parametrize(
     ("file", "pattern", "new", "said"),
     [
-        ("robot.toml", r"kp = (\d+)\.0", r"kp = \g<1>0.0", r"kp of left_hip_yaw_joint is 2000 N·m/rad, .*has 200 "),
-        ("robot.toml", r"effort_limit = (\d+)\.0", r"effort_limit = \g<1>0.0", r"effort_limit of left_hip_yaw_joint"),
-        ("robot.xml", r'range="[^"]*"', 'range="-9 9"', r"qpos_range of left_hip_yaw_joint is -9 to 9 rad, the known"),
+        (
+            "robot.toml",
+            r"kp = (\d+)\.0",
+            r"kp = \g<1>0.0",
+            r"kp of left_hip_yaw_joint is 2000 N·m/rad, .*has 200 ",
+        ),
+        (
+            "robot.toml",
+            r"effort_limit = (\d+)\.0",
+            r"effort_limit = \g<1>0.0",
+            r"effort_limit of left_hip_yaw_joint",
+        ),
+        (
+            "robot.xml",
+            r'range="[^"]*"',
+            'range="-9 9"',
+            r"qpos_range of left_hip_yaw_joint is -9 to 9 rad, the known",
+        ),
         ("robot.xml", r'mass="(\d)', r'mass="9\1', r"inertias or geometry of robot\.xml differ"),
-        ("collision.toml", r"radius = [\d.]+", "radius = 0.001", r"collision\.toml differs from that of"),
+        (
+            "collision.toml",
+            r"radius = [\d.]+",
+            "radius = 0.001",
+            r"collision\.toml differs from that of",
+        ),
     ],
 )
 def test_a_folder_that_differs_from_the_known_robot_is_refused_with_the_value(
@@ -64,14 +84,19 @@ def test_a_folder_that_differs_from_the_known_robot_is_refused_with_the_value(
 
 
 def test_a_run_that_differs_from_the_known_robot_is_refused(h1_2, tmp_path, capsys):
-    stiff = load_robot(tampered(h1_2, tmp_path / "sent", "robot.toml", r"kp = (\d+)\.0", r"kp = \g<1>0.0"))
+    stiff = load_robot(
+        tampered(h1_2, tmp_path / "sent", "robot.toml", r"kp = (\d+)\.0", r"kp = \g<1>0.0")
+    )
     run = untrained(tmp_path / "run", stiff, Dataset.create(tmp_path / "set", stiff))
     assert main([*RUN, "--model", str(run)]) == 2
     assert "the known robot has 200 " in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_folder_supplies_identified_values_and_the_known_robot_all_else(h1_2, tmp_path):
-    save_robot(h1_2.with_servos({JOINT: {"kp": 90.0, "stop_low": -0.5, "stop_high": 0.5}}), tmp_path / "identified")
+    save_robot(
+        h1_2.with_servos({JOINT: {"kp": 90.0, "stop_low": -0.5, "stop_high": 0.5}}),
+        tmp_path / "identified",
+    )
     file = tmp_path / "identified" / "robot.toml"
     file.write_text(re.sub(r"home = [-\d.]+", "home = 0.3", file.read_text()))
     sent, known = load_robot(tmp_path / "identified"), reference_robot("unitree", None)
@@ -106,7 +131,8 @@ def test_identified_values_beyond_what_servos_have_are_refused_on_hardware(h1_2,
 def test_identified_masses_beyond_what_motors_carry_are_refused_on_hardware(h1_2):
     mounts = h1_2.payload_mounts
     heavy, light = (
-        replace(h1_2, payload_mounts=(replace(mounts[0], mass=m), *mounts[1:]), nominal=h1_2) for m in (40, 1)
+        replace(h1_2, payload_mounts=(replace(mounts[0], mass=m), *mounts[1:]), nominal=h1_2)
+        for m in (40, 1)
     )
     with pytest.raises(RobotError, match="identified masses change the torque of left_"):
         hardware_robot(heavy, h1_2)
@@ -119,7 +145,9 @@ def test_an_identified_effort_limit_does_not_widen_that_of_the_plan(h1_2):
     assert strong.effort_limit[at] == h1_2.effort_limit[at]
 
 
-def test_limits_may_come_from_a_folder_that_the_user_names_but_not_beyond_the_motors(h1_2, tmp_path):
+def test_limits_may_come_from_a_folder_that_the_user_names_but_not_beyond_the_motors(
+    h1_2, tmp_path
+):
     folder = tampered(h1_2, tmp_path / "soft", "robot.toml", r"kp = (\d+)\.0", r"kp = 40.0")
     soft = hardware_robot(load_robot(folder), reference_robot("unitree", str(folder)))
     assert UnitreeDriver(soft).kp.tolist() == [40.0] * 27
@@ -132,7 +160,9 @@ def test_limits_may_come_from_a_folder_that_the_user_names_but_not_beyond_the_mo
 
 
 def test_the_robot_of_an_extensions_driver_must_be_named(h1_2):
-    with pytest.raises(UsageError, match=r"driver 'toy' is an extension.*give --limits-from FOLDER"):
+    with pytest.raises(
+        UsageError, match=r"driver 'toy' is an extension.*give --limits-from FOLDER"
+    ):
         reference_robot("toy", None)
     assert reference_robot("toy", str(h1_2.folder)).name == "h1_2"
 
@@ -142,14 +172,18 @@ def test_a_driver_writes_no_command_outside_its_robots_range(h1_2):
     for value in (np.nan, h1_2.qpos_range[13, 1] + 0.06):
         ctrl = h1_2.qpos_home.copy()
         ctrl[driver.joint_names.index(JOINT)] = value
-        with pytest.raises(DriverError, match=f"to {JOINT} is outside its range.*; it was not sent"):
+        with pytest.raises(
+            DriverError, match=f"to {JOINT} is outside its range.*; it was not sent"
+        ):
             driver.write(ctrl)
 
 
 def shifted(robot: RobotSpec, joint: str, by: float) -> SimpleNamespace:
     """A compensator that commands a joint away from its target."""
     shift = np.where(np.array(robot.joint_names) == joint, by, 0.0)
-    return SimpleNamespace(reset=lambda target, mass: None, step=lambda target, qpos: target + shift)
+    return SimpleNamespace(
+        reset=lambda target, mass: None, step=lambda target, qpos: target + shift
+    )
 
 
 def test_the_plan_judges_the_commands_that_a_compensator_makes(so101):
@@ -167,9 +201,19 @@ def test_the_plan_judges_the_commands_that_a_compensator_makes(so101):
         planner.judge_commands(plan, shifted(so101, "elbow_flex", np.nan), (0.0,))
 
 
-def test_a_run_with_compensation_says_how_far_commands_lead_and_whose_limits_hold(so101, tmp_path, capsys):
+def test_a_run_with_compensation_says_how_far_commands_lead_and_whose_limits_hold(
+    so101, tmp_path, capsys
+):
     save_robot(so101.with_servos({"elbow_flex": {"kp": 12.0}}), tmp_path / "identified")
-    words = ["run", "--robot", str(tmp_path / "identified"), "--motion", "sweep-elbow_flex", "--fast", "--compensate"]
+    words = [
+        "run",
+        "--robot",
+        str(tmp_path / "identified"),
+        "--motion",
+        "sweep-elbow_flex",
+        "--fast",
+        "--compensate",
+    ]
     assert main([*words, "--payload-mass", "0", "--blend-speed", "4", "--blend", "0.2"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     lead = re.search(r"commands lead their targets by at most (\d\.\d\d) rad \((\w+)\)", said)

@@ -53,9 +53,13 @@ class Bus(Wire):
         super().__init__(self)  # type: ignore[arg-type]
         self.arm, self.clock, self.way, self.at = arm, clock, "", np.inf
         self.first, self.done, self.writes = np.inf, False, 0
-        self.written: list[tuple[float, int, bytes]] = []  # time, register, the rest of a packet that writes
+        self.written: list[
+            tuple[float, int, bytes]
+        ] = []  # time, register, the rest of a packet that writes
 
-    def put(self, register: reg.Register, value: int, servos: range | tuple[int, ...] = range(1, 7)) -> None:
+    def put(
+        self, register: reg.Register, value: int, servos: range | tuple[int, ...] = range(1, 7)
+    ) -> None:
         for servo in servos:
             at = register.address
             self.arm.memory[servo - 1][at : at + register.size] = register.encode(value)
@@ -77,14 +81,18 @@ class Bus(Wire):
             (WAYS.get(self.way) or (ERRORS.get(self.way, lambda bus: None),))[0](self)
             self.arm._apply()
         self.writes += data[4] == reg.SYNC_WRITE
-        dropped = self.way == "ignores" or (self.way == "drops" and self.writes % 7 in (1, 2))  # the first among them
+        dropped = self.way == "ignores" or (
+            self.way == "drops" and self.writes % 7 in (1, 2)
+        )  # the first among them
         out = self.arm.receive(b"" if wrong and dropped and data[4] != reg.SYNC_READ else data)
         if wrong and self.way == "crossed" and goes:
             goals = self.get(reg.GOAL_POSITION)
             self.put(reg.GOAL_POSITION, goals[ROLL - 1], (ELBOW,))
             self.put(reg.GOAL_POSITION, goals[ELBOW - 1], (ROLL,))
             self.arm._apply()
-        return (data if self.way == "echo" else b"") + (SPOILT[self.way](out) if wrong and self.way in SPOILT else out)
+        return (data if self.way == "echo" else b"") + (
+            SPOILT[self.way](out) if wrong and self.way in SPOILT else out
+        )
 
     def lose(self) -> None:
         self.lost = True
@@ -95,7 +103,9 @@ class Bus(Wire):
         self.put(reg.GOAL_POSITION, 0, servos)
 
     def shift(self) -> None:
-        self.put(reg.HOMING_OFFSET, self.arm.calibration.rows["elbow_flex"].homing_offset + 33, (ELBOW,))
+        self.put(
+            reg.HOMING_OFFSET, self.arm.calibration.rows["elbow_flex"].homing_offset + 33, (ELBOW,)
+        )
         self.arm.calibration.zero[2] -= 33  # 0.05 rad
 
 
@@ -122,10 +132,14 @@ def clock() -> SimulatedClock:
 
 
 @pytest.fixture
-def bus(so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bus]:
+def bus(
+    so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Iterator[Bus]:
     from gaponet.hw.drivers import so101 as driver
 
-    monkeypatch.setattr("gaponet.hw.control.publisher.LOCK_FOLDER", tmp_path)  # other processes may run this test
+    monkeypatch.setattr(
+        "gaponet.hw.control.publisher.LOCK_FOLDER", tmp_path
+    )  # other processes may run this test
     arm = VirtualSO101(so101, load_fleet("easy", so101).unit("virtual-1"))
     arm.live.steps = round(clock.now() / PERIOD)
     bus = Bus(arm, clock)
@@ -135,39 +149,61 @@ def bus(so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch
     arm.close()
 
 
-def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watchdog: bool = False) -> Recording:
+def play(
+    so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watchdog: bool = False
+) -> Recording:
     """One and a half second in which all joints swing."""
     from gaponet.hw.drivers.so101 import SO101Driver
 
     def policy(k: int, state: object) -> np.ndarray | None:
         if k * 0.02 >= stop:
             controller.stop("the operator")
-        return so101.qpos_home + 0.3 * np.sin(0.08 * k) * np.array([1, 0.5, -1, 0.8, 1, 0.5]) if k < 75 else None
+        return (
+            so101.qpos_home + 0.3 * np.sin(0.08 * k) * np.array([1, 0.5, -1, 0.8, 1, 0.5])
+            if k < 75
+            else None
+        )
 
-    controller = Controller(SO101Driver(so101, timeout=0.001), so101, config=QUICK, clock=clock, watchdog=watchdog)
+    controller = Controller(
+        SO101Driver(so101, timeout=0.001), so101, config=QUICK, clock=clock, watchdog=watchdog
+    )
     return controller.run(policy)
 
 
 @pytest.mark.parametrize(
-    ("way", "at"), [*((way, 1.0) for way in WAYS), ("ignores", 0.05), ("gain", 2.35), ("zero", 2.35)]
+    ("way", "at"),
+    [*((way, 1.0) for way in WAYS), ("ignores", 0.05), ("gain", 2.35), ("zero", 2.35)],
 )
-def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(so101, clock, bus, way, at, tmp_path):
+def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(
+    so101, clock, bus, way, at, tmp_path
+):
     bus.way, bus.at = way, at
     recording = play(so101, clock)
     assert recording.fault is not None
     assert recording.fault.kind == "obedience", recording.fault
     assert re.search(WAYS[way][1], recording.fault.text)
-    if at == 1.0 and way in ("ignores", "resets", "brown-out", "crossed"):  # each state tells; three in a row count
+    if at == 1.0 and way in (
+        "ignores",
+        "resets",
+        "brown-out",
+        "crossed",
+    ):  # each state tells; three in a row count
         assert recording.fault.time - bus.first - at <= 5 * 0.02
-    if recording.fault.phase == "damp":  # else it was noticed at the very end, where the arm is held
+    if (
+        recording.fault.phase == "damp"
+    ):  # else it was noticed at the very end, where the arm is held
         off = bus.get(reg.TORQUE_ENABLE) == [0] * 6
-        assert off != recording.events[-1].text.startswith("could NOT be damped: switch the supply off")
+        assert off != recording.events[-1].text.startswith(
+            "could NOT be damped: switch the supply off"
+        )
     with pytest.raises(LogError, match="the robot did not do what it was told: servo"):
         recording.log()
     path = recording.save(tmp_path / "logs", "sway")
     assert path.exists() == (at > 0.5)
     if path.exists():
-        with pytest.raises(LogError, match=r"sway\.parquet: no data, the robot did not do what it was told \(servo"):
+        with pytest.raises(
+            LogError, match=r"sway\.parquet: no data, the robot did not do what it was told \(servo"
+        ):
             import_logs(path, so101, "a", 0.0, tmp_path / "set", position_unit="rad", time_unit="s")
     assert not json.loads((tmp_path / "logs" / "sway.json").read_text())["obeyed"]
 
@@ -178,7 +214,9 @@ def test_a_setting_that_changes_is_noticed_within_a_second(so101, clock, bus):
 
 
 @pytest.mark.parametrize("way", ["", "lossy", "noisy", "echo", "drops"])
-def test_an_honest_arm_is_believed_also_on_a_bus_that_now_and_then_loses_damages_or_echoes(so101, clock, bus, way):
+def test_an_honest_arm_is_believed_also_on_a_bus_that_now_and_then_loses_damages_or_echoes(
+    so101, clock, bus, way
+):
     bus.way, bus.at = way, -np.inf
     recording = play(so101, clock)
     assert recording.fault is None
@@ -208,7 +246,11 @@ def test_a_stop_lowers_the_arm_and_only_then_takes_its_torque(so101, clock, bus)
     off = next(time for time, words in told(bus, reg.TORQUE_ENABLE) if words == b"\0")
     began = recording.events[-2].time
     assert off == pytest.approx(began + QUICK.damp, abs=0.05)
-    limits = [int.from_bytes(words[2:4], "little") for time, words in told(bus, reg.TORQUE_LIMIT) if time < off]
+    limits = [
+        int.from_bytes(words[2:4], "little")
+        for time, words in told(bus, reg.TORQUE_LIMIT)
+        if time < off
+    ]
     assert limits == sorted(limits, reverse=True)
     assert limits[0] > 900
     assert limits[-1] <= 10
@@ -218,9 +260,13 @@ def test_a_stop_lowers_the_arm_and_only_then_takes_its_torque(so101, clock, bus)
     assert np.ptp(held, axis=0).max() < 0.1, "for a second somebody may catch it"
 
 
-def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on(so101, clock, bus, monkeypatch):
+def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on(
+    so101, clock, bus, monkeypatch
+):
     ends: list[bool] = []
-    monkeypatch.setattr("gaponet.hw.control.controller.Watchdog", lambda *_: fake_watchdog(release=ends.append))
+    monkeypatch.setattr(
+        "gaponet.hw.control.controller.Watchdog", lambda *_: fake_watchdog(release=ends.append)
+    )
     bus.way, bus.at = "lost", 1.0
     recording = play(so101, clock, watchdog=True)
     assert recording.fault.kind == "driver"
@@ -241,7 +287,9 @@ def test_one_servo_that_says_nothing_more_is_named_and_the_others_are_lowered(so
 
 
 @pytest.mark.parametrize("way", ["mute", "corrupt", "babble"])
-def test_a_bus_that_says_nothing_true_any_more_carries_at_most_two_more_goals(so101, clock, bus, way):
+def test_a_bus_that_says_nothing_true_any_more_carries_at_most_two_more_goals(
+    so101, clock, bus, way
+):
     bus.way, bus.at = way, 1.0
     assert play(so101, clock).fault.kind in ("stale", "checksum")
     assert sum(time >= bus.first + bus.at for time, _ in told(bus, reg.GOAL_POSITION)) <= 1 + 2
@@ -283,7 +331,9 @@ def swing(
 
     config = ControlConfig(blend=1.5, settle=0.1, blend_out=bool(way), damp=1.0)
     driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
-    recording = Controller(driver, robot, config=config, clock=clock, watchdog=False, payload_mass=told).run(policy)
+    recording = Controller(
+        driver, robot, config=config, clock=clock, watchdog=False, payload_mass=told
+    ).run(policy)
     return recording, clock.robot
 
 
@@ -301,11 +351,17 @@ def test_a_fault_of_an_h1_2_ends_in_damp(monkeypatch, fault, kind, periods):
     assert recording.fault.kind == kind, recording.fault
     assert phases(recording)[-3:] == ["run", "damp", "stopped"]
     damped = next(row["time"] for row in robot.heard if row["kp"][16] == 0)
-    state_age = 1 / RATE  # a fault is in the next state, which the controller reads in the next period
+    state_age = (
+        1 / RATE
+    )  # a fault is in the next state, which the controller reads in the next period
     assert 0 < damped - (robot.first_command + FAULT_S) <= periods * 0.02 + state_age + 1e-6
     judge(recording, received(robot), robot.robot, SafetyConfig())
     silent = fault in ("stop", "repeat", "checksum")
-    text = "could NOT be damped: switch the supply off (nothing was heard" if silent else "damped and let go"
+    text = (
+        "could NOT be damped: switch the supply off (nothing was heard"
+        if silent
+        else "damped and let go"
+    )
     assert recording.events[-1].text.startswith(text)
 
 
@@ -330,7 +386,9 @@ def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(monkeypatch):
         ("zero", 2.5),
     ],
 )  # fmt: skip
-def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_data(monkeypatch, way, at):
+def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_data(
+    monkeypatch, way, at
+):
     recording, _ = swing(monkeypatch, way, at)
     assert recording.fault is not None
     assert "elbow" in recording.fault.text
@@ -338,7 +396,10 @@ def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_d
         assert phases(recording)[-2:] == ["release", "stopped"]
         assert recording.events[-1].text == "let go; the robot did not obey"
     else:
-        assert (recording.fault.kind, recording.fault.phase) == ("jump" if way == "zero" else "frozen", "damp")
+        assert (recording.fault.kind, recording.fault.phase) == (
+            "jump" if way == "zero" else "frozen",
+            "damp",
+        )
     with pytest.raises(LogError, match="did not do what it was told"):
         recording.log()
     steps = np.abs(np.diff([row.state.qpos for row in recording.rows], axis=0))
@@ -346,7 +407,10 @@ def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_d
         "nothing jumps when a robot listens again, and what is limp falls"
     )
     if at == 0.0 and way == "ignores":
-        assert max(row.time for row in recording.rows if row.phase == "blend_in") < recording.rows[0].time + 3.0
+        assert (
+            max(row.time for row in recording.rows if row.phase == "blend_in")
+            < recording.rows[0].time + 3.0
+        )
 
 
 def test_the_weight_waits_until_a_joint_has_followed(monkeypatch):
@@ -367,6 +431,9 @@ def test_an_arm_that_is_too_weak_for_its_load_but_pushes_obeys(monkeypatch):
 def test_a_run_in_which_nothing_moves_shows_nothing_and_is_no_data(monkeypatch):
     recording, _ = swing(monkeypatch, size=0.0)
     assert recording.fault is None
-    assert recording.events[-1].text == "no data: no joint was told to go far enough to show whether the robot obeys"
+    assert (
+        recording.events[-1].text
+        == "no data: no joint was told to go far enough to show whether the robot obeys"
+    )
     with pytest.raises(LogError, match="no joint was told to go far enough"):
         recording.log()

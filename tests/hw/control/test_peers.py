@@ -47,7 +47,9 @@ def start(python: str) -> Iterator:
         processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
         return processes[-1]
 
-    begin.peer = lambda *arguments: begin([python, str(Path(__file__).parent / "peer.py"), *map(str, arguments)])  # type: ignore[attr-defined]
+    begin.peer = lambda *arguments: begin(
+        [python, str(Path(__file__).parent / "peer.py"), *map(str, arguments)]
+    )  # type: ignore[attr-defined]
     yield begin
     for process in processes:
         process.kill()
@@ -57,7 +59,9 @@ def start(python: str) -> Iterator:
 def told(process: subprocess.Popen[str], seconds: float) -> dict:
     """Its last line; it must have ended by itself and well."""
     out, _ = process.communicate(timeout=seconds)
-    assert process.returncode == 0, f"ended with {process.returncode} ({-signal.SIGSEGV} is a crash): {out}"
+    assert process.returncode == 0, (
+        f"ended with {process.returncode} ({-signal.SIGSEGV} is a crash): {out}"
+    )
     return json.loads(out.strip().splitlines()[-1])
 
 
@@ -70,11 +74,27 @@ def test_gaponet_run_moves_a_robot_on_the_sdks_dds_and_leaves_it_alive(start, tm
     peer = start.peer("robot", DOMAIN, SECONDS + 15)
     time.sleep(2.0)
     began = time.monotonic()
-    command = [*GAPONET, "run", "--driver", "unitree", "--domain", str(DOMAIN), "--motion", str(tmp_path / "sway.npz")]
+    command = [
+        *GAPONET,
+        "run",
+        "--driver",
+        "unitree",
+        "--domain",
+        str(DOMAIN),
+        "--motion",
+        str(tmp_path / "sway.npz"),
+    ]
     said = told(start([*command, "--yes", "--json"]), SECONDS + 60)
     assert peer.poll() is None, "the robot's program ended when gaponet connected"
     assert time.monotonic() - began > SECONDS - 10
-    assert [e[1] for e in said["events"]] == ["idle", "blend_in", "run", "blend_out", "release", "stopped"]
+    assert [e[1] for e in said["events"]] == [
+        "idle",
+        "blend_in",
+        "run",
+        "blend_out",
+        "release",
+        "stopped",
+    ]
     assert said["mode_machine"] == 6
     heard = told(peer, SECONDS + 60)
     print(f"\n{SECONDS:g} s: {heard}")

@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from gaponet.hw.control.phases import COMMANDING, ENDED, TRANSITION_TABLE, TRANSITIONS, Action, Phase, Trigger
+from gaponet.hw.control.phases import (
+    COMMANDING,
+    ENDED,
+    TRANSITION_TABLE,
+    TRANSITIONS,
+    Action,
+    Phase,
+    Trigger,
+)
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "controller.md"
 WAITING = (Phase.CONNECT, Phase.IDLE)
@@ -23,27 +31,38 @@ def test_every_event_is_defined_once_in_every_phase_and_leads_forward():
         if action in (Action.IGNORE, Action.RAISE):
             assert following is phase
         else:
-            assert order.index(following) > order.index(phase), "no way leads back, and each one ends"
-            assert (action in SENDING, action is Action.DAMP) == (following in COMMANDING, following is Phase.DAMP)
+            assert order.index(following) > order.index(phase), (
+                "no way leads back, and each one ends"
+            )
+            assert (action in SENDING, action is Action.DAMP) == (
+                following in COMMANDING,
+                following is Phase.DAMP,
+            )
 
 
 @pytest.mark.parametrize("missing", [Trigger.CONSENT, Trigger.READY])
 def test_nothing_moves_without_consent_and_a_robot_that_is_ready(missing):
     reached = {Phase.CONNECT}
-    for phase, trigger in product(Phase, Trigger):  # phases are in the order in which they can be reached
+    for phase, trigger in product(
+        Phase, Trigger
+    ):  # phases are in the order in which they can be reached
         if phase in reached and trigger is not missing:
             reached.add(TRANSITION_TABLE[phase, trigger][0])
     assert reached <= {*WAITING, Phase.STOPPED}
 
 
 @pytest.mark.parametrize("phase", Phase)
-@pytest.mark.parametrize("fault", [t for t in Trigger if "FAULT" in t.name or t is Trigger.NOT_FOLLOWING])
+@pytest.mark.parametrize(
+    "fault", [t for t in Trigger if "FAULT" in t.name or t is Trigger.NOT_FOLLOWING]
+)
 def test_a_stop_in_any_phase_ends_held_or_damped(phase, fault):
     following, action = TRANSITION_TABLE[phase, fault]
     if phase in ENDED:
         assert action is Action.IGNORE, "it goes on damping, or has ended"
     elif phase in WAITING or fault in (Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG):
-        assert (following, action) == (Phase.STOPPED, Action.SEND_NOTHING), "never commanded, or damped already"
+        assert (following, action) == (Phase.STOPPED, Action.SEND_NOTHING), (
+            "never commanded, or damped already"
+        )
     elif following is not Phase.DAMP:
         assert (fault, action) == (Trigger.NOT_FOLLOWING, Action.RELEASE_HERE)
 
@@ -54,7 +73,11 @@ def test_the_page_has_the_same_table():
 
     page = PAGE.read_text(encoding="utf-8").splitlines()
     for phases, triggers, following, action in TRANSITIONS:
-        events = "any other" if triggers == tuple(Trigger) else ", ".join(t.name.lower() for t in triggers)
+        events = (
+            "any other"
+            if triggers == tuple(Trigger)
+            else ", ".join(t.name.lower() for t in triggers)
+        )
         assert row(", ".join(phases), events, following or "the same", action.value) in page
     for trigger in Trigger:
         assert row(trigger.name.lower(), trigger.value) in page

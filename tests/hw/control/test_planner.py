@@ -27,7 +27,9 @@ from gaponet.sysid.motion.path_planner import Trajectory, find_points, finish_se
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.virtual_driver import VirtualDriver
 
-FOLDED = np.array([0.2, -1.70, 1.65, 0.9, 0.4, 1.2])  # pan, lift, elbow, wrist flex and roll, gripper
+FOLDED = np.array(
+    [0.2, -1.70, 1.65, 0.9, 0.4, 1.2]
+)  # pan, lift, elbow, wrist flex and roll, gripper
 OVER = np.array([0.0, -1.2, 0.0, 1.4, 0.0, 0.0])
 DOWN = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0])  # in the table
 QUICK = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
@@ -43,10 +45,14 @@ def judge(so101: RobotSpec) -> Contacts:
     return Contacts(so101)
 
 
-def motion(robot: RobotSpec, to: np.ndarray, joints: tuple[str, ...] | None = None, rows: int = 60) -> Motion:
+def motion(
+    robot: RobotSpec, to: np.ndarray, joints: tuple[str, ...] | None = None, rows: int = 60
+) -> Motion:
     """A small swing of the first named joint around a posture."""
     ctrl = np.repeat(to[None], rows, axis=0)
-    ctrl[:, robot.index(list(joints or robot.joint_names))[0]] += 0.1 * np.sin(np.linspace(0, 2 * np.pi, rows))
+    ctrl[:, robot.index(list(joints or robot.joint_names))[0]] += 0.1 * np.sin(
+        np.linspace(0, 2 * np.pi, rows)
+    )
     return Motion("swing", "joint", 0.02, ctrl, joints)
 
 
@@ -75,7 +81,9 @@ def test_what_cannot_be_is_refused_with_what_is_in_the_way(so101, planner):
     under = np.array([0.0, 1.2, 0.6, 0.0, 0.0, 0.0])
     with pytest.raises(UsageError, match=r"found with .* and the plane at 0 m .* in each other"):
         planner.plan(motion(so101, OVER), under)
-    with pytest.raises(UsageError, match=r"'swing' begins with .* and the plane at 0 m .* into each other"):
+    with pytest.raises(
+        UsageError, match=r"'swing' begins with .* and the plane at 0 m .* into each other"
+    ):
         planner.plan(motion(so101, under), FOLDED)
     with pytest.raises(UsageError, match=r"the first target brings .* and the plane at 0 m"):
         finish_search(planner.begin(under, FOLDED))
@@ -93,7 +101,9 @@ def test_a_way_begins_and_ends_at_rest_and_keeps_its_speed():
     rows = way.rows(0.01)
     speed = np.diff(rows, axis=0) / (way.duration / (len(rows) - 1))
     assert np.abs(speed).max() <= 0.5 + 1e-6
-    np.testing.assert_allclose([rows[0], rows[-1], way.at(way.times[1])], way.points[[0, 2, 1]], atol=1e-12)
+    np.testing.assert_allclose(
+        [rows[0], rows[-1], way.at(way.times[1])], way.points[[0, 2, 1]], atol=1e-12
+    )
     assert np.abs(speed[[0, -1]]).max() < 0.01
 
 
@@ -111,7 +121,9 @@ def virtual(robot: RobotSpec, found: np.ndarray) -> tuple[Controller, list[np.nd
     return Controller(driver, robot, config=QUICK, clock=clock), sent
 
 
-def push_down(planner: Planner, sag: np.ndarray | float = 0.0) -> tuple[CollisionGuard, list[np.ndarray]]:
+def push_down(
+    planner: Planner, sag: np.ndarray | float = 0.0
+) -> tuple[CollisionGuard, list[np.ndarray]]:
     """Live targets go into the table: the guard, and what it makes of them."""
     home = planner.robot.qpos_home
     guard = CollisionGuard(planner, home)
@@ -159,13 +171,19 @@ def test_an_arm_that_started_below_the_clearance_is_brought_back_there_or_as_far
     controller, sent = virtual(so101, low)
     recording = controller.run(lambda k, state: so101.qpos_home if k < 50 else None)
     assert recording.fault is None
-    where = "where it is: gripper and the plane at 0 m would come too near" if cut else "back where it was found"
+    where = (
+        "where it is: gripper and the plane at 0 m would come too near"
+        if cut
+        else "back where it was found"
+    )
     assert where in recording.events[-1].text
     assert not cut or np.abs(sent[-1] - low).max() > 0.02
 
 
 @pytest.mark.parametrize("allowed", [True, False])
-def test_live_targets_reach_a_start_below_the_clearance_only_on_the_way_back(so101, planner, low, allowed):
+def test_live_targets_reach_a_start_below_the_clearance_only_on_the_way_back(
+    so101, planner, low, allowed
+):
     clearance = planner.collision.clearance
     guard = CollisionGuard(planner, low)
     for _ in range(200):
@@ -182,14 +200,22 @@ def test_live_targets_reach_a_start_below_the_clearance_only_on_the_way_back(so1
 def test_a_controller_cuts_them_and_says_what_for(so101, judge):
     controller, sent = virtual(so101, so101.qpos_home)
     way = DOWN - so101.qpos_home
-    recording = controller.run(lambda k, state: so101.qpos_home + min(1, k / 50) * way if k < 90 else None)
+    recording = controller.run(
+        lambda k, state: so101.qpos_home + min(1, k / 50) * way if k < 90 else None
+    )
     assert recording.fault is None
     assert max(judge.deepest(q)[0] for q in sent) == 0
-    assert any("targets are cut: " in e.text and "the plane at 0 m" in e.text for e in recording.events)
+    assert any(
+        "targets are cut: " in e.text and "the plane at 0 m" in e.text for e in recording.events
+    )
 
 
-ACROSS = np.array([-1.34, 0.86, 2.96, 2.27, -0.21, -1.15, -0.1, -2.5, 1.97, 1.78])  # straight from there to HERE …
-HERE = np.array([0.36, 2.83, -1.86, 1.95, 1.71, 1.47, -0.22, -0.6, 3.08, 2.84])  # … its arms go 14 cm into each other
+ACROSS = np.array(
+    [-1.34, 0.86, 2.96, 2.27, -0.21, -1.15, -0.1, -2.5, 1.97, 1.78]
+)  # straight from there to HERE …
+HERE = np.array(
+    [0.36, 2.83, -1.86, 1.95, 1.71, 1.47, -0.22, -0.6, 3.08, 2.84]
+)  # … its arms go 14 cm into each other
 
 
 def straight(free, start, goal, *_):
@@ -206,14 +232,20 @@ def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkey
     with pytest.raises(UsageError, match=r"the plan brings .* cm into each other; 3 cm are kept"):
         finish_search(Planner(robot, robot.operated).begin(far, found))
     hasty = ControlConfig(blend=0.01, blend_speed=1e3), SafetyConfig(acceleration=1e5)
-    with pytest.raises(UsageError, match=r"the plan asks \w+ for [\d.]+ of the torque that may be used"):
+    with pytest.raises(
+        UsageError, match=r"the plan asks \w+ for [\d.]+ of the torque that may be used"
+    ):
         Planner(so101, so101.joint_names, *hasty).plan(motion(so101, OVER), so101.qpos_home)
 
 
 @pytest.mark.parametrize(
-    ("found_way", "obeys"), [(True, True), (False, True), (False, False)], ids=["by way of home", "none", "ignores"]
+    ("found_way", "obeys"),
+    [(True, True), (False, True), (False, False)],
+    ids=["by way of home", "none", "ignores"],
 )
-def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_there(monkeypatch, found_way, obeys):
+def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_there(
+    monkeypatch, found_way, obeys
+):
     robot = load_robot("h1_2")
     judge, found, far = Contacts(robot), robot.qpos_home.copy(), robot.qpos_home.copy()
     at = robot.index(robot.operated)
@@ -223,15 +255,25 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
     driver.at_end = "hold" if obeys else "hand_over"
 
     def read():
-        fault = None if obeys or controller.phase != "blend_out" else Fault("obedience", "it ignores goals")
-        return State(driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))), fault=fault)
+        fault = (
+            None
+            if obeys or controller.phase != "blend_out"
+            else Fault("obedience", "it ignores goals")
+        )
+        return State(
+            driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))), fault=fault
+        )
 
     driver.read, controller.monitor.noisy = read, False
     assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
     legs = itertools.pairwise([found, robot.qpos_home, far])
-    rows = np.concatenate([Trajectory.minimum_jerk(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in legs])
+    rows = np.concatenate(
+        [Trajectory.minimum_jerk(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in legs]
+    )
 
-    def search(*given):  # each step takes a millisecond, and where there is no way it takes a few to find that out
+    def search(
+        *given,
+    ):  # each step takes a millisecond, and where there is no way it takes a few to find that out
         for _ in find_points(*given) if found_way else range(50):
             controller.clock._now += 0.001
             yield
@@ -249,14 +291,23 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
         assert phases(recording)[-3:] == ["blend_out", "release", "stopped"]
         assert last == "let go; the robot did not obey"
         return
-    assert judge.along(np.array([row.ctrl for row in recording.rows if row.ctrl is not None]), 0.02)[0] == 0
+    assert (
+        judge.along(np.array([row.ctrl for row in recording.rows if row.ctrl is not None]), 0.02)[0]
+        == 0
+    )
     np.testing.assert_allclose(sent[-1][at], HERE if found_way else ACROSS, atol=0.02)
     if not found_way:
         text = "where it is: no clear way was found back to where it was found: the straight one brings .*; hold"
         assert re.fullmatch(text, last)
         return
     assert last == "back where it was found; hold"
-    back = np.array([row.target for row in recording.rows if row.phase == "blend_out" and row.target is not None])
+    back = np.array(
+        [
+            row.target
+            for row in recording.rows
+            if row.phase == "blend_out" and row.target is not None
+        ]
+    )
     standing = int(np.argmax(np.abs(back - back[0]).max(axis=1) > 0))
     assert 2 < standing < 100, "it looks for a share of each period"
 
@@ -271,7 +322,9 @@ def test_the_first_command_is_where_it_was_found_or_none_leaves(so101, beyond, c
     found[0] = so101.qpos_range[0, 1] + beyond
     controller, sent = virtual(so101, found)
     honest = controller.driver.read
-    controller.driver.read = lambda: honest() if sent else dataclasses.replace(honest(), qpos=found.copy())
+    controller.driver.read = lambda: (
+        honest() if sent else dataclasses.replace(honest(), qpos=found.copy())
+    )
     controller.driver.qpos_range = so101.qpos_range if cuts_goals else None
     recording = controller.run(lambda k, state: so101.qpos_home if k < 5 else None)
     assert (recording.fault.kind if recording.fault else None) == kind, recording.fault
@@ -282,9 +335,35 @@ def test_an_arm_without_shapes_and_a_robot_that_may_fall_are_asked_for(so101, tm
     (tmp_path / "pan.txt").write_text("shoulder_pan\n0.0\n0.1\n")
     save_robot(so101, tmp_path / "mine")
     (tmp_path / "mine" / "collision.toml").unlink()
-    words = ["run", "--driver", "so101", "--port", "/dev/none", "--motion", str(tmp_path / "pan.txt"), "--yes"]
-    assert main([*words, "--robot", str(tmp_path / "mine"), "--limits-from", str(tmp_path / "mine")]) == 2
+    words = [
+        "run",
+        "--driver",
+        "so101",
+        "--port",
+        "/dev/none",
+        "--motion",
+        str(tmp_path / "pan.txt"),
+        "--yes",
+    ]
+    assert (
+        main([*words, "--robot", str(tmp_path / "mine"), "--limits-from", str(tmp_path / "mine")])
+        == 2
+    )
     assert "so101 has no collision.toml" in " ".join(capsys.readouterr().err.split())
-    assert main(["run", "--driver", "unitree", "--topic", "lowcmd", "--motion", "sweep-left_elbow", "--yes"]) == 2
+    assert (
+        main(
+            [
+                "run",
+                "--driver",
+                "unitree",
+                "--topic",
+                "lowcmd",
+                "--motion",
+                "sweep-left_elbow",
+                "--yes",
+            ]
+        )
+        == 2
+    )
     said = " ".join(capsys.readouterr().err.split())
     assert "legs and torso go off, and a robot that stands falls; say --hangs" in said

@@ -64,7 +64,10 @@ def test_a_port_has_one_lock_whatever_name_leads_to_it(tmp_path):
     try:
         with sole_publisher(str(link)):
             for name in (port, str(link), f"/dev/pts/../pts/{os.path.basename(port)}"):
-                with pytest.raises(UsageError, match="another process commands"), sole_publisher(name):
+                with (
+                    pytest.raises(UsageError, match="another process commands"),
+                    sole_publisher(name),
+                ):
                     pass
     finally:
         os.close(ours), os.close(theirs)

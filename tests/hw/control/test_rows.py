@@ -24,7 +24,13 @@ NAMES = ("elbow", "wrist")
 
 def row(k: int, names: tuple[str, ...] = NAMES) -> Row:
     q = np.full(len(names), 0.001 * k)
-    return Row(0.02 * k, "run", q, q if k % 50 else None, State(0.02 * k - 0.001, q, 2 * q, 3 * q, 40 + q, k, 0.1))
+    return Row(
+        0.02 * k,
+        "run",
+        q,
+        q if k % 50 else None,
+        State(0.02 * k - 0.001, q, 2 * q, 3 * q, 40 + q, k, 0.1),
+    )
 
 
 def recording(count: int, folder=None) -> Recording:
@@ -103,15 +109,21 @@ def test_a_disk_that_is_full_keeps_what_was_written_and_says_so(tmp_path, monkey
     with pytest.raises(LogError, match="not whole, No space left on device; make room"):
         made.log("sway")
     path = made.save(folder, "sway")
-    np.testing.assert_allclose(np.load(folder / "sway.cycles.npy")["qpos.elbow"], 0.001 * np.arange(kept))
+    np.testing.assert_allclose(
+        np.load(folder / "sway.cycles.npy")["qpos.elbow"], 0.001 * np.arange(kept)
+    )
     assert json.loads((folder / "sway.json").read_text())["not_whole"] == "No space left on device"
     assert path.exists()  # there was room for the table
 
 
-def test_a_full_disk_without_room_for_the_header_either_ends_the_recording_only(tmp_path, monkeypatch):
+def test_a_full_disk_without_room_for_the_header_either_ends_the_recording_only(
+    tmp_path, monkeypatch
+):
     folder, real, writes = tmp_path / "logs", os.pwrite, []
 
-    def full(descriptor: int, data: bytes, at: int) -> int:  # a file system that copies what is overwritten
+    def full(
+        descriptor: int, data: bytes, at: int
+    ) -> int:  # a file system that copies what is overwritten
         writes.append(at)
         if len(writes) > 5:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -124,7 +136,9 @@ def test_a_full_disk_without_room_for_the_header_either_ends_the_recording_only(
     end.join(10)
     assert not end.is_alive(), "it waits for ever for a writer that has ended"
     assert made.rows.error.strerror == "No space left on device"
-    np.testing.assert_allclose(np.load(made.rows.path)["qpos.elbow"], 0.001 * np.arange(2 * CHUNK_ROWS))
+    np.testing.assert_allclose(
+        np.load(made.rows.path)["qpos.elbow"], 0.001 * np.arange(2 * CHUNK_ROWS)
+    )
 
 
 def test_what_cannot_be_written_at_the_end_leaves_the_periods(tmp_path, monkeypatch):
@@ -134,7 +148,9 @@ def test_what_cannot_be_written_at_the_end_leaves_the_periods(tmp_path, monkeypa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "sway.json")
 
     monkeypatch.setattr("gaponet.hw.control.recording.write_text", full)
-    with pytest.raises(OSError, match=r"No space left on device; all periods that were written are in sway\.cycles"):
+    with pytest.raises(
+        OSError, match=r"No space left on device; all periods that were written are in sway\.cycles"
+    ):
         made.save(tmp_path / "logs", "sway")
     assert len(np.load(tmp_path / "logs" / "sway.cycles.npy")) == 200
 

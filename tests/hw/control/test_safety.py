@@ -69,7 +69,11 @@ def limits(arm: RobotSpec) -> Limits:
 
 def drawn(rng: np.random.Generator, scale: float, rows: int) -> np.ndarray:
     """Mostly of a sensible size, some enormous, some not numbers."""
-    values = scale * rng.standard_normal((rows, 2)) * rng.choice([0.1, 1.0, 30.0], (rows, 1), p=[0.45, 0.45, 0.1])
+    values = (
+        scale
+        * rng.standard_normal((rows, 2))
+        * rng.choice([0.1, 1.0, 30.0], (rows, 1), p=[0.45, 0.45, 0.1])
+    )
     values[rng.random((rows, 2)) < 1e-3] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
     return values
 
@@ -102,18 +106,25 @@ def test_a_command_is_refused_only_where_the_three_intervals_do_not_meet(limits)
     target, previous, qpos = (s * rng.standard_normal((3000, 2)) for s in (1.0, 0.8, 0.8))
     qvel = rng.standard_normal(qpos.shape)
     out = limit_command(target, previous, qpos, qvel, DT, limits)
-    grid = np.linspace(0, 1, 401)[:, None, None]  # try commands all over the range-and-rate interval
+    grid = np.linspace(0, 1, 401)[
+        :, None, None
+    ]  # try commands all over the range-and-rate interval
     before = np.clip(previous, limits.low, limits.high)
     low, high = np.maximum(limits.low, before - 0.1), np.minimum(limits.high, before + 0.1)
     for part in np.array_split(np.arange(len(qpos)), 6):
         u = low[part] + grid * (high - low)[part]
-        possible = (np.abs(limits.kp * (u - qpos[part]) - limits.kd * qvel[part]) <= limits.effort).any(axis=0)
+        possible = (
+            np.abs(limits.kp * (u - qpos[part]) - limits.kd * qvel[part]) <= limits.effort
+        ).any(axis=0)
         assert not (possible & ~out.feasible[part]).any()
 
 
 def test_identified_gains_are_not_those_of_the_real_servo(arm):
     identified = arm.with_servos({"elbow": {"kp": 3.0}})
-    assert Limits.from_robot(identified, arm.joint_names, SafetyConfig()).kp.tolist() == [20.0, 20.0]
+    assert Limits.from_robot(identified, arm.joint_names, SafetyConfig()).kp.tolist() == [
+        20.0,
+        20.0,
+    ]
 
 
 def test_a_harmless_command_passes_unchanged(limits):
@@ -124,8 +135,12 @@ def test_a_harmless_command_passes_unchanged(limits):
 
 def test_a_joint_pushed_away_faster_than_the_rate_leaves_no_command(limits):
     # kp 20, 0.95 · 5 N·m: the torque interval is q ± 0.2375; the rate interval is 0 ± 0.1
-    assert limit_command(*np.zeros((2, 2)), np.array([0.33, 0.0]), np.zeros(2), DT, limits).feasible.all()
-    assert not limit_command(*np.zeros((2, 2)), np.array([0.34, 0.0]), np.zeros(2), DT, limits).feasible[0]
+    assert limit_command(
+        *np.zeros((2, 2)), np.array([0.33, 0.0]), np.zeros(2), DT, limits
+    ).feasible.all()
+    assert not limit_command(
+        *np.zeros((2, 2)), np.array([0.34, 0.0]), np.zeros(2), DT, limits
+    ).feasible[0]
 
 
 def test_nan_is_never_sent(limits):
@@ -153,7 +168,9 @@ def test_limits_that_leave_nothing_or_more_than_there_is_are_refused(arm):
         SafetyConfig(torque_share=1.5)
     with pytest.raises(UsageError, match=r"tilt is 40; give a positive number up to π rad"):
         SafetyConfig(tilt=40)
-    with pytest.raises(UsageError, match=r"tracking_time is 250; give a positive number up to 60 s"):
+    with pytest.raises(
+        UsageError, match=r"tracking_time is 250; give a positive number up to 60 s"
+    ):
         SafetyConfig(tracking_time=250)
     with pytest.raises(UsageError, match="leaves nothing of the range of shoulder"):
         Limits.from_robot(arm, arm.joint_names, SafetyConfig(margin=2.0))
@@ -172,7 +189,11 @@ def watched(change: dict[str, object], noisy: bool = True, periods: int = 80) ->
         }  # fmt: skip
         ctrl = np.full(2, 0.01 * k)
         if wrong:
-            fields |= {n: v(k, fields, good) if callable(v) else v for n, v in change.items() if n != "late"}
+            fields |= {
+                n: v(k, fields, good) if callable(v) else v
+                for n, v in change.items()
+                if n != "late"
+            }
         else:
             good = fields
         fault = watch.check(now, State(**fields), ctrl, change.get("late", 0.0) if wrong else 0.0)

@@ -30,7 +30,9 @@ class Terminal:
 
     def type(self, key: bytes) -> None:
         os.write(self.master, key)
-        select.select([self.slave], [], [], 2)  # until it has arrived; a terminal that keeps it lets the motion go on
+        select.select(
+            [self.slave], [], [], 2
+        )  # until it has arrived; a terminal that keeps it lets the motion go on
 
 
 @pytest.fixture
@@ -43,7 +45,9 @@ def terminal(monkeypatch) -> Iterator[Terminal]:
 
 
 @pytest.mark.parametrize("key", KEYS.values(), ids=KEYS)
-def test_every_key_stops_a_motion_in_the_next_period_and_the_terminal_is_as_before(arm, terminal, key):
+def test_every_key_stops_a_motion_in_the_next_period_and_the_terminal_is_as_before(
+    arm, terminal, key
+):
     recording = control(NotedArm(arm)).run(acting(lambda: terminal.type(key)), keys=True)
     assert recording.fault is not None
     assert "asked to stop: key " in recording.fault.text

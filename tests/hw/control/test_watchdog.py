@@ -51,9 +51,15 @@ def notes(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def dog(notes: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Watchdog]:
+def dog(
+    notes: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> Iterator[Watchdog]:
     """A watchdog in a process of its own that could damp the robot; its parameter is after how many s it does."""
-    monkeypatch.setattr(watchdog.child_process, "module_command", lambda _, text: [sys.executable, "-c", ROBOT, text])
+    monkeypatch.setattr(
+        watchdog.child_process,
+        "module_command",
+        lambda _, text: [sys.executable, "-c", ROBOT, text],
+    )
     lock = os.open(notes.with_suffix(".lock"), os.O_CREAT | os.O_RDWR)
     fcntl.flock(lock, fcntl.LOCK_EX)
     dog = Watchdog({"notes": str(notes)}, lock, getattr(request, "param", PATIENT), DAMP)
@@ -82,7 +88,9 @@ def beat(dog: Watchdog, weight: float) -> None:
 
 def test_a_robot_is_damped_with_the_last_weight_that_was_commanded(dog, notes):
     beat(dog, 0.1)
-    dog._in.write(bytes([round(WEIGHT_STEPS * weight) for weight in (0.2, 0.8)]))  # two beats that are read at once
+    dog._in.write(
+        bytes([round(WEIGHT_STEPS * weight) for weight in (0.2, 0.8)])
+    )  # two beats that are read at once
     dog.release(unconfirmed=True)
     dog._process.wait(20)
     weights = damped(notes)[:, 1]
@@ -148,14 +156,18 @@ class LooseRobot:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **fails: object) -> None:
         """fails: method → numbers of its calls that fail; None: all."""
         self.now, self.fails, self.calls, self.counts = 0.0, fails, [], Counter()
-        clock = SimpleNamespace(monotonic=lambda: self.now, sleep=lambda s: setattr(self, "now", self.now + s))
+        clock = SimpleNamespace(
+            monotonic=lambda: self.now, sleep=lambda s: setattr(self, "now", self.now + s)
+        )
         monkeypatch.setattr(watchdog, "time", clock)
 
     def __getattr__(self, name: str):
         def call(*values: float, hold: bool = False) -> str:
             self.calls.append((name, *values))
             self.counts[name] += 1
-            if name in self.fails and (self.fails[name] is None or self.counts[name] in self.fails[name]):
+            if name in self.fails and (
+                self.fails[name] is None or self.counts[name] in self.fails[name]
+            ):
                 raise (OSError if name == "damp" else DriverError)(f"{name} failed")
             return "let go"
 
@@ -183,8 +195,12 @@ def test_a_watchdog_gives_up_after_ten_minutes_and_not_before(monkeypatch, capsy
     assert "gave up after 600 s; switch the supply off" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("words", "damped"), [((b"\x64", b"\xc8"), True), ((b"\x64", b"\xff"), False)])
-def test_a_watchdog_waits_for_the_next_heartbeat_as_long_as_it_is_told_and_then_damps(monkeypatch, words, damped):
+@pytest.mark.parametrize(
+    ("words", "damped"), [((b"\x64", b"\xc8"), True), ((b"\x64", b"\xff"), False)]
+)
+def test_a_watchdog_waits_for_the_next_heartbeat_as_long_as_it_is_told_and_then_damps(
+    monkeypatch, words, damped
+):
     """Without time: the pipes are lists, and the wait for a heartbeat is what select is given."""
     robot, waits, said = LooseRobot(monkeypatch), [], []
     heartbeats = iter(words)
@@ -200,12 +216,22 @@ def test_a_watchdog_waits_for_the_next_heartbeat_as_long_as_it_is_told_and_then_
     monkeypatch.setattr(watchdog.signal, "signal", lambda *_: None)
     watchdog.main({"timeout": HANG, "damp": DAMP})
     assert waits == [None, HANG, HANG][: len(waits)], "before the first one it waits for ever"
-    assert said == [watchdog.READY, watchdog.ANSWER, *([watchdog.ANSWER, watchdog.FIRED] if damped else [])]
-    assert [values[0] for name, *values in robot.calls if name == "damp"][:1] == ([1.0] if damped else [])
+    assert said == [
+        watchdog.READY,
+        watchdog.ANSWER,
+        *([watchdog.ANSWER, watchdog.FIRED] if damped else []),
+    ]
+    assert [values[0] for name, *values in robot.calls if name == "damp"][:1] == (
+        [1.0] if damped else []
+    )
 
 
 def test_a_watchdog_that_cannot_reach_the_robot_is_an_error(notes, monkeypatch):
-    monkeypatch.setattr(watchdog.child_process, "module_command", lambda *_: [sys.executable, "-c", "raise SystemExit"])
+    monkeypatch.setattr(
+        watchdog.child_process,
+        "module_command",
+        lambda *_: [sys.executable, "-c", "raise SystemExit"],
+    )
     with open(os.devnull) as lock, pytest.raises(DriverError, match="could not reach the robot"):
         Watchdog({}, lock.fileno(), HANG, DAMP).wait_ready()
 

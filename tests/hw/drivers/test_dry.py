@@ -54,14 +54,36 @@ def test_a_dry_run_beside_a_run_of_the_same_robot_is_refused(arm, tmp_path, monk
     monkeypatch.setattr(publisher, "LOCK_FOLDER", tmp_path)
     inner = Deaf(arm)
     inner.address = "a port"
-    with publisher.sole_publisher("a port"), pytest.raises(UsageError, match="another process commands"):
+    with (
+        publisher.sole_publisher("a port"),
+        pytest.raises(UsageError, match="another process commands"),
+    ):
         Controller(DryRun(inner), arm, clock=inner.clock).run(motion_policy(MOTION, DT))
 
 
 def test_a_dry_run_on_the_command_line_says_what_would_be_sent(arm, tmp_path, capsys):
     write_motion(tmp_path / "sway.npz", MOTION, arm)
-    command = ["run", "--motion", str(tmp_path / "sway.npz"), "--robot", str(arm.folder), "--payload-side", "hand"]
-    command += ["--fast", "--dry-run", "--blend", "0.2", "--blend-speed", "4", "--settle", "0.1", "--damp", "0.1"]
+    command = [
+        "run",
+        "--motion",
+        str(tmp_path / "sway.npz"),
+        "--robot",
+        str(arm.folder),
+        "--payload-side",
+        "hand",
+    ]
+    command += [
+        "--fast",
+        "--dry-run",
+        "--blend",
+        "0.2",
+        "--blend-speed",
+        "4",
+        "--settle",
+        "0.1",
+        "--damp",
+        "0.1",
+    ]
     assert main(command) == 0
     assert "nothing was sent" in " ".join(capsys.readouterr().out.split())
     assert main([*command, "--out", str(tmp_path / "out")]) == 2

@@ -29,7 +29,9 @@ def test_the_checksum_is_crc32_mpeg2_of_the_padded_struct():
     hg.LowCmd.view(data, "mode_machine")[:] = 4
     packed = struct.pack("<2B2x", 1, 4)
     for i in range(35):
-        packed += struct.pack("<B3x5fI", i, *(values[n][i] for n in ("q", "dq", "tau", "kp", "kd")), 0)
+        packed += struct.pack(
+            "<B3x5fI", i, *(values[n][i] for n in ("q", "dq", "tau", "kp", "kd")), 0
+        )
     packed += struct.pack("<4I", 0, 0, 0, 0)
     assert hg.LowCmd.packed_size == 1004  # as the C struct
     assert hg.LowState.packed_size == 2092
@@ -69,8 +71,15 @@ def test_the_wire_layout_is_that_of_cyclonedds():
             values.append(one() if count == 1 else [one() for _ in range(count)])
         return cls(*values)
 
-    inner = {id(hg.IMU): dds.IMUState, id(hg.MOTOR_STATE): dds.MotorState, id(hg.MOTOR_CMD): dds.MotorCmd}
-    for cls, message, fields in ((dds.LowState, hg.LowState, hg.LOW_STATE), (dds.LowCmd, hg.LowCmd, hg.LOW_CMD)):
+    inner = {
+        id(hg.IMU): dds.IMUState,
+        id(hg.MOTOR_STATE): dds.MotorState,
+        id(hg.MOTOR_CMD): dds.MotorCmd,
+    }
+    for cls, message, fields in (
+        (dds.LowState, hg.LowState, hg.LOW_STATE),
+        (dds.LowCmd, hg.LowCmd, hg.LOW_CMD),
+    ):
         sample = build(cls, fields)
         wire = IdlStruct.serialize(sample)
         assert wire[:4] == hg.HEADER
@@ -78,7 +87,9 @@ def test_the_wire_layout_is_that_of_cyclonedds():
         assert len(data) == message.wire_size
         motors = sample.motor_state if cls is dds.LowState else sample.motor_cmd
         for name in ("mode", "q", "dq"):
-            np.testing.assert_array_equal(message.motors(data, name), [getattr(m, name) for m in motors])
+            np.testing.assert_array_equal(
+                message.motors(data, name), [getattr(m, name) for m in motors]
+            )
         assert message.view(data, "crc")[0] == sample.crc
         assert message.view(data, "mode_machine")[0] == sample.mode_machine
         again = message.new()

@@ -55,7 +55,9 @@ def instructions(servos: Servos) -> list[int]:
 def calibration(path: Path, **changes: dict[str, int]) -> Path:
     """The file of the arm that Servos is."""
     row = {"drive_mode": 0, "homing_offset": 0, "range_min": 1000, "range_max": 3000}
-    path.write_text(json.dumps({j: {"id": i + 1} | row | changes.get(j, {}) for i, j in enumerate(JOINTS)}))
+    path.write_text(
+        json.dumps({j: {"id": i + 1} | row | changes.get(j, {}) for i, j in enumerate(JOINTS)})
+    )
     return path
 
 
@@ -64,7 +66,9 @@ def calibration(path: Path, **changes: dict[str, int]) -> Path:
 
 def test_a_packet_is_what_the_protocol_manual_says():
     # from the manual: write 1000 to goal position (42) of servo 1
-    assert reg.packet(1, reg.WRITE, bytes([42, 0xE8, 0x03])).hex(" ") == "ff ff 01 05 03 2a e8 03 e1"
+    assert (
+        reg.packet(1, reg.WRITE, bytes([42, 0xE8, 0x03])).hex(" ") == "ff ff 01 05 03 2a e8 03 e1"
+    )
 
 
 @pytest.mark.parametrize("value", [0, 5, 1000, -1, -1000])
@@ -82,7 +86,9 @@ def test_connecting_writes_nothing(driver, servos):
 
 
 def test_the_gains_are_those_of_the_servos_and_what_differs_is_said(driver, so101):
-    np.testing.assert_allclose(driver.kp, 17.8 / 2)  # LeRobot's P of 16; robot.toml's 17.8 N·m/rad is 32
+    np.testing.assert_allclose(
+        driver.kp, 17.8 / 2
+    )  # LeRobot's P of 16; robot.toml's 17.8 N·m/rad is 32
     assert driver.facts["servos"]["p"] == [16] * 6
     assert driver.facts["servos"]["torque_limit"] == [1000] * 6
     (note,) = driver.facts["remarks"]
@@ -107,18 +113,31 @@ def test_a_servo_that_is_set_otherwise_is_named(so101, wire, servos):
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda servos: servos.set(4, "model", 1284), r"servo 4 \(wrist_flex\) is model 1284 in mode 0"),
-        (lambda servos: servos.set(1, "mode", 1), r"servo 1 \(shoulder_pan\) is model 777 in mode 1"),
-        (lambda servos: servos.silence(4), r"servo 4 \(wrist_flex\) does not answer"),
-        (lambda servos: servos.status.__setitem__(0, 1 << 2), r"servo 1 \(shoulder_pan\): overheat"),
         (
-            lambda servos: [servos.set(n, end, v) for n in (1, 2) for end, v in (("low", 0), ("high", 4095))],
+            lambda servos: servos.set(4, "model", 1284),
+            r"servo 4 \(wrist_flex\) is model 1284 in mode 0",
+        ),
+        (
+            lambda servos: servos.set(1, "mode", 1),
+            r"servo 1 \(shoulder_pan\) is model 777 in mode 1",
+        ),
+        (lambda servos: servos.silence(4), r"servo 4 \(wrist_flex\) does not answer"),
+        (
+            lambda servos: servos.status.__setitem__(0, 1 << 2),
+            r"servo 1 \(shoulder_pan\): overheat",
+        ),
+        (
+            lambda servos: [
+                servos.set(n, end, v) for n in (1, 2) for end, v in (("low", 0), ("high", 4095))
+            ],
             r"no limits in shoulder_pan, shoulder_lift\).*--calibration FILE",
         ),
     ],
     ids=["model", "mode", "missing", "error", "no calibration"],
 )
-def test_servos_that_it_cannot_command_are_refused_and_nothing_is_written(so101, wire, servos, change, complaint):
+def test_servos_that_it_cannot_command_are_refused_and_nothing_is_written(
+    so101, wire, servos, change, complaint
+):
     change(servos)
     with pytest.raises(DriverError, match=complaint):
         SO101Driver(so101, timeout=SILENCE).connect()
@@ -175,7 +194,11 @@ def test_whatever_single_byte_is_changed_a_state_is_true_or_old(driver, servos):
 
     def change(servo: int, reply: bytes) -> bytes:
         at = rng.randrange(3 * len(reply))
-        return reply if at >= len(reply) else reply[:at] + bytes([reply[at] ^ rng.randrange(1, 256)]) + reply[at + 1 :]
+        return (
+            reply
+            if at >= len(reply)
+            else reply[:at] + bytes([reply[at] ^ rng.randrange(1, 256)]) + reply[at + 1 :]
+        )
 
     servos.adversary = change
     true = {}
@@ -210,7 +233,9 @@ def test_answers_that_come_late_are_never_taken_for_those_to_a_later_question(dr
         before, state = driver._state, driver.read()
         assert (state.time != before.time) == own
         if own:
-            np.testing.assert_array_equal(driver.arm.steps(state.qpos), 1100 + 10 * period + np.arange(1, 7))
+            np.testing.assert_array_equal(
+                driver.arm.steps(state.qpos), 1100 + 10 * period + np.arange(1, 7)
+            )
 
 
 def test_a_late_reply_is_not_taken_for_the_next_registers(wire, servos):
@@ -259,13 +284,17 @@ def test_torque_comes_on_with_the_first_goal_and_a_hold_leaves_it_on(driver, ser
     np.testing.assert_allclose(driver.read().qpos, target, atol=STEP_RAD)
     del servos.heard[:]
     driver.write(target)
-    assert [request[5] for request in servos.heard] == [reg.GOAL_POSITION.address], "a servo that reset stays off"
+    assert [request[5] for request in servos.heard] == [reg.GOAL_POSITION.address], (
+        "a servo that reset stays off"
+    )
     count = len(servos.heard)
     driver.close(hold=True)
     assert len(servos.heard) == count
 
 
-def test_from_the_first_goal_until_the_end_no_other_program_can_open_the_port(driver, wire, monkeypatch):
+def test_from_the_first_goal_until_the_end_no_other_program_can_open_the_port(
+    driver, wire, monkeypatch
+):
     calls: list[int] = []
     wire.fileno = lambda: 0
     monkeypatch.setattr("fcntl.ioctl", lambda descriptor, request: calls.append(request))
@@ -306,7 +335,9 @@ def test_a_port_that_is_lost_while_damping_is_opened_again(driver, servos, wire)
     assert servos.heard[0] == OFF
 
 
-def test_the_watchdog_says_nothing_until_it_damps_and_then_asks_nothing(so101, wire, servos, driver):
+def test_the_watchdog_says_nothing_until_it_damps_and_then_asks_nothing(
+    so101, wire, servos, driver
+):
     from gaponet.hw.drivers.open import open_driver
 
     other = open_driver(**driver.watchdog())
@@ -323,7 +354,9 @@ def test_the_watchdog_says_nothing_until_it_damps_and_then_asks_nothing(so101, w
 
 
 def test_a_calibration_of_lerobot_gives_zero_sign_and_range(so101, tmp_path):
-    file = calibration(tmp_path / "arm.json", elbow_flex={"drive_mode": 1}, wrist_flex={"range_max": 3003})
+    file = calibration(
+        tmp_path / "arm.json", elbow_flex={"drive_mode": 1}, wrist_flex={"range_max": 3003}
+    )
     found = read_calibration(file, so101)
     assert found.servos == [1, 2, 3, 4, 5, 6]
     np.testing.assert_allclose(found.zero[:5], [2000, 2000, 2000, 2001.5, 2000])
@@ -332,7 +365,9 @@ def test_a_calibration_of_lerobot_gives_zero_sign_and_range(so101, tmp_path):
 
 @pytest.mark.parametrize("drive_mode", [0, 1])
 def test_the_gripper_closes_where_its_calibration_says(so101, tmp_path, drive_mode):
-    found = read_calibration(calibration(tmp_path / "arm.json", gripper={"drive_mode": drive_mode}), so101)
+    found = read_calibration(
+        calibration(tmp_path / "arm.json", gripper={"drive_mode": drive_mode}), so101
+    )
     closed, opened = so101.qpos_range[so101.index(["gripper"])[0]]
     want = np.zeros(6)
     want[5] = closed
@@ -355,13 +390,19 @@ def test_a_file_that_is_no_calibration_is_refused(so101, tmp_path, content):
 
 
 @pytest.mark.parametrize(
-    ("field", "register"), [("homing_offset", "homing"), ("range_min", "low"), ("range_max", "high")]
+    ("field", "register"),
+    [("homing_offset", "homing"), ("range_min", "low"), ("range_max", "high")],
 )
-def test_a_calibration_that_is_not_in_the_servos_is_refused(so101, wire, servos, tmp_path, field, register):
+def test_a_calibration_that_is_not_in_the_servos_is_refused(
+    so101, wire, servos, tmp_path, field, register
+):
     file = calibration(tmp_path / "arm.json")
     SO101Driver(so101, calibration=file, timeout=SILENCE).connect()
     servos.set(3, register, 1234)
-    with pytest.raises(DriverError, match=rf"{field} of elbow_flex is \d+ in the calibration file and 1234 in servo 3"):
+    with pytest.raises(
+        DriverError,
+        match=rf"{field} of elbow_flex is \d+ in the calibration file and 1234 in servo 3",
+    ):
         SO101Driver(so101, calibration=file, timeout=SILENCE).connect()
 
 
@@ -388,7 +429,9 @@ def arm(so101: RobotSpec) -> Iterator[VirtualSO101]:
 
 
 @pytest.fixture
-def connect(so101: RobotSpec, arm: VirtualSO101, monkeypatch: pytest.MonkeyPatch) -> Callable[[], SO101Driver]:
+def connect(
+    so101: RobotSpec, arm: VirtualSO101, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[], SO101Driver]:
     def connect() -> SO101Driver:
         monkeypatch.setattr(serial, "Serial", lambda *_, **__: Alive(arm))
         driver = SO101Driver(so101, timeout=SILENCE)
@@ -420,7 +463,8 @@ def test_the_virtual_arm_follows_and_its_readings_are_whole_steps(connect, so101
 
 
 @pytest.mark.parametrize(
-    ("register", "value", "by", "ratio"), [(reg.P, 16, 0.0, 1.5), (reg.TORQUE_LIMIT, FULL_TORQUE // 50, 0.5, 3.0)]
+    ("register", "value", "by", "ratio"),
+    [(reg.P, 16, 0.0, 1.5), (reg.TORQUE_LIMIT, FULL_TORQUE // 50, 0.5, 3.0)],
 )
 def test_a_virtual_servo_has_the_stiffness_and_the_torque_of_its_registers(
     connect, so101, arm, register, value, by, ratio

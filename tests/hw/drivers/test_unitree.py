@@ -33,7 +33,12 @@ def robot() -> RobotSpec:
 
 @pytest.fixture(scope="module")
 def served(robot: RobotSpec) -> VirtualH12:
-    return VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), domain=180 + os.getpid() % 40, rate=100.0)
+    return VirtualH12(
+        robot,
+        load_fleet("easy", robot).unit("virtual-4"),
+        domain=180 + os.getpid() % 40,
+        rate=100.0,
+    )
 
 
 def message(motors: int = 27, machine: int = 6) -> np.ndarray:
@@ -75,7 +80,9 @@ def decoded(robot, data):
     ],
     ids=["upright", "leaning", "turned", "none"],
 )  # fmt: skip
-def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(robot, quaternion, tilt):
+def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(
+    robot, quaternion, tilt
+):
     data = message()
     hg.LowState.view(data, "imu_state.quaternion")[:] = quaternion
     assert decoded(robot, data)[0].tilt == pytest.approx(tilt, abs=1e-3, nan_ok=True)
@@ -84,9 +91,17 @@ def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(rob
 def test_only_the_stop_keys_of_the_remote_stop(robot):
     reported = decoded(robot, message())[1]._reported_fault
     pressed = message()
-    for keys, stops in ((0x0008, True), (0x0220, True), (0x0020, False), (0x0200, False), (0x0104, False)):
+    for keys, stops in (
+        (0x0008, True),
+        (0x0220, True),
+        (0x0020, False),
+        (0x0200, False),
+        (0x0104, False),
+    ):
         hg.LowState.view(pressed, "wireless_remote")[2:4] = keys & 0xFF, keys >> 8
-        assert (reported(pressed) is not None and reported(pressed).kind == "stop") == stops, hex(keys)
+        assert (reported(pressed) is not None and reported(pressed).kind == "stop") == stops, hex(
+            keys
+        )
 
 
 def test_what_one_of_several_messages_says_stops_for_good(robot):
@@ -103,7 +118,10 @@ def test_what_one_of_several_messages_says_stops_for_good(robot):
 def unplugged(robot: RobotSpec, **how: str) -> tuple[UnitreeDriver, list[np.ndarray]]:
     """A driver without a bus, and the list of what it sends."""
     driver, sent = UnitreeDriver(robot, **how), []
-    driver._bus, driver._writer = object(), SimpleNamespace(send=lambda data: sent.append(data.copy()))
+    driver._bus, driver._writer = (
+        object(),
+        SimpleNamespace(send=lambda data: sent.append(data.copy())),
+    )
     return driver, sent
 
 
@@ -114,7 +132,10 @@ def test_on_arm_sdk_the_torso_is_held_where_it_was_found_with_its_gains(robot):
         for angle in (0.3, 0.7):
             driver.write(np.where(np.arange(27) == torso, angle, 0.0), 1.0)
         driver.damp()
-        q, kp, kd, mode = ([hg.LowCmd.motors(data, name)[at] for data in sent] for name in ("q", "kp", "kd", "mode"))
+        q, kp, kd, mode = (
+            [hg.LowCmd.motors(data, name)[at] for data in sent]
+            for name in ("q", "kp", "kd", "mode")
+        )
         if held:
             assert (q, kp, mode) == (pytest.approx([0.3] * 3), [robot.kp[torso]] * 3, [1] * 3)
             assert kd == [robot.kd[torso]] * 3
@@ -126,7 +147,11 @@ def test_an_identified_robot_is_commanded_with_the_gains_of_its_real_servos(robo
     driver, sent = unplugged(robot.with_servos({"left_elbow_joint": {"kp": 60.0}}))
     driver.write(robot.qpos_home)
     at = MOTOR_NAMES.index("left_elbow_joint")
-    assert hg.LowCmd.motors(sent[0], "kp")[at] == robot.kp[robot.index(["left_elbow_joint"])[0]] != 60.0
+    assert (
+        hg.LowCmd.motors(sent[0], "kp")[at]
+        == robot.kp[robot.index(["left_elbow_joint"])[0]]
+        != 60.0
+    )
 
 
 def test_damping_gains_are_four_times_the_robots_but_no_more_than_the_effort_limits_allow(robot):
@@ -166,14 +191,20 @@ def test_a_silent_driver_publishes_nothing(robot):
 
 def test_another_publisher_of_the_topic_is_refused(robot, monkeypatch):
     bus = Loopback()
-    monkeypatch.setattr(bus, "publishers", lambda: defaultdict(list, {"rt/arm_sdk": ["a demo (process 7 on robot)"]}))
+    monkeypatch.setattr(
+        bus,
+        "publishers",
+        lambda: defaultdict(list, {"rt/arm_sdk": ["a demo (process 7 on robot)"]}),
+    )
     monkeypatch.setattr("gaponet.hw.drivers.dds", bus, raising=False)
     with pytest.raises(DriverError, match=r"others publish rt/arm_sdk on lo: a demo \(process 7"):
         UnitreeDriver(robot).connect()
 
 
 def test_legs_are_commanded_only_on_lowcmd_and_another_robot_never(robot, so101):
-    assert not any("hip" in j or "knee" in j or "ankle" in j for j in UnitreeDriver(robot, "lowcmd").commanded)
+    assert not any(
+        "hip" in j or "knee" in j or "ankle" in j for j in UnitreeDriver(robot, "lowcmd").commanded
+    )
     with pytest.raises(UsageError, match="does not take the legs"):
         UnitreeDriver(robot, "arm_sdk", "all")
     with pytest.raises(UsageError, match="for the 27 joints of h1_2"):
@@ -230,7 +261,9 @@ def test_a_program_that_is_made_to_use_multicast_on_loopback_is_found():
     from gaponet.hw.drivers import dds
 
     domain = 225 + os.getpid() % 5
-    other = subprocess.Popen([sys.executable, "-c", FORCING, str(domain), FORCED], stdin=subprocess.PIPE)
+    other = subprocess.Popen(
+        [sys.executable, "-c", FORCING, str(domain), FORCED], stdin=subprocess.PIPE
+    )
     try:
         bus, deadline, found = dds.Bus(domain, "lo"), time.monotonic() + 30, set()
         reader = BuiltinDataReader(bus._participant, BuiltinTopicDcpsParticipant)
@@ -254,5 +287,7 @@ def test_a_process_ends_although_the_deletion_of_its_dds_domain_never_does():
         "dds._DOMAINS[0] = Stuck()\n"
         "print('done')\n"
     )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+    )
     assert (ended.returncode, ended.stdout) == (0, "done\n"), ended.stderr

@@ -40,4 +40,9 @@ while (t := time.monotonic() - begun) < seconds:
 tell([joint])
 rclpy.spin_once(node, timeout_sec=0.5)
 fields = ("name", "position", "velocity", "effort")
-print(json.dumps({f: list(getattr(states[-1], f)) for f in fields} | {"moved": max(heard), "targets": len(heard)}))
+print(
+    json.dumps(
+        {f: list(getattr(states[-1], f)) for f in fields}
+        | {"moved": max(heard), "targets": len(heard)}
+    )
+)

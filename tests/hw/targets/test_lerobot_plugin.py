@@ -13,8 +13,16 @@ from contacts import Contacts
 
 from gaponet.base.errors import UsageError
 
-PLUGIN = Path(__file__).parents[3] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
-FOUND = {"shoulder_pan": 11.5, "shoulder_lift": -68.8, "elbow_flex": 0.0, "wrist_flex": 80.2, "wrist_roll": 22.9}
+PLUGIN = (
+    Path(__file__).parents[3] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
+)
+FOUND = {
+    "shoulder_pan": 11.5,
+    "shoulder_lift": -68.8,
+    "elbow_flex": 0.0,
+    "wrist_flex": 80.2,
+    "wrist_roll": 22.9,
+}
 
 
 class Base:
@@ -55,12 +63,17 @@ def plugin(monkeypatch):
 
 
 def seen(gripper: float) -> dict[str, float]:
-    return {f"{joint}.pos": value for joint, value in FOUND.items()} | {"gripper.pos": gripper, "camera": None}
+    return {f"{joint}.pos": value for joint, value in FOUND.items()} | {
+        "gripper.pos": gripper,
+        "camera": None,
+    }
 
 
 def test_a_cameras_depth_is_observed_beside_its_colours(plugin, so101):
     wrist = SimpleNamespace(height=4, width=6, read_latest=lambda: "colours")
-    front = SimpleNamespace(**vars(wrist), use_rgb=True, use_depth=True, read_latest_depth=lambda: "depth")
+    front = SimpleNamespace(
+        **vars(wrist), use_rgb=True, use_depth=True, read_latest_depth=lambda: "depth"
+    )
     robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
     robot.units, robot.cameras = plugin.Units(so101), {"wrist": wrist, "front": front}
     shapes = {"wrist": (4, 6, 3), "front": (4, 6, 3), "front_depth": (4, 6, 1)}
@@ -70,7 +83,9 @@ def test_a_cameras_depth_is_observed_beside_its_colours(plugin, so101):
 
 def test_an_arm_is_not_moved_without_consent(plugin, monkeypatch):
     monkeypatch.setattr("sys.stdin", None)
-    monkeypatch.setattr("subprocess.Popen", lambda *_, **__: pytest.fail("a controller was started"))
+    monkeypatch.setattr(
+        "subprocess.Popen", lambda *_, **__: pytest.fail("a controller was started")
+    )
     robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
     robot.config = plugin.GaponetSO101Config()
     with pytest.raises(UsageError, match=r"nothing was commanded; give --robot\.yes=true"):
@@ -84,9 +99,15 @@ def test_a_controller_that_ends_at_its_start_is_an_error_with_its_messages(plugi
         plugin._Controller.start(lambda address: command)
 
 
-def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_what_it_holds(plugin, so101, tmp_path):
-    (tmp_path / "roll.csv").write_text("time,wrist_roll\n" + "\n".join(f"{0.1 * k},{0.05 * k}" for k in range(5)))
-    config = plugin.GaponetMotionConfig(motions=f"{tmp_path / 'roll.csv'},sweep-shoulder_pan", fps=20.0, lead=0.5)
+def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_what_it_holds(
+    plugin, so101, tmp_path
+):
+    (tmp_path / "roll.csv").write_text(
+        "time,wrist_roll\n" + "\n".join(f"{0.1 * k},{0.05 * k}" for k in range(5))
+    )
+    config = plugin.GaponetMotionConfig(
+        motions=f"{tmp_path / 'roll.csv'},sweep-shoulder_pan", fps=20.0, lead=0.5
+    )
     motion = plugin.GaponetMotion(config)
     motion.connect()
     with pytest.raises(ConnectionError, match="position, which is unknown"):
@@ -96,8 +117,12 @@ def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_wh
     said += [motion.get_action() for _ in range(len(motion._rows) + 5)]
     units = motion.units
     rows = np.array([units.rad(action) for action in said])
-    np.testing.assert_allclose(rows[:10], np.repeat(units.rad(seen(62.0))[None], 10, axis=0), atol=1e-9)
-    assert {round(action["gripper.pos"], 6) for action in said} == {62.0}, "no motion of these names the gripper"
+    np.testing.assert_allclose(
+        rows[:10], np.repeat(units.rad(seen(62.0))[None], 10, axis=0), atol=1e-9
+    )
+    assert {round(action["gripper.pos"], 6) for action in said} == {62.0}, (
+        "no motion of these names the gripper"
+    )
     first = np.abs(rows[:, 4] - 0.2).argmin()
     assert np.ptp(rows[: first + 1], axis=0).argmax() == 4
     assert (np.ptp(rows[: first + 1, [0, 1, 2, 3]], axis=0) == 0).all(), "the file names one joint"

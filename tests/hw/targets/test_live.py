@@ -15,7 +15,14 @@ from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig
-from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, LiveConfig, LiveTargets, Message, decode, next_step
+from gaponet.hw.targets.live import (
+    MAX_MESSAGE_BYTES,
+    LiveConfig,
+    LiveTargets,
+    Message,
+    decode,
+    next_step,
+)
 from gaponet.sysid.motion.motion import Motion
 
 FAULT, HOLD = 1.5, 0.5  # s; from FAULT on a sender goes wrong; HOLD is the default
@@ -50,8 +57,12 @@ def good(t, sender="a"):
 def live(arm, say, seconds=2.6, config=LiveConfig(wait=3.0)):  # noqa: B008
     """Recording, driver, transport and targets after a run; the sender ends after `seconds`."""
     driver = NotedArm(arm)
-    transport = Scripted(driver.clock, lambda t: say(t) if t < seconds else [Message("a", 100.0 + t, end=True)])
-    targets = LiveTargets(transport, arm, driver.commanded, driver.clock, DT, SafetyConfig().speed, config)
+    transport = Scripted(
+        driver.clock, lambda t: say(t) if t < seconds else [Message("a", 100.0 + t, end=True)]
+    )
+    targets = LiveTargets(
+        transport, arm, driver.commanded, driver.clock, DT, SafetyConfig().speed, config
+    )
     return control(driver).run(targets), driver, transport, targets
 
 
@@ -59,7 +70,9 @@ def judge(arm, recording):
     """Every command that left was within range, rate and torque."""
     limits = Limits.from_robot(arm, arm.joint_names, SafetyConfig())
     rows = [r for r in recording.rows if r.ctrl is not None]
-    ctrl, qpos, qvel = (np.array(x) for x in zip(*((r.ctrl, r.state.qpos, r.state.qvel) for r in rows), strict=True))
+    ctrl, qpos, qvel = (
+        np.array(x) for x in zip(*((r.ctrl, r.state.qpos, r.state.qvel) for r in rows), strict=True)
+    )
     assert ((ctrl >= limits.low) & (ctrl <= limits.high)).all()
     assert (np.abs(np.diff(ctrl, axis=0)) <= limits.speed * DT + 1e-12).all()
     assert (np.abs(limits.kp * (ctrl - qpos) - limits.kd * qvel) <= limits.effort).all()
@@ -79,14 +92,22 @@ def test_a_stream_is_played_as_the_same_motion_from_a_file(arm):
     rows = 0.5 * commands(60, seed=1)  # slow enough to be followed at once
 
     def say(t):
-        k = sum(row.phase == "run" for row in controller.recording.rows) + (controller.phase.value == "run")
+        k = sum(row.phase == "run" for row in controller.recording.rows) + (
+            controller.phase.value == "run"
+        )
         row = rows[min(max(k - 1, 0), len(rows) - 1)]
-        return [Message("a", 100 + t, dict(zip(arm.joint_names, row.tolist(), strict=True)), k > len(rows))]
+        return [
+            Message(
+                "a", 100 + t, dict(zip(arm.joint_names, row.tolist(), strict=True)), k > len(rows)
+            )
+        ]
 
     driver = NotedArm(arm)
     controller = control(driver, compensator=Corrects())
     transport = Scripted(driver.clock, say)
-    controller.run(LiveTargets(transport, arm, arm.joint_names, driver.clock, DT, SafetyConfig().speed))
+    controller.run(
+        LiveTargets(transport, arm, arm.joint_names, driver.clock, DT, SafetyConfig().speed)
+    )
     from_file = run(NotedArm(arm), Motion("sway", "whole_body", DT, rows), compensator=Corrects())
     sent = [[r.ctrl for r in x.rows if r.phase == "run"] for x in (from_file, controller.recording)]
     assert len(sent[0]) == len(sent[1]) == 60
@@ -114,19 +135,27 @@ WRONG = {  # from FAULT on, every message is of this kind
     "a joint fewer": (lambda t: [Message("a", 100 + t, {"elbow": 0.0})], "joints"),
     "a jump": (lambda t: [Message("a", 100 + t, {"shoulder": -1.4, "elbow": 1.4})], "speed"),
     "degrees": (lambda t: [Message("a", 100 + t, {"shoulder": 30.0, "elbow": 4.0})], "range"),
-    "too fast": (lambda t: [Message("a", 100 + t, {"shoulder": 1.4 * (-1) ** int(t / DT), "elbow": 0.0})], "speed"),
+    "too fast": (
+        lambda t: [Message("a", 100 + t, {"shoulder": 1.4 * (-1) ** int(t / DT), "elbow": 0.0})],
+        "speed",
+    ),
     "the same again": (lambda t: [good(FAULT - DT)], "order"),
     "backwards": (lambda t: [good(2 * FAULT - t - DT)], "order"),
     "late": (lambda t: [Message("a", 100 + t - 0.11, wave(t))] if t > FAULT + 0.11 else [], "late"),
     "another sender": (lambda t: [good(t, "b")], "stranger"),
-    "malformed": (lambda t: [decode("a", b'{"time": 3, "target": {"shoulder": "0.1"}}')], "malformed"),
+    "malformed": (
+        lambda t: [decode("a", b'{"time": 3, "target": {"shoulder": "0.1"}}')],
+        "malformed",
+    ),
 }
 
 
 @pytest.mark.parametrize("what", WRONG)
 def test_what_cannot_be_taken_is_held_and_then_damped(arm, what):
     wrong, kind = WRONG[what]
-    recording, driver, transport, targets = live(arm, lambda t: [good(t)] if t < FAULT else wrong(t))
+    recording, driver, transport, targets = live(
+        arm, lambda t: [good(t)] if t < FAULT else wrong(t)
+    )
     assert recording.fault is not None
     assert recording.fault.kind == "silence"
     assert set(targets.counts["refused"]) == ({kind} if kind else set())
@@ -134,12 +163,18 @@ def test_what_cannot_be_taken_is_held_and_then_damped(arm, what):
     damped = next(t for t, ctrl in driver.sent if ctrl is None)
     assert all(ctrl is None for t, ctrl in driver.sent if t >= damped)
     held = [r for r in recording.rows if r.target is not None][-10:]
-    np.testing.assert_array_equal(np.ptp([r.target for r in held], axis=0), 0.0)  # the last good one, until then
-    longest = HOLD + (3 * DT if what == "too fast" else DT)  # its first one may be where the last good one was
+    np.testing.assert_array_equal(
+        np.ptp([r.target for r in held], axis=0), 0.0
+    )  # the last good one, until then
+    longest = HOLD + (
+        3 * DT if what == "too fast" else DT
+    )  # its first one may be where the last good one was
     assert HOLD - 2 * DT < damped - transport.began - FAULT <= longest
 
 
-@pytest.mark.parametrize("what", ["silent", "not a number", "a jump", "too fast", "late", "another sender"])
+@pytest.mark.parametrize(
+    "what", ["silent", "not a number", "a jump", "too fast", "late", "another sender"]
+)
 def test_a_burst_of_it_shorter_than_the_hold_is_survived(arm, what):
     def say(t):
         return WRONG[what][0](t) if FAULT <= t < FAULT + HOLD - 2 * DT else [good(t)]
@@ -151,7 +186,9 @@ def test_a_burst_of_it_shorter_than_the_hold_is_survived(arm, what):
 
 
 def test_a_target_that_is_less_than_a_tenth_of_a_second_late_is_taken(arm):
-    recording, _, _, targets = live(arm, lambda t: [Message("a", 100 + t - 0.09 * (t > FAULT), wave(t))])
+    recording, _, _, targets = live(
+        arm, lambda t: [Message("a", 100 + t - 0.09 * (t > FAULT), wave(t))]
+    )
     assert recording.fault is None
     assert set(targets.counts["refused"]) <= {"order"}, "as far as newer ones came before"
 
@@ -163,17 +200,24 @@ def test_a_flood_is_read_to_its_newest_and_can_move_no_faster(arm):
         if t < FAULT:
             return [good(t)]
         start = wave(FAULT)
-        return [Message("a", 100 + t + 1e-5 * i, start | {"shoulder": 0.02 * i + start["shoulder"]}) for i in range(50)]
+        return [
+            Message("a", 100 + t + 1e-5 * i, start | {"shoulder": 0.02 * i + start["shoulder"]})
+            for i in range(50)
+        ]
 
     recording, _, _, targets = live(arm, say)
-    shoulder = np.array([r.target[0] for r in recording.rows if r.target is not None and r.phase == "run"])
+    shoulder = np.array(
+        [r.target[0] for r in recording.rows if r.target is not None and r.phase == "run"]
+    )
     assert np.abs(np.diff(shoulder)).max() <= SafetyConfig().speed * 2 * DT + 1e-9
     assert targets.counts["refused"]["speed"] > 1000
     judge(arm, recording)
 
 
 def test_a_target_a_little_out_of_range_is_brought_into_it(arm):
-    recording, *_ = live(arm, lambda t: [Message("a", 100 + t, {"shoulder": min(1.65, t), "elbow": 0.0})])
+    recording, *_ = live(
+        arm, lambda t: [Message("a", 100 + t, {"shoulder": min(1.65, t), "elbow": 0.0})]
+    )
     assert recording.fault is None
     assert max(r.target[0] for r in recording.rows if r.target is not None) == 1.5
     judge(arm, recording)
@@ -182,12 +226,20 @@ def test_a_target_a_little_out_of_range_is_brought_into_it(arm):
 @pytest.mark.parametrize("most", [50.0, 10.0])
 @pytest.mark.parametrize(
     "shoulder",
-    [lambda t: 0.09 * (-1) ** round(t / DT), lambda t: 0.5 * np.sin(3.5 * t), lambda t: 0.05 * min(int(t / DT), 14)],
+    [
+        lambda t: 0.09 * (-1) ** round(t / DT),
+        lambda t: 0.5 * np.sin(3.5 * t),
+        lambda t: 0.05 * min(int(t / DT), 14),
+    ],
     ids=["buzz", "swing", "a ramp that stops"],
 )
 def test_no_sender_makes_a_command_accelerate_beyond_the_limit(arm, shoulder, most):
     config = LiveConfig(hold=HOLD, wait=3.0, acceleration=most)
-    recording, *_ = live(arm, lambda t: [Message("a", 100 + t, {"shoulder": shoulder(t), "elbow": 0.0})], config=config)
+    recording, *_ = live(
+        arm,
+        lambda t: [Message("a", 100 + t, {"shoulder": shoulder(t), "elbow": 0.0})],
+        config=config,
+    )
     assert recording.fault is None
     at = np.array([r.ctrl[0] for r in recording.rows if r.phase == "run"])
     assert np.abs(np.diff(at, 2)).max() <= most * DT**2 * (1 + 1e-9)
@@ -196,7 +248,9 @@ def test_no_sender_makes_a_command_accelerate_beyond_the_limit(arm, shoulder, mo
 
 
 @pytest.mark.parametrize("rate", [0.2, 1.0, 3.0, 5.0])
-def test_a_target_is_reached_without_overshoot_and_a_ramp_is_followed_as_near_as_it_can_be_stopped(rate):
+def test_a_target_is_reached_without_overshoot_and_a_ramp_is_followed_as_near_as_it_can_be_stopped(
+    rate,
+):
     change, fastest = 50.0 * DT**2, 5.0 * DT
     at = step = np.zeros(1)
     for k in range(200):
@@ -239,8 +293,12 @@ def test_until_the_first_target_nothing_is_commanded_and_not_for_ever(arm):
     assert recording.fault.kind == "silence"
     assert "no target came on nowhere in 3 s" in recording.fault.text
     assert driver.sent == []
-    recording, driver, *_ = live(arm, lambda t: [good(t)] if t > 2.0 else [Message("a", 99.0)], seconds=4.0)
-    assert recording.fault is None, "patience for the robot begins anew while a target is waited for"
+    recording, driver, *_ = live(
+        arm, lambda t: [good(t)] if t > 2.0 else [Message("a", 99.0)], seconds=4.0
+    )
+    assert recording.fault is None, (
+        "patience for the robot begins anew while a target is waited for"
+    )
 
 
 def test_a_sender_that_dies_while_the_robot_goes_to_its_first_target_ends_in_damping(arm):

@@ -17,7 +17,14 @@ from gaponet.hw.control.driver import DriverError
 from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message
 from gaponet.hw.targets.pipe import PipeTransport
 
-STATE = {"time": 7.0, "joint_names": ("a", "b"), "commanded": ("b",), "qpos": [0.1, 0.2], "qvel": [0, 0], "tau": [1, 2]}
+STATE = {
+    "time": 7.0,
+    "joint_names": ("a", "b"),
+    "commanded": ("b",),
+    "qpos": [0.1, 0.2],
+    "qvel": [0, 0],
+    "tau": [1, 2],
+}
 
 
 def received(transport, count, seconds=20.0):
@@ -149,7 +156,9 @@ def trajectory(names, positions, stamp=(5, 7), due=20_000_000, points=1):
     header = kind["std_msgs/msg/Header"](kind["builtin_interfaces/msg/Time"](*stamp), "base")
     none = np.array([])
     due = kind["builtin_interfaces/msg/Duration"](0, due)
-    point = kind["trajectory_msgs/msg/JointTrajectoryPoint"](np.array(positions, float), none, none, none, due)
+    point = kind["trajectory_msgs/msg/JointTrajectoryPoint"](
+        np.array(positions, float), none, none, none, due
+    )
     message = kind["trajectory_msgs/msg/JointTrajectory"](header, list(names), [point] * points)
     return bytes(store.serialize_cdr(message, "trajectory_msgs/msg/JointTrajectory"))
 
@@ -166,11 +175,19 @@ def test_ros_messages_are_on_the_wire_as_another_library_has_them(ros2):
     data = trajectory(["left", "right_elbow"], [0.1, -0.2])
     said = ros2.decode(ros2.JointTrajectory, data[4:])
     assert ros2.encode(said) == data[4:]
-    assert ros2.to_message("a", data[4:]) == Message("a", 5 + 7e-9, {"left": 0.1, "right_elbow": -0.2})
+    assert ros2.to_message("a", data[4:]) == Message(
+        "a", 5 + 7e-9, {"left": 0.1, "right_elbow": -0.2}
+    )
     store = get_typestore(Stores.ROS2_HUMBLE)
-    state = ros2.JointState(ros2.Header(ros2.Time(3, 4), ""), ["left", "b"], [0.1, 0.2], [1.0, 2.0], [])
+    state = ros2.JointState(
+        ros2.Header(ros2.Time(3, 4), ""), ["left", "b"], [0.1, 0.2], [1.0, 2.0], []
+    )
     read = store.deserialize_cdr(data[:4] + ros2.encode(state), "sensor_msgs/msg/JointState")
-    assert (read.header.stamp.sec, read.name, read.velocity.tolist()) == (3, ["left", "b"], [1.0, 2.0])
+    assert (read.header.stamp.sec, read.name, read.velocity.tolist()) == (
+        3,
+        ["left", "b"],
+        [1.0, 2.0],
+    )
     assert bytes(store.serialize_cdr(read, "sensor_msgs/msg/JointState"))[4:] == ros2.encode(state)
 
 
@@ -218,7 +235,10 @@ def test_a_trajectory_on_the_bus_arrives_and_states_are_published(ros2):
 @pytest.mark.parametrize("version", ["jazzy", "kilted"])
 def test_ros_2_itself_is_heard_and_hears_us(ros2, version):
     """rclpy on Fast DDS, whose descriptions of types Cyclone DDS does not take: make peers."""
-    packages = (f"ros-{version}-{name}" for name in ("rclpy", "rmw-fastrtps-cpp", "sensor-msgs", "trajectory-msgs"))
+    packages = (
+        f"ros-{version}-{name}"
+        for name in ("rclpy", "rmw-fastrtps-cpp", "sensor-msgs", "trajectory-msgs")
+    )
     python, domain = environment(f"ros-{version}", "3.12", tuple(packages)), 30 + os.getpid() % 150
     there = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     transport = ros2.ROS2Transport(domain)
@@ -236,7 +256,12 @@ def test_ros_2_itself_is_heard_and_hears_us(ros2, version):
         peer.kill()
         peer.wait()
         transport.close("over")
-    expected = {"name": ["a", "b"], "position": [0.1, 0.2], "velocity": [0.0, 0.0], "effort": [1.0, 2.0]}
+    expected = {
+        "name": ["a", "b"],
+        "position": [0.1, 0.2],
+        "velocity": [0.0, 0.0],
+        "effort": [1.0, 2.0],
+    }
     assert said.items() >= expected.items()
     assert [m.error for m in found if m.error] == []
     assert len({m.sender for m in found}) == 1

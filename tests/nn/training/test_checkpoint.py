@@ -44,13 +44,19 @@ def stop(stage, at):
 def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage, at):
     data, robot, whole = world
     begun = not (stage == "pretraining" and at < 10)
-    with nullcontext() if begun else pytest.raises(ModelError, match="before the first step of training"):
+    with (
+        nullcontext()
+        if begun
+        else pytest.raises(ModelError, match="before the first step of training")
+    ):
         Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, show=stop(stage, at)).run()
     assert read_checkpoint(tmp_path / "run")["steps"] < whole["steps"]
     Trainer(data, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True).run()
     again = read_checkpoint(tmp_path / "run")
     assert differences(whole, again) == []
-    assert [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").open()] == again["progress"]
+    assert [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").open()] == again[
+        "progress"
+    ]
 
 
 def test_a_run_killed_before_its_first_checkpoint_is_begun_again(world, tmp_path):
@@ -65,7 +71,10 @@ def test_a_run_is_not_resumed_on_other_recordings(world, tmp_path):
     data, robot, _ = world
     Trainer(data, robot, tmp_path / "run", TINY_TRAINING, Budget(steps=0)).run()
     other = write_dataset(tmp_path / "other", robot, recordings(robot, 8, rows=50, kp=0.5))
-    with pytest.raises(UsageError, match=r"run: was trained on other recordings than this dataset holds; train anew"):
+    with pytest.raises(
+        UsageError,
+        match=r"run: was trained on other recordings than this dataset holds; train anew",
+    ):
         Trainer(other, robot, tmp_path / "run", TINY_TRAINING, STEPS, resume=True)
 
 
@@ -87,7 +96,15 @@ def test_a_resumed_run_continues_with_gain_1(world, tmp_path, monkeypatch):
         if status.stage == "ppo":
             gains.append(trainer.net.bounded.gain.item())
 
-    trainer = Trainer(data, robot, tmp_path / "run", warm, Budget(steps=4 * WARM + UPDATE), resume=True, show=watch)
+    trainer = Trainer(
+        data,
+        robot,
+        tmp_path / "run",
+        warm,
+        Budget(steps=4 * WARM + UPDATE),
+        resume=True,
+        show=watch,
+    )
     assert trainer.net.bounded.gain == 1.0
     trainer.run()
     assert set(gains) == {1.0}

@@ -27,9 +27,16 @@ def test_the_paper_s_recipe_has_no_supervised_start_and_keeps_what_was_changed()
 
 def test_the_default_number_of_simulations_depends_on_the_device():
     cuda = TrainConfig(ppo=PPOConfig(num_envs=256), device="cuda")
-    assert (TrainConfig().sized().pretraining.num_envs, TrainConfig().sized().ppo.num_envs) == (256, 256)
+    assert (TrainConfig().sized().pretraining.num_envs, TrainConfig().sized().ppo.num_envs) == (
+        256,
+        256,
+    )
     assert (cuda.sized().pretraining.num_envs, cuda.sized().ppo.num_envs) == (4096, 256)
-    assert cuda.options() == cuda.sized().options() == ["--pretraining.num-envs", "4096", "--device", "cuda"]
+    assert (
+        cuda.options()
+        == cuda.sized().options()
+        == ["--pretraining.num-envs", "4096", "--device", "cuda"]
+    )
     assert TrainConfig().options() == TrainConfig().sized().options() == []
 
 
@@ -50,7 +57,9 @@ def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
         raise UsageError("heard")
 
     monkeypatch.setattr(api, "train", train)
-    words = shlex.split(shlex.join(["train", "data", "--out", "run", "--model", "gaponet", *config.options()]))
+    words = shlex.split(
+        shlex.join(["train", "data", "--out", "run", "--model", "gaponet", *config.options()])
+    )
     assert main(words) == 2
     assert heard == [config]
 

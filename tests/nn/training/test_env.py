@@ -24,7 +24,14 @@ def robot(tmp_path):
 
 def make(robot, sequences, num_envs=8, steps=1000, **reward):
     return DeltaEnv(
-        sequences, robot, ModelConfig(history=2), num_envs, steps, RewardConfig(**reward), seed=0, nthread=1
+        sequences,
+        robot,
+        ModelConfig(history=2),
+        num_envs,
+        steps,
+        RewardConfig(**reward),
+        seed=0,
+        nthread=1,
     )
 
 
@@ -58,10 +65,20 @@ def test_an_unrecorded_joint_stands_still_and_has_neither_reward_nor_label(robot
     said = replace(one.meta, notes={"posture": {robot.joint_names[1]: 0.3}})
     still = np.tile(np.float32([np.nan, 0.3]), (len(one), 1))
     stands = lambda x, at: np.where(np.isnan(still), x, at)  # noqa: E731
-    one = replace(one, meta=said, ctrl=stands(one.ctrl, 0.3), qpos=stands(one.qpos, 0.3), qvel=stands(one.qvel, 0.0))
+    one = replace(
+        one,
+        meta=said,
+        ctrl=stands(one.ctrl, 0.3),
+        qpos=stands(one.qpos, 0.3),
+        qvel=stands(one.qvel, 0.0),
+    )
     env = make(robot, [one, other])
     pretraining = Pretraining(
-        build_network(env.config, 2), env, np.ones((120, 2), np.float32), PretrainingConfig(steps=3), 0
+        build_network(env.config, 2),
+        env,
+        np.ones((120, 2), np.float32),
+        PretrainingConfig(steps=3),
+        0,
     )
     _, labels = pretraining.rollout(follow_labels=True)
     unknown = env.first == env.rows.first[0]
@@ -72,9 +89,9 @@ def test_an_unrecorded_joint_stands_still_and_has_neither_reward_nor_label(robot
     assert (reward[unknown, 1] == 0).all()
     assert (reward[:, 0] < 0).all()
     assert (reward[~unknown, 1] < 0).all()
-    fit = Pretraining(pretraining.net, env, pretraining.labels, PretrainingConfig(steps=3, gradient_steps=2), 0).round(
-        lambda: 0.0
-    )
+    fit = Pretraining(
+        pretraining.net, env, pretraining.labels, PretrainingConfig(steps=3, gradient_steps=2), 0
+    ).round(lambda: 0.0)
     assert np.isfinite(fit["label_rmse"])
 
 
@@ -107,7 +124,9 @@ def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(r
     length, drawn = np.array([len(s) for s in sequences]), []
     for g, condition in enumerate(env.rows.conditions):
         mine = np.flatnonzero([Condition.of(s, robot) == condition for s in sequences])
-        drawn += rng.choice(mine, size=(env.rows.group == g).sum(), p=length[mine] / length[mine].sum()).tolist()
+        drawn += rng.choice(
+            mine, size=(env.rows.group == g).sum(), p=length[mine] / length[mine].sum()
+        ).tolist()
     np.testing.assert_array_equal(env.first, env.rows.first[drawn])
 
 

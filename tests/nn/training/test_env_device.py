@@ -10,7 +10,13 @@ from torch.overrides import TorchFunctionMode
 
 from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
+from gaponet.nn.training.config import (
+    Budget,
+    PPOConfig,
+    PretrainingConfig,
+    RewardConfig,
+    TrainConfig,
+)
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.trainer import Trainer
 
@@ -22,7 +28,9 @@ STEPS, CASTS = 200, ("array", "bool", "float", "int", "index")
 def make(folder, device, servo=None, **model):
     robot = replace(write_arm(folder), **servo or {})
     sequences = recordings(robot, 4, rows=60, kp=0.6)
-    return DeltaEnv(sequences, robot, ModelConfig(**model), 8, 90, RewardConfig(), 0, 1, device=device)
+    return DeltaEnv(
+        sequences, robot, ModelConfig(**model), 8, 90, RewardConfig(), 0, 1, device=device
+    )
 
 
 def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
@@ -35,7 +43,9 @@ def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
         delta = rng.normal(0, 0.01, (8, 2)).astype(np.float32)
         reward, done = ours.step(delta)
         like, same = theirs.step(torch.from_numpy(delta))
-        np.testing.assert_allclose(like.numpy(), reward, atol=1e-5 / RewardConfig().position)  # 1e-5 rad
+        np.testing.assert_allclose(
+            like.numpy(), reward, atol=1e-5 / RewardConfig().position
+        )  # 1e-5 rad
         np.testing.assert_array_equal(same.numpy(), done)
         ends += done.sum()
     assert ends > 8
@@ -55,7 +65,9 @@ class Crossings(TorchFunctionMode):
         name = getattr(func, "__name__", "")
         index = args[1] if name in ("__getitem__", "__setitem__") else ()
         parts = index if isinstance(index, tuple) else (index,)
-        waits = [isinstance(i, np.ndarray) or getattr(i, "dtype", None) == torch.bool for i in parts]
+        waits = [
+            isinstance(i, np.ndarray) or getattr(i, "dtype", None) == torch.bool for i in parts
+        ]
         if name in self.WAYS or any(waits):
             self.seen.append((name, args[0].dtype, tuple(args[0].shape)))
         return func(*args, **(kwargs or {}))
@@ -70,7 +82,9 @@ def test_a_tensor_that_goes_to_the_host_is_noted():
     assert len(crossings.seen) >= 4
 
 
-@pytest.mark.parametrize("servo", [{}, {"stribeck": 0.05, "stribeck_speed": 0.2, "delay": [0.03, 0.0]}])
+@pytest.mark.parametrize(
+    "servo", [{}, {"stribeck": 0.05, "stribeck_speed": 0.2, "delay": [0.03, 0.0]}]
+)
 def test_nothing_goes_to_the_host_in_a_step(tmp_path, servo):
     env = make(tmp_path, "warp-cpu", servo, history=2, stride=2)
     delta, resets = torch.zeros(8, 2), 0
@@ -91,7 +105,9 @@ def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
     robot, data = write_arm(tmp_path / "arm"), tmp_path / "data"
     dataset = write_dataset(data, robot, recordings(robot, 8, rows=80, kp=0.5, delay=2))
     small = TrainConfig(
-        ModelConfig(history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
+        ModelConfig(
+            history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)
+        ),
         pretraining=PretrainingConfig(
             rounds=2, num_envs=16, steps=40, gradient_steps=80, batch_size=256, sensor_states=64
         ),
@@ -100,7 +116,9 @@ def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
     )
     steps = 2 * 16 * 40 + 2 * 16 * 8
     Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps)).run()
-    model = Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps + 256), resume=True).run()
+    model = Trainer(
+        dataset, robot, tmp_path / "run", small, Budget(steps=steps + 256), resume=True
+    ).run()
     assert model.card["stages"]["ppo_updates"] >= 4
     assert model.card["val_mpjae"]["model"] < 0.9 * model.card["val_mpjae"]["nominal"]
 

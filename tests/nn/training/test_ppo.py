@@ -12,9 +12,17 @@ from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO, advantages
 from gaponet.nn.training.sensor_fit import fit_inputs
 
-MODEL = ModelConfig(history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,))
+MODEL = ModelConfig(
+    history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,)
+)
 SETTINGS = PPOConfig(
-    num_envs=16, num_steps=8, epochs=1, mini_batches=2, critic_warmup=0, explained=-1e9, critic_hidden=(32,)
+    num_envs=16,
+    num_steps=8,
+    epochs=1,
+    mini_batches=2,
+    critic_warmup=0,
+    explained=-1e9,
+    critic_hidden=(32,),
 )
 
 
@@ -25,7 +33,10 @@ def env(tmp_path):
 
 
 def test_advantages_by_hand():
-    reward, value = torch.tensor([1.0, 2.0, 4.0]).reshape(3, 1, 1), torch.tensor([0.5, 1.0, 2.0]).reshape(3, 1, 1)
+    reward, value = (
+        torch.tensor([1.0, 2.0, 4.0]).reshape(3, 1, 1),
+        torch.tensor([0.5, 1.0, 2.0]).reshape(3, 1, 1),
+    )
     done = torch.tensor([0.0, 1.0, 0.0]).reshape(3, 1, 1)  # a motion ends after the second step
     found = advantages(reward, value, torch.full((1, 1), 8.0), done, gamma=0.5, lam=0.5).flatten()
     # δ = 1 + 0.5·1 − 0.5 = 1;  2 − 1 = 1;  4 + 0.5·8 − 2 = 6;  the first adds 0.25 of the second's, which adds nothing.
@@ -36,14 +47,20 @@ def test_the_actor_is_trained_after_the_critic_explains_the_returns(env):
     torch.manual_seed(0)
     net = build_network(MODEL, 2)
     before = {name: p.clone() for name, p in net.named_parameters()}
-    waiting = PPO(env, net, PPOConfig(num_envs=16, num_steps=8, critic_warmup=2, explained=1.0, critic_hidden=(32,)))
+    waiting = PPO(
+        env,
+        net,
+        PPOConfig(num_envs=16, num_steps=8, critic_warmup=2, explained=1.0, critic_hidden=(32,)),
+    )
     for _ in range(4):
         found = waiting.update()
     assert all(torch.equal(p, before[name]) for name, p in net.named_parameters())
     assert found.explained_variance < 1
     assert found.learning_rate == 0.0
     PPO(env, net, SETTINGS).update()
-    changed = {name.split(".")[0] for name, p in net.named_parameters() if not torch.equal(p, before[name])}
+    changed = {
+        name.split(".")[0] for name, p in net.named_parameters() if not torch.equal(p, before[name])
+    }
     assert changed == {"branch", "trunk", "bias"}
 
 
@@ -61,7 +78,11 @@ def test_joints_that_do_not_explore_are_masked_out(env):
 
 def test_exploration_has_the_set_correlation_and_width(env):
     torch.manual_seed(0)
-    learner = PPO(env, build_network(MODEL, 2), PPOConfig(num_envs=16, num_steps=32, noise_share=1.0, std=0.01))
+    learner = PPO(
+        env,
+        build_network(MODEL, 2),
+        PPOConfig(num_envs=16, num_steps=32, noise_share=1.0, std=0.01),
+    )
     seen = []
     for _ in range(8):
         learner.collect()

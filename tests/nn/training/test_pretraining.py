@@ -20,7 +20,9 @@ from gaponet.sim.replay import replay
 def fitted(tmp_path_factory):
     torch.manual_seed(0)
     robot = write_arm(tmp_path_factory.mktemp("arm"))
-    config = ModelConfig(history=2, num_probes=4, sensor_hidden=(32,), branch_hidden=(16,), trunk_hidden=(16,))
+    config = ModelConfig(
+        history=2, num_probes=4, sensor_hidden=(32,), branch_hidden=(16,), trunk_hidden=(16,)
+    )
     env = DeltaEnv(recordings(robot, 4), robot, config, 32, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
     settings = PretrainingConfig(num_envs=32, steps=64, gradient_steps=2)
@@ -49,14 +51,21 @@ def test_a_full_pool_takes_a_part_of_the_environments_of_each_period_in_turn(fit
     every, some = rows
     assert len(every) == 6 * 32
     kept = np.arange(6 * 32).reshape(6, 32)
-    np.testing.assert_array_equal(some, every[np.concatenate([kept[t, t % 3 :: 3] for t in range(6)])])
+    np.testing.assert_array_equal(
+        some, every[np.concatenate([kept[t, t % 3 :: 3] for t in range(6)])]
+    )
 
 
 def errors(sequences, labels, robot):
     """Mean |error| of each recording under its labels, rad."""
     parts = np.split(labels, np.cumsum([len(s) for s in sequences])[:-1])
     told = [replace(s, ctrl=s.ctrl + part) for s, part in zip(sequences, parts, strict=True)]
-    return np.array([np.abs(t.qpos - s.qpos).mean() for s, t in zip(sequences, replay(told, robot), strict=True)])
+    return np.array(
+        [
+            np.abs(t.qpos - s.qpos).mean()
+            for s, t in zip(sequences, replay(told, robot), strict=True)
+        ]
+    )
 
 
 def test_labels_reduce_the_error_below_a_third(tmp_path):

@@ -18,7 +18,9 @@ from gaponet.nn.training import ranks
 from gaponet.nn.training.config import Budget
 from gaponet.nn.training.trainer import Trainer
 
-pytestmark = pytest.mark.skipif(os.name == "nt", reason="Ctrl-C reaches no single process on Windows")
+pytestmark = pytest.mark.skipif(
+    os.name == "nt", reason="Ctrl-C reaches no single process on Windows"
+)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +29,15 @@ def place(tmp_path_factory):
     robot = write_arm(place / "arm")
     write_dataset(place / "data", robot, recordings(robot, 8, rows=60, kp=0.5))
     script = Path(__file__).parents[2] / "two_ranks.py"
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+        str(script),
+    ]
     done = subprocess.run([*command, str(place)], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-3000:]
     return place
@@ -84,11 +94,15 @@ def test_an_interrupt_of_one_rank_ends_both_and_the_resumed_run_is_equal_bit_for
 
 def test_a_run_is_resumed_by_as_many_processes(place):
     data, robot = Dataset(place / "data"), write_arm(place / "arm")
-    with pytest.raises(UsageError, match="was trained by 2 processes; resume with torchrun --nproc-per-node 2"):
+    with pytest.raises(
+        UsageError, match="was trained by 2 processes; resume with torchrun --nproc-per-node 2"
+    ):
         Trainer(data, robot, place / "run-whole", TINY_TRAINING, Budget(steps=STEPS), resume=True)
 
 
 def test_what_ranks_cannot_share_evenly_is_refused(monkeypatch):
     monkeypatch.setattr(ranks, "world", lambda: 3)
-    with pytest.raises(UsageError, match=r"--pretraining\.num-envs 8: 3 ranks cannot share them evenly"):
+    with pytest.raises(
+        UsageError, match=r"--pretraining\.num-envs 8: 3 ranks cannot share them evenly"
+    ):
         ranks.share(TINY_TRAINING)

@@ -23,7 +23,12 @@ class Trainings:
 
     def __init__(self, interrupted="", later=None, **errors):
         """later: Error of a network after the rest of the budget."""
-        self.calls, self.interrupted, self.later, self.errors = [], interrupted, later, ERRORS | errors
+        self.calls, self.interrupted, self.later, self.errors = (
+            [],
+            interrupted,
+            later,
+            ERRORS | errors,
+        )
 
     def __call__(self, kind, run, share, spent, resume):
         self.calls.append((kind, run.name, round(share, 6), round(spent, 6), resume))
@@ -48,7 +53,9 @@ def test_the_best_kind_gets_the_rest_of_the_budget(tmp_path):
     assert (tmp_path / "run/checkpoint.pt").read_text() == "shared_mlp"
 
 
-def test_an_interrupted_choice_leaves_the_best_so_far_and_goes_on_where_it_was(tmp_path, monkeypatch):
+def test_an_interrupted_choice_leaves_the_best_so_far_and_goes_on_where_it_was(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(GapModel, "load", classmethod(lambda cls, run: run))
     run, train = tmp_path / "run", Trainings(interrupted="shared_mlp")
     train_best(run, False, train)

@@ -21,8 +21,12 @@ from gaponet.report.methods import METHODS
 from gaponet.report.verdict import LEARNED
 
 SMALL = TrainConfig(
-    model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
-    pretraining=PretrainingConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
+    model=ModelConfig(
+        history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)
+    ),
+    pretraining=PretrainingConfig(
+        rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256
+    ),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1, explained=-1e9),
     validate_every=4,
 )
@@ -55,10 +59,15 @@ def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(traine
 
 def test_a_run_whose_budget_buys_no_step_fails_and_can_be_resumed(trained, robot, tmp_path):
     data, _, _ = trained
-    with pytest.raises(ModelError, match=r"the budget ended .* before the first step of training: nothing was learned"):
+    with pytest.raises(
+        ModelError,
+        match=r"the budget ended .* before the first step of training: nothing was learned",
+    ):
         Trainer(data, robot, tmp_path / "run", SMALL, Budget(seconds=1e-6)).run()
     assert not (tmp_path / "run/model").exists()
-    card = Trainer(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
+    card = (
+        Trainer(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
+    )
     assert GapModel.how_trained(card) == "supervised pre-training (1 of 3 rounds), no PPO"
 
 
@@ -69,7 +78,9 @@ def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
     path = write_split(data, other, "motion", ("swapped",))
     config = replace(SMALL, split=str(path))
     assert Trainer(data, robot, tmp_path / "run", config, STEPS).data.splits == other
-    with pytest.raises(UsageError, match="leave out --holdout-units, --holdout-payloads, --rates and --train-share"):
+    with pytest.raises(
+        UsageError, match="leave out --holdout-units, --holdout-payloads, --rates and --train-share"
+    ):
         Trainer(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
 
 
@@ -77,7 +88,9 @@ def test_a_plain_network_trains_and_is_evaluated_beside_the_operator(trained, ro
     data, run, _ = trained
     config = replace(SMALL, model=replace(SMALL.model, kind="mlp", mlp_hidden=(64,)))
     model = Trainer(data, robot, tmp_path / "run", config, STEPS).run()
-    lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()
+    ]
     assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
     assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
     result = evaluate([run, tmp_path / "run"], data, robot).result
@@ -85,7 +98,9 @@ def test_a_plain_network_trains_and_is_evaluated_beside_the_operator(trained, ro
     assert set(ORDER) | {"target", "recorded"} <= set(METHODS)
 
 
-def test_trees_train_without_ppo_and_are_exported_like_networks(trained, robot, tmp_path, monkeypatch):
+def test_trees_train_without_ppo_and_are_exported_like_networks(
+    trained, robot, tmp_path, monkeypatch
+):
     pytest.importorskip("sklearn")
     monkeypatch.setattr("gaponet.nn.trees.TREES", 15)
     config = replace(SMALL, model=replace(SMALL.model, kind="trees"))
@@ -100,7 +115,9 @@ def test_card_and_progress_state_inputs_errors_and_label_fits(trained):
     card = trained[2].card
     lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
     assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
-    assert card["val_mpjae"]["model"] == min(line["val_mpjae"] for line in lines)  # the best is exported
+    assert card["val_mpjae"]["model"] == min(
+        line["val_mpjae"] for line in lines
+    )  # the best is exported
     fitted = [line for line in lines if line["stage"] == "pretraining"]
     assert all(0 < line["label_rmse"] < 0.1 and line["label_rmse_before"] > 0 for line in fitted)
     assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
@@ -120,15 +137,21 @@ def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
 
     monkeypatch.setattr(gaponet.sim.batch, "Batch", note)
     data = dataset(tmp_path / "data", robot, rows=40)
-    Trainer(data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)).run()
+    Trainer(
+        data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)
+    ).run()
     assert asked == {1}
 
 
 @pytest.mark.parametrize("sensors", ["predicted", "off"])
-def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(sensors, trained, robot, tmp_path, monkeypatch):
+def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(
+    sensors, trained, robot, tmp_path, monkeypatch
+):
     monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
     config = replace(
-        SMALL, pretraining=replace(SMALL.pretraining, rounds=0), model=replace(SMALL.model, sensors=sensors)
+        SMALL,
+        pretraining=replace(SMALL.pretraining, rounds=0),
+        model=replace(SMALL.model, sensors=sensors),
     )
     trainer = Trainer(trained[0], robot, tmp_path / "run", config, Budget(steps=16 * 16))
     model = trainer.run()
@@ -138,8 +161,12 @@ def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(sensors, 
         assert model.card["sensor_r2"]["mean"] > 0.3
 
 
-def test_the_gain_is_halved_if_that_reduces_the_validation_error(tmp_path, robot, trained, monkeypatch):
-    def error(validator, net, robot=None):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
+def test_the_gain_is_halved_if_that_reduces_the_validation_error(
+    tmp_path, robot, trained, monkeypatch
+):
+    def error(
+        validator, net, robot=None
+    ):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
         fitted = net is not None and bool(net.trunk[-1].weight.any())
         mean = 0.4 + 0.4 * abs(net.bounded.gain.item() - 0.5) if fitted else 0.5
         return np.full(len(validator.sequences), mean)
@@ -150,7 +177,9 @@ def test_the_gain_is_halved_if_that_reduces_the_validation_error(tmp_path, robot
     assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)
 
 
-def test_ppo_starts_untrained_if_pretraining_increases_the_error(tmp_path, robot, trained, monkeypatch):
+def test_ppo_starts_untrained_if_pretraining_increases_the_error(
+    tmp_path, robot, trained, monkeypatch
+):
     seen = []
 
     def error(validator, net, robot=None):
@@ -164,7 +193,9 @@ def test_ppo_starts_untrained_if_pretraining_increases_the_error(tmp_path, robot
     model = trainer.run()
     rounds, updates = [s for s in seen if s[0] == "pretraining"], [s for s in seen if s[0] == "ppo"]
     assert rounds == [("pretraining", True)] * 2
-    assert updates[:3] == [("ppo", False)] * 3  # the critic alone, beside a network that corrects nothing
+    assert (
+        updates[:3] == [("ppo", False)] * 3
+    )  # the critic alone, beside a network that corrects nothing
     assert updates[4:-1] == [("ppo", True)] * len(updates[4:-1])
     assert GapModel.how_trained(model.card) == (
         f"supervised pre-training (2 rounds), worse than no correction; {len(updates) - 1} updates of PPO from the "
@@ -173,9 +204,12 @@ def test_ppo_starts_untrained_if_pretraining_increases_the_error(tmp_path, robot
 
 
 @pytest.mark.parametrize(
-    ("step", "message"), [(1.0, "--mixed-gains"), (0.0, r"kp \(5.0, 5.0\) .*robot.toml says others")]
+    ("step", "message"),
+    [(1.0, "--mixed-gains"), (0.0, r"kp \(5.0, 5.0\) .*robot.toml says others")],
 )
-def test_recordings_with_several_gains_or_with_others_than_the_robots_need_an_option(robot, tmp_path, step, message):
+def test_recordings_with_several_gains_or_with_others_than_the_robots_need_an_option(
+    robot, tmp_path, step, message
+):
     metas = [(5.0 + step * (i % 2), 5.0) for i in range(8)]
     sequences = [
         replace(s, meta=replace(s.meta, kp=kp, kd=(0.1, 0.1)))
@@ -187,7 +221,9 @@ def test_recordings_with_several_gains_or_with_others_than_the_robots_need_an_op
     Trainer(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)
 
 
-def test_a_training_that_uses_shared_results_equals_the_one_that_made_them(trained, robot, tmp_path, monkeypatch):
+def test_a_training_that_uses_shared_results_equals_the_one_that_made_them(
+    trained, robot, tmp_path, monkeypatch
+):
     data, budget, shared = trained[0], Budget(steps=16 * 60), {}
     first = Trainer(data, robot, tmp_path / "first", SMALL, budget, shared=shared).run()
     monkeypatch.setattr("gaponet.nn.training.trainer.trajectory_labels", None)

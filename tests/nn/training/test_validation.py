@@ -15,7 +15,9 @@ def test_the_error_is_that_of_an_evaluation_where_joints_are_not_recorded(tmp_pa
     robot = write_arm(tmp_path / "arm")
     whole, part = recordings(robot, 2, rows=60, kp=0.5)
     part = replace(part, meta=replace(part.meta, notes={"held_at_home": ["shoulder"]}))
-    evaluated = summary(runs([whole, part], [r.qpos for r in replay([whole, part], robot)], robot), robot)
+    evaluated = summary(
+        runs([whole, part], [r.qpos for r in replay([whole, part], robot)], robot), robot
+    )
     config = ModelConfig(history=2)
     errors = Validator([whole, part], robot, config, 1).errors(build_network(config, 2))
     assert errors.mean() == pytest.approx(evaluated["mpjae"], rel=1e-5)

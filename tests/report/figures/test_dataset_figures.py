@@ -22,13 +22,17 @@ def dataset(arm, tmp_path):
         for payload in (0.0, 0.2):
             ctrl = wave(60, 2, hertz=0.4 + 0.1 * i)
             tau, warm = (1 + i + payload) * ctrl, 30 + payload * np.arange(60)[:, None] * np.ones(2)
-            data.append(arm_sequence(arm, ctrl, late(ctrl, 2), f"m{i}", payload, tau=tau, temperature=warm))
+            data.append(
+                arm_sequence(arm, ctrl, late(ctrl, 2), f"m{i}", payload, tau=tau, temperature=warm)
+            )
     return data
 
 
 def test_every_picture_is_drawn_as_svg_and_png(dataset, arm, tmp_path):
     told = []
-    written, left_out = write_figures(dataset, arm, tmp_path / "out", lambda *what: told.append(what))
+    written, left_out = write_figures(
+        dataset, arm, tmp_path / "out", lambda *what: told.append(what)
+    )
     names = ["composition", "joint_ranges", "torque_temperature"]
     assert sorted(p.name for p in written) == [f"{n}.{s}" for n in names for s in ("png", "svg")]
     assert left_out == {}
@@ -100,7 +104,9 @@ def test_warming_is_counted_from_the_start(dataset):
 
 def test_a_sequence_without_temperature_has_no_such_row(arm):
     ctrl = wave(60, 2)
-    fig = draw.draw_torque_temperature({0.0: arm_sequence(arm, ctrl, ctrl, tau=ctrl)}, ["elbow", "shoulder"], "t")
+    fig = draw.draw_torque_temperature(
+        {0.0: arm_sequence(arm, ctrl, ctrl, tau=ctrl)}, ["elbow", "shoulder"], "t"
+    )
     assert [ax.get_ylabel() for ax in fig.axes[::2]] == ["position, rad", "torque, N·m"]
 
 

@@ -48,8 +48,13 @@ def test_names_of_uploads_cannot_lead_out_of_the_folder(tmp_path):
     logs.mkdir()
     store_upload("a.zip", archive(**{"walk/state.csv": "1", "b.csv": "2"}), logs)
     assert (logs / "walk" / "state.csv").read_text() == "1"
-    for number, name in enumerate(("../out.csv", "/tmp/out.csv", "a/../../out.csv", "..\\out.csv", "C:out.csv")):
-        for kind, upload, content in (("zip", "evil.zip", archive(**{name: "x"})), ("file", name, b"x")):
+    for number, name in enumerate(
+        ("../out.csv", "/tmp/out.csv", "a/../../out.csv", "..\\out.csv", "C:out.csv")
+    ):
+        for kind, upload, content in (
+            ("zip", "evil.zip", archive(**{name: "x"})),
+            ("file", name, b"x"),
+        ):
             (inside := logs / f"{kind}{number}").mkdir()
             store_upload(upload, content, inside)
             assert [p.read_text() for p in inside.rglob("*.csv")] == ["x"]
@@ -243,7 +248,9 @@ def test_a_command_that_is_being_started_is_not_called_cancelled(page):
         watching.join(0.3)
         assert "no result" not in page.status.content
         page.jobs.started = page.jobs.all[-1].folder
-        page.jobs.process = SimpleNamespace(poll=lambda: None, terminate=lambda: None, wait=lambda: None)
+        page.jobs.process = SimpleNamespace(
+            poll=lambda: None, terminate=lambda: None, wait=lambda: None
+        )
     watching.join()
     assert "**gaponet robot**, 0 %" in page.status.content
 
@@ -308,7 +315,9 @@ def test_step_use_exports_the_calibrated_robot_and_a_network_only_if_it_helps(cl
     ]
 
 
-def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(arm, tmp_path, monkeypatch):
+def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(
+    arm, tmp_path, monkeypatch
+):
     pytest.importorskip("viser")
     data, said, pages = Dataset.create(tmp_path / "data", arm), [], []
     for sequence in recordings(arm, 2, rows=60):
@@ -322,7 +331,9 @@ def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(arm, 
 
     monkeypatch.setattr(app, "run_until_interrupt", once)
     monkeypatch.setattr(app.signal, "signal", lambda *_: None)
-    app.serve_dataset(data, app.Scene(shown), app.Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append)
+    app.serve_dataset(
+        data, app.Scene(shown), app.Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append
+    )
     (page,) = pages
     assert said == [f"open {page.address}?step=4 in a browser; Ctrl-C ends"]
     assert page.recording.options == tuple(e.id for e in data.entries)
@@ -341,7 +352,11 @@ def test_curves_are_saved_as_the_page_shows_them(page):
     sent = {}
     client = SimpleNamespace(send_file_download=lambda name, content: sent.update({name: content}))
     chart = draw_curves(page.gui, np.arange(3.0), {"<b>x</b>": (np.zeros(3), "#00838f")}, "rad")
-    save = next(h for h in page.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "").startswith("Save"))
+    save = next(
+        h
+        for h in page.gui._gui_input_handle_from_uuid.values()
+        if getattr(h, "label", "").startswith("Save")
+    )
     assert chart.title == "rad"
     save._impl.update_cb[-1](SimpleNamespace(client=client))
     assert sent["curves.svg"].startswith(b"<?xml")
@@ -352,7 +367,9 @@ def test_curves_are_saved_as_the_page_shows_them(page):
 def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
     write_arm(page.folder / "arm")
     finish(page.jobs, "robot", {}, ("robot", "new", "x", "--out", "arm"))
-    page.described.value = 'time = "t"\ntime_unit = "s"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
+    page.described.value = (
+        'time = "t"\ntime_unit = "s"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
+    )
     page.position.value = "rad"
     time_s = np.arange(300) * 0.02
     for joints, scale, why in (
@@ -363,7 +380,13 @@ def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
         columns = ["t", *(f"{j}_des" for j in joints), *(f"{j}_pos" for j in joints)]
         if joints:
             rows = np.column_stack([time_s, *swing, *swing])
-            np.savetxt(page.folder / "logs" / "m.csv", rows, delimiter=",", header=",".join(columns), comments="")
+            np.savetxt(
+                page.folder / "logs" / "m.csv",
+                rows,
+                delimiter=",",
+                header=",".join(columns),
+                comments="",
+            )
         page._attempt(page._read, None)
         wait_for(page.jobs)
         assert why in _ending(page.jobs.all[-1])
@@ -375,7 +398,9 @@ def test_a_calibration_and_a_training_end_in_step_use_with_their_result(tmp_path
     """Real commands on a VIRTUAL arm, by the buttons of the page; the nominal arm stands for the identified one."""
     pytest.importorskip("viser")
     acts, add = {}, App._button
-    monkeypatch.setattr(App, "_button", lambda self, label, act: acts.update({label: act}) or add(self, label, act))
+    monkeypatch.setattr(
+        App, "_button", lambda self, label, act: acts.update({label: act}) or add(self, label, act)
+    )
     robot = write_arm(tmp_path / "robot")
     for place, kp in (("data", 0.7), ("new", 0.6)):
         data = Dataset.create(tmp_path / place, robot)

@@ -27,7 +27,9 @@ class Clicker:
         from browser import wait
 
         self.browser, self.wait = browser, wait
-        browser.ask("Page.navigate", url=f"{address}?fixedDpr=0.15{step}")  # few pixels: software draws them
+        browser.ask(
+            "Page.navigate", url=f"{address}?fixedDpr=0.15{step}"
+        )  # few pixels: software draws them
         browser.ask("DOM.enable")
         wait(lambda: "1 Robot" in self.text())
 
@@ -42,7 +44,9 @@ class Clicker:
 
     def press(self, x, y):
         for kind in ("mousePressed", "mouseReleased"):
-            self.browser.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+            self.browser.ask(
+                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
+            )
 
     def centre(self, elements):
         box = f"(e => e && (b => [b.x + b.width / 2, b.y + b.height / 2])(e.getBoundingClientRect()))({elements}[0])"
@@ -50,10 +54,14 @@ class Clicker:
 
     def click(self, label):
         element = FIND.format("'button'", json.dumps(label))
-        assert self.wait(lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)"))
+        assert self.wait(
+            lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)")
+        )
 
     def tab(self, label):
-        self.press(*self.centre(FIND.format("'*'", json.dumps(label)) + ".filter(e => !e.children.length)"))
+        self.press(
+            *self.centre(FIND.format("'*'", json.dumps(label)) + ".filter(e => !e.children.length)")
+        )
 
     def field(self, label):
         labels = FIND.format("'label'", json.dumps(label))
@@ -63,7 +71,9 @@ class Clicker:
     def choose(self, label, option):
         self.press(*self.centre(self.field(label)))
         element = FIND.format("'[role=option]'", json.dumps(option))
-        assert self.wait(lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)"))
+        assert self.wait(
+            lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)")
+        )
 
     def write(self, label, text):
         self.wait(lambda: self.browser.value(f"({self.field(label)}[0].select(), true)"))
@@ -79,9 +89,15 @@ class Clicker:
 
     def upload(self, label, file):
         button = f"{FIND.format(repr('button'), json.dumps(label))}[0]"
-        name = self.wait(lambda: self.browser.value(f"{button}.parentElement.querySelector('input[type=file]').id"))
+        name = self.wait(
+            lambda: self.browser.value(
+                f"{button}.parentElement.querySelector('input[type=file]').id"
+            )
+        )
         root = self.browser.ask("DOM.getDocument", depth=0)["root"]["nodeId"]
-        node = self.browser.ask("DOM.querySelector", nodeId=root, selector=f"[id='{name}']")["nodeId"]
+        node = self.browser.ask("DOM.querySelector", nodeId=root, selector=f"[id='{name}']")[
+            "nodeId"
+        ]
         self.browser.ask("DOM.setFileInputFiles", files=[str(file)], nodeId=node)
 
 
@@ -103,8 +119,12 @@ def page(tmp_path):
 def export_agrees(page):
     """Run the exported check: the model file alone moves as in gaponet."""
     script = page.folder / page.jobs.result("export").out / "check.py"
-    check = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, cwd=script.parent)
-    alone, ours = map(float, re.search(r"alone: ([\d.]+) mrad; in gaponet ([\d.]+)", check.stdout).groups())
+    check = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, check=True, cwd=script.parent
+    )
+    alone, ours = map(
+        float, re.search(r"alone: ([\d.]+) mrad; in gaponet ([\d.]+)", check.stdout).groups()
+    )
     print(check.stdout)
     return alone == pytest.approx(ours, rel=0.05)
 
@@ -124,7 +144,9 @@ def write_z1_urdf(path):
         return f'<origin xyz="{" ".join(map(str, position))}" rpy="{" ".join(map(str, turned))}"/>'
 
     for body in map(model.body, range(1, model.nbody)):
-        inertia = " ".join(f'i{n}="{v}"' for n, v in zip(("xx", "yy", "zz"), body.inertia, strict=True))
+        inertia = " ".join(
+            f'i{n}="{v}"' for n, v in zip(("xx", "yy", "zz"), body.inertia, strict=True)
+        )
         inertial = f'{origin(body.ipos, body.iquat)}<mass value="{body.mass[0]}"/>'
         inertial = f'<inertial>{inertial}<inertia {inertia} ixy="0" ixz="0" iyz="0"/></inertial>'
         lines.append(f'<link name="{body.name}">{inertial * bool(body.mass[0])}</link>')
@@ -135,7 +157,9 @@ def write_z1_urdf(path):
             continue
         joint = model.joint(body.jntadr[0])
         low, high = joint.range
-        limit = f'<limit lower="{low}" upper="{high}" effort="{effort[joint.name]}" velocity="3.1"/>'
+        limit = (
+            f'<limit lower="{low}" upper="{high}" effort="{effort[joint.name]}" velocity="3.1"/>'
+        )
         axis = f'<axis xyz="{" ".join(map(str, joint.axis))}"/>'
         lines.append(f'<joint name="{joint.name}" type="revolute">{parent}{axis}{limit}</joint>')
     path.write_text("\n".join([*lines, "</robot>"]))
@@ -157,7 +181,11 @@ def test_from_a_urdf_and_one_real_chirp_of_a_z1_to_an_export_that_agrees(page, i
         at.upload("Upload a log", iit_z1 / "traj_0.pt")
         at.sees("traj_0.pt is stored")
         at.click("Guess logs.toml")
-        at.wait(lambda: 'ctrl = "des_dof_pos"' in browser.value("document.querySelector('textarea').value"))
+        at.wait(
+            lambda: (
+                'ctrl = "des_dof_pos"' in browser.value("document.querySelector('textarea').value")
+            )
+        )
         at.write("cut into pieces, s", "4")
         at.click("Read the logs")
         at.sees("gaponet import has ended")
@@ -242,8 +270,13 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
 def test_200_megabytes_of_another_robot_are_stored_and_refused_with_the_reason(page, tmp_path):
     from browser import Browser
 
-    names = ["time", *(f"{kind}.{joint}" for kind in ("ctrl", "qpos") for joint in ("hip", "knee", "ankle"))]
-    (tmp_path / "walk.csv").write_text(",".join(names) + "\n" + "0.02,0.1,0.2,0.3,0.1,0.2,0.3\n" * 7_000_000)
+    names = [
+        "time",
+        *(f"{kind}.{joint}" for kind in ("ctrl", "qpos") for joint in ("hip", "knee", "ankle")),
+    ]
+    (tmp_path / "walk.csv").write_text(
+        ",".join(names) + "\n" + "0.02,0.1,0.2,0.3,0.1,0.2,0.3\n" * 7_000_000
+    )
     with Browser(1000, 700) as browser:
         at = Clicker(browser, page.address)
         at.use("so101")
@@ -256,21 +289,29 @@ def test_200_megabytes_of_another_robot_are_stored_and_refused_with_the_reason(p
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_the_page_fits_a_desk_and_a_phone_is_readable_and_dark_where_the_system_is(page, width, scheme):
+def test_the_page_fits_a_desk_and_a_phone_is_readable_and_dark_where_the_system_is(
+    page, width, scheme
+):
     from browser import Browser, wait
 
     with Browser(max(width, 500), 720) as browser:
         metrics = {"width": width, "height": 720, "deviceScaleFactor": 1, "mobile": width < 500}
         browser.ask("Emulation.setDeviceMetricsOverride", **metrics)
-        browser.ask("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        browser.ask(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": scheme}],
+        )
         at = Clicker(browser, page.address, "&step=6")
         scheme_now = "document.documentElement.dataset.mantineColorScheme"
-        wait(lambda: browser.value(scheme_now) == scheme and "Train a network" in at.text())  # a dark page loads twice
+        wait(
+            lambda: browser.value(scheme_now) == scheme and "Train a network" in at.text()
+        )  # a dark page loads twice
         assert browser.value("document.documentElement.scrollWidth") <= width
-        letters = (
-            "[...document.querySelectorAll('button, label, p, td, input, [role=tab]')].filter(e => e.offsetParent)"
+        elements = "document.querySelectorAll('button, label, p, td, input, [role=tab]')"
+        letters = f"[...{elements}].filter(e => e.offsetParent)"
+        assert browser.value(
+            f"{letters}.every(e => parseFloat(getComputedStyle(e).fontSize) >= 12)"
         )
-        assert browser.value(f"{letters}.every(e => parseFloat(getComputedStyle(e).fontSize) >= 12)")
         if width > 500:  # the row of steps works from the keyboard
             browser.value("document.querySelector('[role=tab][aria-selected=true]').focus()")
             browser.ask("Input.dispatchKeyEvent", type="keyDown", key="ArrowLeft", code="ArrowLeft")

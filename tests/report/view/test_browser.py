@@ -24,7 +24,9 @@ def web(arm):
     real = recordings(arm, 1, rows=200, kp=0.5)[0]
     swing = 0.8 * np.sin(np.arange(len(real)) / 20)[:, None] * np.ones(2)
     off = {"nominal": 0.4, "gaponet": 0.1}
-    shown = SideBySide(real, arm, tuple(Copy(m, swing + o, np.full(len(real), o)) for m, o in off.items()), None)
+    shown = SideBySide(
+        real, arm, tuple(Copy(m, swing + o, np.full(len(real), o)) for m, o in off.items()), None
+    )
     server, address = open_server("test", 0)
     served = Player(server, Scene(shown), Clip.from_start(shown, 0.0, 3.0))
     served.address = address
@@ -63,11 +65,17 @@ def test_the_canvas_shows_the_robot_and_it_moves_when_played_and_stands_when_not
         web.playing.value = True
         assert wait(lambda: (n := moved(still, page.look("canvas"))) > 300 and n)
         web.playing.value = False
-        for frame in web.frames.values():  # and the eye is no blind one: without robots it sees none
+        for (
+            frame
+        ) in web.frames.values():  # and the eye is no blind one: without robots it sees none
             frame.visible = False
-        wait(lambda: reddish(page.look("canvas")) < 0.1 * reddish(still))  # what is left is an axis of the compass
+        wait(
+            lambda: reddish(page.look("canvas")) < 0.1 * reddish(still)
+        )  # what is left is an axis of the compass
         assert page.complaints() == []
-        print(f"canvas: {len(colours)} colours, {reddish(still)} reddish pixels of {still.shape[0] * still.shape[1]}")
+        print(
+            f"canvas: {len(colours)} colours, {reddish(still)} reddish pixels of {still.shape[0] * still.shape[1]}"
+        )
 
 
 @pytest.mark.parametrize("width", [390, 1200])
@@ -80,10 +88,24 @@ def test_the_report_loads_nothing_else_and_fits_desk_and_phone(evaluated, width,
 
     path = write_report(evaluated, picture=portrait)
     with Browser(max(width, 500), 900) as page:
-        page.ask("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 500)
-        page.ask("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        page.ask(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=900,
+            deviceScaleFactor=1,
+            mobile=width < 500,
+        )
+        page.ask(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": scheme}],
+        )
         page.ask("Page.navigate", url=path.as_uri())
-        wait(lambda: page.value("document.readyState") == "complete" and page.value("!!document.querySelector('h2')"))
+        wait(
+            lambda: (
+                page.value("document.readyState") == "complete"
+                and page.value("!!document.querySelector('h2')")
+            )
+        )
         assert page.value("document.documentElement.scrollWidth") <= width
         assert page.value("[...document.images].every(i => i.naturalWidth > 100)")
         assert page.value("document.images.length") >= 1

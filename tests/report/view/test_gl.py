@@ -52,4 +52,7 @@ def test_a_choice_that_mujoco_cannot_use_is_taken_back(headless):
 def test_commands_that_render_are_imported_without_mujoco():
     """MuJoCo reads MUJOCO_GL once, when it is imported."""
     code = "import sys\nfrom gaponet.cli import demo, report, robot, start, view\nprint('mujoco' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout
+        == "False\n"
+    )

@@ -104,7 +104,12 @@ def test_the_box_holds_the_robot_in_every_frame(four):
 
 
 def test_a_robot_with_a_table_can_be_drawn(arm):
-    assert visual_spec(dataclasses.replace(arm, table=Table(-0.05, 0.3, 3000.0)), "#c8102e", 0.0).compile().npair == 0
+    assert (
+        visual_spec(dataclasses.replace(arm, table=Table(-0.05, 0.3, 3000.0)), "#c8102e", 0.0)
+        .compile()
+        .npair
+        == 0
+    )
 
 
 @pytest.mark.parametrize("name", ["h1_2", "so101"])
@@ -121,7 +126,9 @@ def test_the_robots_of_the_package_can_be_drawn(name):
 
 def test_a_closeup_may_cut_limbs_without_operated_joints():
     h1_2 = load_robot("h1_2")
-    real = Sequence(SequenceMeta("h1_2", "a", "stand", 0.0), h1_2.joint_names, 0.02, *np.zeros((3, 2, 27)))
+    real = Sequence(
+        SequenceMeta("h1_2", "a", "stand", 0.0), h1_2.joint_names, 0.02, *np.zeros((3, 2, 27))
+    )
     standing = SideBySide(real, h1_2, (Copy("recorded", real.qpos, np.zeros(2)),), None)
     whole, near = Scene(standing), Scene(standing, closeup=True)
     assert whole.box[2] < 0.1 < 0.6 < near.box[2]  # feet, pelvis
@@ -217,7 +224,11 @@ def test_every_copy_is_seen_on_a_light_and_a_dark_page():
         return linear @ (0.2126, 0.7152, 0.0722)
 
     own = {method: np.array(rgb(colour(method))[:3]) for method in ("target", *ORDER)}
-    assert all((_page_colour(x) == (255 * x).astype(int)).all() for limb in own.values() for x in (limb, 0.55 * limb))
+    assert all(
+        (_page_colour(x) == (255 * x).astype(int)).all()
+        for limb in own.values()
+        for x in (limb, 0.55 * limb)
+    )
     recorded = np.array(rgb(colour("recorded"))[:3])
     for x in (recorded, 0.55 * recorded, np.array(GHOST_RGBA[:3])):
         light = luminance(_page_colour(x) / 255)

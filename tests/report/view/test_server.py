@@ -34,7 +34,9 @@ def socket_opens(address, path, origin):
 
     uri = f"ws://127.0.0.1:{address.port}{path}"
     try:
-        with connect(uri, origin=origin, subprotocols=[f"viser-v{__version__}"], max_size=None) as socket:
+        with connect(
+            uri, origin=origin, subprotocols=[f"viser-v{__version__}"], max_size=None
+        ) as socket:
             return bool(socket.recv(10))
     except InvalidStatus as refused:
         return refused.response.status_code != 403
@@ -72,7 +74,9 @@ def test_another_site_cannot_post(address):
 def test_the_websocket_needs_the_token_and_the_pages_own_origin(address):
     own = f"http://127.0.0.1:{address.port}"
     assert socket_opens(address, address.path, own)
-    assert socket_opens(address, address.path.rstrip("/"), own)  # what the page derives from its address
+    assert socket_opens(
+        address, address.path.rstrip("/"), own
+    )  # what the page derives from its address
     assert not socket_opens(address, "/", own)
     assert not socket_opens(address, address.path, "https://evil.example")
 

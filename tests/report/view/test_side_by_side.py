@@ -52,16 +52,30 @@ def test_magnifying_moves_the_picture_and_not_the_numbers(dataset, arm):
 
 def test_a_motion_that_is_not_there_is_named_with_those_that_are(dataset, arm):
     shown = side_by_side(dataset, dataset.entries[0], arm)
-    assert [m.method for m in shown.only(("recorded", "nominal")).motions] == ["recorded", "nominal"]
+    assert [m.method for m in shown.only(("recorded", "nominal")).motions] == [
+        "recorded",
+        "nominal",
+    ]
     with pytest.raises(UsageError, match=r"--show gaponet: here are target, nominal, recorded"):
         shown.only(("gaponet",))
-    with pytest.raises(DatasetError, match=r"no such recording of motion1; there are a with 0.2 kg"):
+    with pytest.raises(
+        DatasetError, match=r"no such recording of motion1; there are a with 0.2 kg"
+    ):
         select_entry(dataset, (), "motion1", payload_mass=1.0)
 
 
 def test_a_recording_that_no_run_was_fitted_to_comes_first(dataset, arm, tmp_path):
-    run = untrained(tmp_path / "run", arm, dataset, train=("motion0", "motion1"), val=("motion3",), test=("motion2",))
-    first = untrained(tmp_path / "first", arm, dataset, train=("motion1",), val=("motion3",), test=("motion0",))
+    run = untrained(
+        tmp_path / "run",
+        arm,
+        dataset,
+        train=("motion0", "motion1"),
+        val=("motion3",),
+        test=("motion2",),
+    )
+    first = untrained(
+        tmp_path / "first", arm, dataset, train=("motion1",), val=("motion3",), test=("motion0",)
+    )
     assert select_entry(dataset, (first,)).meta.motion == "motion0"
     assert select_entry(dataset, (first, run)).meta.motion == "motion2"
     assert select_entry(dataset, (run,)).meta.motion == "motion2"

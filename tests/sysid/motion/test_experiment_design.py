@@ -31,8 +31,13 @@ def identified(place, xml=XML):
     robot = write_arm(place / "arm", TOML, xml)
     logs = [record(robot, commands(400, seed), f"m{seed}", kp=0.8, delay=1) for seed in range(2)]
     rng = np.random.default_rng(0)
-    logs = [replace(s, qpos=s.qpos + 4e-4 * rng.standard_normal(s.qpos.shape).astype(np.float32)) for s in logs]
-    save_robot(robot.with_servos({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}), place / "known")
+    logs = [
+        replace(s, qpos=s.qpos + 4e-4 * rng.standard_normal(s.qpos.shape).astype(np.float32))
+        for s in logs
+    ]
+    save_robot(
+        robot.with_servos({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}), place / "known"
+    )
     estimate_uncertainty(load_robot(place / "known"), logs, [], nthread=1).save(place / "known")
     return load_robot(place / "known")
 
@@ -69,9 +74,14 @@ def test_expected_information_is_that_of_a_recording(robot, pool, told):
     """Played on another arm than the identified one."""
     mine = ParameterUncertainty.load(robot)
     nominal = load_robot(robot.folder.parent / "arm")
-    played = [record(nominal, m.sample(nominal.dt), f"n{k}", kp=0.84, delay=1) for k, m in enumerate(pool[:4])]
+    played = [
+        record(nominal, m.sample(nominal.dt), f"n{k}", kp=0.84, delay=1)
+        for k, m in enumerate(pool[:4])
+    ]
     there = ExperimentDesign.from_recordings(robot, mine, played)
-    np.testing.assert_allclose(errors(told.after(range(4))), errors(there.after(range(4))), rtol=0.5)
+    np.testing.assert_allclose(
+        errors(told.after(range(4))), errors(there.after(range(4))), rtol=0.5
+    )
 
 
 def test_more_recordings_never_increase_standard_errors(told):
@@ -107,15 +117,23 @@ def test_kp_of_unloaded_joints_is_reported_as_undetermined(tmp_path, robot, pool
     mine = ParameterUncertainty.load(free)
     motions = [m for m in candidate_motions(Library(free, 3, HELD)) if m.name.startswith("creep")]
     slow = ExperimentDesign.from_recordings(free, mine, simulated_recordings(free, motions, 0.0))
-    unsure = replace(slow, covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0])
+    unsure = replace(
+        slow,
+        covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0],
+    )
     said = undetermined_gains(mine, unsure)
     assert set(said) == {"shoulder", "elbow"}
-    assert all("so no motion separates kp from friction and damping" in why for why in said.values())
+    assert all(
+        "so no motion separates kp from friction and damping" in why for why in said.values()
+    )
 
 
 def test_excite_writes_motions_and_expected_errors(robot, tmp_path, capsys):
     out = tmp_path / "next"
-    assert main(["excite", "--for", str(robot.folder), "--out", str(out), "--seed", "3", "--json"]) == 0
+    assert (
+        main(["excite", "--for", str(robot.folder), "--out", str(out), "--seed", "3", "--json"])
+        == 0
+    )
     said = json.loads(capsys.readouterr().out)
     assert 60 * said["minutes"] <= 30
     assert said["worth_seconds"] >= 0
@@ -130,5 +148,7 @@ def test_a_robot_without_uncertainty_and_two_robots_are_refused(robot, tmp_path,
     plain = robot.folder.parent / "arm"
     assert main(["excite", "--for", str(plain), "--out", str(tmp_path / "a")]) == 2
     assert "keeps only values" in capsys.readouterr().err
-    assert main(["excite", "--for", str(plain), "--robot", "so101", "--out", str(tmp_path / "b")]) == 2
+    assert (
+        main(["excite", "--for", str(plain), "--robot", "so101", "--out", str(tmp_path / "b")]) == 2
+    )
     assert "--robot NAME" in capsys.readouterr().err

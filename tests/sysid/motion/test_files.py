@@ -9,7 +9,9 @@ from gaponet.sysid.motion.files import read_motion
 def test_sage_names_may_be_paths_and_missing_joints_stay_at_home(tmp_path):
     robot = load_robot("h1_2")
     file = tmp_path / "stir.txt"
-    file.write_text(" /h1_2/torso_link/left_shoulder_pitch_joint, /h1_2/x/left_elbow_joint\n0.1, 0.2\n0.3, 0.4\n")
+    file.write_text(
+        " /h1_2/torso_link/left_shoulder_pitch_joint, /h1_2/x/left_elbow_joint\n0.1, 0.2\n0.3, 0.4\n"
+    )
     motion = read_motion(file, robot)
     columns = robot.index(["left_shoulder_pitch_joint", "left_elbow_joint"])
     assert motion.ctrl[:, columns].tolist() == [[0.1, 0.2], [0.3, 0.4]]
@@ -41,9 +43,21 @@ def test_a_public_sage_motion_is_read_and_can_be_fitted():
         ("bad.txt", "shoulder,elbow\n0,0\n", r"1 rows after the line of joint names"),
         ("bad.txt", "shoulder,shoulder\n0,0\n0,0\n", r"two columns are the same joint of arm"),
         ("bad.csv", "shoulder\n0\n0\n", r"bad\.csv:1: no column time, s, so its pace is not known"),
-        ("bad.csv", "time,shoulder\n0,0\n0.02,0\n0.05,0\n", r"time must rise evenly; it steps by 0\.02 to 0\.03 s"),
-        ("bad.txt", "shoulder,elbow\n0,0\n45,0\n", r"bad\.txt: command 2 of shoulder is 45\.000, outside its range"),
-        ("bad.txt", "knee\n0\n1\n", r"names joint 'knee', which robot 'arm' does not have; nearest: "),
+        (
+            "bad.csv",
+            "time,shoulder\n0,0\n0.02,0\n0.05,0\n",
+            r"time must rise evenly; it steps by 0\.02 to 0\.03 s",
+        ),
+        (
+            "bad.txt",
+            "shoulder,elbow\n0,0\n45,0\n",
+            r"bad\.txt: command 2 of shoulder is 45\.000, outside its range",
+        ),
+        (
+            "bad.txt",
+            "knee\n0\n1\n",
+            r"names joint 'knee', which robot 'arm' does not have; nearest: ",
+        ),
     ],
 )
 def test_a_bad_file_is_an_error_that_says_what_is_wrong(arm, tmp_path, name, text, message):
@@ -55,7 +69,10 @@ def test_a_bad_file_is_an_error_that_says_what_is_wrong(arm, tmp_path, name, tex
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"joint_names": np.array("shoulder")}, "array 'joint_names' must hold text in 1 dimensions"),
+        (
+            {"joint_names": np.array("shoulder")},
+            "array 'joint_names' must hold text in 1 dimensions",
+        ),
         ({"joint_names": np.array(["shoulder"], object)}, r"not readable \(Object arrays"),
         ({"ctrl": np.array([["x"], ["y"]])}, "array 'ctrl' must hold numbers in 2 dimensions"),
         ({"ctrl": np.full((3, 1), np.nan)}, r"ctrl has shape \(3, 1\) or holds NaN"),
@@ -69,7 +86,9 @@ def test_a_bad_file_is_an_error_that_says_what_is_wrong(arm, tmp_path, name, tex
 )
 def test_arrays_that_are_no_motion_are_refused(arm, tmp_path, arrays, message):
     good = {"joint_names": np.array(["shoulder"]), "ctrl": np.zeros((3, 1)), "dt": 0.02}
-    np.savez(tmp_path / "bad.npz", **{name: x for name, x in (good | arrays).items() if x is not None})
+    np.savez(
+        tmp_path / "bad.npz", **{name: x for name, x in (good | arrays).items() if x is not None}
+    )
     with pytest.raises(LogError, match=rf"bad\.npz: {message}"):
         read_motion(tmp_path / "bad.npz", arm)
 

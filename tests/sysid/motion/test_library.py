@@ -6,7 +6,14 @@ from gaponet.robot.spec import load_robot
 from gaponet.sysid.motion.feasible import MAX_PAYLOAD
 from gaponet.sysid.motion.library import SIGNALS, Library, short
 
-SOME = ["sweep-left_shoulder_roll", "steps-right_elbow", "reach-both-0", "punch-right-1", "wave-left-0", "march-all-0"]
+SOME = [
+    "sweep-left_shoulder_roll",
+    "steps-right_elbow",
+    "reach-both-0",
+    "punch-right-1",
+    "wave-left-0",
+    "march-all-0",
+]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +69,8 @@ def test_half_the_rate_plays_every_second_row(library):
 
 def test_an_unknown_name_lists_the_forms(library):
     with pytest.raises(
-        UsageError, match=r"h1_2 has no motion 'dance-left-0'; names are <signal>-<joint> .* sweep, creep"
+        UsageError,
+        match=r"h1_2 has no motion 'dance-left-0'; names are <signal>-<joint> .* sweep, creep",
     ):
         library.make("dance-left-0")
     with pytest.raises(UsageError, match="no operated joint 'left_knee'"):
@@ -107,5 +115,7 @@ def test_a_chirp_gets_faster():
 def test_trapezoids_cruise_at_constant_speeds():
     y = SIGNALS["trapezoids"](-2.0, 2.0, np.random.default_rng(3), DT)
     speed = np.abs(np.diff(y)) / DT
-    cruising = sorted({round(float(v), 1) for v in speed if (np.abs(speed - v) < 0.01).sum() > 30 and v > 0.1})
+    cruising = sorted(
+        {round(float(v), 1) for v in speed if (np.abs(speed - v) < 0.01).sum() > 30 and v > 0.1}
+    )
     assert cruising == [0.4, 0.7, 1.0, 1.4]

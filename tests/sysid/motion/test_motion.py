@@ -20,7 +20,10 @@ def test_a_move_starts_and_ends_at_rest_and_passes_the_middle_in_the_middle():
 
 def test_via_points_are_reached_and_held():
     path = through(
-        np.array([[0.0, 1.0], [2.0, -1.0], [0.5, 0.5]]), np.array([1.0, 0.5]), np.array([0.2, 0.3, 0.1]), 0.1
+        np.array([[0.0, 1.0], [2.0, -1.0], [0.5, 0.5]]),
+        np.array([1.0, 0.5]),
+        np.array([0.2, 0.3, 0.1]),
+        0.1,
     )
     assert path.shape == (2 + 10 + 3 + 5 + 1, 2)
     assert (path[:2] == [0.0, 1.0]).all()
@@ -76,5 +79,8 @@ def test_a_motion_that_is_too_heavy_is_brought_nearer_to_its_start(arm):
 
 def test_a_motion_that_cannot_be_fitted_is_refused_with_the_reason(arm):
     limits = Feasibility(arm, 5.0)
-    with pytest.raises(UsageError, match=r"'hold' does not fit arm .* shoulder needs .* at 5 kg, .* lighter payload"):
+    with pytest.raises(
+        UsageError,
+        match=r"'hold' does not fit arm .* shoulder needs .* at 5 kg, .* lighter payload",
+    ):
         limits.fit(Motion("hold", "joint", GRID, still(arm, 0.0)))

@@ -56,7 +56,10 @@ def test_too_little_time_and_payloads_without_a_mount_are_refused(so101):
 
 
 def test_the_command_writes_motions_and_a_sheet(tmp_path, capsys):
-    assert main(["excite", "--robot", "fr3", "--out", str(tmp_path / "m"), "--minutes", "5", "--json"]) == 0
+    assert (
+        main(["excite", "--robot", "fr3", "--out", str(tmp_path / "m"), "--minutes", "5", "--json"])
+        == 0
+    )
     told = json.loads(capsys.readouterr().out)
     sheet = (tmp_path / "m" / "sheet.md").read_text(encoding="utf-8")
     robot = load_robot("fr3")

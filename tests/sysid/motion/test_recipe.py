@@ -18,7 +18,11 @@ GOOD = 'payloads = [0.0]\nunits = ["a"]\nmotions = ["x"]\n'
         ('["a"]', "[3]", r"units\[0\]: should be a valid string"),
         ("motions", "rates = [0]\nmotions", r"rates\[0\]: should be greater than or equal to 1"),
         ("motions", "rates = [1e9]\nmotions", r"rates\[0\]: should be less than or equal to 10000"),
-        ("motions", "repetitions = 1000000000\nmotions", "repetitions: should be less than or equal to 10000"),
+        (
+            "motions",
+            "repetitions = 1000000000\nmotions",
+            "repetitions: should be less than or equal to 10000",
+        ),
         ("motions", "variants = true\nmotions", "variants: should be a valid integer"),
         ("motions", "units2 = 3\nmotions", "units2: is not a known field"),
     ],

@@ -31,12 +31,22 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     text = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in rates.items())
     deviation = max(abs(s.rate_hz * robot.dt - 1) for s in surveys)
     level = "warning" if len(rates) > 1 else "note" if deviation > 0.05 else "ok"
-    hint = f"; robot.toml says {1 / robot.dt:.2f} Hz; the recorded rate is used" if deviation > 0.001 else ""
-    yield Finding(level, "rate", text + hint, values={f"{r:.2f}": count for r, count in rates.items()})
-    resampled = [s.motion for s in surveys if "resampled" in str(s.entry.meta.notes.get("rows", ""))]
+    hint = (
+        f"; robot.toml says {1 / robot.dt:.2f} Hz; the recorded rate is used"
+        if deviation > 0.001
+        else ""
+    )
+    yield Finding(
+        level, "rate", text + hint, values={f"{r:.2f}": count for r, count in rates.items()}
+    )
+    resampled = [
+        s.motion for s in surveys if "resampled" in str(s.entry.meta.notes.get("rows", ""))
+    ]
     if resampled:
         yield Finding(
-            "note", "rate", f"{len(resampled)} sequence(s) were put on a uniform grid: {abbreviate(resampled)}"
+            "note",
+            "rate",
+            f"{len(resampled)} sequence(s) were put on a uniform grid: {abbreviate(resampled)}",
         )
 
 
@@ -44,7 +54,13 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How evenly was it sampled, and what is missing?"""
     jitter = [s.jitter_ms * s.rate_hz / 1e3 for s in surveys]  # of a period
     worst = surveys[int(np.argmax(jitter))]
-    level = "ok" if max(jitter) <= MAX_JITTER[0] else "note" if max(jitter) <= MAX_JITTER[1] else "warning"
+    level = (
+        "ok"
+        if max(jitter) <= MAX_JITTER[0]
+        else "note"
+        if max(jitter) <= MAX_JITTER[1]
+        else "warning"
+    )
     where = f" ({worst.motion})" if worst.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
     if level == "warning" and (unknown := 2 * max(s.uneven_ms for s in surveys)):
@@ -53,7 +69,9 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     longest = max(surveys, key=lambda s: s.longest_gap_ms)
     gaps = [s for s in surveys if s.missing_samples]
     if not gaps:
-        yield Finding("ok", "gaps", f"no samples missing; longest period {longest.longest_gap_ms:.2f} ms")
+        yield Finding(
+            "ok", "gaps", f"no samples missing; longest period {longest.longest_gap_ms:.2f} ms"
+        )
         return
     text = (
         f"{len(gaps)} sequence(s) miss samples, at worst {longest.longest_gap_ms:.0f} ms ({longest.motion}): the state "
@@ -91,7 +109,10 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             by_channel[channel].append(s)
     for channel, hit in by_channel.items():
         notes = [s.entry.meta.notes["nonsense"][channel] for s in hit]
-        rows, done = sum(n["rows"] for n in notes), ", ".join(dict.fromkeys(n["done"] for n in notes))
+        rows, done = (
+            sum(n["rows"] for n in notes),
+            ", ".join(dict.fromkeys(n["done"] for n in notes)),
+        )
         joints = tuple(dict.fromkeys(j for n in notes for j in n["joints"]))
         text = (
             f"{channel} of {abbreviate(list(joints))} was what no joint does (first {notes[0]['worst']:.4g}) in {rows} "
@@ -119,14 +140,19 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 f"in {_motions(hit)}: a stop, an obstacle, too little torque, or not read; leave it out or cut it"
             )
             values = {"at_rad": float(worst.blocked_at[i]), "seconds": float(worst.blocked_s[i])}
-            yield Finding("warning" if name in robot.operated else "note", "blocked", text, (name,), values)
+            yield Finding(
+                "warning" if name in robot.operated else "note", "blocked", text, (name,), values
+            )
 
 
 def unsigned_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> tuple[str, ...]:
     """Return the joints with a changing torque if none of these torques is ever negative: magnitudes, no torques."""
     if not recorded:
         return ()
-    low, high = np.min([t.low for _, t in recorded], axis=0), np.max([t.high for _, t in recorded], axis=0)
+    low, high = (
+        np.min([t.low for _, t in recorded], axis=0),
+        np.max([t.high for _, t in recorded], axis=0),
+    )
     alive = (np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05) & (low < high)
     return () if (alive & (low < 0)).any() else masked_names(robot, alive)
 
@@ -139,7 +165,9 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     over = [(s, t) for s, t in recorded if t.over_limit.any()]
     if not over:
-        ok = Finding("ok", "saturation", "no torque at a limit" if recorded else "no torque recorded")
+        ok = Finding(
+            "ok", "saturation", "no torque at a limit" if recorded else "no torque recorded"
+        )
         yield from [*_flat_torque(recorded, robot)] or [ok]
         return
     worst = np.max([np.maximum(-t.low, t.high) for _, t in over], axis=0)  # (n,) N·m
@@ -150,7 +178,13 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         f"{worst[i]:.2f} N·m on {robot.joint_names[i]} (limit {robot.effort_limit[i]:.2f}): a collision, a "
         "spike or a wrong limit"
     )
-    yield Finding("warning", "saturation", text, (robot.joint_names[i],), {"rows": rows, "worst": float(worst[i])})
+    yield Finding(
+        "warning",
+        "saturation",
+        text,
+        (robot.joint_names[i],),
+        {"rows": rows, "worst": float(worst[i])},
+    )
 
 
 def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
@@ -176,9 +210,15 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if degrees and len(degrees) < (step > 0).sum() / 2:
         text = f"{', '.join(degrees)} has steps 57.3 times as coarse as other joints: degrees beside radians?"
         yield Finding("warning", "unit", f"{text} Import again with the right unit", degrees)
-    coarse = [(float(x), name) for x, name in zip(step, robot.joint_names, strict=True) if x > MAX_RESOLUTION_RAD]
+    coarse = [
+        (float(x), name)
+        for x, name in zip(step, robot.joint_names, strict=True)
+        if x > MAX_RESOLUTION_RAD
+    ]
     if not coarse:
-        yield Finding("ok", "resolution", f"positions change in steps of at most {step.max() * 1e3:.2f} mrad")
+        yield Finding(
+            "ok", "resolution", f"positions change in steps of at most {step.max() * 1e3:.2f} mrad"
+        )
         return
     worst, name = max(coarse)
     text = (
@@ -194,13 +234,17 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does every channel change when it should?"""
     for i, name in enumerate(robot.joint_names):
         moved = [s for s in surveys if s.ctrl_range[i] > 0.1]
-        still = [s for s in moved if s.qpos_range[i] < 0.03 and s.qpos_range[i] < 0.05 * s.ctrl_range[i]]
+        still = [
+            s for s in moved if s.qpos_range[i] < 0.03 and s.qpos_range[i] < 0.05 * s.ctrl_range[i]
+        ]
         if still:
             text = (
                 f"{name} does not move when commanded in {_motions(still)}: unplugged, torque off or not read; leave "
                 "these out"
             )
-            yield Finding("error" if len(still) == len(moved) else "warning", "stuck", text, (name,))
+            yield Finding(
+                "error" if len(still) == len(moved) else "warning", "stuck", text, (name,)
+            )
         # At a stop, an encoder with coarse steps repeats one number too: _blocked reports that.
         steps = any(s.resolution[i] for s in surveys)
         repeated = [s for s in surveys if s.repeated_s[i] > MIN_REPEATED_S and s not in still]

@@ -26,7 +26,12 @@ Loads = dict[Payload, tuple[Array, Array]]  # angles and torques, (k, n) each
 
 TURNS_RAD = (0.3, 0.6, 1.0, 1.5708, 2.3, 3.1416)  # of a zero, tried in both directions
 # Hypotheses of one joint: sign of its angle, turn of its zero, sign of its torque.
-JOINT_FAULTS = [(-1, 0.0, -1), (-1, 0.0, 1), (1, 0.0, -1), *((1, sign * t, 1) for sign in (1, -1) for t in TURNS_RAD)]
+JOINT_FAULTS = [
+    (-1, 0.0, -1),
+    (-1, 0.0, 1),
+    (1, 0.0, -1),
+    *((1, sign * t, 1) for sign in (1, -1) for t in TURNS_RAD),
+]
 MAX_ROWS = 120  # gravity is evaluated some fifteen times for each joint
 MIN_ROWS = 20
 MIN_EVIDENCE = 0.4  # sum over joints of ln(unexplained as logged / unexplained otherwise); correct recordings: < 0.1
@@ -73,11 +78,19 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
         if sum(len(qpos) for qpos, _ in loads.values()) >= MIN_ROWS
     ]  # fmt: skip
     if not results:
-        yield Finding("ok", "gravity", "too few torques and rests: zeros and signs cannot be told from gravity")
+        yield Finding(
+            "ok",
+            "gravity",
+            "too few torques and rests: zeros and signs cannot be told from gravity",
+        )
         return
     best = max(results, key=lambda b: b.evidence)
     improvement = best.otherwise - best.as_logged
-    significant = best.evidence > MIN_EVIDENCE and best.otherwise > MIN_EXPLAINED and improvement > MIN_IMPROVEMENT
+    significant = (
+        best.evidence > MIN_EVIDENCE
+        and best.otherwise > MIN_EXPLAINED
+        and improvement > MIN_IMPROVEMENT
+    )
     if best.hypothesis is not None and significant:
         joints = tuple(robot.joint_names[j] for j in best.hypothesis.joints)
         text = (
@@ -85,7 +98,9 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
             f"than as logged ({best.as_logged:.0%}): wrong in command and state alike, where neither shows it; check "
             "it against the model"
         )
-        yield Finding("warning", "gravity", text, joints, {"evidence": best.evidence}, best.hypothesis.mend)
+        yield Finding(
+            "warning", "gravity", text, joints, {"evidence": best.evidence}, best.hypothesis.mend
+        )
         return
     shares = " and ".join(f"{b.as_logged:.0%}" for b in results)
     text = f"no other zero, sign or order fits gravity better; it explains {shares} of the torques"
@@ -95,7 +110,11 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
 def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Best:
     """Return the hypothesis that explains the torques best; `centred` ignores a constant of each joint."""
     step = max(1, sum(len(qpos) for qpos, _ in loads.values()) // MAX_ROWS)
-    loads = {k: (q[::step].astype(float), t[::step].astype(float)) for k, (q, t) in loads.items() if len(q)}
+    loads = {
+        k: (q[::step].astype(float), t[::step].astype(float))
+        for k, (q, t) in loads.items()
+        if len(q)
+    }
     as_logged = {key: model(qpos, *key) for key, (qpos, _) in loads.items()}
     rms = np.sqrt(np.mean(np.concatenate(list(as_logged.values())) ** 2, axis=0))  # (n) N·m
     loaded = np.flatnonzero(rms > MIN_LOAD * robot.effort_limit)
@@ -118,7 +137,9 @@ def _joint_faults(robot: RobotSpec, loaded: Array) -> Iterator[_Hypothesis]:
         for sign, turn, torque_sign in JOINT_FAULTS:
             words = f"its zero turned by {turn:+.2f} rad" if turn else "its torque negated"
             words = "its angle mirrored" if sign < 0 else words
-            mend: Mend = {"offsets": {name: turn}} if turn else {"signs": {name: sign}} if sign < 0 else {}
+            mend: Mend = (
+                {"offsets": {name: turn}} if turn else {"signs": {name: sign}} if sign < 0 else {}
+            )
             factors = (1 + (sign - 1) * one, turn * one, 1 + (torque_sign - 1) * one)
             yield _Hypothesis(f"{words} at {name}", (j,), mend, np.arange(len(one)), *factors)
 
@@ -163,10 +184,15 @@ def _by_payload(samples: Iterable[tuple[Survey, Array, Array]]) -> Loads:
     parts: dict[Payload, list[tuple[Array, Array]]] = defaultdict(list)
     for s, qpos, torque in samples:
         parts[s.entry.meta.payload_mass, s.entry.meta.payload_side].append((qpos, torque))
-    return {key: (np.concatenate([q for q, _ in p]), np.concatenate([t for _, t in p])) for key, p in parts.items()}
+    return {
+        key: (np.concatenate([q for q, _ in p]), np.concatenate([t for _, t in p]))
+        for key, p in parts.items()
+    }
 
 
-def _unexplained(gravity: dict[Payload, Array], loads: Loads, loaded: Array, centred: bool) -> Array:
+def _unexplained(
+    gravity: dict[Payload, Array], loads: Loads, loaded: Array, centred: bool
+) -> Array:
     """Return the share of the torques' square that gravity, times a scale ≥ 0 per joint, does not explain, (loaded)."""
     x = np.concatenate([gravity[key][:, loaded] for key in loads])
     y = np.concatenate([torque[:, loaded] for _, torque in loads.values()])

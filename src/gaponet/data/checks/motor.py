@@ -51,7 +51,9 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             f"identify separates them). As a dead time this is {verdict}"
         )
     level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
-    yield Finding(level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()})
+    yield Finding(
+        level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()}
+    )
     for name, late in dead_time.items():
         slow, near = expected[name]
         if len(dead_time) > 2 and late - usual > MAX_EXTRA_LAG_S and late > max(2 * slow, near):
@@ -74,11 +76,16 @@ def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, full)
     dofs = [model.joint(name).dofadr[0] for name in robot.joint_names]
-    damping = np.where(np.isfinite(robot.damping), robot.damping, model.dof_damping[dofs]) + robot.kd
+    damping = (
+        np.where(np.isfinite(robot.damping), robot.damping, model.dof_damping[dofs]) + robot.kd
+    )
     inertia = np.diag(full)[dofs]
     stiff = np.where(robot.kp > 0, robot.kp, np.inf)
     lags = np.stack([damping / stiff, np.pi / 2 * np.sqrt(inertia / stiff)], axis=1)
-    return {name: (float(slow), float(near)) for name, (slow, near) in zip(robot.joint_names, lags, strict=True)}
+    return {
+        name: (float(slow), float(near))
+        for name, (slow, near) in zip(robot.joint_names, lags, strict=True)
+    }
 
 
 def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -89,18 +96,28 @@ def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         for p in dict.fromkeys([payloads[0], payloads[-1]])
     }
     largest = {name: max(abs(e[name].middle) for e in errors.values()) for name in robot.operated}
-    sagging = sorted((name for name in robot.operated if largest[name] >= MIN_SAG_RAD), key=lambda name: -largest[name])
+    sagging = sorted(
+        (name for name in robot.operated if largest[name] >= MIN_SAG_RAD),
+        key=lambda name: -largest[name],
+    )
     if sagging:
         by_payload = "; ".join(
-            ", ".join(f"{name} {_mrad(e[name])}" for name in sagging[:4]) + (f" with {p:g} kg" if payloads[1:] else "")
+            ", ".join(f"{name} {_mrad(e[name])}" for name in sagging[:4])
+            + (f" with {p:g} kg" if payloads[1:] else "")
             for p, e in errors.items()
         )
-        more = f"; {len(sagging) - 4} more joints above {MIN_SAG_RAD * 1e3:.0f}" if len(sagging) > 4 else ""
+        more = (
+            f"; {len(sagging) - 4} more joints above {MIN_SAG_RAD * 1e3:.0f}"
+            if len(sagging) > 4
+            else ""
+        )
         text = (
             f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. Within ± "
             "(stiction) a joint can stop anywhere"
         )
-        values = {f"{p:g} kg": {name: e[name].middle for name in sagging} for p, e in errors.items()}
+        values = {
+            f"{p:g} kg": {name: e[name].middle for name in sagging} for p, e in errors.items()
+        }
         yield Finding("note", "sag", text, tuple(sagging), values)
     elif all(e.up + e.down == 0 for by_joint in errors.values() for e in by_joint.values()):
         text = "the robot never rests under a constant command: sag and offsets are not determined; add holds"
@@ -111,9 +128,14 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Can the torque signal be trusted?"""
     recorded = [(s, s.torque) for s in surveys if s.torque is not None]
     if not recorded:
-        yield Finding("note", "torque", "no torque recorded; equivalent torque comes from inverse dynamics")
+        yield Finding(
+            "note", "torque", "no torque recorded; equivalent torque comes from inverse dynamics"
+        )
         return
-    low, high = np.min([t.low for _, t in recorded], axis=0), np.max([t.high for _, t in recorded], axis=0)
+    low, high = (
+        np.min([t.low for _, t in recorded], axis=0),
+        np.max([t.high for _, t in recorded], axis=0),
+    )
     used = np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05
     constant, unsigned = masked_names(robot, used & (low == high)), unsigned_torque(recorded, robot)
     if constant:
@@ -123,7 +145,9 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         text = "torque is unsigned (never negative, though joints move both ways): a current's magnitude; do not fit it"
         yield Finding("warning", "torque", text, unsigned)
     if spiky := [(s, t) for s, t in recorded if t.spikes.any()]:
-        height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])  # (sequences, n) N·m
+        height = np.array(
+            [np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky]
+        )  # (sequences, n) N·m
         k, i = np.unravel_index(height.argmax(), height.shape)
         samples = sum(int(t.spikes.sum()) for _, t in spiky)
         text = (
@@ -137,7 +161,13 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
     """Return joint → lags in motions that command it at FAST_COMMAND_RAD_S or more, s; only joints that have any."""
     lags = {
-        name: np.array([s.delay[i] for s in surveys if s.speed[i] >= FAST_COMMAND_RAD_S and np.isfinite(s.delay[i])])
+        name: np.array(
+            [
+                s.delay[i]
+                for s in surveys
+                if s.speed[i] >= FAST_COMMAND_RAD_S and np.isfinite(s.delay[i])
+            ]
+        )
         for i, name in enumerate(robot.joint_names)
     }
     return {name: x for name, x in lags.items() if len(x)}
@@ -145,17 +175,27 @@ def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
 
 def lag_values(lags: Array) -> dict[str, float]:
     """Return median and range of lags, s, and their number."""
-    return {"median": float(np.median(lags)), "min": float(lags.min()), "max": float(lags.max()), "motions": len(lags)}
+    return {
+        "median": float(np.median(lags)),
+        "min": float(lags.min()),
+        "max": float(lags.max()),
+        "motions": len(lags),
+    }
 
 
 def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticError]:
     """Return the static error of each operated joint over all static poses."""
     poses = StaticPoses.joined([s.static_poses for s in surveys], len(robot.joint_names))
-    return {name: poses.static_error(j) for name, j in zip(robot.operated, robot.operated_index, strict=True)}
+    return {
+        name: poses.static_error(j)
+        for name, j in zip(robot.operated, robot.operated_index, strict=True)
+    }
 
 
 def _mrad(error: StaticError) -> str:
-    band = f" ± {error.half_band * 1e3:.0f}" if error.balanced else " (approached from one side only)"
+    band = (
+        f" ± {error.half_band * 1e3:.0f}" if error.balanced else " (approached from one side only)"
+    )
     return f"{error.middle * 1e3:+.0f}{band}"
 
 

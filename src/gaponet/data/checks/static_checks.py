@@ -33,7 +33,10 @@ MIN_SCALE_ERROR = 0.1
 SOFTNESS_BOUNDS = (0.5, 1.8)
 MIN_SAG_RAD = 0.01  # rms of the nominal sag, below which softness is unknown
 MIN_UNIT_DISTANCE_RAD = 0.03  # between sequences of one robot
-MIN_MASS, MIN_MASS_SHARE = 0.25, 0.5  # of the heaviest label (or kg); of the misfit that another mass must explain
+MIN_MASS, MIN_MASS_SHARE = (
+    0.25,
+    0.5,
+)  # of the heaviest label (or kg); of the misfit that another mass must explain
 MIN_LOAD_CHANGE_RAD = 1e-3  # by which a joint rests elsewhere with another label
 MIN_EVIDENCE = 10.0  # for other labels: poses times the logarithm by which their scatter falls
 MIN_GROUP_DISTANCE_RAD, MIN_GROUP_SCATTERS = 0.006, 6.0  # between two groups of recordings
@@ -46,8 +49,14 @@ MAX_ODD_SEQUENCES = 10  # that are reported
 MIN_RECORDINGS = 3
 MIN_LOAD = 0.01  # of the torque limit, by which the weight on a joint changes
 MIN_SHARE = 0.3  # of the weight that the command does not hold
-MIN_UNEXPLAINED, MIN_IMPROVEMENT = 0.02, 8.0  # share of the torque that PD does not explain; times as much as with it
-MAX_SAG = (0.25, 2.5)  # of the sag that kp and the weight give: at a share of 1, and more per share below
+MIN_UNEXPLAINED, MIN_IMPROVEMENT = (
+    0.02,
+    8.0,
+)  # share of the torque that PD does not explain; times as much as with it
+MAX_SAG = (
+    0.25,
+    2.5,
+)  # of the sag that kp and the weight give: at a share of 1, and more per share below
 MIN_JOINTS_SHARE = 1 / 3  # of the joints that are judged
 
 
@@ -94,13 +103,20 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
     poses = _collect(surveys, robot, model)
     judged = [j for j in robot.operated_index.tolist() if (poses.joint == j).sum() >= MIN_POSES]
     if not judged:
-        yield Finding("ok", "rests", "too few rests: offsets, scales, gains and payloads cannot be told; add holds")
+        yield Finding(
+            "ok",
+            "rests",
+            "too few rests: offsets, scales, gains and payloads cannot be told; add holds",
+        )
         return
     findings = _swapped_labels(surveys, poses, judged) or _two_units(surveys, robot, poses, judged)
     if findings:
         yield from findings
         return
-    while len(findings) < MAX_ODD_SEQUENCES and (odd := _odd_sequence(surveys, robot, poses, judged)) is not None:
+    while (
+        len(findings) < MAX_ODD_SEQUENCES
+        and (odd := _odd_sequence(surveys, robot, poses, judged)) is not None
+    ):
         findings.append(odd[1])
         poses = poses.only(poses.sequence != odd[0])
     findings = findings or _two_units(surveys, robot, poses, judged, min_size=1, min_joints=3)
@@ -116,13 +132,17 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
             softness |= {} if SOFTNESS_BOUNDS[0] < soft < SOFTNESS_BOUNDS[1] else {name: soft}
     if softness:
         median = max(float(np.median(list(softness.values()))), 0.0)
-        fed = "" if median > 1 else ", or was a torque fed forward (feedforward_torque in logs.toml)"
+        fed = (
+            "" if median > 1 else ", or was a torque fed forward (feedforward_torque in logs.toml)"
+        )
         text = (
             f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: were these logs made "
             f"at other gains, or with another payload than their label{fed}? Import again with --kp or --payload-mass"
         )
         findings.append(Finding("warning", "gains", text, tuple(softness), {"softness": softness}))
-    yield from findings or [Finding("ok", "rests", "rests agree with gravity, gains and payload labels")]
+    yield from findings or [
+        Finding("ok", "rests", "rests agree with gravity, gains and payload labels")
+    ]
 
 
 def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
@@ -139,7 +159,9 @@ def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
         nth, pose = np.nonzero((poses.distinct & (poses.approach != 0))[:, robot.operated_index].T)
         at = pose, (j := robot.operated_index[nth])
         columns = np.column_stack([np.ones(len(j)), poses.ctrl[at], -load[at], -poses.approach[at]])
-        parts.append((np.full(len(j), number), j, poses.qpos[at] - poses.ctrl[at], columns, -heavier[at]))
+        parts.append(
+            (np.full(len(j), number), j, poses.qpos[at] - poses.ctrl[at], columns, -heavier[at])
+        )
     return _Poses(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -151,9 +173,13 @@ def _fit(poses: _Poses) -> _Fit:
     folds = range(min(len(numbers), MAX_FOLDS))
     without = {f: _solve(poses.columns[fold != f], poses.error[fold != f])[0] for f in folds}
     every = np.array(list(without.values()))
-    jackknife = np.sqrt((len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0))
+    jackknife = np.sqrt(
+        (len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0)
+    )
     std = np.maximum(formal_std, jackknife) if len(every) > 2 else 3 * formal_std
-    return _Fit(x, std, scatter, {s: without[i % MAX_FOLDS] for i, s in enumerate(numbers.tolist())})
+    return _Fit(
+        x, std, scatter, {s: without[i % MAX_FOLDS] for i, s in enumerate(numbers.tolist())}
+    )
 
 
 def _solve(
@@ -164,9 +190,13 @@ def _solve(
     a = prior
     for _ in range(MAX_ITERATIONS):
         a = np.concatenate([columns * (weight / scatter)[:, None], prior])
-        x = np.linalg.lstsq(a, np.concatenate([error * weight / scatter, prior @ expected]), rcond=None)[0]
+        x = np.linalg.lstsq(
+            a, np.concatenate([error * weight / scatter, prior @ expected]), rcond=None
+        )[0]
         residual = np.abs(error - columns @ x)
-        scatter = max(1.48 * float(np.median(residual)), MIN_SCATTER_RAD) if len(residual) else scatter
+        scatter = (
+            max(1.48 * float(np.median(residual)), MIN_SCATTER_RAD) if len(residual) else scatter
+        )
         weight = np.sqrt(1 / np.maximum(1, residual / (3 * scatter)))
     return x, np.sqrt(np.diag(np.linalg.inv(a.T @ a))), scatter
 
@@ -181,7 +211,11 @@ def _offset_and_scale(name: str, fit: _Fit) -> Iterator[Finding]:
         yield Finding("warning", "scale", text, (name,), {"scale": scale})
     elif fit.significant[0] and abs(offset) > MIN_OFFSET_RAD:
         far = abs(offset) > FAR_OFFSET_RAD
-        verdict = "more than assembly leaves: a wrong zero or a missed homing" if far else "as assembly leaves it"
+        verdict = (
+            "more than assembly leaves: a wrong zero or a missed homing"
+            if far
+            else "as assembly leaves it"
+        )
         text = (
             f"{name} rests {offset * 1e3:+.0f} ± {fit.std[0] * 1e3:.0f} mrad off its command, sag and stiction "
             f"taken off: a constant offset, {verdict}; gaponet identify finds it, or take it off at import"
@@ -208,16 +242,25 @@ def _swapped_labels(surveys: list[Survey], poses: _Poses, judged: list[int]) -> 
     loaded = np.abs(poses.per_kg) * (labels[-1] - labels[0]) > MIN_LOAD_CHANGE_RAD
     if best[0] < max(MIN_EVIDENCE, 0.1 * loaded.sum()):
         return []
-    swaps = ", ".join(f"{a:g} kg rests as {b:g} kg" for a, b in zip(labels, best[1], strict=True) if a != b)
+    swaps = ", ".join(
+        f"{a:g} kg rests as {b:g} kg" for a, b in zip(labels, best[1], strict=True) if a != b
+    )
     text = f"what is labelled {swaps}: payload labels in each other's place? Import again with the right --payload-mass"
     return [Finding("warning", "payload", text, (), {"labels": labels, "rests_as": best[1]})]
 
 
 def _two_units(
-    surveys: list[Survey], robot: RobotSpec, poses: _Poses, judged: list[int], min_size: int = 2, min_joints: int = 2
+    surveys: list[Survey],
+    robot: RobotSpec,
+    poses: _Poses,
+    judged: list[int],
+    min_size: int = 2,
+    min_joints: int = 2,
 ) -> list[Finding]:
     """Do the recordings form two groups of `min_size` or more that rest apart in `min_joints` or more joints?"""
-    median = np.full((len(surveys), len(judged)), np.nan)  # residual of each sequence and joint, rad
+    median = np.full(
+        (len(surveys), len(judged)), np.nan
+    )  # residual of each sequence and joint, rad
     for column, j in enumerate(judged):
         own = poses.of_joint(j)
         residual = own.error - own.columns @ _solve(own.columns, own.error)[0]
@@ -233,20 +276,28 @@ def _two_units(
         sums, per = centred.cumsum(axis=0)[cuts - 1], (1 / cuts + 1 / (len(order) - cuts))[:, None]
         within = np.sqrt(np.maximum((centred**2).sum(axis=0) - sums**2 * per, 0) / (len(order) - 2))
         gaps = np.abs(sums) * per
-        far = (gaps > MIN_GROUP_DISTANCE_RAD) & (gaps > MIN_GROUP_SCATTERS * np.maximum(within, MIN_SCATTER_RAD))
+        far = (gaps > MIN_GROUP_DISTANCE_RAD) & (
+            gaps > MIN_GROUP_SCATTERS * np.maximum(within, MIN_SCATTER_RAD)
+        )
         for cut, gap, apart in zip(cuts.tolist(), gaps.max(axis=1).tolist(), far, strict=True):
             if (int(apart.sum()), gap) > best[:2]:
                 names = [robot.joint_names[j] for j, yes in zip(judged, apart, strict=True) if yes]
                 best = (len(names), gap, names, order[:cut])
     if best[0] < min_joints:
         return []
-    motions = [[surveys[i].motion for i in known if (i in best[3]) == side] for side in (True, False)]
+    motions = [
+        [surveys[i].motion for i in known if (i in best[3]) == side] for side in (True, False)
+    ]
     text = (
         f"{abbreviate(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where {abbreviate(motions[1])} do "
         f"({abbreviate(best[2])}): two robots under one name, or zeros set in between? Import one part with another "
         "--unit-id"
     )
-    return [Finding("warning", "unit_id", text, tuple(best[2]), {"apart": best[1], "motions": motions[0]})]
+    return [
+        Finding(
+            "warning", "unit_id", text, tuple(best[2]), {"apart": best[1], "motions": motions[0]}
+        )
+    ]
 
 
 def _odd_sequence(
@@ -269,7 +320,9 @@ def _odd_sequence(
             slopes.append(x[SOFTNESS] * own.per_kg / fit.scatter)
             middle = float(np.median(residual))
             scatter = max(fit.scatter, 1.48 * float(np.median(np.abs(residual - middle))))
-            if abs(middle) > max(MIN_UNIT_DISTANCE_RAD, SIGNIFICANCE * scatter / np.sqrt(len(residual))):
+            if abs(middle) > max(
+                MIN_UNIT_DISTANCE_RAD, SIGNIFICANCE * scatter / np.sqrt(len(residual))
+            ):
                 apart[robot.joint_names[j]] = middle
         judged_sequence = _judge_sequence(surveys[number], heaviest, residuals, slopes, apart)
         if judged_sequence is not None and (odd is None or judged_sequence[0] > odd[0]):
@@ -308,7 +361,9 @@ def _judge_sequence(
             f"{meta.unit_id} say ({abbreviate(list(apart))}): another robot, or zeros set in between? Import it with "
             "another --unit-id"
         )
-        return mean_square, Finding("warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart})
+        return mean_square, Finding(
+            "warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart}
+        )
     return None
 
 
@@ -317,10 +372,18 @@ def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iter
     recorded = [(s, s.torque) for s in surveys if s.torque is not None]
     if not recorded or unsigned_torque(recorded, robot):
         return
-    shares = {name: x for j, name in enumerate(robot.joint_names) if (x := _shares(surveys, robot, model, j))}
+    shares = {
+        name: x
+        for j, name in enumerate(robot.joint_names)
+        if (x := _shares(surveys, robot, model, j))
+    }
     fed = {name: x for name, x in shares.items() if x[0] > 0}
     if not shares or len(fed) < MIN_JOINTS_SHARE * len(shares):
-        what = "no torque beside the commands is seen at rest" if shares else "too few rests with torque to tell"
+        what = (
+            "no torque beside the commands is seen at rest"
+            if shares
+            else "too few rests with torque to tell"
+        )
         yield Finding("ok", "feed-forward", what)
         return
     share, alone, both = np.clip(np.median(list(fed.values()), axis=0), 0, 1)
@@ -331,19 +394,32 @@ def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iter
         "the joint. Name its column in logs.toml (feedforward_torque); without it, gaponet identify takes the missing "
         "sag for stiffer motors, and a simulator needs the same torque"
     )
-    yield Finding("warning", "feed-forward", text, tuple(fed), {name: x[0] for name, x in fed.items()})
+    yield Finding(
+        "warning", "feed-forward", text, tuple(fed), {name: x[0] for name, x in fed.items()}
+    )
 
 
-def _shares(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int) -> tuple[float, float, float] | None:
+def _shares(
+    surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int
+) -> tuple[float, float, float] | None:
     """Return the share of a joint's weight that is fed forward (0 if it may be none), and the shares of its torque that
     PD alone and both explain; None with too few holds, or without a weight that changes."""
     parts = [np.zeros((0, 5))]
     for number, s in enumerate(surveys):
         if s.holds is not None and (s.holds[:, 0] == joint).any():
             own = s.holds[s.holds[:, 0] == joint]
-            meta, kp = s.entry.meta, max(float(robot.with_gains(*s.entry.meta.recorded_gains).kp[joint]), 1e-9)
+            meta, kp = (
+                s.entry.meta,
+                max(float(robot.with_gains(*s.entry.meta.recorded_gains).kp[joint]), 1e-9),
+            )
             weight = model(own[:, 3:], meta.payload_mass, meta.payload_side)[:, joint]
-            columns = (np.full(len(own), number), own[:, 2] / kp, weight / kp, own[:, 1], own[:, 3 + joint])
+            columns = (
+                np.full(len(own), number),
+                own[:, 2] / kp,
+                weight / kp,
+                own[:, 1],
+                own[:, 3 + joint],
+            )
             parts.append(np.stack(columns, axis=1))
     recording, torque, weight, error, qpos = np.concatenate(parts).T  # (k,); torques over kp, rad
     numbers, fold = np.unique(recording, return_inverse=True)
@@ -352,9 +428,13 @@ def _shares(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int)
         return None
     fold = fold % MAX_FOLDS
     sag, _, _ = _explained(error, fold, weight)
-    _, _, alone = _explained(torque, fold, error, qpos)  # qpos: command and state may differ in scale
+    _, _, alone = _explained(
+        torque, fold, error, qpos
+    )  # qpos: command and state may differ in scale
     share, std, both = _explained(torque, fold, weight, error, qpos)
-    significant = share > max(MIN_SHARE, SIGNIFICANCE * std) and sag < MAX_SAG[0] + MAX_SAG[1] * max(1 - share, 0.0)
+    significant = share > max(MIN_SHARE, SIGNIFICANCE * std) and sag < MAX_SAG[0] + MAX_SAG[
+        1
+    ] * max(1 - share, 0.0)
     better = 1 - alone > max(MIN_UNEXPLAINED, MIN_IMPROVEMENT * (1 - both))
     return (share if significant and better else 0.0), alone, both
 

@@ -34,16 +34,24 @@ from gaponet.robot.spec import RobotSpec
 
 MAX_LAG_S = 0.4
 STANDSTILL_S, STANDSTILL_RAD = 0.2, 0.005  # a joint that moves less in this time stands still
-BLOCKED_ERROR_RAD = 0.15  # distance of a blocked joint from its command; a loaded joint may be as far,
+BLOCKED_ERROR_RAD = (
+    0.15  # distance of a blocked joint from its command; a loaded joint may be as far,
+)
 BLOCKED_COMMAND_RAD = 0.1  # so that its command must also move by this
 REPEATED_COMMAND_RAD = 0.1  # the command must move by this while the state repeats itself
 SLOPE_MIN_RANGE_RAD = 0.2  # of the command; below, sag and stiction decide the slope
 SLOW_HZ = 0.3  # faster, a servo's resonance changes the slope
-GRAVITY_SAMPLES, SLOW_RAD_S = 60, 0.5  # rows in which torque is compared with gravity, and the highest speed there
+GRAVITY_SAMPLES, SLOW_RAD_S = (
+    60,
+    0.5,
+)  # rows in which torque is compared with gravity, and the highest speed there
 HOLD_S, HELD_COMMAND_RAD = 0.4, 2e-3  # time and range of a command that stands still
 TORQUE_TOLERANCE = 0.05  # share of the torque limit by which a reading may exceed it
 EQUAL_RAD = 1e-5  # command and state that differ by less are one signal
-JUMP_RAD, JUMP_RAD_S2 = 0.1, 1000.0  # distance from the line between the neighbouring rows that no joint reaches
+JUMP_RAD, JUMP_RAD_S2 = (
+    0.1,
+    1000.0,
+)  # distance from the line between the neighbouring rows that no joint reaches
 ZERO_JUMP_RAD = 0.05  # step from a row of zeros to the next row
 COMMAND_STEP_RAD = 0.05  # step of a command; the torque may follow it
 SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
@@ -51,7 +59,10 @@ SPECTRUM_HZ = np.arange(0.5, 60, 0.1)
 MOVING_RAD = 0.05
 JOB_ROWS, MIN_PARALLEL_ROWS = 40_000, 600_000  # of one job; from which starting processes pays
 OVERHEAD_ROWS = 1500  # rows that take as long as the fixed costs of a recording
-LEVELS, LEVEL_TOLERANCE = 8, 0.1  # distinct positions from which a step is known; deviation in steps
+LEVELS, LEVEL_TOLERANCE = (
+    8,
+    0.1,
+)  # distinct positions from which a step is known; deviation in steps
 
 
 class Torque(NamedTuple):
@@ -89,13 +100,21 @@ class Survey:
     equals_command: Array  # joints whose state is the command itself, (n)
     jump_rows: Array  # rows with a position that no joint can reach and leave in a period, (n)
     zero_rows: int  # rows in which every joint is exactly 0, far from the rows around
-    qvel_ratio: Array  # recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves
+    qvel_ratio: (
+        Array  # recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves
+    )
     blocked_s: Array  # longest standstill far from a moving command, (n) s
     blocked_at: Array  # its position, (n) rad
     standstill_s: float  # longest standstill of all joints while the commands of half of them move
-    repeated_s: Array  # longest stretch in which a joint repeats one number while its command moves, (n) s
-    all_repeated_s: float  # longest stretch in which the whole state repeats itself while the command moves
-    resolution: Array  # step between positions, (n) rad; 0 where positions are continuous, or too few
+    repeated_s: (
+        Array  # longest stretch in which a joint repeats one number while its command moves, (n) s
+    )
+    all_repeated_s: (
+        float  # longest stretch in which the whole state repeats itself while the command moves
+    )
+    resolution: (
+        Array  # step between positions, (n) rad; 0 where positions are continuous, or too few
+    )
     torque: Torque | None  # None if no torque was recorded
     static_poses: StaticPoses
     response: Response  # of the operated joints
@@ -104,8 +123,12 @@ class Survey:
     # state, (n); NaN where the joint does not move
     velocity_correlation: Array  # of the command with the measured velocity, (n)
     torque_correlation: Array  # of the command with the measured torque, (n)
-    gravity_samples: Array | None  # positions and torques in slow rows, (2, k, n); None if no torque was recorded
-    holds: Array | None  # of single joints that rest under a constant command: joint, command − position (rad), torque,
+    gravity_samples: (
+        Array | None
+    )  # positions and torques in slow rows, (2, k, n); None if no torque was recorded
+    holds: (
+        Array | None
+    )  # of single joints that rest under a constant command: joint, command − position (rad), torque,
     # and positions of all joints, (k, 3 + n); None if no torque was recorded
 
     @property
@@ -131,11 +154,22 @@ class Survey:
     @classmethod
     def of(cls, entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
         """Measure one sequence."""
-        ctrl, qpos, dt, notes, op = sequence.ctrl, sequence.qpos, sequence.dt, entry.meta.notes, robot.operated_index
+        ctrl, qpos, dt, notes, op = (
+            sequence.ctrl,
+            sequence.qpos,
+            sequence.dt,
+            entry.meta.notes,
+            robot.operated_index,
+        )
         blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
         follows, opposes = _correlations(ctrl, qpos, dt)
-        delay, lead = estimate_delay(ctrl, qpos, dt, MAX_LAG_S), estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
-        apart = np.abs(qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2)  # from the line between the neighbouring rows
+        delay, lead = (
+            estimate_delay(ctrl, qpos, dt, MAX_LAG_S),
+            estimate_delay(qpos, ctrl, dt, MAX_LAG_S),
+        )
+        apart = np.abs(
+            qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2
+        )  # from the line between the neighbouring rows
         return Survey(
             entry=entry,
             samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
@@ -151,7 +185,8 @@ class Survey:
             follows=follows,
             opposes=opposes,
             slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
-            equals_command=(np.ptp(ctrl, axis=0) > MOVING_RAD) & (np.abs(ctrl - qpos) < EQUAL_RAD).all(axis=0),
+            equals_command=(np.ptp(ctrl, axis=0) > MOVING_RAD)
+            & (np.abs(ctrl - qpos) < EQUAL_RAD).all(axis=0),
             jump_rows=(apart > max(JUMP_RAD, JUMP_RAD_S2 / 2 * dt**2)).sum(axis=0),
             zero_rows=_zero_rows(sequence, notes, robot),
             qvel_ratio=_qvel_ratio(sequence),
@@ -171,7 +206,9 @@ class Survey:
         )
 
 
-def survey_all(dataset: Dataset, robot: RobotSpec, progress: Progress, executor: str | Executor) -> list[Survey]:
+def survey_all(
+    dataset: Dataset, robot: RobotSpec, progress: Progress, executor: str | Executor
+) -> list[Survey]:
     """Return one survey per sequence, in the order of the dataset's entries; many are measured by the executor.
 
     Raises:
@@ -224,9 +261,14 @@ def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Arr
     """Return the slope of the state over the command of `lag` rows before; NaN for a fast joint with unknown lag."""
     slope = np.full(len(lag), np.nan)
     slow = [lowpass(x, dt, SLOW_HZ) for x in (ctrl, qpos)] if len(ctrl) * dt > 3 / SLOW_HZ else None
-    for j in np.flatnonzero((np.ptp(ctrl, axis=0) > SLOPE_MIN_RANGE_RAD) & ((lag > 0) | (speed < FAST_COMMAND_RAD_S))):
+    for j in np.flatnonzero(
+        (np.ptp(ctrl, axis=0) > SLOPE_MIN_RANGE_RAD) & ((lag > 0) | (speed < FAST_COMMAND_RAD_S))
+    ):
         steps, candidates = round(float(lag[j])), []
-        for a, b in ((ctrl, qpos), *([slow] if slow and np.ptp(slow[0][:, j]) > SLOPE_MIN_RANGE_RAD else [])):
+        for a, b in (
+            (ctrl, qpos),
+            *([slow] if slow and np.ptp(slow[0][:, j]) > SLOPE_MIN_RANGE_RAD else []),
+        ):
             u, v = a[: len(a) - steps, j].astype(float), b[steps:, j].astype(float)
             u = u - u.mean()
             candidates.append(float(u @ v / (u @ u)))
@@ -237,20 +279,38 @@ def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Arr
 def _kind_of_command(sequence: Sequence) -> dict[str, Array]:
     """Compare the command with the position soon after, with the velocity, and with the torque."""
     every = max(1, round(0.02 / sequence.dt))
-    ctrl, qpos = (np.ascontiguousarray(x[::every].T, float) for x in (sequence.ctrl, sequence.qpos))  # (n, T)
+    ctrl, qpos = (
+        np.ascontiguousarray(x[::every].T, float) for x in (sequence.ctrl, sequence.qpos)
+    )  # (n, T)
     rows, speed = qpos.shape[1], np.gradient(qpos, axis=1)
     distances, velocity = [], []
     for lag in range(0, min(round(MAX_LAG_S / 0.02), rows // 2), 2):
         u, q = ctrl[:, : rows - lag], qpos[:, lag:]
         product = np.abs(u @ q.T) / (rows - lag)  # (n, n)
-        u_power, q_power, variance = (u**2).mean(axis=1)[:, None], (q**2).mean(axis=1), np.maximum(q.var(axis=1), 1e-12)
-        for scale in (1.0, np.degrees(1), np.radians(1)):  # other checks judge units, signs and names
+        u_power, q_power, variance = (
+            (u**2).mean(axis=1)[:, None],
+            (q**2).mean(axis=1),
+            np.maximum(q.var(axis=1), 1e-12),
+        )
+        for scale in (
+            1.0,
+            np.degrees(1),
+            np.radians(1),
+        ):  # other checks judge units, signs and names
             square = scale**2 * u_power + q_power - 2 * scale * product
             distances.append((np.maximum(square, 0) / variance).min(axis=1))
         velocity.append(correlation(u, speed[:, lag:]))
     near = np.where(np.ptp(qpos, axis=1) > MOVING_RAD, np.sqrt(np.min(distances, axis=0)), np.nan)
-    torque = np.full(near.shape, np.nan) if sequence.tau is None else correlation(ctrl, sequence.tau[::every].T)
-    return {"command_distance": near, "velocity_correlation": np.max(velocity, axis=0), "torque_correlation": torque}
+    torque = (
+        np.full(near.shape, np.nan)
+        if sequence.tau is None
+        else correlation(ctrl, sequence.tau[::every].T)
+    )
+    return {
+        "command_distance": near,
+        "velocity_correlation": np.max(velocity, axis=0),
+        "torque_correlation": torque,
+    }
 
 
 def _standing(qpos: Array, dt: float) -> Array:
@@ -292,7 +352,10 @@ def _zero_rows(sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> i
     for values, min_edges in ((sequence.qpos[:, logged], 1), (sequence.ctrl[:, logged], 2)):
         far = np.abs(np.diff(values, axis=0)).max(axis=1) > ZERO_JUMP_RAD  # (T − 1,)
         for run in _runs((values == 0).all(axis=1)):
-            edges = [*far[run.start - 1 : run.start if run.start else 0], *far[run.stop - 1 : run.stop]]
+            edges = [
+                *far[run.start - 1 : run.start if run.start else 0],
+                *far[run.stop - 1 : run.stop],
+            ]
             # A command may step away from zero; it does not step there and back within a few rows.
             if sum(edges) >= min_edges and (min_edges == 1 or run.stop - run.start <= 5):
                 count += run.stop - run.start
@@ -314,9 +377,20 @@ def _holds(sequence: Sequence) -> Array | None:
     rests = range_before(sequence.ctrl, rows) < HELD_COMMAND_RAD
     rests &= range_before(sequence.qpos, max(2, rows // 4)) < STANDSTILL_RAD
     rests[:rows] = False
-    stretches = [(j, run) for j, mask in enumerate(rests.T) for run in _runs(mask) if run.stop - run.start > least]
-    means = [[x[run].mean(axis=0) for x in (sequence.ctrl, sequence.qpos, sequence.tau)] for _, run in stretches]
-    holds = [[j, ctrl[j] - qpos[j], tau[j], *qpos] for (j, _), (ctrl, qpos, tau) in zip(stretches, means, strict=True)]
+    stretches = [
+        (j, run)
+        for j, mask in enumerate(rests.T)
+        for run in _runs(mask)
+        if run.stop - run.start > least
+    ]
+    means = [
+        [x[run].mean(axis=0) for x in (sequence.ctrl, sequence.qpos, sequence.tau)]
+        for _, run in stretches
+    ]
+    holds = [
+        [j, ctrl[j] - qpos[j], tau[j], *qpos]
+        for (j, _), (ctrl, qpos, tau) in zip(stretches, means, strict=True)
+    ]
     return np.reshape(holds, (-1, 3 + rests.shape[1])).astype(float)
 
 
@@ -324,7 +398,9 @@ def _qvel_ratio(sequence: Sequence) -> Array:
     derivative = differentiate(sequence.qpos, sequence.dt)
     power = (derivative**2).sum(axis=0)
     moves = np.ptp(sequence.qpos, axis=0) > MOVING_RAD
-    return np.where(moves, (sequence.qvel * derivative).sum(axis=0) / np.where(power > 0, power, 1.0), np.nan)
+    return np.where(
+        moves, (sequence.qvel * derivative).sum(axis=0) / np.where(power > 0, power, 1.0), np.nan
+    )
 
 
 def _all_repeated(sequence: Sequence) -> float:
@@ -333,7 +409,9 @@ def _all_repeated(sequence: Sequence) -> float:
     same = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in state if x is not None], axis=0)
     late = round(MAX_LAG_S / 2 / sequence.dt)
     moved = lambda r: np.ptp(sequence.ctrl[r.start : max(r.stop - late, r.start) + 1], axis=0).max()  # noqa: E731
-    rows = max((r.stop - r.start for r in _runs(same) if moved(r) > REPEATED_COMMAND_RAD), default=0)
+    rows = max(
+        (r.stop - r.start for r in _runs(same) if moved(r) > REPEATED_COMMAND_RAD), default=0
+    )
     return rows * sequence.dt
 
 
@@ -377,7 +455,10 @@ def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
     magnitude = np.abs(tau)
     window = max(3, round(SPIKE_WINDOW_S / sequence.dt))
     usual = median_filter(magnitude, size=(window, 1), mode="nearest")
-    steps = np.abs(np.diff(sequence.ctrl, axis=0, prepend=sequence.ctrl[:1])).max(axis=1) > COMMAND_STEP_RAD
+    steps = (
+        np.abs(np.diff(sequence.ctrl, axis=0, prepend=sequence.ctrl[:1])).max(axis=1)
+        > COMMAND_STEP_RAD
+    )
     calm = maximum_filter1d(steps, 2 * window + 1) == 0
     return Torque(
         low=tau.min(axis=0),
@@ -394,6 +475,10 @@ def _spectrum(qpos: Array, dt: float) -> Array:
     if not moved.size or len(moved) < 100:
         return np.full(len(SPECTRUM_HZ), np.nan)
     v = np.diff(moved, axis=0)
-    power = np.log(np.abs(np.fft.rfft(v * np.hanning(len(v))[:, None], axis=0)) ** 2 + 1e-30).mean(axis=1)
+    power = np.log(np.abs(np.fft.rfft(v * np.hanning(len(v))[:, None], axis=0)) ** 2 + 1e-30).mean(
+        axis=1
+    )
     smooth = np.convolve(power, np.ones(3) / 3, "same")
-    return np.where(0.48 / dt > SPECTRUM_HZ, np.interp(SPECTRUM_HZ, np.fft.rfftfreq(len(v), dt), smooth), np.nan)
+    return np.where(
+        0.48 / dt > SPECTRUM_HZ, np.interp(SPECTRUM_HZ, np.fft.rfftfreq(len(v), dt), smooth), np.nan
+    )

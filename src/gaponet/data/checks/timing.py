@@ -16,7 +16,10 @@ from gaponet.robot.spec import RobotSpec
 
 MAX_ITERATIONS = 6  # of estimating shifts and the common response in turn
 MIN_RECORDINGS = 4  # from which one of them can be compared with the others
-MIN_SHIFT_S, SHIFT_SCATTERS = 0.012, 4.0  # by which a recording follows later than the others; times their scatter
+MIN_SHIFT_S, SHIFT_SCATTERS = (
+    0.012,
+    4.0,
+)  # by which a recording follows later than the others; times their scatter
 UNEVEN_ROWS_SHARE = 2.0  # of the unevenness of rows: a command may be that late, and an interpolated state that early
 MIN_LEAD_S = 0.015  # by which joints begin to move before their commands
 MIN_EARLY_RATIO = 1.08  # unexplained motion without future commands over that with them, if joints move before them
@@ -26,7 +29,10 @@ DEAD_TIMES = (  # up to s, verdict
     (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
 MIN_DRIFT, MIN_DRIFT_ERRORS = 3e-4, 4.5  # s/s; standard errors
-MOTION_SHARE, MIN_DRIFT_DURATION_S = 0.7, 10.0  # of the scatter that motions explain; recordings that show a drift
+MOTION_SHARE, MIN_DRIFT_DURATION_S = (
+    0.7,
+    10.0,
+)  # of the scatter that motions explain; recordings that show a drift
 MIN_NOTCH_DEPTH = 1.5  # natural logarithm of power
 AVERAGING_WIDTHS_S = np.geomspace(0.04, 0.4, 150)
 
@@ -40,7 +46,9 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     unknown = max(s.uneven_ms for s in complete) * UNEVEN_ROWS_SHARE / 1e3  # s
     findings = [*_late_recordings(comparable, unknown)]
     odd = {recording for f in findings for recording in f.values["recordings"]}
-    common = Response.common([s.response for s in complete], [s.entry.id not in odd for s in complete])
+    common = Response.common(
+        [s.response for s in complete], [s.entry.id not in odd for s in complete]
+    )
     known = np.isfinite(common.onset)
     onset = float(np.median(common.onset[known])) if known.any() else np.nan
     if known.any() and np.median(common.early[known]) < MIN_EARLY_RATIO:
@@ -55,7 +63,9 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     elif np.isfinite(onset):
         verdict = next(words for limit, words in DEAD_TIMES if onset <= limit)
         text = f"joints begin to move {max(onset, 0) * 1e3:.0f} ms after their commands: {verdict}"
-        yield Finding("warning" if onset > MAX_DEAD_TIME_S else "ok", "lag", text, (), {"onset_s": onset})
+        yield Finding(
+            "warning" if onset > MAX_DEAD_TIME_S else "ok", "lag", text, (), {"onset_s": onset}
+        )
     for name, extra in zip(robot.operated, common.onset - onset, strict=True):
         if extra > MAX_EXTRA_LAG_S and np.isfinite(common.onset).sum() > 2:
             text = (
@@ -67,7 +77,11 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     commanded, moved = np.mean([s.spectra for s in complete], axis=0)
     width, depth = _averaging(moved)
     # Steps at a regular pace have notches too.
-    if depth > MIN_NOTCH_DEPTH and unknown < step and _averaging(commanded, np.array([width]))[1] < depth / 3:
+    if (
+        depth > MIN_NOTCH_DEPTH
+        and unknown < step
+        and _averaging(commanded, np.array([width]))[1] < depth / 3
+    ):
         text = (
             f"states never move at the multiples of {1 / width:.1f} Hz, as averages over {width * 1e3:.0f} ms: log the "
             "encoder itself; what is averaged is late, and fast motions are lost"
@@ -110,10 +124,16 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
         for s, late in zip(surveys, shifts.tolist(), strict=True)
         if abs(late) > limit and max(s.speed) >= FAST_COMMAND_RAD_S
     ]  # stiction delays slow motions
-    for word, group in (("later", [f for f in far if f[1] > 0]), ("sooner", [f for f in far if f[1] < 0])):
+    for word, group in (
+        ("later", [f for f in far if f[1] > 0]),
+        ("sooner", [f for f in far if f[1] < 0]),
+    ):
         single = len(group) < MIN_RECORDINGS
         for part in [[one] for one in group] if single else [group]:
-            labels = [f"{s.motion} ({s.entry.meta.unit_id}, {s.entry.meta.payload_mass:g} kg)" for s, _ in part]
+            labels = [
+                f"{s.motion} ({s.entry.meta.unit_id}, {s.entry.meta.payload_mass:g} kg)"
+                for s, _ in part
+            ]
             ms = sorted(abs(late) * 1e3 for _, late in part)
             by = f"{ms[0]:.0f} ms" if single else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
             text = (
@@ -121,7 +141,10 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
                 "other recordings: clocks of command and state that are apart, or another servo; leave them out if it "
                 "is the clocks"
             )
-            values = {"recordings": [s.entry.id for s, _ in part], "late_s": [late for _, late in part]}
+            values = {
+                "recordings": [s.entry.id for s, _ in part],
+                "late_s": [late for _, late in part],
+            }
             yield Finding("warning", "lag", text, (), values)
 
 
@@ -132,12 +155,17 @@ def _drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterat
     between = duration[long] * (1 - 1 / shifts.shape[1])
     first, middle, last = shifts[long, 0], shifts[long, 1:-1].mean(axis=1), shifts[long, -1]
     slope, curvature = (last - first) / between, (last + first - 2 * middle) / between / np.sqrt(3)
-    slope, curvature = slope[np.isfinite(slope)], curvature[np.isfinite(curvature)]  # a drift has no curvature
+    slope, curvature = (
+        slope[np.isfinite(slope)],
+        curvature[np.isfinite(curvature)],
+    )  # a drift has no curvature
     if len(slope) < MIN_RECORDINGS:
         return
     drift = float(np.median(slope))
     resolution = 2e-3 / float(between.max()) / np.sqrt(len(slope))
-    error = max(MOTION_SHARE * _standard_error(slope - drift), _standard_error(curvature), resolution)
+    error = max(
+        MOTION_SHARE * _standard_error(slope - drift), _standard_error(curvature), resolution
+    )
     if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error, unknown / float(between.max())):
         text = (
             f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "

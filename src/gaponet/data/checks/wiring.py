@@ -14,12 +14,22 @@ from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
 MIN_COMMAND_RAD = 0.05  # a joint with a smaller command range shows neither order, sign nor unit
-SLOPE_BOUNDS = (0.5, 1.25)  # a loaded joint falls short of its command, or passes it if its load is on top
-MAX_OWN_CORRELATION, MIN_OTHER_CORRELATION, MIN_MOTIONS = 0.8, 0.95, 3  # of a swap that shows in several motions
+SLOPE_BOUNDS = (
+    0.5,
+    1.25,
+)  # a loaded joint falls short of its command, or passes it if its load is on top
+MAX_OWN_CORRELATION, MIN_OTHER_CORRELATION, MIN_MOTIONS = (
+    0.8,
+    0.95,
+    3,
+)  # of a swap that shows in several motions
 MAX_DISTANCE = 0.7  # of positions from position commands, in standard deviations of the positions
 MIN_KIND_CORRELATION = 0.7  # of the command with what else it may be
 MIN_FOLLOWING = 0.75  # correlation of velocities, from which commands are positions that a weak motor does not reach
-RATIO_BOUNDS = (0.03, 10.0)  # measured over commanded range; between 0.03 and 0.1 a joint may be stuck
+RATIO_BOUNDS = (
+    0.03,
+    10.0,
+)  # measured over commanded range; between 0.03 and 0.1 a joint may be stuck
 QVEL_RATIO_BOUNDS = (0.5, 2.0)
 MIN_WIDEST_COMMAND_RAD, MAX_READ_AS_DEGREES_RAD = 0.12, np.radians(3.3)
 
@@ -31,7 +41,9 @@ def _moved(surveys: list[Survey], joint: int) -> list[Survey]:
 def _follow_small_commands(survey: Survey) -> Array:
     """Return which joints move far with a small command, as where state and command have different units, (n)."""
     follow = np.diag(survey.follows) > MIN_FOLLOWING
-    return follow & (survey.qpos_range > np.maximum(MIN_COMMAND_RAD, RATIO_BOUNDS[1] * survey.ctrl_range))
+    return follow & (
+        survey.qpos_range > np.maximum(MIN_COMMAND_RAD, RATIO_BOUNDS[1] * survey.ctrl_range)
+    )
 
 
 def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -42,12 +54,18 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         moved = s.ctrl_range > MIN_COMMAND_RAD
         motions += moved | _follow_small_commands(s)
         for i in np.flatnonzero(moved & (np.diag(s.follows) < 0.3) & (np.diag(s.opposes) < 0.6)):
-            others = np.flatnonzero((s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6).any()))
+            others = np.flatnonzero(
+                (s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6).any())
+            )
             if others.size:
                 j = int(others[s.follows[i, others].argmax()])
                 candidates[int(i), j].append(float(s.follows[i, j]))
     candidates |= _swapped_pairs(surveys, motions)
-    swapped = {pair: evidence for pair, evidence in candidates.items() if 2 * len(evidence) >= motions[pair[0]]}
+    swapped = {
+        pair: evidence
+        for pair, evidence in candidates.items()
+        if 2 * len(evidence) >= motions[pair[0]]
+    }
     for (own, other), correlations in swapped.items():
         a, b = robot.joint_names[own], robot.joint_names[other]
         text = (
@@ -60,7 +78,11 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if idle:
         level = "warning" if set(idle) & set(robot.operated) else "note"
         text = f"no motion commands {abbreviate(list(idle))} over more than {MIN_COMMAND_RAD:g} rad"
-        text += ", read as degrees; were they logged in rad?" if set(idle) & set(_read_as_degrees(surveys)) else ""
+        text += (
+            ", read as degrees; were they logged in rad?"
+            if set(idle) & set(_read_as_degrees(surveys))
+            else ""
+        )
         yield Finding(level, "order", f"{text}: nothing can be learned there", idle)
     if not swapped:
         yield Finding("ok", "order", "each command moves the joint of its name")
@@ -74,7 +96,11 @@ def _swapped_pairs(surveys: list[Survey], motions: Array) -> dict[tuple[int, int
     pairs = {}
     for i in np.flatnonzero((motions >= MIN_MOTIONS) & (own < MAX_OWN_CORRELATION)):
         j = int(cross[i].argmax())
-        if j != i and min(cross[i, j], cross[j, i]) > MIN_OTHER_CORRELATION and own[j] < MAX_OWN_CORRELATION:
+        if (
+            j != i
+            and min(cross[i, j], cross[j, i]) > MIN_OTHER_CORRELATION
+            and own[j] < MAX_OWN_CORRELATION
+        ):
             pairs[int(i), j] = follows[follows[:, i, j] > MIN_OTHER_CORRELATION, i, j].tolist()
     return pairs
 
@@ -88,7 +114,10 @@ def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     correlation = {
         kind: float(np.median(column(field)[judged]))
-        for kind, field in (("velocities", "velocity_correlation"), ("torques", "torque_correlation"))
+        for kind, field in (
+            ("velocities", "velocity_correlation"),
+            ("torques", "torque_correlation"),
+        )
     }
     best = max(correlation, key=lambda kind: np.nan_to_num(correlation[kind]))
     kind = f"they are most like {best} (correlation {correlation[best]:.2f})"
@@ -154,7 +183,9 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _moves_first(survey: Survey, joints: list[int]) -> bool:
     """True if several of the joints move before their commands in a recording, and most of those that move."""
-    leads = [bool(np.isfinite(survey.lead[i])) for i in joints if survey.ctrl_range[i] > MIN_COMMAND_RAD]
+    leads = [
+        bool(np.isfinite(survey.lead[i])) for i in joints if survey.ctrl_range[i] > MIN_COMMAND_RAD
+    ]
     return sum(leads) >= 2 and 2 * sum(leads) > len(leads)
 
 
@@ -178,7 +209,11 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "turn), or a motor that does not reach its targets; check both at a right angle"
             )
             wrong.append(Finding("warning", "unit", text, (name,), {"slope": slope}))
-        moved = [s for s in surveys if np.isfinite(s.qvel_ratio[i]) and s.qpos_range[i] > 20 * s.resolution[i]]
+        moved = [
+            s
+            for s in surveys
+            if np.isfinite(s.qvel_ratio[i]) and s.qpos_range[i] > 20 * s.resolution[i]
+        ]
         ratio = median([s.qvel_ratio[i] for s in moved])
         if not QVEL_RATIO_BOUNDS[0] < ratio < QVEL_RATIO_BOUNDS[1]:
             text = (
@@ -203,7 +238,11 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _units(surveys: list[Survey]) -> dict[str, str]:
     """Return joint → unit from which its positions were converted."""
-    return {name: unit for s in surveys for name, unit in s.entry.meta.notes.get("converted_from", {}).items()}
+    return {
+        name: unit
+        for s in surveys
+        for name, unit in s.entry.meta.notes.get("converted_from", {}).items()
+    }
 
 
 def _read_as_degrees(surveys: list[Survey]) -> tuple[str, ...]:
@@ -212,7 +251,9 @@ def _read_as_degrees(surveys: list[Survey]) -> tuple[str, ...]:
 
 def _converted(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if degrees := _read_as_degrees(surveys):
-        yield Finding("note", "unit", f"logged in degrees, converted: {', '.join(degrees)}", degrees)
+        yield Finding(
+            "note", "unit", f"logged in degrees, converted: {', '.join(degrees)}", degrees
+        )
     for name in (name for name, unit in _units(surveys).items() if unit == "fraction"):
         low, high = robot.qpos_range[robot.joint_names.index(name)]
         text = f"{name} is logged as 0..1, not in rad: mapped to its range [{low:.2f}, {high:.2f}], velocity computed"

@@ -26,13 +26,26 @@ WORDS = {
     "temperature": ("temperature", "temp"),
     "qpos": ("qpos", "pos", "position", "positions", "q", "meas", "measured", "actual", "act", "state", "angle", "enc"),
 }  # fmt: skip
-CLOCKS = ("time", "t", "timestamp", "stamp", "time_s", "time_ms", "time_us", "time_ns", "clock", "ts")
+CLOCKS = (
+    "time",
+    "t",
+    "timestamp",
+    "stamp",
+    "time_s",
+    "time_ms",
+    "time_us",
+    "time_ns",
+    "clock",
+    "ts",
+)
 NOT_POSITIONS = ("qvel", "tau", "temperature")
 ROWS = 4000  # that are looked at
 APART = 0.5  # of a command's own motion by which repetitions of it differ at the most
 
 
-def guess_logs(recordings: list[RawRecording], robot: RobotSpec, fmt: str, known: dict[str, Any]) -> str:
+def guess_logs(
+    recordings: list[RawRecording], robot: RobotSpec, fmt: str, known: dict[str, Any]
+) -> str:
     """The text of a logs.toml.
 
     Args:
@@ -45,7 +58,11 @@ def guess_logs(recordings: list[RawRecording], robot: RobotSpec, fmt: str, known
     specified = dict(known) | {k: v for k, v in first.default.items() if k not in known}
     lines = [f"# {fmt}; the first recording: {first.where or first.source}",
              f"# its columns: {first.shown(40)}", "# Lines with a ? are guesses: look at them.", ""]  # fmt: skip
-    stated = {c: specified[c] for c in WORDS if c in specified and _values(first, specified[c]) is not None}
+    stated = {
+        c: specified[c]
+        for c in WORDS
+        if c in specified and _values(first, specified[c]) is not None
+    }
     channels = _channels(first) | stated
     joints = _joints(first, channels)
     lines += _clock(first, specified)
@@ -72,7 +89,9 @@ def _kind(name: str) -> str | None:
     """Which channel a name speaks of; of a command's, positions only."""
     parts = re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
     matches = [channel for channel, words in WORDS.items() if any(part in words for part in parts)]
-    excluded = {"ctrl": NOT_POSITIONS, FEEDFORWARD: ("qpos", "qvel", "temperature")}.get(matches[0] if matches else "")
+    excluded = {"ctrl": NOT_POSITIONS, FEEDFORWARD: ("qpos", "qvel", "temperature")}.get(
+        matches[0] if matches else ""
+    )
     if excluded and any(c in matches for c in excluded):
         return None  # a commanded velocity or torque; a feed-forward of something else
     return matches[0] if matches else None
@@ -85,7 +104,9 @@ def _channels(recording: RawRecording) -> dict[str, str]:
     for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
         if kind := _kind(name):
             matches.setdefault(kind, name)
-    singles = [n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS]
+    singles = [
+        n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS
+    ]
     shapes = defaultdict[str, Counter[str]](Counter)
     for name in singles:
         if kind := _kind(name):
@@ -98,7 +119,9 @@ def _patterns(name: str) -> list[str]:
     """Each way to read a name as joint and words: shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}."""
     words = list(re.finditer(r"[A-Za-z0-9]+", name))
     matches = []
-    for known, run in groupby(words, lambda m: any(m[0].lower() in words for words in WORDS.values())):
+    for known, run in groupby(
+        words, lambda m: any(m[0].lower() in words for words in WORDS.values())
+    ):
         first, *_, last = *(together := list(run)), together[-1]
         if known and last.end() < len(name):
             matches.append(name[: last.end() + 1] + "{joint}")
@@ -116,17 +139,27 @@ def _joints(recording: RawRecording, channels: dict[str, str]) -> list[str]:
         return list(recording.signals.get(pattern) or ("0",))
     before, after = map(re.escape, pattern.split("{joint}"))
     kind = "qpos" if "qpos" in channels else "ctrl"
-    return [m[1] for c in recording.columns if (m := re.fullmatch(f"{before}(.+?){after}", c)) and _kind(c) == kind]
+    return [
+        m[1]
+        for c in recording.columns
+        if (m := re.fullmatch(f"{before}(.+?){after}", c)) and _kind(c) == kind
+    ]
 
 
 def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> list[str]:
     """joints and [names]."""
     if not joints:
         return []
-    if all(j.isdigit() for j in joints) and "{joint}" not in (channels.get("qpos") or channels["ctrl"]):
+    if all(j.isdigit() for j in joints) and "{joint}" not in (
+        channels.get("qpos") or channels["ctrl"]
+    ):
         n = len(joints)
         own = list(robot.joint_names[:n]) + [""] * (n - len(robot.joint_names))
-        question = "the robot's order: is it the log's?" if n >= len(robot.joint_names) else "which joints are these?"
+        question = (
+            "the robot's order: is it the log's?"
+            if n >= len(robot.joint_names)
+            else "which joints are these?"
+        )
         return [f"joints = {json.dumps(own)}  # ? {question}"]
     strange = []
     for joint in joints:
@@ -138,7 +171,10 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
         return []
     left = [j for j in robot.joint_names if j not in joints]
     in_order = len(left) == len(strange)
-    lines = ["", "[names]  # ? the log's = the robot's" + (", in the order of both" if in_order else "")]
+    lines = [
+        "",
+        "[names]  # ? the log's = the robot's" + (", in the order of both" if in_order else ""),
+    ]
     for i, joint in enumerate(strange):
         lines.append(f"{_text(joint)} = {_text(left[i] if in_order else '…')}")
     return lines
@@ -153,12 +189,21 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     if clock is None:
         own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
         return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
-    low, period, high = np.percentile(np.diff(recording.load([clock])[clock].values[:ROWS]), [5, 50, 95])
+    low, period, high = np.percentile(
+        np.diff(recording.load([clock])[clock].values[:ROWS]), [5, 50, 95]
+    )
     units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
     unit = units[0] if units else "s"
     lines = [] if clock == "time" else [f"time = {_text(clock)}"]
-    uneven = f"; uneven: {low * SECONDS[unit]:.3g} to {high * SECONDS[unit]:.3g} s" if high - low > 0.2 * period else ""
-    return [*lines, f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s{uneven}']
+    uneven = (
+        f"; uneven: {low * SECONDS[unit]:.3g} to {high * SECONDS[unit]:.3g} s"
+        if high - low > 0.2 * period
+        else ""
+    )
+    return [
+        *lines,
+        f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s{uneven}',
+    ]
 
 
 def _values(recording: RawRecording, pattern: str) -> Array | None:
@@ -169,7 +214,11 @@ def _values(recording: RawRecording, pattern: str) -> Array | None:
     if "{joint}" not in pattern:
         return None
     before, after = map(re.escape, pattern.split("{joint}"))
-    names = [c for c in recording.columns if re.fullmatch(f"{before}(.+?){after}", c) and c in recording.signals]
+    names = [
+        c
+        for c in recording.columns
+        if re.fullmatch(f"{before}(.+?){after}", c) and c in recording.signals
+    ]
     if not names:
         return None
     loaded = recording.load(names)

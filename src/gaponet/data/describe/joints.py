@@ -10,7 +10,9 @@ from gaponet.base.errors import JointMismatchError
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
 
 
-def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: dict[str, str] | None) -> list[str]:
+def resolve_all(
+    names: Sequence[str], robot: RobotSpec, where: str, joint_map: dict[str, str] | None
+) -> list[str]:
     """The robot's joint of each name in a log, in the same order; one error for all that it does not have.
 
     Args:
@@ -29,7 +31,9 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
             strange.append((name, error))
     if len(strange) == 1:
         raise strange[0][1]
-    kin = [] if matched or joint_map else [name for name in packaged_robots() if _all_of(name, names)]
+    kin = (
+        [] if matched or joint_map else [name for name in packaged_robots() if _all_of(name, names)]
+    )
     if strange and kin:
         raise JointMismatchError(
             f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of robot '{kin[0]}': "
@@ -42,14 +46,20 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
             close = difflib.get_close_matches(name.split("/")[-1], free, n=1, cutoff=0.5)
             maps.append(f"--map {name}={close[0] if close else '…'}")
             free = [j for j in free if j not in close]
-        left = f" (… is one of {', '.join(free)})" if free and any(m.endswith("=…") for m in maps) else ""
+        left = (
+            f" (… is one of {', '.join(free)})"
+            if free and any(m.endswith("=…") for m in maps)
+            else ""
+        )
         raise JointMismatchError(
             f"{where} names joints {', '.join(n for n, _ in strange)}, which robot '{robot.name}' does not have. "
             f"Map them with {' '.join(maps)}{left}, or under [names] in logs.toml; "
             'what is no joint of this robot is left out by ignore = ["NAME", …] there'
         )
     if len(set(matched)) != len(matched):
-        raise JointMismatchError(f"{where}: two names map to one joint: {', '.join(matched)}; mend --map or [names]")
+        raise JointMismatchError(
+            f"{where}: two names map to one joint: {', '.join(matched)}; mend --map or [names]"
+        )
     return matched
 
 

@@ -60,11 +60,15 @@ class LogsFile(TypedDict, total=False):
     feedforward_torque: Text  # N·m that the controller added to its PD torque
     command_file: Text  # where commands lie in a file beside the state's: "{name}_cmd.csv"
     header: Annotated[list[str], Len(1, 2000)]  # names of the columns of a table that has none
-    joints: Annotated[list[str], Len(1, 500)]  # of the columns of an array that does not name them, in its order
+    joints: Annotated[
+        list[str], Len(1, 500)
+    ]  # of the columns of an array that does not name them, in its order
     ignore: list[str]  # columns that are no joints of this robot; "" in joints does the same
     # ctrl is a policy's action: target = home + scale · action
     action_scale: Annotated[float, Interval(ge=1e-6, le=1e3)]
-    kp: Gain | dict[str, Gain] | Text  # while recording, N·m/rad: of all joints, by joint, or an array's name
+    kp: (
+        Gain | dict[str, Gain] | Text
+    )  # while recording, N·m/rad: of all joints, by joint, or an array's name
     kd: Gain | dict[str, Gain] | Text  # N·m·s/rad
     columns: dict[str, str]  # single columns, ours = the log's: "ctrl.elbow" = "cmd_1"
     names: dict[str, str]  # the log's joint = the robot's
@@ -72,7 +76,9 @@ class LogsFile(TypedDict, total=False):
     signs: dict[str, Sign]  # −1: the log counts the other way round
     offsets: dict[str, Offset]  # rad to add to positions, after unit and sign
     posture: dict[str, Offset]  # rad at which a joint stood that the log does not hold
-    clock: dict[Literal["ctrl", "qpos", "qvel", "tau", "temperature", "feedforward_torque"], str]  # ctrl = "t_cmd"
+    clock: dict[
+        Literal["ctrl", "qpos", "qvel", "tau", "temperature", "feedforward_torque"], str
+    ]  # ctrl = "t_cmd"
 
 
 def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile, Path | None]:
@@ -95,10 +101,20 @@ class Naming:
             raise UsageError(
                 f'{self.where}: manifest = "{specified["manifest"]}": it lies beside logs.toml; give its name'
             )
-        self.sheet = _read_sheet((where or Path()).parent / specified["manifest"]) if "manifest" in specified else None
+        self.sheet = (
+            _read_sheet((where or Path()).parent / specified["manifest"])
+            if "manifest" in specified
+            else None
+        )
         self.unused = set(range(len(self.sheet or ())))
-        stated = {k: specified[k] for k in ("unit", "payload", "side", "kp", "kd") if k in specified}
-        self.all = {FIELDS[k][0]: v for k, v in stated.items() if k in ("unit", "side") or not isinstance(v, str)}
+        stated = {
+            k: specified[k] for k in ("unit", "payload", "side", "kp", "kd") if k in specified
+        }
+        self.all = {
+            FIELDS[k][0]: v
+            for k, v in stated.items()
+            if k in ("unit", "side") or not isinstance(v, str)
+        }
 
     def of(self, name: str, path: str) -> dict[str, Any]:
         """Fields of SequenceMeta for a recording called `name` at a path relative to the logs."""
@@ -110,7 +126,9 @@ class Naming:
                     f'{path}: its name does not look like motion = "{self.text}" of {self.where}; rename it, or list '
                     "the recordings in a manifest"
                 )
-            facts |= _agreeing(facts, _fields(match.groupdict(), path), path, f"logs.toml and {name}")
+            facts |= _agreeing(
+                facts, _fields(match.groupdict(), path), path, f"logs.toml and {name}"
+            )
         if self.sheet is not None:
             rows = [
                 i for i, row in enumerate(self.sheet)
@@ -130,7 +148,9 @@ class Naming:
         """Refuse rows of the sheet that name no recording: one that is missing, or a name with a slip."""
         if self.sheet and self.unused:
             names = ", ".join(self.sheet[i]["file"] for i in sorted(self.unused))
-            raise LogError(f"the manifest of {self.where} names recordings that are not there: {names}; mend the names")
+            raise LogError(
+                f"the manifest of {self.where} names recordings that are not there: {names}; mend the names"
+            )
 
 
 def _agreeing(facts: dict[str, Any], more: dict[str, Any], path: str, both: str) -> dict[str, Any]:
@@ -140,7 +160,9 @@ def _agreeing(facts: dict[str, Any], more: dict[str, Any], path: str, both: str)
         if isinstance(second, dict):
             more[field] = (first if isinstance(first, dict) else {"": first}) | second
         elif second != first:
-            raise LogError(f"{path}: {both} contradict: {field} {first} and {second}; delete the wrong one")
+            raise LogError(
+                f"{path}: {both} contradict: {field} {first} and {second}; delete the wrong one"
+            )
     return more
 
 
@@ -155,9 +177,17 @@ def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool
             raise UsageError(f'{where}: motion = "{text}": use each of {known} at most once')
         seen.add(word)
         loose += not literal and FIELDS[word][1].startswith(".+")
-        parts.append(re.escape(literal) if literal else f"(?P<{word}>{FIELDS[word][1]})" if word else FIELDS[""][1])
+        parts.append(
+            re.escape(literal)
+            if literal
+            else f"(?P<{word}>{FIELDS[word][1]})"
+            if word
+            else FIELDS[""][1]
+        )
     if loose > MOST_LOOSE:
-        raise UsageError(f'{where}: motion = "{text}": at most {MOST_LOOSE} words may be of any text; use a manifest')
+        raise UsageError(
+            f'{where}: motion = "{text}": at most {MOST_LOOSE} words may be of any text; use a manifest'
+        )
     return re.compile("".join(parts)), "/" in text
 
 
@@ -173,7 +203,11 @@ def _fields(stated: dict[str, str], where: str) -> dict[str, Any]:
         if field in NUMBERS:
             try:
                 value = float(value.replace("p", "."))
-                if not (np.isfinite(value) and value >= 0 and (field != "repetition" or value == int(value))):
+                if not (
+                    np.isfinite(value)
+                    and value >= 0
+                    and (field != "repetition" or value == int(value))
+                ):
                     raise ValueError
             except ValueError:
                 raise LogError(f"{where}: {word} is '{text}', not a number ≥ 0; mend it") from None
@@ -198,7 +232,11 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
     if not file.is_file() or file.stat().st_size > 16 << 20:
         raise UsageError(f"{file}: the manifest is missing, or no table; a CSV with a column file")
     try:
-        rows = list(table := csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig")), skipinitialspace=True))
+        rows = list(
+            table := csv.DictReader(
+                io.StringIO(file.read_text(encoding="utf-8-sig")), skipinitialspace=True
+            )
+        )
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{file}: not a CSV table ({error})") from None
     if not rows or not rows[0].get("file"):
@@ -206,12 +244,20 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
     columns = ["file", *_known(rows[0])]
     ours = {name: k for k, (field, _) in FIELDS.items() if k for name in (k, field)}
     for name in (names := list(table.fieldnames or ())):
-        near = ours.get(word := name.strip().lower(), "payload" if word.startswith("payload") else "")
+        near = ours.get(
+            word := name.strip().lower(), "payload" if word.startswith("payload") else ""
+        )
         if (near and name not in columns) or (name in columns and names.count(name) > 1):
             raise UsageError(f"{file}: column '{name}': write {near or name}, once")
     if long := [row["file"] for row in rows if any(row.get(None, ()))]:
-        raise UsageError(f"{file}: the row of {long[0]} has more cells than the header; is a decimal comma in it?")
-    return [{c: row[c] or "" for c in columns if row.get(c) is not None} for row in rows if row.get("file")]
+        raise UsageError(
+            f"{file}: the row of {long[0]} has more cells than the header; is a decimal comma in it?"
+        )
+    return [
+        {c: row[c] or "" for c in columns if row.get(c) is not None}
+        for row in rows
+        if row.get("file")
+    ]
 
 
 def _known(columns: Iterable[Any]) -> list[str]:

@@ -20,7 +20,9 @@ MOSTLY = 0.2  # of a joint's rows: more nonsense than this, and nothing of the c
 UNASKED = 1.0  # rad that no joint moves of itself while all are told to stand still
 
 
-def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: list[str], robot: RobotSpec) -> Array:
+def to_radians(
+    name: str, values: Array, joint_names: tuple[str, ...], units: list[str], robot: RobotSpec
+) -> Array:
     """Positions or velocities in the unit of the log → rad or rad/s.
 
     Args:
@@ -79,11 +81,17 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
                 "done": source if tolerable else "left out",
             }  # fmt: skip
             channels.pop(name)
-            channels |= {name: Channel(log.channels[name].time, _made_up(name, log, wrong))} if tolerable else {}
+            channels |= (
+                {name: Channel(log.channels[name].time, _made_up(name, log, wrong))}
+                if tolerable
+                else {}
+            )
     if not replaced:
         return log
     return replace(
-        log, channels=channels, meta=log.meta | {"notes": log.meta.get("notes", {}) | {"nonsense": replaced}}
+        log,
+        channels=channels,
+        meta=log.meta | {"notes": log.meta.get("notes", {}) | {"nonsense": replaced}},
     )
 
 
@@ -91,7 +99,9 @@ def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
     """Where a channel holds what no joint does, (k, n)."""
     values = np.abs(log.channels[name].values)
     if name in ("tau", FEEDFORWARD):
-        return np.asarray(values > np.maximum(20 * robot.effort_limit[robot.index(log.joint_names)], 100.0))
+        return np.asarray(
+            values > np.maximum(20 * robot.effort_limit[robot.index(log.joint_names)], 100.0)
+        )
     if name != "qvel":
         return values > MOST[name]
     time, qpos = log.channels["qpos"]
@@ -105,7 +115,9 @@ def _made_up(name: str, log: Log, wrong: Array) -> Array:
     out = np.array(values, float)
     for j in np.flatnonzero(wrong.any(axis=0)):
         bad = wrong[:, j]
-        known = (at, np.gradient(qpos[:, j], at)) if name == "qvel" else (time[~bad], values[~bad, j])
+        known = (
+            (at, np.gradient(qpos[:, j], at)) if name == "qvel" else (time[~bad], values[~bad, j])
+        )
         out[bad, j] = np.interp(time[bad], *known)
     return out
 
@@ -114,7 +126,9 @@ def _place(log: Log, name: str, row: int) -> str:
     return f"{log.row(name, row)}: {name}"
 
 
-def require_radians(values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]) -> None:
+def require_radians(
+    values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]
+) -> None:
     """Refuse positions (k, n) that can only be degrees, or another joint's; where: what to call a row in the error.
 
     A real joint may pass its MJCF limit by a calibration offset, not by a radian and half a turn.

@@ -14,7 +14,9 @@ from gaponet.data.formats import find_logs, look, read_logs
 from gaponet.data.log import Log, skip_bad_rows
 from gaponet.robot.spec import RobotSpec
 
-NAMED = re.compile(r"^(\[names\]|joints = )", re.MULTILINE)  # lines of a logs.toml by which joints are told apart
+NAMED = re.compile(
+    r"^(\[names\]|joints = )", re.MULTILINE
+)  # lines of a logs.toml by which joints are told apart
 
 
 class DescriptionNeededError(LogError):
@@ -59,7 +61,9 @@ def read_first_recording(
         return by(None)
     except GAPONetError as error:
         try:
-            kind, known, recordings = look(logs, options.get("fmt"), allow_pickle=options.get("allow_pickle", False))
+            kind, known, recordings = look(
+                logs, options.get("fmt"), allow_pickle=options.get("allow_pickle", False)
+            )
         except GAPONetError:
             raise error from None
     text = guess_logs(recordings, robot, kind, dict(known))

@@ -68,7 +68,9 @@ class RawRecording:
 
     def shown(self, most: int = 12) -> str:
         """The signals, for an error."""
-        names = [f"{name}[{len(labels)}]" if labels else name for name, labels in self.signals.items()]
+        names = [
+            f"{name}[{len(labels)}]" if labels else name for name, labels in self.signals.items()
+        ]
         return ", ".join(names[:most]) + (", …" if len(names) > most else "")
 
     def beside(self, commands: RawRecording) -> RawRecording:
@@ -102,27 +104,44 @@ class RawRecording:
             and (a.ndim == 1 or 0 < a.shape[1] <= WIDEST)
         }  # fmt: skip
         signals = {
-            n: () if a.ndim == 1 else names if a.shape[1] == len(names) else tuple(map(str, range(a.shape[1])))
+            n: ()
+            if a.ndim == 1
+            else names
+            if a.shape[1] == len(names)
+            else tuple(map(str, range(a.shape[1])))
             for n, a in numeric.items()
         }
         source = f"{file}#{part}" if part else str(file)
         load = lambda wanted: {n: Signal(numeric[n].astype(float)) for n in wanted}  # noqa: E731
         return RawRecording(name or file.stem, source, signals, load, source, (str(file),), **more)
 
-    def to_log(self, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None) -> Log:
+    def to_log(
+        self, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
+    ) -> Log:
         """The columns that `specified` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
         given, specified = specified, self.default | specified
         chosen = _choose(self, robot, specified, joint_map)
         if FEEDFORWARD in given and FEEDFORWARD not in chosen:
-            raise LogError(f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: {self.shown()}")
+            raise LogError(
+                f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: {self.shown()}"
+            )
         units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
         own: dict[Any, str] = specified.get("clock", {})
         clocks = {channel: own.get(channel) or specified.get("time") for channel in chosen}
-        gains = {name: _gain_columns(self, specified, name, chosen["ctrl"]) for name in ("kp", "kd")}
-        names = {signal for joints in (*chosen.values(), *gains.values()) for signal, _ in joints.values()}
-        loaded = self.load([*names, *{c for c in clocks.values() if c in self.signals and c not in names}])
+        gains = {
+            name: _gain_columns(self, specified, name, chosen["ctrl"]) for name in ("kp", "kd")
+        }
+        names = {
+            signal
+            for joints in (*chosen.values(), *gains.values())
+            for signal, _ in joints.values()
+        }
+        loaded = self.load(
+            [*names, *{c for c in clocks.values() if c in self.signals and c not in names}]
+        )
         times = {
-            channel: _time(self, specified, loaded, clocks[channel], channel, chosen[channel]) for channel in chosen
+            channel: _time(self, specified, loaded, clocks[channel], channel, chosen[channel])
+            for channel in chosen
         }
         joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
         in_units = [units[j] for j in joints]
@@ -131,9 +150,13 @@ class RawRecording:
             values = np.stack([_column(loaded, *columns[j]) for j in joints], axis=1).astype(float)
             if channel == "ctrl" and "action_scale" in specified:
                 values = robot.qpos_home[robot.index(joints)] + specified["action_scale"] * values
-            channels[channel] = Channel(times[channel], to_radians(channel, values, joints, in_units, robot))
+            channels[channel] = Channel(
+                times[channel], to_radians(channel, values, joints, in_units, robot)
+            )
         start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
-        shifted = {id(c.time): c.time - start for c in channels.values()}  # epoch nanoseconds would lose their digits
+        shifted = {
+            id(c.time): c.time - start for c in channels.values()
+        }  # epoch nanoseconds would lose their digits
         meta = dict(self.meta)
         for name, columns in gains.items():
             if columns:
@@ -168,16 +191,25 @@ def reading(file: Path, what: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        hint = "it is cut short: copy or record it again" if _cut_short(file, error) else "is it the right file?"
+        hint = (
+            "it is cut short: copy or record it again"
+            if _cut_short(file, error)
+            else "is it the right file?"
+        )
         raise LogError(f"{file}: not a readable {what} ({reason}); {hint}") from None
 
 
-ENDS = {b"\x89MCAP0\r\n": b"\x89MCAP0\r\n", b"PAR1": b"PAR1"}  # how files begin → how those that are whole end
+ENDS = {
+    b"\x89MCAP0\r\n": b"\x89MCAP0\r\n",
+    b"PAR1": b"PAR1",
+}  # how files begin → how those that are whole end
 
 
 def _cut_short(file: Path, error: Exception) -> bool:
     """Return True if the end of a file is missing, by the error or by its last bytes."""
-    if isinstance(error, EOFError) or re.search(r"truncated|unexpected(ly)? end|end.of.file", str(error).lower()):
+    if isinstance(error, EOFError) or re.search(
+        r"truncated|unexpected(ly)? end|end.of.file", str(error).lower()
+    ):
         return True
     if not file.is_file():
         return False
@@ -195,29 +227,47 @@ Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
 Chosen = dict[str, Columns]  # by channel
 
 
-def _choose(recording: RawRecording, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None) -> Chosen:
+def _choose(
+    recording: RawRecording, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
+) -> Chosen:
     """Which column holds what."""
     where, columns = recording.where or recording.source, recording.columns
     single = specified.get("columns", {})
     for ours, theirs in single.items():
         if ours.partition(".")[0] not in CHANNELS or "." not in ours:
-            raise UsageError(f"logs.toml: '{ours}' is neither time nor {'.<joint>, '.join(CHANNELS)}.<joint>")
+            raise UsageError(
+                f"logs.toml: '{ours}' is neither time nor {'.<joint>, '.join(CHANNELS)}.<joint>"
+            )
         if theirs not in columns:
-            raise LogError(f"{where}: column '{theirs}' (for {ours}) is missing; there are: {recording.shown()}")
+            raise LogError(
+                f"{where}: column '{theirs}' (for {ours}) is missing; there are: {recording.shown()}"
+            )
     chosen: Chosen = {}
     for channel in (*CHANNELS, *DERIVED):
         named = _matching(recording, specified, channel, set(single.values()))
-        named += [(ours.partition(".")[2], theirs) for ours, theirs in single.items() if ours.startswith(f"{channel}.")]
-        named = [(joint, column) for joint, column in named if not ignored(joint, specified.get("ignore", ()))]
+        named += [
+            (ours.partition(".")[2], theirs)
+            for ours, theirs in single.items()
+            if ours.startswith(f"{channel}.")
+        ]
+        named = [
+            (joint, column)
+            for joint, column in named
+            if not ignored(joint, specified.get("ignore", ()))
+        ]
         if not named:
             continue
         joints = resolve_all([joint for joint, _ in named], robot, where, joint_map)
-        chosen[channel] = {joint: columns[column] for joint, (_, column) in zip(joints, named, strict=True)}
+        chosen[channel] = {
+            joint: columns[column] for joint, (_, column) in zip(joints, named, strict=True)
+        }
     _require_complete(chosen, recording, specified)
     return chosen
 
 
-def _matching(recording: RawRecording, specified: LogsFile, channel: str, taken: set[str]) -> list[tuple[str, str]]:
+def _matching(
+    recording: RawRecording, specified: LogsFile, channel: str, taken: set[str]
+) -> list[tuple[str, str]]:
     """(joint, column) of a pattern: "{joint}_des", or an array whose columns are joints."""
     pattern = specified.get(channel)
     if not isinstance(pattern, str):
@@ -233,14 +283,22 @@ def _matching(recording: RawRecording, specified: LogsFile, channel: str, taken:
                     f"write joints = [{len(labels)} names, in its order] into logs.toml"
                 )
             labels = tuple(given)
-        return [(joint, f"{pattern}[{x}]" if own else pattern) for joint, x in zip(labels, own or "0", strict=True)]
+        return [
+            (joint, f"{pattern}[{x}]" if own else pattern)
+            for joint, x in zip(labels, own or "0", strict=True)
+        ]
     if pattern.count("{joint}") != 1:
         return []  # an array that this recording does not have
     # q_{joint} reads q_des_1 as well: where another channel says more of a column's name, it is that channel's.
     longer = [
-        str(p) for c in CHANNELS if (p := specified.get(c)) and "{joint}" in str(p) and len(str(p)) > len(pattern)
+        str(p)
+        for c in CHANNELS
+        if (p := specified.get(c)) and "{joint}" in str(p) and len(str(p)) > len(pattern)
     ]
-    mine, *others = [re.compile("(?P<joint>.+?)".join(map(re.escape, p.split("{joint}")))) for p in (pattern, *longer)]
+    mine, *others = [
+        re.compile("(?P<joint>.+?)".join(map(re.escape, p.split("{joint}"))))
+        for p in (pattern, *longer)
+    ]
     return [
         (m["joint"], column)
         for column in recording.columns
@@ -249,7 +307,9 @@ def _matching(recording: RawRecording, specified: LogsFile, channel: str, taken:
     ]  # fmt: skip
 
 
-def _gain_columns(recording: RawRecording, specified: LogsFile, name: str, ctrl: Columns) -> Columns:
+def _gain_columns(
+    recording: RawRecording, specified: LogsFile, name: str, ctrl: Columns
+) -> Columns:
     """joint → column, where logs.toml says that an array holds the gains; it has the columns of the command's."""
     array = specified.get(name)
     if not isinstance(array, str):
@@ -288,7 +348,9 @@ def _require_complete(columns: Chosen, recording: RawRecording, specified: LogsF
         odd = sorted(columns["ctrl"].keys() ^ columns[kind].keys())
         if odd:
             other = kind if odd[0] in columns["ctrl"] else "ctrl"
-            raise LogError(f"{where}: column '{other}.{odd[0]}' is missing: every channel needs the same joints")
+            raise LogError(
+                f"{where}: column '{other}.{odd[0]}' is missing: every channel needs the same joints"
+            )
 
 
 def _units(
@@ -300,7 +362,11 @@ def _units(
         for j, u in specified.get("joint_units", {}).items()
     }
     for what, unit, known in (
-        ("time unit", specified.get("time_unit", "s" if "rate" in specified else ""), tuple(SECONDS)),
+        (
+            "time unit",
+            specified.get("time_unit", "s" if "rate" in specified else ""),
+            tuple(SECONDS),
+        ),
         ("position unit", specified.get("position_unit", ""), LOG_UNITS),
         *((f"unit of {joint}", unit, LOG_UNITS) for joint, unit in single.items()),
     ):
@@ -320,9 +386,17 @@ def _time(
     if channel not in specified.get("clock", {}) and own.time is not None:
         return own.time
     if "rate" in specified:
-        periods = specified["rate"] * float(np.median(np.diff(loaded[clock].values))) if clock in loaded else 0.0
-        if periods > 0 and min(abs(periods * unit - 1) for unit in SECONDS.values()) > 0.1:  # in no unit of time
-            raise LogError(f"{where}: '{clock}' is not at rate = {specified['rate']:g} Hz; leave out one of them")
+        periods = (
+            specified["rate"] * float(np.median(np.diff(loaded[clock].values)))
+            if clock in loaded
+            else 0.0
+        )
+        if (
+            periods > 0 and min(abs(periods * unit - 1) for unit in SECONDS.values()) > 0.1
+        ):  # in no unit of time
+            raise LogError(
+                f"{where}: '{clock}' is not at rate = {specified['rate']:g} Hz; leave out one of them"
+            )
         return np.arange(len(own.values)) / specified["rate"]
     if clock not in recording.signals:
         explanation = f"'{clock or 'time'}' (the clock of {channel})"
@@ -332,7 +406,9 @@ def _time(
         )
     time = np.asarray(loaded[clock].values, float)
     if time.shape != (len(own.values),):
-        raise LogError(f"{where}: clock '{clock}' has shape {time.shape}, {channel} {len(own.values)} rows")
+        raise LogError(
+            f"{where}: clock '{clock}' has shape {time.shape}, {channel} {len(own.values)} rows"
+        )
     return time * SECONDS[specified.get("time_unit", "s")]
 
 

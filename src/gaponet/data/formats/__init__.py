@@ -86,12 +86,18 @@ def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
     if path.is_file():
         return [path] if path.suffix.lower() in suffixes else []
     matches = (f for f in path.rglob("*") if f.suffix.lower() in suffixes and f.is_file())
-    return sorted(f for f in matches if not any(part.startswith(".") for part in f.relative_to(path).parts))
+    return sorted(
+        f for f in matches if not any(part.startswith(".") for part in f.relative_to(path).parts)
+    )
 
 
 def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
-    matches = [fmt for fmt, where in formats().items() if attempt(where, partial(_detects, fmt, path), False)]
+    matches = [
+        fmt
+        for fmt, where in formats().items()
+        if attempt(where, partial(_detects, fmt, path), False)
+    ]
     others = [fmt for fmt in matches if fmt != "table"]
     if others and len(matches) > len(others):
         tables = module("table").find(path)
@@ -99,11 +105,17 @@ def detect(path: Path) -> str:
             matches = others
     if len(matches) > 1:
         ways = " or ".join(f"--format {fmt}" for fmt in matches)
-        raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in matches)}; say {ways}")
+        raise LogError(
+            f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in matches)}; say {ways}"
+        )
     if not matches:
         if (path / "dataset.json").is_file():
-            raise LogError(f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}")
-        raise LogError(f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains them)")
+            raise LogError(
+                f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}"
+            )
+        raise LogError(
+            f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains them)"
+        )
     return matches[0]
 
 
@@ -139,8 +151,14 @@ def read_logs(
     kind = _require_allowed(reader, path, allow_pickle)
     for name in specified:
         if name not in ALWAYS and name not in _options(reader):
-            option = f"--{name.replace('_', '-')}" if by_hand.get(name) is not None else f"{file}: {name}"
-            raise UsageError(f"{option} means nothing to the {kind} format, which fixes it itself; leave it out")
+            option = (
+                f"--{name.replace('_', '-')}"
+                if by_hand.get(name) is not None
+                else f"{file}: {name}"
+            )
+            raise UsageError(
+                f"{option} means nothing to the {kind} format, which fixes it itself; leave it out"
+            )
     names = specified.get("names", {}) | (joint_map or {})
     naming, root = Naming(specified, file), path if path.is_dir() else path.parent
     bad = skipped_rows()
@@ -196,14 +214,21 @@ def _loaders(
     """(name, what reads it) of every recording."""
     if not hasattr(reader, "recordings"):
         yield from reader.read(
-            path, robot, names or None, **{k: v for k, v in specified.items() if k in getattr(reader, "OPTIONS", ())}
+            path,
+            robot,
+            names or None,
+            **{k: v for k, v in specified.items() if k in getattr(reader, "OPTIONS", ())},
         )
         return
     recordings = _recordings(reader, path, specified)
     if "command_file" in specified:
         full = _defaults(reader) | specified
-        beside = {c: COMMAND + str(full.get(c, "")) for c in COMMANDS if c == "ctrl" or c in specified}
-        specified = cast("LogsFile", specified | beside | {"clock": _beside_clock(full, tuple(beside))})
+        beside = {
+            c: COMMAND + str(full.get(c, "")) for c in COMMANDS if c == "ctrl" or c in specified
+        }
+        specified = cast(
+            "LogsFile", specified | beside | {"clock": _beside_clock(full, tuple(beside))}
+        )
         recordings = _with_commands(list(recordings), specified["command_file"])
     for recording in recordings:
         yield recording.name, partial(recording.to_log, robot, specified, names or None)
@@ -227,7 +252,9 @@ def _with_commands(recordings: list[RawRecording], pattern: str) -> Iterator[Raw
         if Path(recording.source).name in wanted.values():
             continue
         if wanted[recording.source] not in by_file:
-            raise LogError(f'{recording.source}: its command_file "{wanted[recording.source]}" is not beside it')
+            raise LogError(
+                f'{recording.source}: its command_file "{wanted[recording.source]}" is not beside it'
+            )
         yield recording.beside(by_file[wanted[recording.source]])
 
 
@@ -240,7 +267,10 @@ def _beside_clock(specified: LogsFile, commands: tuple[str, ...]) -> dict[str, s
 
 def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str, str]) -> Log:
     """Signs and offsets, where logs.toml says some, noted; and where joints stood that the log does not hold."""
-    stood = {robot.resolve(j, "[posture] of logs.toml", names): v for j, v in specified.get("posture", {}).items()}
+    stood = {
+        robot.resolve(j, "[posture] of logs.toml", names): v
+        for j, v in specified.get("posture", {}).items()
+    }
     if stood:
         log = replace(log, meta=log.meta | {"posture": stood})
     signs, offsets = ({robot.resolve(j, f"[{t}] of logs.toml", names): v for j, v in specified.get(t, {}).items()}  # type: ignore[attr-defined]
@@ -253,11 +283,16 @@ def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str,
     offset = np.array([offsets.get(j, 0.0) for j in log.joint_names])
     turned = {
         name: Channel(
-            c.time, c.values if name == "temperature" else sign * c.values + offset * (name in ("ctrl", "qpos"))
+            c.time,
+            c.values
+            if name == "temperature"
+            else sign * c.values + offset * (name in ("ctrl", "qpos")),
         )
         for name, c in log.channels.items()
     }
-    notes = log.meta.get("notes", {}) | {k: v for k, v in (("signs", signs), ("offsets", offsets)) if v}
+    notes = log.meta.get("notes", {}) | {
+        k: v for k, v in (("signs", signs), ("offsets", offsets)) if v
+    }
     return require_plausible(replace(log, channels=turned, meta=log.meta | {"notes": notes}), robot)
 
 
@@ -271,15 +306,24 @@ def _named(log: Log, option: dict[str, Any], robot: RobotSpec, names: dict[str, 
         meta["notes"] = meta.get("notes", {}) | {"estimated": option.pop("estimated")}
     for name, value in option.items():
         if stated.get(name) not in (None, value):
-            raise UsageError(f"{log.source}: {name} is {stated[name]} in the file and {value} in logs.toml; mend one")
+            raise UsageError(
+                f"{log.source}: {name} is {stated[name]} in the file and {value} in logs.toml; mend one"
+            )
         stated[name] = value
     return replace(log, meta=meta | ({"stated": stated} if stated else {}))
 
 
-def _gains(name: str, option: Any, log: Log, robot: RobotSpec, names: dict[str, str]) -> list[float]:
+def _gains(
+    name: str, option: Any, log: Log, robot: RobotSpec, names: dict[str, str]
+) -> list[float]:
     """One number for all joints, or {joint: number} with the robot's own for the others ("": for all others)."""
     if not isinstance(option, dict):
         return [option] * len(log.joint_names)
-    given = {robot.resolve(j, f"{name} of logs.toml", names) if j else "": value for j, value in option.items()}
+    given = {
+        robot.resolve(j, f"{name} of logs.toml", names) if j else "": value
+        for j, value in option.items()
+    }
     own = getattr(robot.nominal or robot, name)[robot.index(log.joint_names)]
-    return [given.get(j, given.get("", float(o))) for j, o in zip(log.joint_names, own, strict=True)]
+    return [
+        given.get(j, given.get("", float(o))) for j, o in zip(log.joint_names, own, strict=True)
+    ]

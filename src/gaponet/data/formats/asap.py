@@ -23,7 +23,13 @@ from gaponet.data.sequence import OPTIONAL
 
 SUFFIXES = (".pkl",)
 PICKLED = True
-DEFAULT: LogsFile = {"ctrl": "action", "qpos": "dof", "qvel": "dof_vel", "position_unit": "rad", "time_unit": "s"}
+DEFAULT: LogsFile = {
+    "ctrl": "action",
+    "qpos": "dof",
+    "qvel": "dof_vel",
+    "position_unit": "rad",
+    "time_unit": "s",
+}
 TARGETS = "target"  # signal made of action, where the file says how
 
 
@@ -34,7 +40,9 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         motions = motions if isinstance(motions, dict) else {}
         motions = {str(k): v for k, v in motions.items() if isinstance(v, dict) and "dof" in v}
         if not motions:
-            raise LogError(f"{file}: no motion with dof in it; an ASAP file is {{motion: {{dof, action, fps}}}}")
+            raise LogError(
+                f"{file}: no motion with dof in it; an ASAP file is {{motion: {{dof, action, fps}}}}"
+            )
         for name, motion in motions.items():
             yield _recording(file, name, motion)
 
@@ -46,24 +54,38 @@ def _read(file: Path) -> Any:
 
 def _recording(file: Path, name: str, motion: dict[str, Any]) -> RawRecording:
     where = f"{file}#{name}"
-    arrays = {k: v for k, v in motion.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiu" and v.ndim}
+    arrays = {
+        k: v
+        for k, v in motion.items()
+        if isinstance(v, np.ndarray) and v.dtype.kind in "fiu" and v.ndim
+    }
     fps = motion.get("fps")
     if not isinstance(fps, (int, float, np.number)) or not 1 <= float(fps) <= 10_000:
         raise LogError(f"{where}: fps is {fps!r:.40}; a number from 1 to 10000 Hz")
     if "action" not in arrays or "dof" not in arrays:
-        raise LogError(f"{where}: no {'action' if 'dof' in arrays else 'dof'}: a motion to follow, not a log")
+        raise LogError(
+            f"{where}: no {'action' if 'dof' in arrays else 'dof'}: a motion to follow, not a log"
+        )
     rows = min(len(arrays["action"]), len(arrays["dof"]))
     arrays = {k: v[:rows] for k, v in arrays.items() if len(v) >= rows}
     default = LogsFile(rate=float(fps))
     scale, home = motion.get("action_scale"), motion.get("default_dof_pos")
-    if isinstance(scale, (int, float)) and isinstance(home, np.ndarray) and home.shape == arrays["action"].shape[1:]:
+    if (
+        isinstance(scale, (int, float))
+        and isinstance(home, np.ndarray)
+        and home.shape == arrays["action"].shape[1:]
+    ):
         arrays[TARGETS] = np.asarray(home, float) + scale * arrays["action"]
         default["ctrl"] = TARGETS
     names = motion.get("joint_names")
     labels = tuple(map(str, names)) if isinstance(names, (list, np.ndarray)) else ()
     meta: dict[str, Any] = {}
     if isinstance(motion.get("stated"), str):  # a file of ours
-        meta["stated"] = restated(parse_json(dict[str, Any], motion["stated"], where, LogError), where)
+        meta["stated"] = restated(
+            parse_json(dict[str, Any], motion["stated"], where, LogError), where
+        )
         default |= {c: c for c in ("ctrl", *OPTIONAL) if c in arrays}  # type: ignore[typeddict-item]
     motion_name = str(meta["stated"]["motion"]) if meta else name
-    return RawRecording.of_arrays(file, arrays, labels, motion_name, part=name, meta=meta, default=default)
+    return RawRecording.of_arrays(
+        file, arrays, labels, motion_name, part=name, meta=meta, default=default
+    )

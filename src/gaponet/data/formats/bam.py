@@ -55,7 +55,10 @@ class BamFile(TypedDict):
 
 def detects(path: Path) -> bool:
     """A file that begins as BAM's do, or a folder with one."""
-    return any(f.suffix.lower() == ".json" and _is_bam(f) for f in ([path] if path.is_file() else path.glob("*.json")))
+    return any(
+        f.suffix.lower() == ".json" and _is_bam(f)
+        for f in ([path] if path.is_file() else path.glob("*.json"))
+    )
 
 
 def _is_bam(file: Path) -> bool:
@@ -79,7 +82,9 @@ def read(
     if not files:
         raise LogError(f"{path}: no recording of BAM (JSON with trajectory and entries)")
     for file in files:
-        log_data = read_json(BamFile, file, LogError, "record it again, or leave the file out", allow_extra=True)
+        log_data = read_json(
+            BamFile, file, LogError, "record it again, or leave the file out", allow_extra=True
+        )
         yield log_data["trajectory"], partial(_log, file, log_data, robot, joint_map)
 
 
@@ -92,9 +97,14 @@ def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, s
             f"write gain (and gain_volts) into the [[servo]] of {joint} in the robot.toml of {robot.name}"
         )
     on = log_data["entries"]
-    off = next((i for i, e in enumerate(on) if not e["torque_enable"] or e["goal_position"] is None), len(on))
+    off = next(
+        (i for i, e in enumerate(on) if not e["torque_enable"] or e["goal_position"] is None),
+        len(on),
+    )
     if off < 2:
-        raise LogError(f"{file}: torque is off from the start; a log needs commands that the servo follows")
+        raise LogError(
+            f"{file}: torque is off from the start; a log needs commands that the servo follows"
+        )
     on, cut = on[:off], on[off:]
     channels = {"ctrl": "goal_position", "qpos": "position", "qvel": "speed", "temperature": "temp"}
     time = np.array([e["timestamp"] for e in on])
@@ -104,7 +114,11 @@ def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, s
             "%s: vin says %g V, the servo measured %g V: the gain is taken at vin; correct the file if that is wrong",
             file, log_data["vin"], volts,
         )  # fmt: skip
-    gain = log_data["kp"] * servo.gain * (log_data["vin"] / servo.gain_volts if servo.gain_volts else 1.0)
+    gain = (
+        log_data["kp"]
+        * servo.gain
+        * (log_data["vin"] / servo.gain_volts if servo.gain_volts else 1.0)
+    )
     return Log(
         robot.name,
         (joint,),

@@ -40,11 +40,19 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")})
         demos.sort(key=lambda demo: int(re.sub(r"\D", "", demo)[:9] or 0))
         for demo in demos or [""]:
-            members = {n.removeprefix(demo).lstrip("/"): labels for n, labels in arrays.items() if n.startswith(demo)}
+            members = {
+                n.removeprefix(demo).lstrip("/"): labels
+                for n, labels in arrays.items()
+                if n.startswith(demo)
+            }
             part = demo.rpartition("/")[2]
             name = f"{file.stem}-{part}" if part else file.stem
             aloha = not demo and {"action", "observations/qpos"} <= members.keys()
-            default = {k: v for k, v in ALOHA.items() if v in members or k == "position_unit"} if aloha else {}
+            default = (
+                {k: v for k, v in ALOHA.items() if v in members or k == "position_unit"}
+                if aloha
+                else {}
+            )
             yield RawRecording(
                 name, f"{file}#{part}" if part else str(file), members, partial(_load, file, demo), str(file),
                 (str(file),), default=cast("LogsFile", default),
@@ -76,9 +84,18 @@ def _listed(file: Path) -> dict[str, tuple[str, ...]]:
                 item = group[name]
                 if isinstance(item, h5py.Group) and depth < DEEPEST:
                     groups.append((path, item, depth + 1))
-                elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and 1 <= item.ndim <= 2:
+                elif (
+                    isinstance(item, h5py.Dataset)
+                    and item.dtype.kind in "fiu"
+                    and 1 <= item.ndim <= 2
+                ):
                     width = item.shape[1] if item.ndim == 2 else 0
-                    if len(item) > 0 and width <= WIDEST and item.external is None and not item.is_virtual:
+                    if (
+                        len(item) > 0
+                        and width <= WIDEST
+                        and item.external is None
+                        and not item.is_virtual
+                    ):
                         arrays[path] = tuple(map(str, range(width)))
                 if len(arrays) > MOST:
                     raise LogError(f"{file}: more than {MOST} arrays; give one recording per file")
@@ -92,6 +109,8 @@ def _load(file: Path, demo: str, names: list[str]) -> dict[str, Signal]:
         for name in names:
             item = root[f"{demo}/{name}".lstrip("/")]
             if item.size * 8 > MAX_ARRAYS_BYTES:
-                raise LogError(f"{file}: {name} has {item.shape} numbers; cut the log into shorter ones")
+                raise LogError(
+                    f"{file}: {name} has {item.shape} numbers; cut the log into shorter ones"
+                )
             arrays[name] = Signal(np.asarray(item[()], float))
         return arrays

@@ -25,7 +25,9 @@ TIME_COLUMNS = ("time", "t", "timestamp", "stamp")
 def joint_column(names: list[str], logs: LogsFile) -> str | None:
     """Return the column with the joints' names; None if the table has none, or has a column of commands per joint."""
     before, pattern, after = str(logs.get("ctrl", "ctrl.{joint}")).partition("{joint}")
-    if pattern and any(n.startswith(before) and n.endswith(after) and len(n) > len(before + after) for n in names):
+    if pattern and any(
+        n.startswith(before) and n.endswith(after) and len(n) > len(before + after) for n in names
+    ):
         return None
     return next((name for name in names if name.lower() in JOINT_COLUMNS), None)
 
@@ -43,19 +45,32 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> RawRe
     times = [n for n in names if n == logs.get("time") or n.lower() in TIME_COLUMNS]
     time = logs.get("time") if logs.get("time") in times else next(iter(times), None)
     if time is None:
-        raise LogError(f"{file}:1: a row per joint, and no column of times; name it in logs.toml: time = …")
+        raise LogError(
+            f"{file}:1: a row per joint, and no column of times; name it in logs.toml: time = …"
+        )
     table = _table(file, names)
     of_row = np.array([str(name) for name in table.column(joint).to_pylist()], dtype=object)
     joints = tuple(dict.fromkeys(of_row.tolist()))
     order = [np.flatnonzero(of_row == name) for name in joints]
     stamps = _numbers(file, table, time)
-    if len({len(rows) for rows in order}) > 1 or any((stamps[rows] != stamps[order[0]]).any() for rows in order):
+    if len({len(rows) for rows in order}) > 1 or any(
+        (stamps[rows] != stamps[order[0]]).any() for rows in order
+    ):
         counts = ", ".join(f"{name} {len(rows)}" for name, rows in zip(joints, order, strict=True))
-        raise LogError(f"{file}: joints have different times ({counts} rows); write every joint at every time")
-    used = {n for n in names if n in logs.values() or not table.column(n).null_count} - {joint, time}
+        raise LogError(
+            f"{file}: joints have different times ({counts} rows); write every joint at every time"
+        )
+    used = {n for n in names if n in logs.values() or not table.column(n).null_count} - {
+        joint,
+        time,
+    }
     numbers = [n for n in names if n in used and is_number(table.column(n).type)]
-    arrays = {n: np.stack([_numbers(file, table, n)[rows] for rows in order], axis=1) for n in numbers}
-    recording = RawRecording.of_arrays(file, {time: stamps[order[0]]} | arrays, joints, default={"time": time})
+    arrays = {
+        n: np.stack([_numbers(file, table, n)[rows] for rows in order], axis=1) for n in numbers
+    }
+    recording = RawRecording.of_arrays(
+        file, {time: stamps[order[0]]} | arrays, joints, default={"time": time}
+    )
     return replace(recording, where=f"{file}:1")
 
 
@@ -70,7 +85,9 @@ def _table(file: Path, names: list[str]) -> pa.Table:
     delimiter = next((d for d in ",;\t" if d.encode() in header), " ")
     try:
         return pc.read_csv(
-            pa.py_buffer(body), pc.ReadOptions(use_threads=False), pc.ParseOptions(delimiter=delimiter)
+            pa.py_buffer(body),
+            pc.ReadOptions(use_threads=False),
+            pc.ParseOptions(delimiter=delimiter),
         ).rename_columns(names)
     except pa.ArrowInvalid as error:
         raise LogError(f"{file}: not a readable CSV file ({error}); export it again") from None
@@ -86,5 +103,7 @@ def is_number(kind: pa.DataType) -> bool:
 def _numbers(file: Path, table: pa.Table, name: str) -> Array:
     column = table.column(name)
     if not is_number(column.type) or column.null_count:
-        raise LogError(f"{file}: column '{name}' holds cells that are no numbers; repair or cut these rows")
+        raise LogError(
+            f"{file}: column '{name}' holds cells that are no numbers; repair or cut these rows"
+        )
     return np.asarray(column.to_numpy(), float)

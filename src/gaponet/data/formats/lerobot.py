@@ -30,7 +30,16 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.plausibility import to_radians
-from gaponet.data.formats.lerobot_set import AGAIN, FEATURES, Feature, Set, Stated, read_table, sets_under, tasks_of
+from gaponet.data.formats.lerobot_set import (
+    AGAIN,
+    FEATURES,
+    Feature,
+    Set,
+    Stated,
+    read_table,
+    sets_under,
+    tasks_of,
+)
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 
@@ -44,7 +53,9 @@ INDEX = ("timestamp", "frame_index", "episode_index")  # columns of data files
 
 def detects(path: Path) -> bool:
     """A folder with meta/info.json, or of such folders."""
-    return path.is_dir() and any(next(path.glob(name), None) for name in ("meta/info.json", "*/meta/info.json"))
+    return path.is_dir() and any(
+        next(path.glob(name), None) for name in ("meta/info.json", "*/meta/info.json")
+    )
 
 
 def find(path: Path) -> list[Path]:
@@ -79,14 +90,19 @@ def read(
         for episode in part.episodes:
             file = part.data_file(episode)
             if file != open_file:
-                open_file, table = file, _Frames(part, file, robot, joint_map, unit, joints, tuple(ignore or ()))
+                open_file, table = (
+                    file,
+                    _Frames(part, file, robot, joint_map, unit, joints, tuple(ignore or ())),
+                )
             assert table is not None
             yield _motion(episode, tasks), partial(table.episode, episode)
 
 
 def read_episode(part: Set, episode: dict[str, Any], robot: RobotSpec, table: pa.Table) -> Log:
     """The Log of one episode of what gaponet exported, from rows of its data file that were read elsewhere."""
-    return _Frames(part, part.data_file(episode), robot, None, _unit(part, None), None, (), table).episode(episode)
+    return _Frames(
+        part, part.data_file(episode), robot, None, _unit(part, None), None, (), table
+    ).episode(episode)
 
 
 def _unit(part: Set, given: str | None) -> str:
@@ -95,10 +111,16 @@ def _unit(part: Set, given: str | None) -> str:
               if f in part.features]  # fmt: skip
     if part.ours and stated == ["rad", "rad"]:
         if given not in (None, "rad"):
-            raise UsageError(f"--position-unit {given}: {part.path}/meta/info.json says rad; leave it out")
+            raise UsageError(
+                f"--position-unit {given}: {part.path}/meta/info.json says rad; leave it out"
+            )
         return "rad"
     if given not in POSITION_UNITS:
-        explanation = f"'{given}' is not one of {', '.join(POSITION_UNITS)}" if given else "is not written in the set"
+        explanation = (
+            f"'{given}' is not one of {', '.join(POSITION_UNITS)}"
+            if given
+            else "is not written in the set"
+        )
         raise UsageError(
             f"{part.path}: the unit of positions {explanation}; say --position-unit deg (SO-101 sets), signed_percent "
             "(older ones, −100..100) or rad"
@@ -113,7 +135,13 @@ class _Frames:
         self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str,
         joints: list[str] | None, ignore: tuple[str, ...], table: pa.Table | None = None,
     ) -> None:  # fmt: skip
-        self.part, self.file, self.robot, self.given, self.ignore = part, file, robot, joints, ignore
+        self.part, self.file, self.robot, self.given, self.ignore = (
+            part,
+            file,
+            robot,
+            joints,
+            ignore,
+        )
         features = part.features
         present = {ours: theirs for ours, theirs in FEATURES.items() if theirs in features}
         for need in ("ctrl", "qpos"):
@@ -131,7 +159,9 @@ class _Frames:
                     f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both action and {FEATURES[channel]}"
                 )
         # A gripper is 0..100 of its range wherever the other joints are not SI.
-        shares = {j for j, u in zip(robot.joint_names, robot.log_units, strict=True) if u == "fraction"}
+        shares = {
+            j for j, u in zip(robot.joint_names, robot.log_units, strict=True) if u == "fraction"
+        }
         scaled = shares if unit in ("deg", "signed_percent") else ()
         self.units = ["percent" if j in scaled else unit for j in self.joints]
         table = read_table(file, (*present.values(), *INDEX), table=table)
@@ -139,7 +169,9 @@ class _Frames:
             c: _matrix(file, table, f, len(names[c]))[:, [names[c].index(j) for j in self.joints]]
             for c, f in present.items()
         }
-        self.timestamp, self.frame, self.episodes = (_matrix(file, table, name, 1)[:, 0] for name in INDEX)
+        self.timestamp, self.frame, self.episodes = (
+            _matrix(file, table, name, 1)[:, 0] for name in INDEX
+        )
 
     def _joints(self, feature: str, spec: Feature, joint_map: dict[str, str] | None) -> list[str]:
         """The robot's own joint of each column, "" where it is said to be none."""
@@ -155,7 +187,11 @@ class _Frames:
                 "logs.toml beside the set"
             )
         short = [str(name).removesuffix(".pos") for name in names]
-        ours = iter(resolve_all([n for n in short if not ignored(n, self.ignore)], self.robot, where, joint_map))
+        ours = iter(
+            resolve_all(
+                [n for n in short if not ignored(n, self.ignore)], self.robot, where, joint_map
+            )
+        )
         return ["" if ignored(n, self.ignore) else next(ours) for n in short]
 
     def episode(self, row: dict[str, Any]) -> Log:
@@ -168,12 +204,16 @@ class _Frames:
                 "download or export the set again"
             )
         time = self._time(where)
-        channels = {c: Channel(time, self._si(c, values[where])) for c, values in self.columns.items()}
+        channels = {
+            c: Channel(time, self._si(c, values[where])) for c, values in self.columns.items()
+        }
         meta: dict[str, Any] = {
             "files": dict.fromkeys(channels, str(self.file)),
             "first_line": int(where[0]) + 1,
             "dt": self.part.dt,
-            "converted_from": {j: u for j, u in zip(self.joints, self.units, strict=True) if u != "rad"},
+            "converted_from": {
+                j: u for j, u in zip(self.joints, self.units, strict=True) if u != "rad"
+            },
         }
         if self.part.ours:
             explanation = self.part.ours["dataset"]
@@ -187,7 +227,11 @@ class _Frames:
         """Frames are a period apart; their timestamps, float32, lose digits and are believed only where they differ."""
         regular = np.arange(len(where)) * self.part.dt
         since_start = self.timestamp[where] - self.timestamp[where[0]]
-        return regular if np.abs(since_start - regular).max(initial=0) < max(1e-3, 1e-6 * regular[-1]) else since_start
+        return (
+            regular
+            if np.abs(since_start - regular).max(initial=0) < max(1e-3, 1e-6 * regular[-1])
+            else since_start
+        )
 
     def _si(self, channel: str, values: Array) -> Array:
         """Percentages to fractions, then as for every format."""
@@ -218,12 +262,18 @@ def _matrix(file: Path, table: Any, feature: str, n: int) -> Array:
     lists = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
     kind = kind.value_type if lists else kind
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or not (lists or n == 1):
-        raise LogError(f"{file}: {feature} is {table.schema.field(feature).type}, not {n} numbers a row; {AGAIN}")
+        raise LogError(
+            f"{file}: {feature} is {table.schema.field(feature).type}, not {n} numbers a row; {AGAIN}"
+        )
     wrong = column.is_null().to_numpy(False)
     if lists and not wrong.any():
         wrong = pc.list_value_length(column).to_numpy(zero_copy_only=False) != n
     flat = column.flatten() if lists else column
     if wrong.any() or flat.null_count:
-        row = int(wrong.argmax()) if wrong.any() else int(flat.is_null().to_numpy(False).argmax()) // n
+        row = (
+            int(wrong.argmax())
+            if wrong.any()
+            else int(flat.is_null().to_numpy(False).argmax()) // n
+        )
         raise LogError(f"{file}:{row + 1}: {feature} is not {n} numbers; {AGAIN}")
     return flat.to_numpy(zero_copy_only=False).astype(float).reshape(-1, n)

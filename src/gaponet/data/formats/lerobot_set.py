@@ -31,11 +31,15 @@ FEATURES = {
     "temperature": "observation.temperature",
 }
 OURS = "gaponet.json"  # beside info.json in an export: dt, and that the episodes' metadata are ours
-STATED = tuple(f for f in SequenceMeta.__dataclass_fields__ if f != "robot")  # columns of our meta/episodes
+STATED = tuple(
+    f for f in SequenceMeta.__dataclass_fields__ if f != "robot"
+)  # columns of our meta/episodes
 GAINS = ("kp", "kd")
 AGAIN = "download or export it again"
 
-Findings = dict[str, dict[str, float | None]]  # of a recording; none in sets from before they were written
+Findings = dict[
+    str, dict[str, float | None]
+]  # of a recording; none in sets from before they were written
 Name = Annotated[str, Len(1, 200)]
 Count = Annotated[int, Interval(ge=0, le=10**9)]
 Chunk = Annotated[int, Interval(ge=0, le=10**6)]
@@ -143,7 +147,13 @@ def _open(file: Path) -> Set:
     root, features = file.parents[1], info["features"]
     ours = file.with_name(OURS)
     stated = (
-        read_json(Ours, ours, LogError, "restore it, or delete it to read the set as a stock one", allow_extra=True)
+        read_json(
+            Ours,
+            ours,
+            LogError,
+            "restore it, or delete it to read the set as a stock one",
+            allow_extra=True,
+        )
         if ours.is_file()
         else None
     )
@@ -152,22 +162,30 @@ def _open(file: Path) -> Set:
         episodes = _listed(listed, info.get("chunks_size", 1000))
     else:
         episodes = [
-            row for f in sorted((root / "meta" / "episodes").glob("*/*.parquet")) for row in _episodes(f, stated)
+            row
+            for f in sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+            for row in _episodes(f, stated)
         ]
     if not episodes:
         raise LogError(f"{root}: meta/episodes lists no episode; {AGAIN}")
     episodes.sort(key=lambda e: e["episode_index"])
     known = {
-        f: validated(Feature, features[f], f"{file}: features.{f}", LogError, AGAIN, allow_extra=True)
+        f: validated(
+            Feature, features[f], f"{file}: features.{f}", LogError, AGAIN, allow_extra=True
+        )
         for f in FEATURES.values()
         if f in features
     }
     part = Set(root, info, known, episodes, stated)
     if not listed.is_file():
         return part
-    here = [e for e in episodes if part.data_file(e).is_file()]  # v2: one file an episode, and often only some of them
+    here = [
+        e for e in episodes if part.data_file(e).is_file()
+    ]  # v2: one file an episode, and often only some of them
     if not here:
-        raise LogError(f"{root}: none of the {len(episodes)} episodes' data files is there; {AGAIN}")
+        raise LogError(
+            f"{root}: none of the {len(episodes)} episodes' data files is there; {AGAIN}"
+        )
     return replace(part, episodes=here, absent=len(episodes) - len(here))
 
 
@@ -175,7 +193,8 @@ def _listed(file: Path, chunk: int) -> list[dict[str, Any]]:
     """Episodes of a v2.1 set, a line of JSON each."""
     lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
     rows = [
-        parse_json(Listed, line, f"{file}:{i}", LogError, AGAIN, allow_extra=True) for i, line in enumerate(lines, 1)
+        parse_json(Listed, line, f"{file}:{i}", LogError, AGAIN, allow_extra=True)
+        for i, line in enumerate(lines, 1)
     ]
     return [dict(r) | {"data/chunk_index": r["episode_index"] // chunk} for r in rows]
 
@@ -193,13 +212,17 @@ def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
     """A row of an export's episodes, with what it says of its recording checked, as `stated`."""
     where = f"{file}: episode {row['episode_index']}"
     stated = {name: row[name] for name in STATED if name in row} | {"robot": "?"}
-    stated["notes"] = parse_json(dict[str, Any], str(row["notes"]), f"{where}: notes", LogError, hint)
+    stated["notes"] = parse_json(
+        dict[str, Any], str(row["notes"]), f"{where}: notes", LogError, hint
+    )
     for name in GAINS:
         gains = str(stated.pop(name))
         if gains != "null":
             stated[name] = parse_json(list[float], gains, f"{where}: {name}", LogError, hint)
     stated = asdict(validated(SequenceMeta, stated, where, LogError, hint))
-    findings = parse_json(Findings, str(row.get("findings", "{}")), f"{where}: findings", LogError, hint)
+    findings = parse_json(
+        Findings, str(row.get("findings", "{}")), f"{where}: findings", LogError, hint
+    )
     return row | {"stated": {name: stated[name] for name in STATED}, "findings": findings}
 
 
@@ -223,7 +246,11 @@ def tasks_of(part: Set) -> dict[int, str]:
 
 
 def read_table(
-    file: Path, need: tuple[str, ...], also: tuple[str, ...] = (), hint: str = AGAIN, table: pa.Table | None = None
+    file: Path,
+    need: tuple[str, ...],
+    also: tuple[str, ...] = (),
+    hint: str = AGAIN,
+    table: pa.Table | None = None,
 ) -> Any:
     """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file.
 
@@ -234,6 +261,8 @@ def read_table(
     for name in need:
         if there.count(name) != 1:
             text = "is missing" if name not in there else "stands twice"
-            raise LogError(f"{file}: column '{name}' {text}; it has {', '.join(there[:12])}; {hint}")
+            raise LogError(
+                f"{file}: column '{name}' {text}; it has {', '.join(there[:12])}; {hint}"
+            )
     wanted = [*need, *(name for name in also if there.count(name) == 1)]
     return parquet.read(file, wanted) if table is None else table.select(wanted)

@@ -33,8 +33,19 @@ def _read(file: Path) -> dict[str, Any]:
 
     with file.open("rb") as stream:
         if b"MATLAB 7.3" in stream.read(128):
-            raise LogError(f"{file}: a v7.3 file, which is HDF5: rename it to .h5, or save it with -v7")
+            raise LogError(
+                f"{file}: a v7.3 file, which is HDF5: rename it to .h5, or save it with -v7"
+            )
     with reading(file, ".mat file"):
         specified = loadmat(file, simplify_cells=True)
-        specified |= {f"{name}.{k}": x for name, v in specified.items() if isinstance(v, dict) for k, x in v.items()}
-        return {n: x for n, x in specified.items() if isinstance(x, np.ndarray) and x.dtype.kind in "fiu"}
+        specified |= {
+            f"{name}.{k}": x
+            for name, v in specified.items()
+            if isinstance(v, dict)
+            for k, x in v.items()
+        }
+        return {
+            n: x
+            for n, x in specified.items()
+            if isinstance(x, np.ndarray) and x.dtype.kind in "fiu"
+        }

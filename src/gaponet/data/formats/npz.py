@@ -49,28 +49,39 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
 
 def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> RawRecording:
     """Read a file that data.writers.npz wrote, in SI units, with all its metadata."""
-    specified = parse_json(dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again")
+    specified = parse_json(
+        dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again"
+    )
     stated = restated(specified.get("stated"), f"{file}: {OURS}")
     default = LogsFile(time_unit="s", position_unit="rad")
     default |= {c: c for c in (*CHANNELS, *DERIVED) if c in arrays}  # type: ignore[typeddict-item]
-    meta = {"stated": stated} | ({"dt": specified["dt"]} if isinstance(specified.get("dt"), float) else {})
-    return RawRecording.of_arrays(file, arrays, names, str(stated["motion"]), meta=meta, default=default)
+    meta = {"stated": stated} | (
+        {"dt": specified["dt"]} if isinstance(specified.get("dt"), float) else {}
+    )
+    return RawRecording.of_arrays(
+        file, arrays, names, str(stated["motion"]), meta=meta, default=default
+    )
 
 
 def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[RawRecording]:
     """GAPONet's: the first axis counts motions."""
     keys = [k for k in GAPONET.values() if k in arrays]
     count = min(len(arrays[k]) for k in keys)
-    single = len(names) == count and all(arrays[k].dtype != object and arrays[k].ndim == 2 for k in keys)
+    single = len(names) == count and all(
+        arrays[k].dtype != object and arrays[k].ndim == 2 for k in keys
+    )
     payloads = np.asarray(arrays["payloads"]).ravel() if "payloads" in arrays else ()
     for i in range(count):
         one = {k: np.asarray(arrays[k][i], float) for k in keys}
         one = {k: a[:, None] for k, a in one.items()} if single else one
         if any(a.ndim != 2 for a in one.values()):
-            raise LogError(f"{file}: motion {i} of {', '.join(keys)} is not rows of joints; write it again")
+            raise LogError(
+                f"{file}: motion {i} of {', '.join(keys)} is not rows of joints; write it again"
+            )
         rows = min(len(a) for a in one.values())
         used = np.flatnonzero(
-            one["real_dof_positions"][:rows].any(axis=1) | one["real_dof_positions_cmd"][:rows].any(axis=1)
+            one["real_dof_positions"][:rows].any(axis=1)
+            | one["real_dof_positions_cmd"][:rows].any(axis=1)
         )
         end = int(used[-1]) + 1 if len(used) else 0  # behind it zeros pad the array
         stated = {"payload_mass": float(payloads[i])} if len(payloads) == count else {}
@@ -78,7 +89,13 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
         one = {k: a[:end] for k, a in one.items()}
         joints = names[i : i + 1] if single else names
         yield RawRecording.of_arrays(
-            file, one, joints, f"{file.stem}-{i:04d}", str(i), meta={"stated": stated}, default=default
+            file,
+            one,
+            joints,
+            f"{file.stem}-{i:04d}",
+            str(i),
+            meta={"stated": stated},
+            default=default,
         )
 
 
@@ -86,13 +103,19 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
 def _read(file: Path) -> dict[str, Any]:
     """Every array; those of objects by a safe unpickler."""
     with pickles.open_zip(file, "npz file") as packed:
-        return {n.removesuffix(".npy"): _array(packed.read(n), f"{file}: {n}") for n in packed.namelist()}
+        return {
+            n.removesuffix(".npy"): _array(packed.read(n), f"{file}: {n}")
+            for n in packed.namelist()
+        }
 
 
 def _array(data: bytes, where: str) -> Any:
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
     if header is None or not header(stream)[2].hasobject:
         return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
     arrays = pickles.load(stream.read(), where)

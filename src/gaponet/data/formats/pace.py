@@ -50,13 +50,29 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
 def _read(file: Path) -> dict[str, Any]:
     """Every array of numbers; others are left alone."""
     with pickles.open_zip(file, ".pt file of tensors") as packed:  # as torch 1.6 and later write
-        top = next((n.removesuffix("data.pkl") for n in packed.namelist() if n.endswith("/data.pkl")), None)
+        top = next(
+            (n.removesuffix("data.pkl") for n in packed.namelist() if n.endswith("/data.pkl")), None
+        )
         if top is None:
-            raise LogError(f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the right file?")
+            raise LogError(
+                f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the right file?"
+            )
         if f"{top}byteorder" in packed.namelist() and packed.read(f"{top}byteorder") != b"little":
-            raise LogError(f"{file}: written big-endian; load it and save it again on another machine")
-        specified = pickles.load(packed.read(f"{top}data.pkl"), str(file), lambda key: packed.read(f"{top}data/{key}"))
+            raise LogError(
+                f"{file}: written big-endian; load it and save it again on another machine"
+            )
+        specified = pickles.load(
+            packed.read(f"{top}data.pkl"), str(file), lambda key: packed.read(f"{top}data/{key}")
+        )
     if not isinstance(specified, dict):
-        raise LogError(f"{file}: holds no dictionary of tensors; save {{time, dof_pos, des_dof_pos}}")
-    arrays = {str(name): value for name, value in specified.items() if isinstance(value, (np.ndarray, int, float))}
-    return {n: np.asarray(v, float) for n, v in arrays.items() if np.asarray(v).dtype.kind in "fiub"}
+        raise LogError(
+            f"{file}: holds no dictionary of tensors; save {{time, dof_pos, des_dof_pos}}"
+        )
+    arrays = {
+        str(name): value
+        for name, value in specified.items()
+        if isinstance(value, (np.ndarray, int, float))
+    }
+    return {
+        n: np.asarray(v, float) for n, v in arrays.items() if np.asarray(v).dtype.kind in "fiub"
+    }

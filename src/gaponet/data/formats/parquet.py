@@ -22,7 +22,9 @@ def header(file: Path) -> tuple[list[str], dict[str, str]]:
     with reading(file, "Parquet file"):
         schema = pq.read_schema(file)
         metadata = (schema.metadata or {}).items()
-        return list(schema.names), {k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in metadata}
+        return list(schema.names), {
+            k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in metadata
+        }
 
 
 @sandboxed(LogError, "pyarrow.parquet")

@@ -38,7 +38,9 @@ def open_zip(file: Path, what: str) -> Iterator[zipfile.ZipFile]:
     """
     with reading(file, what), zipfile.ZipFile(file) as packed:
         if sum(part.file_size for part in packed.infolist()) > MAX_ARRAYS_BYTES:
-            raise LogError(f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; cut it into shorter logs")
+            raise LogError(
+                f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; cut it into shorter logs"
+            )
         yield packed
 
 
@@ -53,7 +55,11 @@ class _Type:
         self.text, self.order = str(text), ""
 
     def __setstate__(self, state: Any) -> None:
-        self.order = state[1] if isinstance(state, tuple) and len(state) > 1 and state[1] in ("<", ">", "|") else ""
+        self.order = (
+            state[1]
+            if isinstance(state, tuple) and len(state) > 1 and state[1] in ("<", ">", "|")
+            else ""
+        )
 
     def real(self) -> np.dtype[Any]:
         kind = np.dtype(self.text[:20])
@@ -71,7 +77,11 @@ class _Array:
 
     def real(self, made: Any) -> Any:
         shape, kind, order, data = self.state[-4:]
-        if not isinstance(kind, _Type) or not isinstance(shape, tuple) or not all(type(n) is int for n in shape):
+        if (
+            not isinstance(kind, _Type)
+            or not isinstance(shape, tuple)
+            or not all(type(n) is int for n in shape)
+        ):
             raise _RefusedError("an array without type or shape")
         if kind.text.lstrip("|<>=")[:1] == "O":
             out = np.empty(len(data), object)
@@ -90,7 +100,11 @@ class _Wrapped:
 
     def read(self, state: Any, stream: io.BytesIO) -> None:
         kind, shape = state.get("dtype"), state.get("shape")
-        if not isinstance(kind, _Type) or kind.real().kind not in KINDS or not isinstance(shape, tuple):
+        if (
+            not isinstance(kind, _Type)
+            or kind.real().kind not in KINDS
+            or not isinstance(shape, tuple)
+        ):
             raise _RefusedError("an array of objects inside a joblib file")
         padding = state.get("numpy_array_alignment_bytes")
         if padding is not None:
@@ -122,16 +136,26 @@ class _Tensor:
     """A tensor that was meant: a view of a storage, which the persistent id before it named."""
 
     def __init__(self, storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> None:
-        if not isinstance(storage, np.ndarray) or not isinstance(size, tuple) or not isinstance(stride, tuple):
+        if (
+            not isinstance(storage, np.ndarray)
+            or not isinstance(size, tuple)
+            or not isinstance(stride, tuple)
+        ):
             raise _RefusedError("a tensor without storage, size or stride")
-        if len(size) != len(stride) or not all(type(n) is int and n >= 0 for n in (offset, *size, *stride)):
+        if len(size) != len(stride) or not all(
+            type(n) is int and n >= 0 for n in (offset, *size, *stride)
+        ):
             raise _RefusedError("a tensor whose size is not numbers")
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
         if math.prod(size) and last >= len(storage):
             raise _RefusedError(f"a tensor of size {size} in a storage of {len(storage)}")
         steps, self.array = [n * storage.itemsize for n in stride], None
-        if math.prod(size) <= len(storage):  # one may claim to be large by repeating one number: it is left alone
-            self.array = np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
+        if math.prod(size) <= len(
+            storage
+        ):  # one may claim to be large by repeating one number: it is left alone
+            self.array = np.lib.stride_tricks.as_strided(
+                storage[offset:], size, steps, writeable=False
+            ).copy()
 
 
 def _codec(text: Any, encoding: Any) -> bytes:
@@ -166,7 +190,12 @@ class _Unpickler(pickle._Unpickler):
         return MEANT[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
-        known = isinstance(pid, tuple) and len(pid) == 5 and isinstance(pid[1], str) and pid[1] in STORAGES.values()
+        known = (
+            isinstance(pid, tuple)
+            and len(pid) == 5
+            and isinstance(pid[1], str)
+            and pid[1] in STORAGES.values()
+        )
         if self.storage is None or not known:
             raise _RefusedError("a persistent id that is no storage of tensors")
         return np.frombuffer(self.storage(str(pid[2])), np.dtype("<" + pid[1]))
@@ -219,4 +248,6 @@ def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None)
         return made(_Unpickler(io.BytesIO(data), storage).load())
     except Exception as error:  # a damaged stream makes the machine of a pickle fail in any way
         reason = " ".join(str(error).split())[:150] or type(error).__name__
-        raise LogError(f"{where}: not a pickle of arrays, numbers and text ({reason}); nothing of it was run") from None
+        raise LogError(
+            f"{where}: not a pickle of arrays, numbers and text ({reason}); nothing of it was run"
+        ) from None

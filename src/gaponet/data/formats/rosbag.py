@@ -53,7 +53,8 @@ NOT_JOINTS = re.compile(  # packages and messages of what is seen, of bodies and
 )
 MOST = 256  # numbers of a field: more is a picture
 CONTROLLER = (
-    f"std_msgs/Header header\nstring[] joint_names\n{POINT} reference\n{POINT} feedback\n{POINT} error\n{POINT} output"
+    f"std_msgs/Header header\nstring[] joint_names\n{POINT} reference\n{POINT} feedback\n"
+    f"{POINT} error\n{POINT} output"
 )
 Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its columns, its numbers)
 
@@ -61,33 +62,52 @@ Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its colum
 def find(path: Path) -> list[Path]:
     """Bags: folders with metadata.yaml, and files that lie in none."""
     files = files_under(path, SUFFIXES)
-    return sorted({f.parent if (f.parent / "metadata.yaml").is_file() and path.is_dir() else f for f in files})
+    return sorted(
+        {f.parent if (f.parent / "metadata.yaml").is_file() and path.is_dir() else f for f in files}
+    )
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every bag."""
     for bag in find(path):
         topics = _peeked(bag)
-        signals = {f"{topic}.{field}": labels for topic, fields in topics.items() for field, labels in fields.items()}
+        signals = {
+            f"{topic}.{field}": labels
+            for topic, fields in topics.items()
+            for field, labels in fields.items()
+        }
         files = tuple(map(str, files_under(bag, SUFFIXES)))
         meta: dict[str, Any] = {}
         load = partial(_load, bag, meta)
-        yield RawRecording(bag.stem, str(bag), signals, load, "", files, meta=meta, default=_usual(signals))
+        yield RawRecording(
+            bag.stem, str(bag), signals, load, "", files, meta=meta, default=_usual(signals)
+        )
 
 
 def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
     """Which signals are command and state, where only one of each can be."""
     measured = lambda s: ".feedback." in s or ".actual." in s  # noqa: E731
-    is_command = lambda s: not measured(s) and (any(w in s.lower() for w in COMMANDS) or s.endswith(".point"))  # noqa: E731
+    is_command = lambda s: (  # noqa: E731
+        not measured(s) and (any(w in s.lower() for w in COMMANDS) or s.endswith(".point"))
+    )
     states = [s for s in signals if s.endswith((".position", ".q")) and not is_command(s)]
     specified: LogsFile = {}
-    commands = [s for s in signals if is_command(s) and s.endswith((".position", ".point", ".data", ".q"))]
+    commands = [
+        s for s in signals if is_command(s) and s.endswith((".position", ".point", ".data", ".q"))
+    ]
     if len(states) > 1:  # a controller's feedback repeats what another topic says
         states = [s for s in states if not measured(s)] or states
     if len(states) == 1:
         specified["qpos"] = states[0]
-        for channel, (theirs, motors) in {"qvel": ("velocity", "dq"), "tau": ("effort", "tau_est")}.items():
-            name = states[0].rpartition(".")[0] + "." + (motors if states[0].endswith(".q") else theirs)
+        for channel, (theirs, motors) in {
+            "qvel": ("velocity", "dq"),
+            "tau": ("effort", "tau_est"),
+        }.items():
+            name = (
+                states[0].rpartition(".")[0]
+                + "."
+                + (motors if states[0].endswith(".q") else theirs)
+            )
             if name in signals:
                 specified[channel] = name  # type: ignore[literal-required]
     if len(commands) == 1:
@@ -108,23 +128,40 @@ def _opened(bag: Path) -> Iterator[Any]:
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in HG.items():
         store.register(get_types_from_msg(text, f"unitree_hg/msg/{name}"))
-    store.register(get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState"))
+    store.register(
+        get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState")
+    )
     with reading(bag, "bag"), AnyReader([bag], default_typestore=store) as reader:
         yield reader
 
 
-def _messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, float, Fields, float | None]]:
+def _messages(
+    reader: Any, connections: list[Any]
+) -> Iterator[tuple[Any, float, Fields, float | None]]:
     """(connection, recorder's time, fields, stamp) of each message; times in s."""
     for connection, time, raw in reader.messages(connections):
         message = reader.deserialize(raw, connection.msgtype)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
-        stamped = stamp.sec + 1e-9 * stamp.nanosec if stamp is not None and (stamp.sec or stamp.nanosec) else None
-        yield connection, 1e-9 * time, KINDS.get(connection.msgtype, _numbers)(connection.topic, message), stamped
+        stamped = (
+            stamp.sec + 1e-9 * stamp.nanosec
+            if stamp is not None and (stamp.sec or stamp.nanosec)
+            else None
+        )
+        yield (
+            connection,
+            1e-9 * time,
+            KINDS.get(connection.msgtype, _numbers)(connection.topic, message),
+            stamped,
+        )
 
 
 def _known(reader: Any) -> list[Any]:
     known = reader.typestore.types
-    return [c for c in reader.connections if c.msgcount and c.msgtype in known and not NOT_JOINTS.match(c.msgtype)]
+    return [
+        c
+        for c in reader.connections
+        if c.msgcount and c.msgtype in known and not NOT_JOINTS.match(c.msgtype)
+    ]
 
 
 @sandboxed(LogError, "rosbags.highlevel", 4.0)
@@ -150,7 +187,11 @@ def _peek(bag: Path, reader: Any) -> dict[str, dict[str, tuple[str, ...]]]:
     if not topics:
         types = ", ".join(sorted({c.msgtype for c in reader.connections})) or "no topics at all"
         strange = sorted({c.msgtype for c in reader.connections} - set(reader.typestore.types))
-        why = f"; the bag does not define {', '.join(strange)}: record as .mcap, which does" if strange else ""
+        why = (
+            f"; the bag does not define {', '.join(strange)}: record as .mcap, which does"
+            if strange
+            else ""
+        )
         raise LogError(f"{bag}: none of its topics is about joints; it has {types}{why}")
     return topics
 
@@ -166,11 +207,16 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
     """The same, and notes."""
     with _opened(bag) as reader:
         topics = _peek(bag, reader)
-        wanted = {t: {f: labels for f, labels in fields.items() if f"{t}.{f}" in names} for t, fields in topics.items()}
+        wanted = {
+            t: {f: labels for f, labels in fields.items() if f"{t}.{f}" in names}
+            for t, fields in topics.items()
+        }
         wanted = {topic: fields for topic, fields in wanted.items() if fields}
         rows: dict[str, list[Any]] = {topic: [] for topic in wanted}
         used = {topic.split("#")[0] for topic in wanted}
-        for connection, time, fields, stamp in _messages(reader, [c for c in _known(reader) if c.topic in used]):
+        for connection, time, fields, stamp in _messages(
+            reader, [c for c in _known(reader) if c.topic in used]
+        ):
             for topic, known in wanted.items():
                 if topic.split("#")[0] == connection.topic and all(
                     f in fields and set(fields[f][0]) == set(labels) for f, labels in known.items()
@@ -178,11 +224,21 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
                     values = []
                     for f, labels in known.items():
                         own, numbers = fields[f]
-                        values.append(list(numbers) if own == labels else [numbers[own.index(name)] for name in labels])
-                    rows[topic].append((time, time if stamp is None else stamp, stamp is not None, values))
+                        values.append(
+                            list(numbers)
+                            if own == labels
+                            else [numbers[own.index(name)] for name in labels]
+                        )
+                    rows[topic].append(
+                        (time, time if stamp is None else stamp, stamp is not None, values)
+                    )
     notes: dict[str, Any] = {}
     times = _clocks(
-        {t: np.array([r[:3] for r in messages], float).reshape(-1, 3) for t, messages in rows.items()}, notes
+        {
+            t: np.array([r[:3] for r in messages], float).reshape(-1, 3)
+            for t, messages in rows.items()
+        },
+        notes,
     )
     loaded: dict[str, Signal] = {}
     for topic, known in wanted.items():
@@ -190,7 +246,10 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
         fresh = _fresh(times[topic], columns)
         if not fresh.all():
             notes["repeated"] = notes.get("repeated", 0) + int((~fresh).sum())
-        loaded |= {f"{topic}.{f}": Signal(v[fresh], times[topic][fresh]) for f, v in zip(known, columns, strict=True)}
+        loaded |= {
+            f"{topic}.{f}": Signal(v[fresh], times[topic][fresh])
+            for f, v in zip(known, columns, strict=True)
+        }
     return {name: loaded[name] for name in names}, notes
 
 
@@ -223,7 +282,9 @@ def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]
         elif apart or drifts:
             rate, start = off[topic]
             times[topic] = stamp + start + rate * (received - received[0])
-            notes.setdefault("clock", {})[topic] = f"stamps moved by {start:.4f} s and {1e6 * rate:.0f} ppm"
+            notes.setdefault("clock", {})[topic] = (
+                f"stamps moved by {start:.4f} s and {1e6 * rate:.0f} ppm"
+            )
         else:
             times[topic] = stamp
     return times
@@ -240,20 +301,34 @@ def _numbers(topic: str, m: Any) -> Fields:
         elif isinstance(value, list) and value and isinstance(value[0], str):
             texts.append(tuple(value))
         elif isinstance(value, list) and value and hasattr(value[0], "__dataclass_fields__"):
-            numbers = [f for f in value[0].__dataclass_fields__ if isinstance(getattr(value[0], f), int | float)]
+            numbers = [
+                f
+                for f in value[0].__dataclass_fields__
+                if isinstance(getattr(value[0], f), int | float)
+            ]
             messages |= {f"{name}.{f}": ((), [getattr(part, f) for part in value]) for f in numbers}
-            texts += [tuple(t) for f in ("name", "joint_name") if all(t := [getattr(x, f, "") for x in value])]
+            texts += [
+                tuple(t)
+                for f in ("name", "joint_name")
+                if all(t := [getattr(x, f, "") for x in value])
+            ]
         elif hasattr(value, "__dataclass_fields__") and name != "header":
             messages |= {f"{name}.{f}": x for f, x in _numbers(topic, value).items()}
     named = lambda k: next((t for t in texts if len(t) == k), tuple(map(str, range(k))))  # noqa: E731
-    return {f: (labels or named(len(x)), x) for f, (labels, x) in messages.items() if 0 < len(x) <= MOST}
+    return {
+        f: (labels or named(len(x)), x) for f, (labels, x) in messages.items() if 0 < len(x) <= MOST
+    }
 
 
 def _controller(topic: str, m: Any) -> Fields:
     names, messages = tuple(m.joint_names), {}
     for part in ("reference", "desired", "feedback", "actual"):
         point = getattr(m, part, None)
-        for theirs, ours in (("positions", "position"), ("velocities", "velocity"), ("effort", "effort")):
+        for theirs, ours in (
+            ("positions", "position"),
+            ("velocities", "velocity"),
+            ("effort", "effort"),
+        ):
             if point is not None and len(values := getattr(point, theirs)) == len(names):
                 messages[f"{part}.{ours}"] = (names, values)
     return messages
@@ -277,7 +352,10 @@ def _motors(field: str, names: tuple[str, ...]) -> Callable[[str, Any], Fields]:
     return fields
 
 
-STATE, COMMAND = _motors("motor_state", ("q", "dq", "tau_est")), _motors("motor_cmd", ("q", "dq", "tau", "kp", "kd"))
+STATE, COMMAND = (
+    _motors("motor_state", ("q", "dq", "tau_est")),
+    _motors("motor_cmd", ("q", "dq", "tau", "kp", "kd")),
+)
 KINDS: dict[str, Callable[[str, Any], Fields]] = {
     "trajectory_msgs/msg/JointTrajectory": _trajectory,
     "control_msgs/msg/JointTrajectoryControllerState": _controller,

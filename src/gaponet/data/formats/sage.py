@@ -47,9 +47,14 @@ def read(
     """Yield (motion, what reads its Log) for every real motion folder under path."""
     folders = find(path)
     if not folders:
-        raise LogError(f"{path}: no folder with control.csv and state_motor.csv; point at a SAGE folder")
+        raise LogError(
+            f"{path}: no folder with control.csv and state_motor.csv; point at a SAGE folder"
+        )
     for folder in folders:
-        yield os.path.basename(os.path.abspath(folder)), partial(_read_motion, folder, robot, joint_map)
+        yield (
+            os.path.basename(os.path.abspath(folder)),
+            partial(_read_motion, folder, robot, joint_map),
+        )
 
 
 def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
@@ -75,7 +80,10 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
     return Log(
         robot.name,
         names,
-        {k: Channel(c.time, to_radians(k, c.values, names, units, robot)) for k, c in channels.items()},
+        {
+            k: Channel(c.time, to_radians(k, c.values, names, units, robot))
+            for k, c in channels.items()
+        },
         str(folder),
         {
             "files": dict.fromkeys(channels, str(state)) | {"ctrl": str(control)},
@@ -93,11 +101,17 @@ def _read_csv(file: Path, n: int, kind: str) -> tuple[Array, dict[str, Array]]:
     columns = [c.strip().lower() for c in header.split(",")]
     lists = columns[2:]
     if columns[:2] != ["type", "timestamp"]:
-        raise LogError(f"{file}:1: header is '{header[:60]}', expected type,timestamp,positions,...")
+        raise LogError(
+            f"{file}:1: header is '{header[:60]}', expected type,timestamp,positions,..."
+        )
     if len(set(columns)) != len(columns):
-        raise LogError(f"{file}:1: a column stands twice in the header {', '.join(columns)}; delete or rename one")
+        raise LogError(
+            f"{file}:1: a column stands twice in the header {', '.join(columns)}; delete or rename one"
+        )
     if "positions" not in lists:
-        raise LogError(f"{file}:1: column 'positions' is missing; the header has: {', '.join(columns)}")
+        raise LogError(
+            f"{file}:1: column 'positions' is missing; the header has: {', '.join(columns)}"
+        )
     body = body.rstrip()
     if not body:
         raise LogError(f"{file}: holds no rows; delete the motion folder or record it again")
@@ -122,7 +136,9 @@ def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
             read_options=csv.ReadOptions(column_names=names, use_threads=False),
             parse_options=csv.ParseOptions(ignore_empty_lines=False),
             convert_options=csv.ConvertOptions(
-                include_columns=names[1:], column_types=dict.fromkeys(names[1:], pa.float64()), null_values=[""]
+                include_columns=names[1:],
+                column_types=dict.fromkeys(names[1:], pa.float64()),
+                null_values=[""],
             ),
         )
     except pa.ArrowInvalid as error:
@@ -135,7 +151,9 @@ def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
 
 def _refuse_row(file: Path, body: bytes, n: int, k: int, kind: str) -> None:
     """Raise for the first line that is not TYPE,time and k lists of n numbers, or of another type than `kind`."""
-    row = re.compile(rf'([A-Za-z_]+),{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE)
+    row = re.compile(
+        rf'([A-Za-z_]+),{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE
+    )
     for i, line in enumerate(body.decode("utf-8", errors="replace").split("\n")):
         if (match := row.fullmatch(line.rstrip("\r"))) and match[1].lower() != kind:
             raise LogError(
@@ -158,4 +176,6 @@ def _seconds(file: Path, time: Array) -> float:
         return 1e-6
     if not period > 0:
         return 1e-6  # Log refuses the row where time goes back or is not a number
-    raise LogError(f"{file}: the median period is {period:g}, neither microseconds nor seconds; mend the timestamps")
+    raise LogError(
+        f"{file}: the median period is {period:g}, neither microseconds nor seconds; mend the timestamps"
+    )

@@ -25,7 +25,9 @@ from gaponet.data.log import CHANNELS, skipped_rows
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
-NOT_OBEYED = "gaponet.not_obeyed"  # metadata of a table that is no data, and why (hw/control/recording.py)
+NOT_OBEYED = (
+    "gaponet.not_obeyed"  # metadata of a table that is no data, and why (hw/control/recording.py)
+)
 DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
 
 
@@ -40,7 +42,11 @@ def find(path: Path) -> list[Path]:
     """The file, or the tables directly in the folder."""
     if path.is_file():
         return files_under(path, SUFFIXES)
-    tables = [f for f in path.iterdir() if f.is_file() and f.suffix.lower() in SUFFIXES and f.name not in NOT_OURS]
+    tables = [
+        f
+        for f in path.iterdir()
+        if f.is_file() and f.suffix.lower() in SUFFIXES and f.name not in NOT_OURS
+    ]
     return sorted(f for f in tables if not f.name.startswith(".") and _is_table(f))
 
 
@@ -48,7 +54,9 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every table, except the manifest."""
     files = [f for f in find(path) if f.name != specified.get("manifest")]
     if not files:
-        raise LogError(f"{path}: no .csv, .txt or .parquet file in it; point at a table or a folder of tables")
+        raise LogError(
+            f"{path}: no .csv, .txt or .parquet file in it; point at a table or a folder of tables"
+        )
     for file in files:
         line = 1
         if file.suffix.lower() == ".parquet":
@@ -62,7 +70,9 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         if joint := joint_rows.joint_column(names, specified):
             yield joint_rows.recording(file, names, joint, specified)
             continue
-        yield RawRecording(file.stem, str(file), dict.fromkeys(names, ()), load, f"{file}:1", (str(file),), line)
+        yield RawRecording(
+            file.stem, str(file), dict.fromkeys(names, ()), load, f"{file}:1", (str(file),), line
+        )
 
 
 def _is_table(file: Path) -> bool:
@@ -93,7 +103,9 @@ def _csv_header(file: Path, given: list[str] | None) -> tuple[list[str], int]:
             line = lines.readline(1 << 20)
             header = next(csv.reader([line], delimiter=_delimiter(line), skipinitialspace=True), [])
         except csv.Error as error:
-            raise LogError(f"{file}:1: not a header of a table ({error}); is it the right file?") from None
+            raise LogError(
+                f"{file}:1: not a header of a table ({error}); is it the right file?"
+            ) from None
     header = line.split() if _delimiter(line) == " " else header
     if not any(header):
         raise LogError(f"{file}: empty; a table needs a header line and rows")
@@ -102,7 +114,9 @@ def _csv_header(file: Path, given: list[str] | None) -> tuple[list[str], int]:
     if given is None:
         return [str(i) for i in range(len(header))], 0
     if len(given) != len(header):
-        raise LogError(f"{file}:1: {len(header)} cells, header in logs.toml names {len(given)}; name each")
+        raise LogError(
+            f"{file}:1: {len(header)} cells, header in logs.toml names {len(given)}; name each"
+        )
     return given, 0
 
 
@@ -118,14 +132,19 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
     if not body:
         raise LogError(f"{file}: holds a header and no rows; delete it or record again")
     if delimiter == " ":
-        body, delimiter = re.sub(rb"[ \t]+", b",", re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", body)), ","
+        body, delimiter = (
+            re.sub(rb"[ \t]+", b",", re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", body)),
+            ",",
+        )
     try:
         table = pc.read_csv(
             pa.py_buffer(body),
             read_options=pc.ReadOptions(column_names=names, use_threads=False),
             parse_options=pc.ParseOptions(ignore_empty_lines=False, delimiter=delimiter),
             convert_options=pc.ConvertOptions(
-                include_columns=wanted, column_types=dict.fromkeys(wanted, pa.float64()), null_values=[""]
+                include_columns=wanted,
+                column_types=dict.fromkeys(wanted, pa.float64()),
+                null_values=[""],
             ),
         )
         whole = not any(table.column(name).null_count for name in wanted)
@@ -137,7 +156,9 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
     rows = _read_slowly(file, body.decode("utf-8", "replace"), names, wanted, delimiter, first)
     if not rows:
         raise LogError(f"{file}: not a readable CSV file ({reason}); export it again")
-    return {name: Signal(column) for name, column in zip(wanted, np.array(rows, float).T, strict=True)}
+    return {
+        name: Signal(column) for name, column in zip(wanted, np.array(rows, float).T, strict=True)
+    }
 
 
 def _read_slowly(
@@ -163,7 +184,9 @@ def _read_slowly(
 
 def _number(row: list[str], place: int, names: list[str], name: str) -> float:
     if len(row) != len(names):
-        raise ValueError(f"{len(row)} cells, the header has {len(names)}; the file may be cut short")
+        raise ValueError(
+            f"{len(row)} cells, the header has {len(names)}; the file may be cut short"
+        )
     try:
         return float(row[place])
     except ValueError:
@@ -186,7 +209,9 @@ def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
     for name in wanted:
         column = table.column(name)
         if not joint_rows.is_number(column.type):
-            raise LogError(f"{file}: column '{name}' is {column.type}, not numbers; export it as float64")
+            raise LogError(
+                f"{file}: column '{name}' is {column.type}, not numbers; export it as float64"
+            )
         if column.null_count and skipped_rows() is None:
             row = int(column.is_null().to_numpy().argmax()) + 1
             raise LogError(f"{file}:{row}: column '{name}' is empty; repair or cut the row")

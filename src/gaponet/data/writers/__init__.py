@@ -23,7 +23,9 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
-WRITERS = {name: f"gaponet.data.writers.{name}" for name in ("sage", "npz", "lerobot", "asap", "mcap")}
+WRITERS = {
+    name: f"gaponet.data.writers.{name}" for name in ("sage", "npz", "lerobot", "asap", "mcap")
+}
 
 
 @dataclass(frozen=True)
@@ -94,11 +96,17 @@ def _describe(dataset: Dataset, folder: Path) -> None:
     joints = dataset.joint_names
     gains = [f"{name}.{joint}" for name in ("kp", "kd") for joint in joints]
     text = io.StringIO()
-    rows = csv.DictWriter(text, ["file", "motion", "unit", "payload", "side", "rep", "level", "virtual", *gains])
+    rows = csv.DictWriter(
+        text, ["file", "motion", "unit", "payload", "side", "rep", "level", "virtual", *gains]
+    )
     rows.writeheader()
     for entry in dataset.entries:
         m = entry.meta
-        known = {f"{n}.{j}": repr(g) for n in ("kp", "kd") for j, g in zip(joints, getattr(m, n) or (), strict=False)}
+        known = {
+            f"{n}.{j}": repr(g)
+            for n in ("kp", "kd")
+            for j, g in zip(joints, getattr(m, n) or (), strict=False)
+        }
         rows.writerow(
             {"file": entry.id, "motion": m.motion, "unit": m.unit_id, "payload": repr(m.payload_mass),
              "side": m.payload_side, "rep": m.repetition, "level": m.level, "virtual": "yes" if m.virtual else "no"}

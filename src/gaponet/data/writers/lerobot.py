@@ -42,7 +42,10 @@ FeatureStatistics = dict[str, Statistics]  # feature → of its samples
 
 FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults, at most
 USUAL_MB, SHARE = 2.0, 1 / 2000  # of a file, and of all bytes before it
-BLOCK_MB, BLOCK_EPISODES = 32.0, 64  # a block ends with a file, once it holds as much of both together
+BLOCK_MB, BLOCK_EPISODES = (
+    32.0,
+    64,
+)  # a block ends with a file, once it holds as much of both together
 INDEX = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
          "task_index": "int64"}  # fmt: skip
 PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -92,20 +95,35 @@ class _Set:
     """One LeRobot set, and the writing of it."""
 
     def __init__(
-        self, dataset: Dataset, folder: Path, dt: float, channels: tuple[str, ...], entries: list[Entry]
+        self,
+        dataset: Dataset,
+        folder: Path,
+        dt: float,
+        channels: tuple[str, ...],
+        entries: list[Entry],
     ) -> None:
-        self.dataset, self.folder, self.dt, self.channels, self.entries = dataset, folder, dt, channels, entries
+        self.dataset, self.folder, self.dt, self.channels, self.entries = (
+            dataset,
+            folder,
+            dt,
+            channels,
+            entries,
+        )
         self.n = len(dataset.joint_names)
         self.tasks: dict[str, int] = {}
         self.frames = 0
 
     def write(self, tell: Tell) -> None:
         """Write all files."""
-        self._write_meta(_pooled([self._write_block(*block, tell) for block in enumerate(self._blocks())]))
+        self._write_meta(
+            _pooled([self._write_block(*block, tell) for block in enumerate(self._blocks())])
+        )
 
     def _blocks(self) -> Iterator[list[_Placed]]:
         """Episodes of whole data files that one file of meta/episodes lists; the journal alone decides the ends."""
-        row = 4 * self.n * len(self.channels) + sum(np.dtype(kind).itemsize for kind in INDEX.values())
+        row = 4 * self.n * len(self.channels) + sum(
+            np.dtype(kind).itemsize for kind in INDEX.values()
+        )
         block: list[_Placed] = []
         file = size = total = 0
         fill, ended = 0.0, False  # of the block; whether a file ended with the last episode
@@ -118,13 +136,21 @@ class _Set:
                     block, fill = [], 0.0
             task = self.tasks.setdefault(entry.meta.motion, len(self.tasks))
             block.append(_Placed(entry, index, self.frames, task, file))
-            size, total, fill = size + more, total + more, fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES
+            size, total, fill = (
+                size + more,
+                total + more,
+                fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES,
+            )
             self.frames += entry.rows
             ended = int(entry.hash[:8], 16) / 2**32 < more / max(USUAL_MB * 1e6, SHARE * total)
         yield block
 
     def _place(self, what: str, number: int) -> Path:
-        place = self.folder / what / PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
+        place = (
+            self.folder
+            / what
+            / PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
+        )
         place.parent.mkdir(parents=True, exist_ok=True)
         return place
 
@@ -143,7 +169,10 @@ class _Set:
                         writer.close()
                     file = episode.file
                     writer = pq.ParquetWriter(
-                        self._place("data", file), self._schema(), compression="snappy", use_dictionary=False
+                        self._place("data", file),
+                        self._schema(),
+                        compression="snappy",
+                        use_dictionary=False,
                     )
                 assert writer is not None
                 writer.write_table(self._table(columns))
@@ -153,7 +182,9 @@ class _Set:
         finally:
             if writer is not None:
                 writer.close()
-        pq.write_table(pa.Table.from_pylist(rows), self._place("meta/episodes", number), compression="snappy")
+        pq.write_table(
+            pa.Table.from_pylist(rows), self._place("meta/episodes", number), compression="snappy"
+        )
         return _pooled(stats)
 
     def _read(self, entry: Entry) -> Sequence:
@@ -167,7 +198,9 @@ class _Set:
     def _schema(self) -> pa.Schema:
         import pyarrow as pa
 
-        vector = pa.list_(pa.float32(), self.n) if self.n > 1 else pa.float32()  # one value is no list in LeRobot
+        vector = (
+            pa.list_(pa.float32(), self.n) if self.n > 1 else pa.float32()
+        )  # one value is no list in LeRobot
         fields = [(FEATURES[c], vector) for c in self.channels]
         return pa.schema(fields + [(name, pa.type_for_alias(kind)) for name, kind in INDEX.items()])
 
@@ -200,7 +233,9 @@ class _Set:
         pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
         write_json(meta / "info.json", self._info())
         write_json(meta / "stats.json", stats)
-        header = {k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header}
+        header = {
+            k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header
+        }
         write_json(meta / OURS, {
             "format": 1, "robot": self.dataset.robot_name, "joint_names": self.dataset.joint_names, "dt": self.dt,
             "dataset_hash": dataset_hash(self.entries), "virtual": any(e.meta.virtual for e in self.entries),
@@ -210,10 +245,17 @@ class _Set:
     def _info(self) -> dict[str, Any]:
         names = list(self.dataset.joint_names)
         features: dict[str, Any] = {
-            FEATURES[c]: {"dtype": "float32", "shape": [self.n], "names": names, "info": {"unit": UNITS[c]}}
+            FEATURES[c]: {
+                "dtype": "float32",
+                "shape": [self.n],
+                "names": names,
+                "info": {"unit": UNITS[c]},
+            }
             for c in self.channels
         }
-        features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in INDEX.items()}
+        features |= {
+            name: {"dtype": kind, "shape": [1], "names": None} for name, kind in INDEX.items()
+        }
         return {
             "codebase_version": VERSION, "robot_type": self.dataset.robot_name,
             "total_episodes": len(self.entries), "total_frames": self.frames, "total_tasks": len(self.tasks),
@@ -248,9 +290,22 @@ def _task_table(tasks: dict[str, int]) -> pa.Table:
 
     kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
     columns = [
-        {"name": name, "field_name": name, "pandas_type": pandas, "numpy_type": numpy, "metadata": None}
+        {
+            "name": name,
+            "field_name": name,
+            "pandas_type": pandas,
+            "numpy_type": numpy,
+            "metadata": None,
+        }
         for name, (pandas, numpy) in kinds.items()
     ]
-    header = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
-    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.string())})
+    header = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": columns,
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table(
+        {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.string())}
+    )
     return table.replace_schema_metadata({"pandas": json.dumps(header)})

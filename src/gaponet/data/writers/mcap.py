@@ -32,11 +32,19 @@ def write_recording(entry: Entry, sequence: Sequence, robot: RobotSpec, folder: 
     ctrl, qpos, qvel = (np.asarray(x, float) for x in (sequence.ctrl, sequence.qpos, sequence.qvel))
     tau = np.zeros((len(sequence), 0)) if sequence.tau is None else np.asarray(sequence.tau, float)
     with Writer(folder / entry.id, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        state, command = (bag.add_connection(t, KIND, typestore=store) for t in ("/joint_states", "/joint_commands"))
+        state, command = (
+            bag.add_connection(t, KIND, typestore=store)
+            for t in ("/joint_states", "/joint_commands")
+        )
         for t in range(len(sequence)):
             now = START + round(1e9 * sequence.dt * t)
             stamp = types["builtin_interfaces/msg/Time"](sec=now // 10**9, nanosec=now % 10**9)
             header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
-            for topic, values in ((state, (qpos[t], qvel[t], tau[t])), (command, (ctrl[t], none, none))):
-                bag.write(topic, now, store.serialize_cdr(types[KIND](header, names, *values), KIND))
+            for topic, values in (
+                (state, (qpos[t], qvel[t], tau[t])),
+                (command, (ctrl[t], none, none)),
+            ):
+                bag.write(
+                    topic, now, store.serialize_cdr(types[KIND](header, names, *values), KIND)
+                )
     return Path(entry.id)

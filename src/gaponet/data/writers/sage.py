@@ -27,7 +27,9 @@ def write_recording(entry: Entry, sequence: Sequence, robot: RobotSpec, folder: 
     state |= {"torques": sequence.tau} if sequence.tau is not None else {}
     for name, columns in (("control", {"positions": sequence.ctrl}), ("state_motor", state)):
         values = [_in_log_units(kind, x, robot) for kind, x in columns.items()]
-        write_text(folder / place / f"{name}.csv", _text(name.upper(), sequence, list(columns), values))
+        write_text(
+            folder / place / f"{name}.csv", _text(name.upper(), sequence, list(columns), values)
+        )
     write_text(folder / place / "joint_list.txt", "\n".join(sequence.joint_names) + "\n")
     return place
 

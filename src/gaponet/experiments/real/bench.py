@@ -51,11 +51,17 @@ class Bench:
         """
         unknown = set(sets) - {c.name for c in self.cards.set}
         if unknown:
-            raise UsageError(f"no set '{min(unknown)}'; there are {', '.join(c.name for c in self.cards.set)}")
-        present = [c for c in self.cards.set if self._is_present(c) and (not sets or c.name in sets)]
+            raise UsageError(
+                f"no set '{min(unknown)}'; there are {', '.join(c.name for c in self.cards.set)}"
+            )
+        present = [
+            c for c in self.cards.set if self._is_present(c) and (not sets or c.name in sets)
+        ]
         every = {q for c in present for q in c.questions}
         if set(names) - every:
-            raise UsageError(f"no question '{min(set(names) - every)}'; there are {', '.join(sorted(every))}")
+            raise UsageError(
+                f"no question '{min(set(names) - every)}'; there are {', '.join(sorted(every))}"
+            )
         left_out = {f.folder: f.why for f in self.cards.left_out if (self.data / f.folder).exists()}
         left_out |= {c.folder: "not there" for c in self.cards.set if not self._is_present(c)}
         rows: list[Row] = []
@@ -77,7 +83,9 @@ class Bench:
             if estimated:
                 labels[card.name] = estimated.remarks
             for name in (q for q in card.questions if not names or q in names):
-                rows += self.evaluate(card, name, list(questions(name, dataset, robot, self._elsewhere(card))))
+                rows += self.evaluate(
+                    card, name, list(questions(name, dataset, robot, self._elsewhere(card)))
+                )
             seconds[card.name] += sum(r["seconds"] for r in rows if r["set"] == card.name)
         return {"rows": rows, "cards": {c.name: c.title for c in present}, "labels": labels, "left_out": left_out,
                 "seconds": {k: round(v) for k, v in seconds.items()}}  # fmt: skip
@@ -128,18 +136,24 @@ class Bench:
 
     def _elsewhere(self, card: Card) -> Callable[[], RobotSpec] | None:
         """Return a function that identifies the robot on the other data set of a card; None if that is not present."""
-        other = next((c for c in self.cards.set if c.name == card.elsewhere and self._is_present(c)), None)
+        other = next(
+            (c for c in self.cards.set if c.name == card.elsewhere and self._is_present(c)), None
+        )
         return functools.partial(self._identified_on, other) if other else None
 
     def _identified_on(self, card: Card) -> RobotSpec:
         dataset, robot, _ = prepare(card, self.data, self.work)
-        return identified(self._with_folder(card, next(questions(card.questions[0], dataset, robot, None)))).robot
+        return identified(
+            self._with_folder(card, next(questions(card.questions[0], dataset, robot, None)))
+        ).robot
 
     def _with_folder(self, card: Card, question: Question) -> Question:
         """Return the question with a folder of its own for identified robots and trainings."""
         return replace(question, work=self.work / "made" / f"{card.name}-{question.split_hash}")
 
-    def _evaluate_fold(self, card: Card, question: Question, method: str, fit: Method) -> dict[str, Any]:
+    def _evaluate_fold(
+        self, card: Card, question: Question, method: str, fit: Method
+    ) -> dict[str, Any]:
         """Fit and evaluate, or read the stored evaluation: errors of the test recordings, rad; seconds; note."""
         words = (card.name, question.name, question.split_hash, method)
         file = self.work / "answers" / (re.sub(r"[^A-Za-z0-9]+", "-", " ".join(words)) + ".json")
@@ -176,7 +190,9 @@ def _averages(
 def _lacks_data(method: str, question: Question) -> bool:
     if method == "constant":
         return len({(s.meta.payload_mass, s.meta.unit_id) for s in question.train}) < 2
-    return (method == "elsewhere" and question.elsewhere is None) or (method == "adapted" and not question.few)
+    return (method == "elsewhere" and question.elsewhere is None) or (
+        method == "adapted" and not question.few
+    )
 
 
 def load_method(where: str) -> tuple[str, Method]:
@@ -188,7 +204,11 @@ def load_method(where: str) -> tuple[str, Method]:
     if where in plugins.registry(plugins.METHODS, {}):
         return where, plugins.require(plugins.METHODS, where, {}, "method")
     file, _, name = where.rpartition(":")
-    spec = importlib.util.spec_from_file_location(Path(file).stem, file) if Path(file).is_file() else None
+    spec = (
+        importlib.util.spec_from_file_location(Path(file).stem, file)
+        if Path(file).is_file()
+        else None
+    )
     if spec is None or spec.loader is None:
         raise UsageError(f"--method {where}: no such file; give FILE.py:FUNCTION")
     module = importlib.util.module_from_spec(spec)

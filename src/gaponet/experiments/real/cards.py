@@ -20,7 +20,9 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.labels import Labels, estimate, write
 
 CARDS = Path(__file__).with_name("cards.toml")
-ROBOTS = Path(__file__).with_name("robots")  # robots of the data sets that the package does not have
+ROBOTS = Path(__file__).with_name(
+    "robots"
+)  # robots of the data sets that the package does not have
 DATA_VARIABLE = "GAPONET_DATA"  # environment variable: folder of the data sets
 
 
@@ -106,7 +108,9 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
     """Import a card's recordings below `work` once. Return dataset, robot, and the estimated labels if any."""
     own = ROBOTS / card.robot
     robot, place, labels = load_robot(own if own.is_dir() else card.robot), work / card.name, None
-    options: dict[str, Any] = {k: v for k in ("rate", "joints", "ignore", "posture") if (v := getattr(card, k))}
+    options: dict[str, Any] = {
+        k: v for k in ("rate", "joints", "ignore", "posture") if (v := getattr(card, k))
+    }
     options |= {"position_unit": card.position_unit} if card.position_unit else {}
     place.mkdir(parents=True, exist_ok=True)
     source = data / card.folder
@@ -117,13 +121,21 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
             shutil.copy2(file, source)
     if card.labels:
         gain = dict(zip(robot.joint_names, robot.kp.tolist(), strict=True))
-        labels = estimate(read_logs(source, robot, rate=card.rate), card.labels.payloads, card.labels.units, gain)
+        labels = estimate(
+            read_logs(source, robot, rate=card.rate), card.labels.payloads, card.labels.units, gain
+        )
         write(labels, place)
         options["manifest"] = "labels.csv"
     logs = place / "logs.toml"
     write_text(logs, "".join(f"{k} = {_toml(v)}\n" for k, v in options.items()))
     report = import_logs(
-        source, robot, card.unit, card.payload, place / "data", logs=logs if options else None, cut=card.cut
+        source,
+        robot,
+        card.unit,
+        card.payload,
+        place / "data",
+        logs=logs if options else None,
+        cut=card.cut,
     )
     report.dataset.set_provenance(licence=card.licence, source=card.source)
     return report.dataset, robot, labels

@@ -39,13 +39,18 @@ class FittedSim:
 
     robot: RobotSpec
     corrector: Corrector | None = None  # changes the targets (gaponet.sim.replay.Corrector)
-    shift: Callable[[Sequence], Array] | None = None  # returns an offset of a recording's simulated positions, (n,) rad
+    shift: Callable[[Sequence], Array] | None = (
+        None  # returns an offset of a recording's simulated positions, (n,) rad
+    )
     note: str = ""  # remark for the reader of the table
 
     def positions(self, sequences: list[Sequence]) -> list[Array]:
         """Return open-loop rollouts, (T, n) rad each."""
         replays = replay(sequences, self.robot, self.corrector, lock_idle=True)
-        return [t.qpos + (self.shift(s) if self.shift else 0.0) for s, t in zip(sequences, replays, strict=True)]
+        return [
+            t.qpos + (self.shift(s) if self.shift else 0.0)
+            for s, t in zip(sequences, replays, strict=True)
+        ]
 
     def errors(self, sequences: list[Sequence]) -> list[float]:
         """Return the mean |error| of each rollout over the recorded joints, rad."""
@@ -103,8 +108,13 @@ def adapted(question: Question) -> FittedSim:
     """The robot identified on other data, adapted on a few recordings of the test's unit or session."""
     if not question.few:
         raise UsageError(f"{question.name}: has no recordings for adaptation")
-    start, few = (identified if question.elsewhere is None else elsewhere)(question).robot, question.few
-    seconds = len(few) * WINDOW_S if few[0].duration < WINDOW_S else ADAPTATION_S  # all of the short windows
+    start, few = (
+        (identified if question.elsewhere is None else elsewhere)(question).robot,
+        question.few,
+    )
+    seconds = (
+        len(few) * WINDOW_S if few[0].duration < WINDOW_S else ADAPTATION_S
+    )  # all of the short windows
     fit = adapt(few, start, seconds, judge=True)
     return FittedSim(fit.robot if fit.accepted else start)
 
@@ -175,12 +185,16 @@ def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
         parts: dict[str, dict[str, str]] = {"test": {}}
         for part, sequences in zip(("train", "val"), train_val(question), strict=True):
             hashes = {s.content_hash(): s for s in sequences}
-            entries = [dataset.find(h) or dataset.append(s, content_hash=h) for h, s in hashes.items()]
+            entries = [
+                dataset.find(h) or dataset.append(s, content_hash=h) for h, s in hashes.items()
+            ]
             parts[part] = {e.id: e.hash for e in entries}
         write_text(split, json.dumps({"parts": parts}))
         config = replace(_recipe(steps), model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
         resume = (training / "checkpoint.pt").is_file()
-        trainer = Trainer(dataset, start.robot, training, config, Budget(steps=steps), resume=resume)
+        trainer = Trainer(
+            dataset, start.robot, training, config, Budget(steps=steps), resume=resume
+        )
         trainer.baseline = fit_delay_offset(question)
         trainer.run()
     model = GapModel.load(training)

@@ -57,7 +57,9 @@ def _more_than(fitted: dict[str, Any] | None, row: dict[str, Any]) -> str:
     """Return how much larger a row's error is than that of identification, ± over motions; "" if it is no rival."""
     if fitted in (None, row) or not (fitted.keys() & row.keys() >= {"by_motion_mrad"}):
         return ""
-    more = np.array([row["by_motion_mrad"][motion] - mrad for motion, mrad in fitted["by_motion_mrad"].items()])
+    more = np.array(
+        [row["by_motion_mrad"][motion] - mrad for motion, mrad in fitted["by_motion_mrad"].items()]
+    )
     return _plus_minus(more.mean(), standard_error(more) if len(more) > 1 else None)
 
 

@@ -76,16 +76,25 @@ def questions(
     lead = canonical_motions(dataset)
     entries = dataset.entries
 
-    def split(train: list[Entry], val: list[Entry], test: list[Entry], few: list[Entry] = []) -> Question:  # noqa: B006
+    def split(
+        train: list[Entry],
+        val: list[Entry],
+        test: list[Entry],
+        few: list[Entry] = [],  # noqa: B006
+    ) -> Question:
         if not val:
             cell = {e.id: f"{e.meta.motion} {e.meta.payload_mass:g}" for e in train}
             judges = hash_order(cell.values())[::VALIDATION_STRIDE]
             val = [e for e in train if cell[e.id] in judges]
             train = [e for e in train if cell[e.id] not in judges]
-        digest = hashlib.sha256(f"{dataset_hash(train + val)} {dataset_hash(test)}".encode()).hexdigest()[:8]
+        digest = hashlib.sha256(
+            f"{dataset_hash(train + val)} {dataset_hash(test)}".encode()
+        ).hexdigest()[:8]
         read = lambda part: dataset.sequences(part)  # noqa: E731
         motions = [lead[e.meta.motion] for e in test]
-        return Question(name, robot, read(train), read(val), read(test), motions, digest, read(few), elsewhere)
+        return Question(
+            name, robot, read(train), read(val), read(test), motions, digest, read(few), elsewhere
+        )
 
     if name in ("new motions", "another session"):
         parts = split_entries(dataset)
@@ -96,12 +105,15 @@ def questions(
         yield split(parts["train"], parts["val"], parts["test"])
     elif name == "new commands":
         order = {
-            j: hash_order({e.meta.motion for e in entries if _joint(e) == j}) for j in {_joint(e) for e in entries}
+            j: hash_order({e.meta.motion for e in entries if _joint(e) == j})
+            for j in {_joint(e) for e in entries}
         }
         for fold in range(FOLDS):
             out = {names[fold] for names in order.values() if fold < len(names) > 1}
             yield split(
-                [e for e in entries if e.meta.motion not in out], [], [e for e in entries if e.meta.motion in out]
+                [e for e in entries if e.meta.motion not in out],
+                [],
+                [e for e in entries if e.meta.motion in out],
             )
     elif name.endswith(" kg left out"):
         mass = float(name.split()[0])
@@ -116,7 +128,12 @@ def questions(
             }
             seen = [e for e in of_unit if e.meta.motion in first.values()]
             few = [e for j in first for e in [e for e in seen if _joint(e) == j][:FEW_RECORDINGS]]
-            yield split([e for e in entries if e not in of_unit], [], [e for e in of_unit if e not in seen], few)
+            yield split(
+                [e for e in entries if e not in of_unit],
+                [],
+                [e for e in of_unit if e not in seen],
+                few,
+            )
     else:
         raise UsageError(f"question '{name}' is not known; docs/benchmark.md lists them")
 
@@ -137,14 +154,18 @@ def train_val(question: Question) -> tuple[list[Sequence], list[Sequence]]:
     for unrecorded in {s.meta.unrecorded for s in fitted}:
         motions = hash_order(s.meta.motion for s in fitted if s.meta.unrecorded == unrecorded)
         val |= set(motions[:1] if len(motions) > 1 else [])
-    return [s for s in fitted if s.meta.motion not in val], [s for s in fitted if s.meta.motion in val]
+    return [s for s in fitted if s.meta.motion not in val], [
+        s for s in fitted if s.meta.motion in val
+    ]
 
 
 def repeatability(question: Question) -> float:
     """Mean |difference| between the errors of two recordings of one command, unit and payload, rad; NaN without any."""
     groups: dict[tuple[object, ...], list[Sequence]] = {}
     for s, motion in zip(question.test, question.test_motions, strict=True):
-        groups.setdefault((motion, *s.meta.repetition_key[1:], s.meta.unrecorded, s.meta.kp), []).append(s)
+        groups.setdefault(
+            (motion, *s.meta.repetition_key[1:], s.meta.unrecorded, s.meta.kp), []
+        ).append(s)
     pairs = [d for group in groups.values() for d in _differences(group, question.robot)]
     least = min((command for command, _ in pairs), default=0.0)
     errors = [d for command, d in pairs if command <= max(least, MAX_COMMAND_DIFFERENCE_RAD)]
@@ -156,7 +177,9 @@ def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[tuple[floa
     for first, second in itertools.combinations(group, 2):
         rows = min(len(first), len(second))
         command = first.ctrl[:rows] - second.ctrl[:rows]
-        error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - command)[:, recorded_joints(first, robot)]
+        error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - command)[
+            :, recorded_joints(first, robot)
+        ]
         if np.abs(command).mean() < MAX_COMMAND_DIFFERENCE:
             yield float(np.abs(command).mean()), float(error.mean())
 
@@ -164,5 +187,7 @@ def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[tuple[floa
 def recorded_joints(sequence: Sequence, robot: RobotSpec) -> list[int]:
     """Return the columns of the operated joints that a recording holds."""
     return [
-        int(i) for i, j in zip(robot.operated_index, robot.operated, strict=True) if j not in sequence.meta.unrecorded
+        int(i)
+        for i, j in zip(robot.operated_index, robot.operated, strict=True)
+        if j not in sequence.meta.unrecorded
     ]

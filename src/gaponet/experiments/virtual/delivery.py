@@ -89,7 +89,9 @@ def deliver(
                     settled = 0 if not away[:, h].any() else int(np.flatnonzero(away[:, h])[-1]) + 1
                     settle = settled * robot.dt if settled < len(away) else float("nan")
                     offset = np.abs(offsets[-last:, h]).mean(axis=0)
-                    errors.append(HoldError(method, seed, payload, offset, not away[-last:, h].any(), settle))
+                    errors.append(
+                        HoldError(method, seed, payload, offset, not away[-last:, h].any(), settle)
+                    )
     return errors
 
 
@@ -113,21 +115,31 @@ class Delivery(UnitExperiment):
     def require(self, data: Dataset) -> None:
         """Refuse short holds, and recordings of real robots, which cannot be executed."""
         if self.hold < AVERAGED_S + 0.5:
-            raise UsageError(f"--hold {self.hold:g}: offsets are those of the last second; hold for 1.5 s or more")
+            raise UsageError(
+                f"--hold {self.hold:g}: offsets are those of the last second; hold for 1.5 s or more"
+            )
         if not any(e.meta.virtual for e in data.entries):
             raise UsageError(
                 f"{data.path}: holds recordings of real robots; delivery plays a virtual unit, give its dataset"
             )
 
-    def measure(self, session: Session, progress: Progress) -> tuple[list[HoldError], dict[str, Any]]:
+    def measure(
+        self, session: Session, progress: Progress
+    ) -> tuple[list[HoldError], dict[str, Any]]:
         """Execute every goal with every payload by every method. Return errors and arguments of Session.result."""
         progress("goals", 0.0)
         masses = session.payloads
         planner = GoalPlanner(session.robot, max(masses), GOAL_SEED, self.hold)
         per_plan = GOALS_PER_TRAJECTORY * len(planner.arms)
         plans = planner.plans(-(-self.goals // per_plan))
-        errors = deliver(session.robot, session.unit[1], planner, plans, masses, session.trained, progress)
-        return errors, {"goals_per_payload": len(plans) * per_plan, "hold_s": self.hold, "config": HOLD}
+        errors = deliver(
+            session.robot, session.unit[1], planner, plans, masses, session.trained, progress
+        )
+        return errors, {
+            "goals_per_payload": len(plans) * per_plan,
+            "hold_s": self.hold,
+            "config": HOLD,
+        }
 
     def run(self, session: Session, progress: Progress) -> Result:
         """Execute every goal and return tables, figures and sentences."""
@@ -168,7 +180,9 @@ def paper_table(errors: ListOf[HoldError]) -> ResultTable:
     columns = ["payload per hand", *(f"{title(m)}: {a}, cm" for m in shown for a in AXES)]
     rows: list[tuple[Any, ...]] = []
     for p in payloads(errors):
-        rows.append((f"{p:g} kg", *(_along(select(errors, m, p), a) for m in shown for a in range(3))))
+        rows.append(
+            (f"{p:g} kg", *(_along(select(errors, m, p), a) for m in shown for a in range(3)))
+        )
         if p in TABLE_1:
             printed = [TABLE_1[p][TABLE_1_METHODS[m]] for m in shown]
             rows.append((f"{p:g} kg, the paper", *(offset for axes in printed for offset in axes)))
@@ -193,7 +207,9 @@ def sentences(errors: ListOf[HoldError]) -> list[str]:
     """Return the conclusions."""
     names, masses = methods(errors), payloads(errors)
     light, heavy = masses[0], masses[-1]
-    offset = {(m, p): [mean_offset(errors, m, p, a) for a in range(3)] for m in names for p in masses}
+    offset = {
+        (m, p): [mean_offset(errors, m, p, a) for a in range(3)] for m in names for p in masses
+    }
     texts = []
     for m in names[1:]:
         parts = [
@@ -202,9 +218,15 @@ def sentences(errors: ListOf[HoldError]) -> list[str]:
         ]
         texts.append(f"At {heavy:g} kg, {title(m)} against raw targets: {', '.join(parts)}.")
     for m in names[1:]:
-        worse = [x for x, v, raw in zip(AXES, offset[m, light], offset["raw", light], strict=True) if v > raw]
+        worse = [
+            x
+            for x, v, raw in zip(AXES, offset[m, light], offset["raw", light], strict=True)
+            if v > raw
+        ]
         if worse:
-            texts.append(f"At {light:g} kg, {title(m)} is WORSE than raw targets along {', '.join(worse)}.")
+            texts.append(
+                f"At {light:g} kg, {title(m)} is WORSE than raw targets along {', '.join(worse)}."
+            )
     if not any("WORSE" in s for s in texts):
         texts.append(f"At {light:g} kg nothing is worse than raw targets along any axis.")
     return texts
@@ -227,5 +249,7 @@ def draw_offsets(errors: ListOf[HoldError]) -> Figure:
         ax.axhline(SUCCESS_RADIUS_M * 1e2, color="#111111", lw=0.7, ls=DASHED)
         ax.set_title(f"{AXES[a]}, {AXIS_NAMES[a]}")
     fig.axes[0].set_ylabel("|hand − goal|, cm")
-    legend(fig, "Offset at the goal, VIRTUAL robot; mean and standard error over goals; dashed: 1 cm")
+    legend(
+        fig, "Offset at the goal, VIRTUAL robot; mean and standard error over goals; dashed: 1 cm"
+    )
     return fig

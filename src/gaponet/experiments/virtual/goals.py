@@ -54,7 +54,9 @@ def find_hands(robot: RobotSpec, model: mujoco.MjModel) -> list[Arm]:
         names = [name for name in robot.operated if int(model.joint(name).bodyid[0]) in chain]
         arms.append(Arm(mount.side, 1.0, robot.index(names), f"payload_{mount.side}"))
     if not arms:
-        raise UsageError(f"{robot.name} has no [[payload_mount]]: it has no hand that could deliver anything")
+        raise UsageError(
+            f"{robot.name} has no [[payload_mount]]: it has no hand that could deliver anything"
+        )
     return arms
 
 
@@ -124,7 +126,9 @@ class GoalPlanner:
         first = np.unique(np.floor(positions / VOXEL_M).astype(int), axis=0, return_index=True)[1]
         chosen = first[positions[first, 0] >= MIN_FRONT_M]
         if not len(chosen):
-            raise UsageError(f"{self.robot.name}: no hand reaches {MIN_FRONT_M:g} m in front of the base")
+            raise UsageError(
+                f"{self.robot.name}: no hand reaches {MIN_FRONT_M:g} m in front of the base"
+            )
         return positions[chosen]
 
     def _plan(self) -> Plan | None:
@@ -137,7 +141,9 @@ class GoalPlanner:
                 return None
             for ik, place in zip(self.ik, goal, strict=True):
                 q = ik.solve(q, place)
-            if np.abs(self.hand_positions(q) - goal).max() > IK_TOLERANCE_M or not self.limits.can_hold(q):
+            if np.abs(
+                self.hand_positions(q) - goal
+            ).max() > IK_TOLERANCE_M or not self.limits.can_hold(q):
                 return None
             postures.append(q)
             goals.append(goal)

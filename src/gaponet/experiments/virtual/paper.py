@@ -58,7 +58,10 @@ TABLE_2: dict[str, tuple[tuple[str, str, Printed | None], ...]] = {
         ("in, predictor alone", "payload_input=on:payload_trunk=off", None),
         ("out", "", OWN),
     ),
-    "control rate": (("50 Hz", "", OWN), ("100 Hz", "rates=100", Printed(140, (0.019, 0.019, 0.023, 0.021)))),
+    "control rate": (
+        ("50 Hz", "", OWN),
+        ("100 Hz", "rates=100", Printed(140, (0.019, 0.019, 0.023, 0.021))),
+    ),
     "history H": (
         ("2", "history=2", Printed(80, (0.016, 0.016, 0.017, 0.019))),
         ("4", "", OWN),
@@ -79,13 +82,19 @@ TABLE_2: dict[str, tuple[tuple[str, str, Printed | None], ...]] = {
 }
 
 PAPER_MODEL = "paper"  # the paper's network in its own setting
-SUPERVISED = f"{PAPER_MODEL}:payload_input=off:pretraining.rounds=2"  # the same, trained as by gaponet train
+SUPERVISED = (
+    f"{PAPER_MODEL}:payload_input=off:pretraining.rounds=2"  # the same, trained as by gaponet train
+)
 LEARNED = ("mlp", PAPER_MODEL, "gaponet")
 AXES = delivery.AXES
 RECIPES = {"paper": "PPO alone", "labels": "supervised labels, then PPO"}
 # Comparisons of Table 2 that our network supports: change of the paper's network → of ours, which observes the payload.
 OUR_SETTINGS: dict[str, dict[str, str | None]] = {
-    "payload input": {"payload_input=on": "", "payload_input=on:payload_trunk=off": None, "": "payload_input=off"},
+    "payload input": {
+        "payload_input=on": "",
+        "payload_input=on:payload_trunk=off": None,
+        "": "payload_input=off",
+    },
     "control rate": {},
     "history H": {},
 }
@@ -160,7 +169,9 @@ class Paper(UnitExperiment):
         supervised = Table2Row("training", RECIPES["labels"], SUPERVISED, None)
         tables = [card_table(data, robot), claim_table(scores, errors, joints[0])]
         tables += [tracking.by_payload(scores, part, joints) for part in parts]
-        tables += [f(errors) for f in (delivery.paper_table, delivery.offset_table)] if virtual else []
+        tables += (
+            [f(errors) for f in (delivery.paper_table, delivery.offset_table)] if virtual else []
+        )
         tables += [table_2(outcomes, own, supervised), table_2(outcomes, study)]
         tables += [replace(tracking.by_joint(scores, part, robot), shown=False) for part in parts]
         heading = f"The GAPONet paper's figures and tables ({source})"
@@ -194,7 +205,11 @@ def table_2_rows(study: Study) -> list[Table2Row]:
         for setting, change, printed in rows:
             changes = change if own else OUR_SETTINGS[comparison].get(change, change)
             if changes is not None:
-                allowed_rows.append(Table2Row(comparison, setting, f"{kind}:{changes}" if changes else kind, printed))
+                allowed_rows.append(
+                    Table2Row(
+                        comparison, setting, f"{kind}:{changes}" if changes else kind, printed
+                    )
+                )
     return allowed_rows
 
 
@@ -207,7 +222,13 @@ def card_table(data: Dataset, robot: RobotSpec) -> ResultTable:
         "signals": len({c for e in entries for c in e.channels}),
     }  # fmt: skip
     rows: list[tuple[Any, ...]] = [(name, printed, here[name]) for name, printed in CARD.items()]
-    rows.append(("payloads, kg", ", ".join(f"{p:g}" for p in PAYLOADS), _listed(e.meta.payload_mass for e in entries)))
+    rows.append(
+        (
+            "payloads, kg",
+            ", ".join(f"{p:g}" for p in PAYLOADS),
+            _listed(e.meta.payload_mass for e in entries),
+        )
+    )
     rows.append(("rates, Hz", "50, 100", _listed(round(1 / e.dt) for e in entries)))
     caption = (
         "The paper's counts do not agree with each other: 28.46 h at 50 Hz are 5.1 million frames, and 257,493 frames "
@@ -220,17 +241,27 @@ def _listed(values: Iterable[float]) -> str:
     return ", ".join(f"{v:g}" for v in sorted(set(values)))
 
 
-def claim_table(scores: ListOf[Score], errors: ListOf[HoldError], joints: tracking.JointSet) -> ResultTable:
+def claim_table(
+    scores: ListOf[Score], errors: ListOf[HoldError], joints: tracking.JointSet
+) -> ResultTable:
     """The paper's claims, and the same reduction of the error by each model here, %."""
     learned = [m for m in LEARNED if m in methods(scores)]
     rows: list[tuple[Any, ...]] = []
 
-    def reductions(measured: ListOf[Any], base: float, value: Callable[[Any], float]) -> list[MeanStd]:
-        return [over_seeds(select(measured, m), lambda one: reduction(value(one), base)) for m in learned]
+    def reductions(
+        measured: ListOf[Any], base: float, value: Callable[[Any], float]
+    ) -> list[MeanStd]:
+        return [
+            over_seeds(select(measured, m), lambda one: reduction(value(one), base))
+            for m in learned
+        ]
 
     for part in dict.fromkeys(s.part for s in scores):
         of_part, base = [s for s in scores if s.part == part], tracking.BASELINE[part]
-        for name, mass in (("Q_dis, all payloads", None), ("Q_dis, heaviest payload", payloads(of_part)[-1])):
+        for name, mass in (
+            ("Q_dis, all payloads", None),
+            ("Q_dis, heaviest payload", payloads(of_part)[-1]),
+        ):
             group = select(of_part, payload=mass)
             error = tracking.q_dis(group, base, joints[1]).mean
             values = reductions(group, error, lambda s: float(s.q_dis[joints[1]].mean()))
@@ -238,26 +269,47 @@ def claim_table(scores: ListOf[Score], errors: ListOf[HoldError], joints: tracki
     heavy = payloads(errors)[-1:]
     for a, axis in enumerate(AXES if heavy and "mlp" in methods(errors) else ()):
         error = delivery.mean_offset(errors, "mlp", heavy[0], a)
-        values = reductions(select(errors, payload=heavy[0]), error, lambda e, a=a: float(e.offset[a]))  # type: ignore[misc]
-        rows.append((f"delivery: {axis} at {heavy[0]:g} kg, less than {title('mlp')}", CLAIMS[axis], *values))
+        values = reductions(
+            select(errors, payload=heavy[0]), error, lambda e, a=a: float(e.offset[a])
+        )  # type: ignore[misc]
+        rows.append(
+            (
+                f"delivery: {axis} at {heavy[0]:g} kg, less than {title('mlp')}",
+                CLAIMS[axis],
+                *values,
+            )
+        )
     caption = (
         f"Per cent less error, mean ± std over seeds; Q_dis of {joints[0]}. The paper says Q_dis once of simulator and "
         "robot (alignment) and once of target and robot (compensation)."
     )
     return ResultTable(
-        "claims", ("claim", "the paper, %", *(f"{title(m)}, %" for m in learned)), tuple(rows), caption, 0
+        "claims",
+        ("claim", "the paper, %", *(f"{title(m)}, %" for m in learned)),
+        tuple(rows),
+        caption,
+        0,
     )
 
 
 def table_2(outcomes: StudyOutcomes, study: Study, *extra: Table2Row) -> ResultTable:
     """Table 2 of the paper with the rows of one network, and the paper's row behind each."""
     masses = sorted({e.meta.payload_mass for e in study.data.entries})
-    columns = ("setting", "Obs Dim", *(f"{m:g} kg" for m in masses), "eight joints", "of nominal", "the paper")
+    columns = (
+        "setting",
+        "Obs Dim",
+        *(f"{m:g} kg" for m in masses),
+        "eight joints",
+        "of nominal",
+        "the paper",
+    )
     rows = []
     for row in (*table_2_rows(study), *extra):
         if runs := outcomes.of_model(row.word):
             printed = row.printed
-            nominal = summarize([outcomes.baselines(row.word)["nominal"]], "known", "mpjae", scale=1).mean
+            nominal = summarize(
+                [outcomes.baselines(row.word)["nominal"]], "known", "mpjae", scale=1
+            ).mean
             rows.append((
                 f"{row.comparison}: {row.setting}",
                 study.variant(row.word).config.model.observation_dim(len(study.robot.operated)),

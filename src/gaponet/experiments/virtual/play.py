@@ -30,7 +30,9 @@ SAME_METHOD = ("mlp_match=on",)  # changed settings that leave the method's name
 class TrainedModel:
     """A trained model and the run that it comes from."""
 
-    method: str  # kind of model, with identified+ in front where it corrects an identified simulator
+    method: (
+        str  # kind of model, with identified+ in front where it corrects an identified simulator
+    )
     seed: int
     run: Path
     model: GapModel
@@ -58,7 +60,9 @@ def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[TrainedModel]:
         runs += [run for run in inside if not _has_changed_settings(run)]
     if not runs:
         names = ", ".join(map(str, folders))
-        raise UsageError(f"--runs {names}: no run of gaponet train or cells of gaponet experiment compare there")
+        raise UsageError(
+            f"--runs {names}: no run of gaponet train or cells of gaponet experiment compare there"
+        )
     trained: dict[tuple[str, int], TrainedModel] = {}
     for run in runs:
         model = GapModel.load(run)
@@ -70,7 +74,10 @@ def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[TrainedModel]:
                 f"{run}: {title(key[0])} seed {key[1]} is there already ({trained[key].run}); give one of them"
             )
         trained[key] = TrainedModel(*key, run, model, corrected)
-    return [trained[key] for key in sorted(trained, key=lambda k: (k[0].startswith(IDENTIFIED), k[0] != "mlp", k))]
+    return [
+        trained[key]
+        for key in sorted(trained, key=lambda k: (k[0].startswith(IDENTIFIED), k[0] != "mlp", k))
+    ]
 
 
 def _has_changed_settings(run: Path) -> bool:
@@ -81,7 +88,9 @@ def _has_changed_settings(run: Path) -> bool:
 PLANNED = CompensatorConfig(dynamics=True)  # targets of planned motions are smooth
 START_WARMING_K = 12.0  # above ambient: a robot that has been working (testing/play.py)
 
-Progress = Callable[[str, float], None]  # called with the name of the step and the share of it that is done
+Progress = Callable[
+    [str, float], None
+]  # called with the name of the step and the share of it that is done
 
 
 class HasTargets(Protocol):
@@ -131,9 +140,15 @@ def execute(
     Yields:
         Method, seed and trajectories.
     """
-    methods: list[tuple[str, int | None, RobotSpec | None, GapModel | None]] = [("raw", None, None, None)]
+    methods: list[tuple[str, int | None, RobotSpec | None, GapModel | None]] = [
+        ("raw", None, None, None)
+    ]
     methods.append(("feedforward", None, robot.before_identification, None))
-    methods += [("identified feedforward", None, t.robot, None) for t in trained if t.robot.nominal is not None][:1]
+    methods += [
+        ("identified feedforward", None, t.robot, None)
+        for t in trained
+        if t.robot.nominal is not None
+    ][:1]
     methods += [(t.method, t.seed, t.robot, t.model) for t in trained]
     for name, seed, simulator, model in methods:
         compensator = None if simulator is None else Compensator(
@@ -156,7 +171,10 @@ def _play(
     Limbs without an operated joint stay at home: with a fixed base they share no dynamics with the others. The seed of
     a motion's noise and rest position is its number.
     """
-    targets = np.stack([np.concatenate([c, np.repeat(c[-1:], len(ctrl[0]) - len(c), axis=0)]) for c in ctrl], axis=1)
+    targets = np.stack(
+        [np.concatenate([c, np.repeat(c[-1:], len(ctrl[0]) - len(c), axis=0)]) for c in ctrl],
+        axis=1,
+    )
     locked = idle_joints(robot, robot.operated)
     loads = [(float(m), "both") for m in mass]
     robots = VirtualRobot(robot, [unit] * len(mass), loads, robot.dt, locked=locked, nthread=1)
@@ -168,7 +186,9 @@ def _play(
     done = running.cumsum() / running.sum()
     for t, target in enumerate(targets):
         reading = robots.read()
-        sent = target if compensator is None else compensator.step(target, reading.qpos, reading.qvel)
+        sent = (
+            target if compensator is None else compensator.step(target, reading.qpos, reading.qvel)
+        )
         out[:, t] = reading.qpos, reading.qvel, robots.true_qpos()
         robots.step(sent, np.arange(running[t]))
         progress(float(done[t]))

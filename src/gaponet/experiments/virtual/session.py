@@ -47,7 +47,11 @@ class UnitExperiment:
     def study(self, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> Study:
         """Return the study of the trainings where no runs are given; the unit that executes is held out."""
         units = sorted({e.meta.unit_id for e in data.entries})
-        holdout = (self.unit or units[-1],) if len(units) > 1 and (not self.unit or self.unit in units) else ()
+        holdout = (
+            (self.unit or units[-1],)
+            if len(units) > 1 and (not self.unit or self.unit in units)
+            else ()
+        )
         return Study.from_options(data, robot, out, options, holdout_units=holdout)
 
     def quick(self) -> UnitExperiment:
@@ -131,6 +135,12 @@ class Session:
             "compensator": ", ".join(f"{k} {v}" for k, v in asdict(config).items()),
         }  # fmt: skip
         runs = [f"{t.method} seed {t.seed} ({t.model.weights_hash()})" for t in self.trained]
-        repeat = facts(self.data, sorted({t.seed for t in self.trained}), **setup, runs=runs, **more)
-        provenance = describe_provenance(self.data) + f" {QUICK_LABEL}." * (self.study is not None and self.study.quick)
-        return Result(name, title, provenance, repeat, tuple(tables), dict(figures), tuple(sentences))
+        repeat = facts(
+            self.data, sorted({t.seed for t in self.trained}), **setup, runs=runs, **more
+        )
+        provenance = describe_provenance(self.data) + f" {QUICK_LABEL}." * (
+            self.study is not None and self.study.quick
+        )
+        return Result(
+            name, title, provenance, repeat, tuple(tables), dict(figures), tuple(sentences)
+        )

@@ -42,12 +42,16 @@ def payloads(measured: Iterable[Measured]) -> list[float]:
     return sorted({m.payload for m in measured})
 
 
-def select(measured: Iterable[M], method: str | None = None, payload: float | None = None) -> list[M]:
+def select(
+    measured: Iterable[M], method: str | None = None, payload: float | None = None
+) -> list[M]:
     """Return the measurements of a method, of a payload, or of both."""
     return [m for m in measured if method in (None, m.method) and payload in (None, m.payload)]
 
 
-def over_seeds(measured: ListOf[M], value: Callable[[M], Any], scale: float = 1.0, average: Any = np.mean) -> MeanStd:
+def over_seeds(
+    measured: ListOf[M], value: Callable[[M], Any], scale: float = 1.0, average: Any = np.mean
+) -> MeanStd:
     """Mean and standard deviation over seeds of each seed's average; one number for a method without seeds."""
     by_seed: dict[int | None, list[float]] = {}
     for m in measured:

@@ -50,7 +50,10 @@ MEANING = {
     "alignment": "between simulator and robot under the same targets, open-loop rollout",
     "compensation": "between targets and robot",
 }
-FIGURE_TITLES = {"alignment": "Alignment: simulator to robot", "compensation": "Compensation: robot to target"}
+FIGURE_TITLES = {
+    "alignment": "Alignment: simulator to robot",
+    "compensation": "Compensation: robot to target",
+}
 REST_S = 2.0  # under the first target before a motion begins, for the compensator to blend in
 
 
@@ -73,10 +76,16 @@ def track(
     progress: Progress = lambda step, share: None,
 ) -> list[Score]:
     """Execute every motion with every payload (kg per hand), raw and compensated, and in every simulator."""
-    pairs, op, rest = with_payloads(motions, payloads), robot.operated_index, round(REST_S / robot.dt)
+    pairs, op, rest = (
+        with_payloads(motions, payloads),
+        robot.operated_index,
+        round(REST_S / robot.dt),
+    )
     ctrl = [np.concatenate([np.repeat(m.ctrl[:1], rest, axis=0), m.ctrl]) for m, _ in pairs]
     scores: list[Score] = []
-    for method, seed, played in execute(robot, unit, ctrl, [p for _, p in pairs], trained, PLANNED, progress):
+    for method, seed, played in execute(
+        robot, unit, ctrl, [p for _, p in pairs], trained, PLANNED, progress
+    ):
         if method == "raw":
             recorded = []
             for i, (motion, payload) in enumerate(pairs):
@@ -101,8 +110,12 @@ def align(
 
     The identified simulator is that of the models that correct it.
     """
-    simulators: list[tuple[str, int | None, RobotSpec, TrainedModel | None]] = [("nominal", None, robot, None)]
-    simulators += [("identified", None, t.robot, None) for t in trained if t.robot.nominal is not None][:1]
+    simulators: list[tuple[str, int | None, RobotSpec, TrainedModel | None]] = [
+        ("nominal", None, robot, None)
+    ]
+    simulators += [
+        ("identified", None, t.robot, None) for t in trained if t.robot.nominal is not None
+    ][:1]
     simulators += [(t.method, t.seed, t.robot, t) for t in trained]
     scores: list[Score] = []
     for method, seed, simulator, model in simulators:
@@ -111,11 +124,15 @@ def align(
         def report(done: int, total: int, method: str = method) -> None:
             progress(f"{method} simulator", done / total)
 
-        replays = replay(list(recorded), simulator, corrector, nthread=1, progress=report, lock_idle=True)
+        replays = replay(
+            list(recorded), simulator, corrector, nthread=1, progress=report, lock_idle=True
+        )
         for s, simulated in zip(recorded, replays, strict=True):
             error = (simulated.qpos - s.qpos)[1:, robot.operated_index]
             q_dis = np.abs(error.astype(float)).sum(axis=0) * s.dt
-            scores.append(Score(method, seed, s.meta.payload_mass, "alignment", s.meta.motion, q_dis))
+            scores.append(
+                Score(method, seed, s.meta.payload_mass, "alignment", s.meta.motion, q_dis)
+            )
     return scores
 
 
@@ -190,7 +207,9 @@ def by_payload(scores: ListOf[Score], part: str, sets: ListOf[JointSet]) -> Resu
     for label, columns in sets:
         for payload in [*masses, None] if len(masses) > 1 else masses:
             values = {m: q_dis(select(of_part, payload=payload), m, columns) for m in names}
-            cuts = (f"{reduction(values[m].mean, values[BASELINE[part]].mean):.0f} %" for m in learned)
+            cuts = (
+                f"{reduction(values[m].mean, values[BASELINE[part]].mean):.0f} %" for m in learned
+            )
             where = f"{label}, all payloads" if payload is None else f"{label}, {payload:g} kg"
             rows.append((where, *values.values(), *cuts))
     heads = (*(title(m) for m in names), *(f"{title(m)} cuts" for m in learned))
@@ -207,7 +226,9 @@ def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> ResultTable:
         for p in payloads(of_part) for i, joint in enumerate(robot.operated)
     ]  # fmt: skip
     head = ("Q_dis, rad·s", *(title(m) for m in names))
-    return ResultTable(f"{part}-joints", head, tuple(rows), f"Q_dis {MEANING[part]}, joint by joint.", digits=4)
+    return ResultTable(
+        f"{part}-joints", head, tuple(rows), f"Q_dis {MEANING[part]}, joint by joint.", digits=4
+    )
 
 
 def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> MeanStd:
@@ -220,10 +241,19 @@ def conclusion(scores: ListOf[Score], part: str, joints: JointSet) -> str:
     label, columns = joints
     of_part = [s for s in scores if s.part == part]
     names, masses, cuts = methods(of_part), payloads(of_part), list[str]()
-    error = {p: {m: q_dis(select(of_part, payload=p), m, columns).mean for m in names} for p in (None, *masses)}
+    error = {
+        p: {m: q_dis(select(of_part, payload=p), m, columns).mean for m in names}
+        for p in (None, *masses)
+    }
     for m in names[1:]:
-        overall, heavy = (percent_text(reduction(error[p][m], error[p][BASELINE[part]])) for p in (None, masses[-1]))
-        cuts.append(f"{title(m)} {overall}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
+        overall, heavy = (
+            percent_text(reduction(error[p][m], error[p][BASELINE[part]]))
+            for p in (None, masses[-1])
+        )
+        cuts.append(
+            f"{title(m)} {overall}"
+            + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else "")
+        )
     return f"{part}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}."
 
 

@@ -39,12 +39,16 @@ def generated(robot: RobotSpec, count: int, max_payload: float) -> list[UnseenMo
     names = [f"{kind}-{side}-{VARIANT}" for side in sides for kind in BUILDERS]
     names = names or hash_order(library.names())
     if count > len(names):
-        raise UsageError(f"--count {count}: {robot.name} has {len(names)} motions for this experiment")
+        raise UsageError(
+            f"--count {count}: {robot.name} has {len(names)} motions for this experiment"
+        )
     idle = robot.index(idle_joints(robot, robot.operated))
     motions = []
     for name in names[:count]:
         ctrl = library.make(name).sample(robot.dt)
-        ctrl[:, idle] = robot.qpos_home[idle]  # with a fixed base they share no dynamics with the others
+        ctrl[:, idle] = robot.qpos_home[
+            idle
+        ]  # with a fixed base they share no dynamics with the others
         motions.append(UnseenMotion(name, ctrl))
     return motions
 
@@ -72,10 +76,14 @@ def require_unseen(
 
 def training_motions(dataset: Dataset, trained: ListOf[TrainedModel]) -> set[str]:
     """Return the names of the motions in the training and validation sets of the runs."""
-    hashes = {h for t in trained for part in ("train", "val") for h in split_of_run(t.run)[part].values()}
+    hashes = {
+        h for t in trained for part in ("train", "val") for h in split_of_run(t.run)[part].values()
+    }
     names = {e.meta.motion for e in dataset.entries if e.hash in hashes}
     if not names:
-        raise UsageError(f"{dataset.path}: holds nothing that these runs were trained on; give the dataset of the runs")
+        raise UsageError(
+            f"{dataset.path}: holds nothing that these runs were trained on; give the dataset of the runs"
+        )
     return names
 
 

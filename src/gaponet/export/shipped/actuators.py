@@ -36,7 +36,9 @@ def isaaclab_actuators(folder: Path) -> dict[str, Any]:
 
     facts = read(folder / "facts.json")
     fields = ActuatorNetMLPCfg.__dataclass_fields__
-    limit = "actuator_effort_limit" if "actuator_effort_limit" in fields else "effort_limit"  # Isaac Lab 3 renamed it
+    limit = (
+        "actuator_effort_limit" if "actuator_effort_limit" in fields else "effort_limit"
+    )  # Isaac Lab 3 renamed it
     return {
         name: ActuatorNetMLPCfg(
             joint_names_expr=[name], network_file=str(folder / f"{name}.pt"), pos_scale=1.0, vel_scale=1.0,

@@ -11,7 +11,9 @@ from pydrake.systems.analysis import Simulator
 
 from gaponet.export.shipped.mujoco_servos import Check, delay_weights
 
-logging.getLogger("drake").setLevel(logging.ERROR)  # about parts of the MJCF that Drake ignores; robot_cfg.py has them
+logging.getLogger("drake").setLevel(
+    logging.ERROR
+)  # about parts of the MJCF that Drake ignores; robot_cfg.py has them
 HERE = Path(__file__).parent
 check = Check(HERE)
 names, decimation = check.names, check.facts["decimation"]
@@ -42,7 +44,9 @@ for motion in check.motions:
             target = (weights * past).sum(0) + offset
             desired.FixValue(context, np.concatenate([target, np.zeros(len(names))]))
             forces.FixValue(context, robot_cfg.friction(plant, context, target))
-            simulator.AdvanceTo((k * decimation + i + 0.5) * check.step)  # one discrete step, despite rounding
+            simulator.AdvanceTo(
+                (k * decimation + i + 0.5) * check.step
+            )  # one discrete step, despite rounding
         path.append(plant.GetPositions(context)[at])
     paths.append(np.array(path))
 check.report_motions("Drake", paths)

@@ -32,7 +32,9 @@ class Scene(InteractiveSceneCfg):
     robot: ArticulationCfg = ArticulationCfg(
         prim_path="{ENV_REGEX_NS}/Robot",
         spawn=sim_utils.UsdFileCfg(usd_path=usd.path),
-        init_state=ArticulationCfg.InitialStateCfg(joint_pos={n: j["home"] for n, j in check.facts["plain"].items()}),
+        init_state=ArticulationCfg.InitialStateCfg(
+            joint_pos={n: j["home"] for n, j in check.facts["plain"].items()}
+        ),
         actuators=gaponet.isaaclab_actuators(HERE),
     )
 
@@ -59,10 +61,16 @@ class Events:
 
 events = Events()
 if sys.argv[1:]:
-    unit = {"file": sys.argv[1], "rows": [int(sys.argv[2])] * check.worlds, "asset_cfg": SceneEntityCfg("robot")}
+    unit = {
+        "file": sys.argv[1],
+        "rows": [int(sys.argv[2])] * check.worlds,
+        "asset_cfg": SceneEntityCfg("robot"),
+    }
     events.unit = EventTermCfg(func=apply_units, mode="reset", params=unit)
 fields = ("integrator", "tolerance", "iterations", "ls_iterations")
-solver = MJWarpSolverCfg(disable_contacts=True, **{field: check.facts["options"][field] for field in fields})
+solver = MJWarpSolverCfg(
+    disable_contacts=True, **{field: check.facts["options"][field] for field in fields}
+)
 cfg = ManagerBasedEnvCfg(
     decimation=check.facts["decimation"], scene=Scene(num_envs=check.worlds, env_spacing=2.0),
     sim=sim_utils.SimulationCfg(

@@ -11,5 +11,8 @@ check = Check(HERE)
 file = str(HERE / check.facts["file"])
 for form, what in (("plain", "the MJCF alone"), ("joints", "the MJCF with servo_law.py")):
     models = [mujoco.MjModel.from_xml_path(file) for _ in check.motions]
-    paths = [play(m, check.facts, x, check.facts["prefix"], form) for m, x in zip(models, check.motions, strict=True)]
+    paths = [
+        play(m, check.facts, x, check.facts["prefix"], form)
+        for m, x in zip(models, check.motions, strict=True)
+    ]
     check.report_motions(what, [path[1:] for path in paths], form)

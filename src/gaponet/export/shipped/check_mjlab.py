@@ -26,7 +26,9 @@ joints = {"entity_name": "robot", "actuator_names": (".*",)}
 if networks:
     from actuators import mjlab_actuators
 
-    entity = gaponet.mjlab_entity(HERE, articulation=EntityArticulationInfoCfg(actuators=mjlab_actuators(HERE)))
+    entity = gaponet.mjlab_entity(
+        HERE, articulation=EntityArticulationInfoCfg(actuators=mjlab_actuators(HERE))
+    )
     action = JointPositionActionCfg(**joints, use_default_offset=False)
 else:
     entity, action = gaponet.mjlab_entity(HERE), gaponet.mjlab_action(HERE, check=False, **joints)

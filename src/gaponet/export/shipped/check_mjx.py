@@ -21,13 +21,18 @@ model, dt = spec.compile(), check.step * check.facts["decimation"]
 steps = round(dt / model.opt.timestep)
 model.opt.timestep = dt / steps
 dof, at, servo = addresses(model, check.names, check.facts["prefix"])
-weights = jp.array(delay_weights([joint["delay"] for joint in check.facts["plain"].values()], model.opt.timestep))
+weights = jp.array(
+    delay_weights([joint["delay"] for joint in check.facts["plain"].values()], model.opt.timestep)
+)
 device = mjx.put_model(model)
 home = mjx.make_data(model)
 fresh, start = np.zeros(check.ctrl.shape[:2], bool), np.zeros((2, *check.ctrl.shape))
 for row, motions in check.starts.items():
     for world, motion in motions.items():
-        fresh[row, world], start[:, row, world] = True, [motion[field][0] for field in ("qpos", "qvel")]
+        fresh[row, world], start[:, row, world] = (
+            True,
+            [motion[field][0] for field in ("qpos", "qvel")],
+        )
 
 
 def step(carry: Any, _: Any) -> Any:
@@ -48,6 +53,8 @@ def period(carry: Any, row: Any) -> Any:
     return (data, past), data.qpos[at]
 
 
-first = jax.tree.map(lambda x: jp.stack([x] * check.worlds), (home, jp.zeros((len(weights), len(check.names)))))
+first = jax.tree.map(
+    lambda x: jp.stack([x] * check.worlds), (home, jp.zeros((len(weights), len(check.names))))
+)
 rows = tuple(map(jp.array, (check.ctrl, fresh, *start)))
 check.report("MJX", jax.jit(lambda c, x: jax.lax.scan(jax.vmap(period), c, x)[1])(first, rows))

@@ -25,7 +25,12 @@ joints = [[label.rsplit("/", 1)[-1] for label in robot.joint_label].index(name) 
 dof, at = ([starts[i] for i in joints] for starts in (robot.joint_qd_start, robot.joint_q_start))
 if networks:
     for i, k, name in zip(dof, at, names, strict=True):
-        robot.add_actuator(newton.actuators.DriveNeuralMLP, index=i, pos_index=k, model_path=str(HERE / f"{name}.onnx"))
+        robot.add_actuator(
+            newton.actuators.DriveNeuralMLP,
+            index=i,
+            pos_index=k,
+            model_path=str(HERE / f"{name}.onnx"),
+        )
 else:
     import robot_cfg
 
@@ -44,7 +49,9 @@ solver = newton.solvers.SolverMuJoCo(model, disable_contacts=True, **options)
 states, control = [model.state(), model.state()], model.control()
 rows = lambda x: x.numpy().reshape(worlds, -1)  # noqa: E731
 target = 0.0 * rows(model.joint_q)
-histories = [[actuator.state(), actuator.state()] for actuator in model.actuators] if networks else []
+histories = (
+    [[actuator.state(), actuator.state()] for actuator in model.actuators] if networks else []
+)
 zeros = dict.fromkeys(names, 0.0)
 tables = (zeros, zeros) if networks else (robot_cfg.DELAYS, robot_cfg.OFFSETS)
 delay, offset = (np.array([table[name] for name in names]) for table in tables)
@@ -64,7 +71,9 @@ def start(motions: dict[int, Motion], ctrl: Any) -> None:
     for actuator, (history, _) in zip(model.actuators if networks else [], histories, strict=True):
         errors, places = history.drive_state.pos_error_history.numpy(), actuator.pos_indices.numpy()
         fresh = [i for i, place in enumerate(places) if place // q.shape[1] in motions]
-        errors[:, fresh] = (target.ravel() - q.ravel())[places[fresh]]  # as if the command had always been in force
+        errors[:, fresh] = (target.ravel() - q.ravel())[
+            places[fresh]
+        ]  # as if the command had always been in force
         history.drive_state.pos_error_history.assign(errors)
 
 
@@ -84,4 +93,6 @@ def period(ctrl: Any) -> Any:
 
 
 form, what = ("actuator networks", "'s neural drives") if networks else ("plain", "")
-check.report(f"Newton {newton.__version__}{what}, warp {wp.__version__}", check.run(start, period), form)
+check.report(
+    f"Newton {newton.__version__}{what}, warp {wp.__version__}", check.run(start, period), form
+)

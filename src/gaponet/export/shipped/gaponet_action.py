@@ -54,14 +54,18 @@ class Past:
 
     def reset(self, ids: Any = None) -> None:
         """Restart worlds (indices, a mask, a slice; None for all) with the next state."""
-        self.fresh = self.fresh.clone()  # inference tensors cannot be written to outside inference mode
+        self.fresh = (
+            self.fresh.clone()
+        )  # inference tensors cannot be written to outside inference mode
         self.fresh[slice(None) if ids is None else ids] = True
 
     def delta(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor, payload_mass: Tensor) -> Tensor:
         """Δa, (num_envs, n) rad; once per control period."""
         delta = torch.zeros_like(ctrl)
         if self.program is not None:
-            delta, self.frames = self.program(qpos, qvel, ctrl, payload_mass, self.frames, self.fresh)
+            delta, self.frames = self.program(
+                qpos, qvel, ctrl, payload_mass, self.frames, self.fresh
+            )
         self.fresh = torch.zeros_like(self.fresh)
         return delta
 
@@ -74,16 +78,26 @@ class Aligner:
     """
 
     def __init__(
-        self, folder: str | Path, joint_names: list[str], num_envs: int, device: Any, payload_mass: float | None = None
+        self,
+        folder: str | Path,
+        joint_names: list[str],
+        num_envs: int,
+        device: Any,
+        payload_mass: float | None = None,
     ) -> None:
         from torch.export.passes import move_to_device_pass
 
         facts = read_facts(folder)
         corrected = facts["corrected"]
         if missing := [name for name in corrected if name not in joint_names]:
-            raise ValueError(f"{folder}: corrects '{missing[0]}', which is not among {', '.join(joint_names)}")
+            raise ValueError(
+                f"{folder}: corrects '{missing[0]}', which is not among {', '.join(joint_names)}"
+            )
         self.columns = torch.tensor([joint_names.index(name) for name in corrected], device=device)
-        ranges = [facts["joints"].get(name, {}).get("range") or (-torch.inf, torch.inf) for name in joint_names]
+        ranges = [
+            facts["joints"].get(name, {}).get("range") or (-torch.inf, torch.inf)
+            for name in joint_names
+        ]
         self.low, self.high = torch.tensor(ranges, device=device).T
         module = None
         if "model" in facts:
@@ -94,7 +108,9 @@ class Aligner:
                     f"{folder}/{PROGRAM}: torch {torch.__version__} is too old for it; 2.11 does"
                 ) from error
             module = move_to_device_pass(program, str(device)).module()
-        self.past = Past(module, num_envs, facts.get("model", {}).get("depth", 1), len(corrected), device)
+        self.past = Past(
+            module, num_envs, facts.get("model", {}).get("depth", 1), len(corrected), device
+        )
         mass = facts["payload_mass"] if payload_mass is None else payload_mass
         self.payload_mass = torch.full((num_envs,), float(mass), device=device)
         self.sent = torch.zeros(num_envs, len(joint_names), device=device)
@@ -129,7 +145,9 @@ class AlignedAction:
     standing_command: Tensor | None = None
     _processed_actions: Tensor
 
-    def align(self, entity: Any, ids: Any, names: list[str], offset: float = 0.0, form: str = "joints") -> None:
+    def align(
+        self, entity: Any, ids: Any, names: list[str], offset: float = 0.0, form: str = "joints"
+    ) -> None:
         """Load the export for the joints `names` of an entity, at its columns `ids`.
 
         Args:
@@ -139,18 +157,26 @@ class AlignedAction:
         me: Any = self
         facts = read_facts(self.folder)
         if "model" in facts and abs((dt := me._env.step_dt) / facts["dt"] - 1) > 0.02:
-            raise ValueError(f"{self.folder}: its network has a control period of {facts['dt']} s, not {dt} s")
+            raise ValueError(
+                f"{self.folder}: its network has a control period of {facts['dt']} s, not {dt} s"
+            )
         self.aligner = Aligner(self.folder, list(names), me.num_envs, me.device, self.payload_mass)
-        self.servo_offset = offset * torch.tensor([facts[form][name]["offset"] for name in names], device=me.device)
+        self.servo_offset = offset * torch.tensor(
+            [facts[form][name]["offset"] for name in names], device=me.device
+        )
         self._aligned, self._columns = entity, ids
 
     def process_actions(self, actions: Tensor) -> None:
         super().process_actions(actions)  # type: ignore[misc]
         data, ids = self._aligned.data, self._columns
         q, v = (tensor(x)[:, ids] for x in (data.joint_pos, data.joint_vel))
-        bias = data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0  # mjlab subtracts it again
+        bias = (
+            data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0
+        )  # mjlab subtracts it again
         self.restart(q, q if self.standing_command is None else self.standing_command)
-        self._processed_actions = self.aligner(q, v, self._processed_actions - bias) + bias + self.servo_offset
+        self._processed_actions = (
+            self.aligner(q, v, self._processed_actions - bias) + bias + self.servo_offset
+        )
 
     def restart(self, qpos: Tensor, command: Tensor) -> None:
         """Restart the fresh worlds at a position, under a command that has been in force for long."""
@@ -165,7 +191,9 @@ class CheckPlayer:
 
     def __init__(self, check: Check) -> None:
         self.check = check
-        self.start = torch.zeros(2, check.worlds, len(check.names))  # qpos and qvel in which worlds start
+        self.start = torch.zeros(
+            2, check.worlds, len(check.names)
+        )  # qpos and qvel in which worlds start
 
     def reset_event(self) -> Any:
         """Return the function of an event term in mode "reset"; a copy of it still reads this object."""
@@ -175,7 +203,9 @@ class CheckPlayer:
             order = [self.check.names.index(name) for name in robot.joint_names]
             position, velocity = (x[env_ids][:, order] for x in self.start)
             if hasattr(robot, "write_joint_state_to_sim_index"):  # Isaac Lab 3
-                robot.write_joint_state_to_sim_index(position=position, velocity=velocity, env_ids=env_ids)
+                robot.write_joint_state_to_sim_index(
+                    position=position, velocity=velocity, env_ids=env_ids
+                )
             else:
                 robot.write_joint_state_to_sim(position, velocity, env_ids=env_ids)
 
@@ -194,7 +224,9 @@ class CheckPlayer:
 
         def step(ctrl: Any) -> Any:
             target = torch.tensor(ctrl, dtype=torch.float)[:, columns]
-            term.standing_command = target  # check motions start under a command that has been in force for long
+            term.standing_command = (
+                target  # check motions start under a command that has been in force for long
+            )
             env.step(target)
             return tensor(robot.data.joint_pos)[:, order].clone().numpy()
 
@@ -204,7 +236,9 @@ class CheckPlayer:
 # ---- mjlab
 
 
-def mjlab_action(folder: str | Path, payload_mass: float | None = None, check: bool = True, **options: Any) -> Any:
+def mjlab_action(
+    folder: str | Path, payload_mass: float | None = None, check: bool = True, **options: Any
+) -> Any:
     """Return a JointPositionActionCfg that aligns; `check` refuses a scene that is not the simulator of training."""
     from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
 
@@ -217,7 +251,9 @@ def mjlab_action(folder: str | Path, payload_mass: float | None = None, check: b
                 require_scene(env.sim.mj_model, f"{cfg.entity_name}/", self.folder)
             names = list(self._target_names)
             self.delays = DelayBuffers(env.sim, cfg.entity_name, names)
-            self.terms = ServoModel(env.sim, self._entity, cfg.entity_name, names, read_facts(self.folder))
+            self.terms = ServoModel(
+                env.sim, self._entity, cfg.entity_name, names, read_facts(self.folder)
+            )
             hold_friction(env.sim, cfg.entity_name, self.folder)
 
         def restart(self, qpos: Tensor, command: Tensor) -> None:
@@ -226,7 +262,9 @@ def mjlab_action(folder: str | Path, payload_mass: float | None = None, check: b
 
         def apply_actions(self) -> None:
             super().apply_actions()
-            self.terms.before(self._processed_actions - self._entity.data.encoder_bias[:, self._target_ids])
+            self.terms.before(
+                self._processed_actions - self._entity.data.encoder_bias[:, self._target_ids]
+            )
 
     class Cfg(JointPositionActionCfg):
         def build(self, env: Any) -> Any:
@@ -242,8 +280,13 @@ def mjlab_entity(folder: str | Path, **options: Any) -> Any:
     from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 
     home = {name: joint["home"] for name, joint in read_facts(folder)["joints"].items()}
-    servos = EntityArticulationInfoCfg(actuators=(XmlActuatorCfg(target_names_expr=(".*",), command_field="position"),))
-    own = {"articulation": servos, "init_state": EntityCfg.InitialStateCfg(joint_pos=home)} | options
+    servos = EntityArticulationInfoCfg(
+        actuators=(XmlActuatorCfg(target_names_expr=(".*",), command_field="position"),)
+    )
+    own = {
+        "articulation": servos,
+        "init_state": EntityCfg.InitialStateCfg(joint_pos=home),
+    } | options
     return EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_file(str(Path(folder) / ROBOT)), **own)
 
 
@@ -257,7 +300,9 @@ def mjlab_options(folder: str | Path) -> tuple[Any, int]:
 
     facts = read_facts(folder)
     fields = {field.name for field in dataclasses.fields(MujocoCfg)}
-    return MujocoCfg(**{k: v for k, v in facts["options"].items() if k in fields}), facts["decimation"]
+    return MujocoCfg(**{k: v for k, v in facts["options"].items() if k in fields}), facts[
+        "decimation"
+    ]
 
 
 def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
@@ -269,7 +314,9 @@ def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
     sim.expand_model_fields(("dof_invweight0",))  # one per world; before, all worlds share one
     for name in facts["joints"]:
         dof = sim.mj_model.joint(f"{entity}/{name}").dofadr[0]
-        sim.model.dof_invweight0[:, dof] = float(sim.mj_model.dof_invweight0[dof]) * facts["dof_invweight0_factor"]
+        sim.model.dof_invweight0[:, dof] = (
+            float(sim.mj_model.dof_invweight0[dof]) * facts["dof_invweight0_factor"]
+        )
 
 
 class DelayBuffers:
@@ -282,16 +329,24 @@ class DelayBuffers:
         self.base, self.source = torch.zeros(size), torch.zeros(size, dtype=torch.long)
         for column, name in enumerate(names):
             servo = model.actuator(f"{entity}/{name}").id
-            start, count = int(model.actuator_historyadr[servo]), int(model.actuator_history[servo, 0])
+            start, count = (
+                int(model.actuator_historyadr[servo]),
+                int(model.actuator_history[servo, 0]),
+            )
             if start < 0 or not count:
                 continue
-            times, values = slice(start + 2, start + 2 + count), slice(start + 2 + count, start + 2 + 2 * count)
+            times, values = (
+                slice(start + 2, start + 2 + count),
+                slice(start + 2 + count, start + 2 + 2 * count),
+            )
             self.mask[start : values.stop] = self.times[times] = self.values[values] = True
             self.base[start + 1] = count - 1  # index of the newest sample; user data come before it
             self.base[times] = -model.opt.timestep * torch.arange(count, 0, -1)
             self.source[values] = column
         self.any = bool(self.mask.any())
-        vars(self).update({k: x.to(sim.device) for k, x in vars(self).items() if isinstance(x, Tensor)})
+        vars(self).update(
+            {k: x.to(sim.device) for k, x in vars(self).items() if isinstance(x, Tensor)}
+        )
 
     def restart(self, fresh: Tensor, command: Tensor) -> None:
         """Fill the buffers of fresh worlds with a command, (num_envs, names) rad."""
@@ -304,30 +359,53 @@ class DelayBuffers:
 class ServoModel:
     """Servo model beyond PD, applied before every physics step of mjlab."""
 
-    def __init__(self, sim: Any, entity: Any, name: str, joints: list[str], facts: dict[str, Any]) -> None:
+    def __init__(
+        self, sim: Any, entity: Any, name: str, joints: list[str], facts: dict[str, Any]
+    ) -> None:
         column = {f: torch.tensor([facts["joints"][j].get(f, 0.0) for j in joints], device=sim.device)
                   for f in ("kp", "offset", "frictionloss", "effort_limit", *SERVO_TERMS)}  # fmt: skip
-        self.sim, self.terms, model = sim, present({f: column[f] for f in SERVO_TERMS}), sim.mj_model
+        self.sim, self.terms, model = (
+            sim,
+            present({f: column[f] for f in SERVO_TERMS}),
+            sim.mj_model,
+        )
         self.joints, self.effort = joints, column["effort_limit"]
-        self.dof = torch.tensor([model.joint(f"{name}/{j}").dofadr[0] for j in joints], device=sim.device)
-        self.at = torch.tensor([model.joint(f"{name}/{j}").qposadr[0] for j in joints], device=sim.device)
-        self.servo = torch.tensor([model.actuator(f"{name}/{j}").id for j in joints], device=sim.device)
-        self.kp, self.frictionloss, self.bias = column["kp"], column["frictionloss"], column["kp"] * column["offset"]
+        self.dof = torch.tensor(
+            [model.joint(f"{name}/{j}").dofadr[0] for j in joints], device=sim.device
+        )
+        self.at = torch.tensor(
+            [model.joint(f"{name}/{j}").qposadr[0] for j in joints], device=sim.device
+        )
+        self.servo = torch.tensor(
+            [model.actuator(f"{name}/{j}").id for j in joints], device=sim.device
+        )
+        self.kp, self.frictionloss, self.bias = (
+            column["kp"],
+            column["frictionloss"],
+            column["kp"] * column["offset"],
+        )
         if not self.terms:
             return
         sim.expand_model_fields(("dof_frictionloss", "actuator_biasprm", "actuator_forcerange"))
         self.torque = torch.zeros(sim.num_envs, len(joints), device=sim.device)
         self.load, update = torch.zeros_like(self.torque), entity.update
 
-        def updated(dt: float) -> None:  # after each physics step, before forward() overwrites these
+        def updated(
+            dt: float,
+        ) -> None:  # after each physics step, before forward() overwrites these
             update(dt)
-            self.torque, self.load = sim.data.actuator_force[:, self.servo], sim.data.qfrc_bias[:, self.dof]
+            self.torque, self.load = (
+                sim.data.actuator_force[:, self.servo],
+                sim.data.qfrc_bias[:, self.dof],
+            )
 
         entity.update = updated
 
     def set_units(self, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]) -> None:
         """Give worlds the numbers of units: field → (len(env_ids), joints). Delays stay as exported."""
-        columns = torch.tensor(columns_of(joints, self.joints, "the action term"), device=env_ids.device)
+        columns = torch.tensor(
+            columns_of(joints, self.joints, "the action term"), device=env_ids.device
+        )
         write_model(self.sim.model, env_ids, self.dof[columns], self.servo[columns], units)
         at = env_ids[:, None]
 
@@ -376,23 +454,36 @@ class DelayedAction:
         steps = self.delay / me._env.physics_dt
         age = torch.arange(int(torch.ceil(steps.max() - 1e-5)) + 1, device=me.device)[:, None, None]
         if len(age) > 1 and getattr(me._env, "_physics_handles_decimation", False):
-            raise ValueError("servos are late by parts of a control period: cfg.sim.use_newton_actuators = False")
+            raise ValueError(
+                "servos are late by parts of a control period: cfg.sim.use_newton_actuators = False"
+            )
         self.weights = (1 - (age - steps).abs()).clamp(min=0)
-        past = getattr(self, "commands", torch.zeros(1, me.num_envs, self.delay.shape[1], device=me.device))
+        past = getattr(
+            self, "commands", torch.zeros(1, me.num_envs, self.delay.shape[1], device=me.device)
+        )
         self.commands = past[age[:, 0, 0].clamp(max=len(past) - 1)]  # newest first
 
     def set_units(self, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]) -> None:
         """Give worlds the delays and offsets of units: field → (len(env_ids), joints)."""
         me: Any = self
-        columns = torch.tensor(columns_of(joints, me._joint_names, "the action term"), device=me.device)
-        delay, me.servo_offset = (x.expand(me.num_envs, -1).clone() for x in (self.delay, me.servo_offset))
-        delay[env_ids[:, None], columns], me.servo_offset[env_ids[:, None], columns] = units["delay"], units["offset"]
+        columns = torch.tensor(
+            columns_of(joints, me._joint_names, "the action term"), device=me.device
+        )
+        delay, me.servo_offset = (
+            x.expand(me.num_envs, -1).clone() for x in (self.delay, me.servo_offset)
+        )
+        delay[env_ids[:, None], columns], me.servo_offset[env_ids[:, None], columns] = (
+            units["delay"],
+            units["offset"],
+        )
         self.set_delays(delay)
 
     def restart(self, qpos: Tensor, command: Tensor) -> None:
         """Fill the buffers of fresh worlds with a command, (num_envs, joints) rad."""
         me: Any = self
-        self.commands = torch.where(me.aligner.past.fresh[:, None], command + me.servo_offset, self.commands)
+        self.commands = torch.where(
+            me.aligner.past.fresh[:, None], command + me.servo_offset, self.commands
+        )
 
     def apply_actions(self) -> None:
         me: Any = self
@@ -403,10 +494,17 @@ class DelayedAction:
         me._processed_actions = newest
 
 
-def isaaclab_action(folder: str | Path, payload_mass: float | None = None, check: bool = True, **options: Any) -> Any:
+def isaaclab_action(
+    folder: str | Path, payload_mass: float | None = None, check: bool = True, **options: Any
+) -> Any:
     """Return a JointPositionActionCfg that aligns; `check` refuses a network trained with a servo model."""
     here: Any = sys.modules[__name__]
-    own = {"class_type": here.IsaacLabTerm, "folder": str(folder), "payload_mass": payload_mass, "check": check}
+    own = {
+        "class_type": here.IsaacLabTerm,
+        "folder": str(folder),
+        "payload_mass": payload_mass,
+        "check": check,
+    }
     return here.IsaacLabActionCfg(**{"use_default_offset": False} | own | options)
 
 
@@ -439,7 +537,13 @@ def _isaaclab_term() -> Any:
                 raise ValueError(
                     f"{cfg.folder}: trained with a servo model ({law}), which Isaac Lab lacks; or give check=False"
                 )
-            self.align(self._asset, self._joint_ids, self._joint_names, offset=1.0, form=_isaaclab_form(facts))
+            self.align(
+                self._asset,
+                self._joint_ids,
+                self._joint_names,
+                offset=1.0,
+                form=_isaaclab_form(facts),
+            )
             servos = facts[_isaaclab_form(facts)]
             self.set_delays([[servos[name]["delay"] for name in self._joint_names]])
 

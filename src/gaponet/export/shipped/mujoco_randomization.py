@@ -25,7 +25,11 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
     """
     form = "plain_units" if "plain_units" in drawn else "units"
     for i, name in enumerate(drawn["joints"]):
-        unit = {field: float(values[row][i]) for field, values in drawn[form].items() if field != "links"}
+        unit = {
+            field: float(values[row][i])
+            for field, values in drawn[form].items()
+            if field != "links"
+        }
         joint = model.joint(name)
         dof, kp, limit = joint.dofadr[0], unit["kp"], unit["effort_limit"]
         model.dof_damping[dof], model.dof_frictionloss[dof] = unit["damping"], unit["frictionloss"]
@@ -38,7 +42,9 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
                 if model.actuator_forcelimited[servo]:
                     model.actuator_forcerange[servo] = -limit, limit
                 if samples := int(model.actuator_history[servo, 0]):
-                    model.actuator_delay[servo] = min(unit["delay"], (samples - 2) * model.opt.timestep)
+                    model.actuator_delay[servo] = min(
+                        unit["delay"], (samples - 2) * model.opt.timestep
+                    )
     set_links(model, drawn, row, form)
 
 
@@ -58,5 +64,9 @@ def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[s
     """
     joints = {name: dict(servo) for name, servo in facts["joints"].items()}
     for i, name in enumerate(drawn["joints"]):
-        joints[name] |= {field: float(values[row][i]) for field, values in drawn["units"].items() if field != "links"}
+        joints[name] |= {
+            field: float(values[row][i])
+            for field, values in drawn["units"].items()
+            if field != "links"
+        }
     return facts | {"joints": joints}

@@ -39,22 +39,37 @@ class Servos:
         import mujoco
 
         joints = facts["joints"]
-        numbers = [f for f, value in next(iter(joints.values())).items() if isinstance(value, int | float)]
+        numbers = [
+            f for f, value in next(iter(joints.values())).items() if isinstance(value, int | float)
+        ]
         column = {f: np.array([j.get(f, 0.0) for j in joints.values()]) for f in numbers}
         self.model = model
         self.dof, self.qpos, self.servo = addresses(model, list(joints), prefix)
         self.kp, self.frictionloss = column["kp"], column["frictionloss"]
         self._motor, self._play_time = (column["armature"], column["damping"], column["kd"]), np.nan
         self.bias, self.effort = self.kp * column["offset"], column["effort_limit"]
-        model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = column["armature"], column["damping"]
-        model.actuator_gainprm[self.servo, 0], model.actuator_biasprm[self.servo, 0] = self.kp, self.bias
-        model.actuator_biasprm[self.servo, 1], model.actuator_biasprm[self.servo, 2] = -self.kp, -column["kd"]
+        model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = (
+            column["armature"],
+            column["damping"],
+        )
+        model.actuator_gainprm[self.servo, 0], model.actuator_biasprm[self.servo, 0] = (
+            self.kp,
+            self.bias,
+        )
+        model.actuator_biasprm[self.servo, 1], model.actuator_biasprm[self.servo, 2] = (
+            -self.kp,
+            -column["kd"],
+        )
         model.dof_frictionloss[self.dof] = self.frictionloss
-        model.qpos0[self.qpos] += np.array([facts["plain"][name]["zero"] for name in joints]) - column["zero"]
+        model.qpos0[self.qpos] += (
+            np.array([facts["plain"][name]["zero"] for name in joints]) - column["zero"]
+        )
         if model.nhistory:
             model.actuator_delay[self.servo] = column["delay"]
         mujoco.mj_setConst(model, mujoco.MjData(model))
-        model.dof_invweight0[self.dof] *= facts["dof_invweight0_factor"]  # stiff friction, which no MJCF can express
+        model.dof_invweight0[self.dof] *= facts[
+            "dof_invweight0_factor"
+        ]  # stiff friction, which no MJCF can express
         self.terms = present({name: column[name] for name in SERVO_TERMS if name in column})
 
     def before(self, data: Any) -> None:
@@ -70,14 +85,18 @@ class Servos:
             model.actuator_forcerange[self.servo] = np.stack(limits, axis=-1)
         if "encoder_step" in self.terms or "min_torque" in self.terms:
             ctrl = data.ctrl[self.servo]
-            bias = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q) - self.kp * (ctrl - q)
+            bias = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q) - self.kp * (
+                ctrl - q
+            )
         if "backlash" in self.terms:
             h = model.opt.timestep
             if data.time != self._play_time:  # a new state
                 self.play = Play(self.terms["backlash"], *self._motor, load, qvel)
             else:
                 self.play.after(qvel, torque, data.qfrc_constraint[self.dof], h)
-            limit, armature, damping, applied, gear, more = self.play.before(limit, self.kp, q, qvel, h)
+            limit, armature, damping, applied, gear, more = self.play.before(
+                limit, self.kp, q, qvel, h
+            )
             model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = armature, damping
             data.qfrc_applied[self.dof], model.actuator_gear[self.servo, 0] = applied, gear
             bias, self._play_time = bias + more, data.time + h
@@ -101,7 +120,9 @@ def fill_delays(model: Any, data: Any) -> None:
             mujoco.mj_initCtrlHistory(model, data, i, None, np.full(samples, data.ctrl[i]))
 
 
-def play(model: Any, facts: dict[str, Any], motion: Motion, prefix: str = "", form: str = "joints") -> Any:
+def play(
+    model: Any, facts: dict[str, Any], motion: Motion, prefix: str = "", form: str = "joints"
+) -> Any:
     """Play a motion in plain MuJoCo from its first state, as if its first command had always been in force.
 
     Args:
@@ -184,7 +205,9 @@ class Check:
             self.ctrl[row:, world] = motion["ctrl"][-1]
             self.ctrl[row : row + len(motion["ctrl"]) - 1, world] = motion["ctrl"][:-1]
 
-    def run(self, start: Callable[[dict[int, Motion], Any], None], step: Callable[[Any], Any]) -> Any:
+    def run(
+        self, start: Callable[[dict[int, Motion], Any], None], step: Callable[[Any], Any]
+    ) -> Any:
         """Play all motions; return positions after each period, (T, worlds, n) rad.
 
         Args:
@@ -206,7 +229,10 @@ class Check:
             form: Form of the robot that was played, a key of error_mrad in facts.json.
         """
         places = zip(self._places, self.motions, strict=True)
-        paths = [np.asarray(path)[row : row + len(motion["qpos"]) - 1, world] for (row, world), motion in places]
+        paths = [
+            np.asarray(path)[row : row + len(motion["qpos"]) - 1, world]
+            for (row, world), motion in places
+        ]
         self.report_motions(f"{engine}, {self.worlds} worlds", paths, form)
 
     def report_motions(self, engine: str, paths: list[Any], form: str = "plain") -> None:

@@ -63,7 +63,11 @@ def _differs(what: str, now: Any, wanted: Any) -> list[str]:
 
 def joint_fields(model: Any, name: str) -> dict[str, Any]:
     """Return the fields of an MjModel for a joint and the servo of that name; three of each of a servo's parameters."""
-    row = {"jnt": model.joint(name).id, "dof": model.joint(name).dofadr[0], "actuator": model.actuator(name).id}
+    row = {
+        "jnt": model.joint(name).id,
+        "dof": model.joint(name).dofadr[0],
+        "actuator": model.actuator(name).id,
+    }
     values = {field: getattr(model, field)[row[field.split("_")[0]]] for field in FIELDS}
     return {field: (x[:3] if field.endswith("prm") else x).tolist() for field, x in values.items()}
 
@@ -74,8 +78,15 @@ def solver_options(model: Any) -> dict[str, Any]:
 
     values = {name: getattr(model.opt, name) for name in OPTIONS}
     options = {name: x.tolist() if hasattr(x, "tolist") else x for name, x in values.items()}
-    for name, kind in (("integrator", "Integrator"), ("cone", "Cone"), ("jacobian", "Jacobian"), ("solver", "Solver")):
-        options[name] = getattr(mujoco, f"mjt{kind}")(getattr(model.opt, name)).name.split("_", 1)[1].lower()
+    for name, kind in (
+        ("integrator", "Integrator"),
+        ("cone", "Cone"),
+        ("jacobian", "Jacobian"),
+        ("solver", "Solver"),
+    ):
+        options[name] = (
+            getattr(mujoco, f"mjt{kind}")(getattr(model.opt, name)).name.split("_", 1)[1].lower()
+        )
     for name, kind in (("disableflags", "Disable"), ("enableflags", "Enable")):
         bits = getattr(mujoco, f"mjt{kind}Bit").__members__.items()
         flags = {key.split("BL_")[1].lower(): bit.value for key, bit in bits if "BL_" in key}

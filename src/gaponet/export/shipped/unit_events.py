@@ -32,10 +32,14 @@ Units = dict[str, Tensor]  # field → (worlds, joints), SI units
 def read_units(file: str | Path, form: str) -> tuple[list[str], Units]:
     """Return joints and all units, (units, joints). A robot without a servo model has one form of them."""
     drawn = json.loads(Path(file).read_text(encoding="utf-8"))
-    return drawn["joints"], {field: torch.tensor(x) for field, x in drawn.get(form, drawn["units"]).items()}
+    return drawn["joints"], {
+        field: torch.tensor(x) for field, x in drawn.get(form, drawn["units"]).items()
+    }
 
 
-def draw_units(file: str | Path, form: str, env: Any, env_ids: Any, rows: Any) -> tuple[Tensor, list[str], Units]:
+def draw_units(
+    file: str | Path, form: str, env: Any, env_ids: Any, rows: Any
+) -> tuple[Tensor, list[str], Units]:
     """Draw a unit for each of the worlds `env_ids` (indices, a slice; None for all).
 
     Args:
@@ -47,7 +51,11 @@ def draw_units(file: str | Path, form: str, env: Any, env_ids: Any, rows: Any) -
     """
     joints, units = read_units(file, form)
     ids = torch.arange(env.num_envs, device=env.device)[slice(None) if env_ids is None else env_ids]
-    row = torch.randint(len(units["kp"]), (len(ids),)) if rows is None else torch.as_tensor(rows)[ids.cpu()]
+    row = (
+        torch.randint(len(units["kp"]), (len(ids),))
+        if rows is None
+        else torch.as_tensor(rows)[ids.cpu()]
+    )
     return ids, joints, {field: x[row].to(env.device) for field, x in units.items()}
 
 
@@ -78,9 +86,16 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
     def use_units(env: Any, env_ids: Any) -> None:
         action = env.action_manager.get_term(term)
         servos = getattr(action, "terms", None)
-        ids, joints, units = draw_units(file, "units" if servos else "plain_units", env, env_ids, rows)
+        ids, joints, units = draw_units(
+            file, "units" if servos else "plain_units", env, env_ids, rows
+        )
         if bodies:
-            write_links(env.sim, ids, [f"{action.cfg.entity_name}/{name}" for name in bodies], units["links"])
+            write_links(
+                env.sim,
+                ids,
+                [f"{action.cfg.entity_name}/{name}" for name in bodies],
+                units["links"],
+            )
         if servos:
             return servos.set_units(ids, joints, units)
         model, joints = env.sim.mj_model, [f"{action.cfg.entity_name}/{name}" for name in joints]
@@ -97,18 +112,27 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
 def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: Units) -> None:
     """Write units to a model of mjlab, at the addresses of the joints."""
     at, kp, limit = env_ids[:, None], units["kp"], units["effort_limit"]
-    model.dof_armature[at, dof], model.dof_frictionloss[at, dof] = units["armature"], units["frictionloss"]
+    model.dof_armature[at, dof], model.dof_frictionloss[at, dof] = (
+        units["armature"],
+        units["frictionloss"],
+    )
     damping = model.dof_damping  # MuJoCo's versions differ in whether it has powers of the speed
     damping[(at, dof, 0) if damping.ndim == 3 else (at, dof)] = units["damping"]
     model.actuator_gainprm[at, servo, 0] = kp
-    model.actuator_biasprm[at, servo, 0], model.actuator_biasprm[at, servo, 1] = kp * units["offset"], -kp
+    model.actuator_biasprm[at, servo, 0], model.actuator_biasprm[at, servo, 1] = (
+        kp * units["offset"],
+        -kp,
+    )
     model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
 
 
 def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> None:
     """Write mass, centre of mass and inertia of bodies to a model of mjlab, (worlds, bodies, 11)."""
     model, parents = sim.model, sim.mj_model.body_parentid.tolist()
-    at = env_ids[:, None], torch.tensor([sim.mj_model.body(name).id for name in bodies], device=links.device)
+    at = (
+        env_ids[:, None],
+        torch.tensor([sim.mj_model.body(name).id for name in bodies], device=links.device),
+    )
     model.body_mass[at], model.body_ipos[at] = links[..., 0], links[..., 1:4]
     model.body_inertia[at], model.body_iquat[at] = links[..., 4:7], links[..., 7:]
     total = model.body_mass[env_ids].clone()
@@ -121,7 +145,12 @@ def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> 
 
 
 def apply_units(
-    env: Any, env_ids: Any, asset_cfg: Any, file: str, term: str | None = "joint_pos", rows: Any = None
+    env: Any,
+    env_ids: Any,
+    asset_cfg: Any,
+    file: str,
+    term: str | None = "joint_pos",
+    rows: Any = None,
 ) -> None:
     """Event term of Isaac Lab 2.3 and 3. Of the servo model units have torque-speed lines; kd stays.
 
@@ -139,7 +168,9 @@ def apply_units(
     columns = columns_of(joints, robot.joint_names, "joints of the articulation")
     groups = {joint: group for group in robot.actuators.values() if not hasattr(group, "network")
               for joint in getattr(group, "joint_names", ())}  # fmt: skip
-    columns_of(joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)")
+    columns_of(
+        joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)"
+    )
     if "no_load_speed" in units:
         _speed_lines(robot, joints, groups, units, ids)
     if term is None:
@@ -147,18 +178,26 @@ def apply_units(
     elif hasattr(action := env.action_manager.get_term(term), "set_units"):
         action.set_units(ids, joints, units)
     else:
-        raise ValueError(f"action term '{term}' has no delays and offsets; use isaaclab_action, or term=None")
+        raise ValueError(
+            f"action term '{term}' has no delays and offsets; use isaaclab_action, or term=None"
+        )
     _write(robot, "armature", columns, ids, units["armature"])
-    both = any(name.startswith("write_joint_dynamic_friction") for name in dir(robot))  # PhysX, where rest ≥ motion
+    both = any(
+        name.startswith("write_joint_dynamic_friction") for name in dir(robot)
+    )  # PhysX, where rest ≥ motion
     friction = units["frictionloss"], units["frictionloss"] if both else None, units["damping"]
     _write(robot, "friction_coefficient", columns, ids, *friction)
-    implicit = [i for i, joint in enumerate(joints) if getattr(groups[joint], "is_implicit_model", False)]
+    implicit = [
+        i for i, joint in enumerate(joints) if getattr(groups[joint], "is_implicit_model", False)
+    ]
     for what, field in (("stiffness", "kp"), ("effort_limit", "effort_limit")):
         for i, joint in enumerate(joints):  # simulations have gains of implicit actuators only
             group = groups[joint]
             values = getattr(group, f"actuator_{what}", None)  # Isaac Lab 3 renamed the limit
             values = getattr(group, what) if values is None else values
-            getattr(values, "torch", values)[ids, list(group.joint_names).index(joint)] = units[field][:, i]
+            getattr(values, "torch", values)[ids, list(group.joint_names).index(joint)] = units[
+                field
+            ][:, i]
         if implicit:
             _write(robot, what, [columns[i] for i in implicit], ids, units[field][:, implicit])
 
@@ -167,13 +206,19 @@ def _write(robot: Any, what: str, columns: list[int], ids: Tensor, *values: Tens
     """Call a writer of Isaac Lab 3 or 2, whose first parameters are the values, (worlds, joints)."""
     names = f"write_joint_{what}_to_sim_index", f"write_joint_{what}_to_sim"
     write = getattr(robot, names[0], getattr(robot, names[1], None))
-    places = [] if write is None else [name for name in inspect.signature(write).parameters if name[-4:] != "_ids"]
+    places = (
+        []
+        if write is None
+        else [name for name in inspect.signature(write).parameters if name[-4:] != "_ids"]
+    )
     if write is None or len(places) < len(values):
         raise ValueError(f"{names[1]} is missing or lacks parameters: take Isaac Lab 2.3 or 3")
     write(**dict(zip(places, values, strict=False)), joint_ids=columns, env_ids=ids)
 
 
-def _speed_lines(robot: Any, joints: list[str], groups: dict[str, Any], units: Units, ids: Tensor) -> None:
+def _speed_lines(
+    robot: Any, joints: list[str], groups: dict[str, Any], units: Units, ids: Tensor
+) -> None:
     """Set the torque-speed lines of DCMotors: torque at rest, and the speed without torque. A speed of 0 is no line.
 
     Isaac Lab 3 computes the groups of a class as one, by an actuator of its own.
@@ -181,11 +226,20 @@ def _speed_lines(robot: Any, joints: list[str], groups: dict[str, Any], units: U
     together = [batch.actuator for batch in getattr(robot.actuators, "_execution_batches", ())]
     for i, joint in enumerate(joints):
         limit, speed = units["effort_limit"][:, i], units["no_load_speed"][:, i]
-        motors = [m for m in (groups[joint], *together) if joint in m.joint_names and hasattr(m, "_saturation_effort")]
+        motors = [
+            m
+            for m in (groups[joint], *together)
+            if joint in m.joint_names and hasattr(m, "_saturation_effort")
+        ]
         if not motors and (speed > 0).any():
-            raise ValueError(f"joint '{joint}' needs a torque-speed line: take isaaclab_actuators, or a DCMotorCfg")
+            raise ValueError(
+                f"joint '{joint}' needs a torque-speed line: take isaaclab_actuators, or a DCMotorCfg"
+            )
         for motor in motors:
-            column, top = list(motor.joint_names).index(joint), getattr(motor, "actuator_velocity_limit", None)
+            column, top = (
+                list(motor.joint_names).index(joint),
+                getattr(motor, "actuator_velocity_limit", None),
+            )
             top = motor.velocity_limit if top is None else top
             top = getattr(top, "torch", top)
             motor._saturation_effort = (
@@ -202,9 +256,13 @@ def _delay(joints: list[str], groups: dict[str, Any], steps: Tensor, ids: Tensor
     for joint, lag in zip(joints, steps.round().int().T, strict=True):
         group = groups[joint]
         if (lags.setdefault(id(group), lag) != lag).any():
-            raise ValueError(f"joint '{joint}' needs a delay of its own: make an actuator group for each joint")
+            raise ValueError(
+                f"joint '{joint}' needs a delay of its own: make an actuator group for each joint"
+            )
         buffers = [getattr(group, name) for name in DELAY_BUFFERS if hasattr(group, name)]
         if lag.any() and not buffers:
-            raise ValueError(f"joint '{joint}' needs a delay: take DelayedPDActuatorCfg, or isaaclab_action")
+            raise ValueError(
+                f"joint '{joint}' needs a delay: take DelayedPDActuatorCfg, or isaaclab_action"
+            )
         for buffer in buffers:
             buffer.set_time_lag(lag, ids)

@@ -47,10 +47,16 @@ def require_consent(
     descriptor = require_terminal(option)
     import termios  # not on Windows
 
-    termios.tcflush(descriptor, termios.TCIFLUSH)  # an answer typed before the question was shown answers nothing
-    sys.stderr.write(f"{escape(statement)} {question} Type '{word}' to start; anything else leaves: ")
+    termios.tcflush(
+        descriptor, termios.TCIFLUSH
+    )  # an answer typed before the question was shown answers nothing
+    sys.stderr.write(
+        f"{escape(statement)} {question} Type '{word}' to start; anything else leaves: "
+    )
     sys.stderr.flush()
-    line = os.read(descriptor, 1024).decode(errors="replace")  # not sys.stdin, which may hold earlier bytes
+    line = os.read(descriptor, 1024).decode(
+        errors="replace"
+    )  # not sys.stdin, which may hold earlier bytes
     if not line.endswith("\n"):  # end of file, also behind a word
         sys.stderr.write("\n")
     elif line.strip().lower() == word:

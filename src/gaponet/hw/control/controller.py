@@ -17,19 +17,36 @@ from gaponet.hw.control.clock import Clock, MonotonicClock, no_garbage_collectio
 from gaponet.hw.control.driver import Driver, DriverError, Fault, State
 from gaponet.hw.control.following import FollowingMonitor
 from gaponet.hw.control.output import Context, Output
-from gaponet.hw.control.phases import COMMANDING, ENDED, MOVING, TRANSITION_TABLE, Action, ControlConfig, Phase, Trigger
+from gaponet.hw.control.phases import (
+    COMMANDING,
+    ENDED,
+    MOVING,
+    TRANSITION_TABLE,
+    Action,
+    ControlConfig,
+    Phase,
+    Trigger,
+)
 from gaponet.hw.control.plan import Plan, Planner, TargetCompensator
 from gaponet.hw.control.publisher import sole_publisher
 from gaponet.hw.control.recording import Event, Recording
 from gaponet.hw.control.rows import Row
-from gaponet.hw.control.safety import DISOBEDIENCE_FAULTS, EXTERNAL_FAULTS, Limits, SafetyConfig, StateMonitor
+from gaponet.hw.control.safety import (
+    DISOBEDIENCE_FAULTS,
+    EXTERNAL_FAULTS,
+    Limits,
+    SafetyConfig,
+    StateMonitor,
+)
 from gaponet.hw.control.stop import StopKeys, StopRequest, stop_on_signals
 from gaponet.hw.control.target import PhaseChange, Readiness, TargetGenerator
 from gaponet.hw.control.watchdog import Watchdog
 from gaponet.hw.targets.policy import Policy, motion_policy
 from gaponet.robot.spec import RobotSpec
 
-WATCHDOG_PERIODS = 5.0  # control periods without a heartbeat after which the watchdog damps the robot
+WATCHDOG_PERIODS = (
+    5.0  # control periods without a heartbeat after which the watchdog damps the robot
+)
 
 
 class Controller:
@@ -72,7 +89,11 @@ class Controller:
             folder: Folder in which the recording is written period by period; default a temporary file.
             metadata: Saved with the recording (unit id, model …).
         """
-        self.driver, self.clock, self.config = driver, clock or MonotonicClock(), config or ControlConfig()
+        self.driver, self.clock, self.config = (
+            driver,
+            clock or MonotonicClock(),
+            config or ControlConfig(),
+        )
         self.dt, safety = 1.0 / self.config.rate, safety or SafetyConfig()
         if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():
             planner = Planner(robot, driver.commanded, self.config, safety)
@@ -85,13 +106,24 @@ class Controller:
             robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
             meta=(metadata or {}) | {"payload_mass": payload_mass},
         )  # fmt: skip
-        self.monitor = StateMonitor(driver.joint_names, self.context.joints, self.dt, safety, driver.noisy)
+        self.monitor = StateMonitor(
+            driver.joint_names, self.context.joints, self.dt, safety, driver.noisy
+        )
         self.following = FollowingMonitor(self.context)
         self.output = Output(self.context, self.monitor)
         self.readiness = Readiness(self.context, self.output)
         self._targets: TargetGenerator | None = None
-        self._folder, self._use_watchdog, self._on_event, self._on_connect = folder, watchdog, on_event, on_connect
-        self._k, self._now, self._phase_start = 0, 0.0, 0  # this period, its start in s, first period of the phase
+        self._folder, self._use_watchdog, self._on_event, self._on_connect = (
+            folder,
+            watchdog,
+            on_event,
+            on_connect,
+        )
+        self._k, self._now, self._phase_start = (
+            0,
+            0.0,
+            0,
+        )  # this period, its start in s, first period of the phase
         self._state: State | None = None  # last one
         self._error: BaseException | None = None  # of other code; raised when the robot is damped
         self._reported_full_disk = False
@@ -126,7 +158,9 @@ class Controller:
             raise UsageError("a controller runs once; make a new one")
         driver, output = self.driver, self.output
         with ExitStack() as stack:
-            stack.enter_context(no_garbage_collection())  # exited last: during one no heartbeat is sent
+            stack.enter_context(
+                no_garbage_collection()
+            )  # exited last: during one no heartbeat is sent
             lock = stack.enter_context(sole_publisher(driver.address))
             stack.callback(lambda: driver.close(hold=output.damping_since is None))
             driver.connect()
@@ -134,19 +168,27 @@ class Controller:
             output.limits = output.servo_limits()
             self._on_connect(driver)
             stack.enter_context(stop_on_signals(self.stop))
-            pressed = stack.enter_context(StopKeys(self.stop)) if keys else None  # counts from the consent on
-            gains = {name: getattr(driver, name)[self.context.joints].tolist() for name in ("kp", "kd")}
+            pressed = (
+                stack.enter_context(StopKeys(self.stop)) if keys else None
+            )  # counts from the consent on
+            gains = {
+                name: getattr(driver, name)[self.context.joints].tolist() for name in ("kp", "kd")
+            }
             self.recording.meta |= gains | driver.facts
             if self._folder:
                 self.recording.write_to(self._folder)
             stack.callback(self.recording.rows.close)
             if self._use_watchdog and (spec := driver.watchdog()) is not None:
-                watchdog = output.watchdog = Watchdog(spec, lock, WATCHDOG_PERIODS * self.dt, self.config.damp)
+                watchdog = output.watchdog = Watchdog(
+                    spec, lock, WATCHDOG_PERIODS * self.dt, self.config.damp
+                )
                 stack.callback(lambda: watchdog.release(output.unconfirmed))
                 watchdog.wait_ready()
             if policy is None:
                 if self.plan is None or self.plan.motion is None:
-                    raise UsageError("there is nothing to play: give a policy, or a plan with a motion")
+                    raise UsageError(
+                        "there is nothing to play: give a policy, or a plan with a motion"
+                    )
                 policy = motion_policy(self.plan.motion, self.dt)
             self._loop(policy, pressed)
             self._verify()
@@ -155,7 +197,10 @@ class Controller:
         return self.recording
 
     def _loop(self, policy: Policy, keys: StopKeys | None) -> None:
-        start, due = self.clock.now(), 0  # due: the period after the last one; _k: the next one that is possible
+        start, due = (
+            self.clock.now(),
+            0,
+        )  # due: the period after the last one; _k: the next one that is possible
         self._now = self.readiness.since = start
         self._fire(Trigger.CONSENT, "waiting for fresh states")
         for remark in self.driver.facts.get("remarks", ()):
@@ -171,7 +216,9 @@ class Controller:
                 self.stop(problem)
             self.recording.late.append(self._now - self.output.due)
             self._period(policy)
-            lost = int((self.clock.now() - start) / self.dt) - self._k  # whole periods by which this one ran over
+            lost = (
+                int((self.clock.now() - start) / self.dt) - self._k
+            )  # whole periods by which this one ran over
             self.recording.missed += max(lost - 1, 0)
             self._k, due = self._k + max(1, lost), self._k + 1
 
@@ -209,7 +256,9 @@ class Controller:
         except (DriverError, OSError) as error:
             fault = Fault("driver", str(error))
         if state:
-            ctrl = None if self.recording.disobedience else self.output.ctrl  # while it is let go no joint must follow
+            ctrl = (
+                None if self.recording.disobedience else self.output.ctrl
+            )  # while it is let go no joint must follow
             fault = self.monitor.check(self._now, state, ctrl, self._now - self.output.due)
             if self.phase in MOVING:
                 fault = fault or self.following.check(state, self.output)
@@ -251,7 +300,9 @@ class Controller:
         left = self.output.damping_left(self._now)
         try:
             self.output.damp(left)
-        except Exception as error:  # of any kind: damp again in the next period, raise it at the end
+        except (
+            Exception
+        ) as error:  # of any kind: damp again in the next period, raise it at the end
             if not isinstance(error, DriverError | OSError):
                 self._error = self._error or error
             if not any(e.text == str(error) for e in self.recording.events):
@@ -270,7 +321,9 @@ class Controller:
         if fault:
             self._note(fault.text, fault.kind, self.clock.now())
         elif self.following.share and not self.following.shown.any():
-            self.recording.disobedience = "no joint was told to go far enough to show whether the robot obeys"
+            self.recording.disobedience = (
+                "no joint was told to go far enough to show whether the robot obeys"
+            )
             self._note(f"no data: {self.recording.disobedience}", now=self.clock.now())
 
     def _fail(self, fault: Fault) -> None:
@@ -279,7 +332,10 @@ class Controller:
         if output.weight is None:
             trigger, text = Trigger.FAULT_BEFORE_COMMAND, f"{text}; nothing was commanded"
         elif output.watchdog and output.watchdog.fired():
-            trigger, text = Trigger.FAULT_AFTER_WATCHDOG, f"{text}; the watchdog has damped the robot"
+            trigger, text = (
+                Trigger.FAULT_AFTER_WATCHDOG,
+                f"{text}; the watchdog has damped the robot",
+            )
         elif fault.kind == "obedience" and self.driver.at_end == "hand_over":
             trigger = Trigger.NOT_FOLLOWING
         self._fire(trigger, text, fault.kind)
@@ -308,6 +364,8 @@ class Controller:
         self.recording.events.append(event)
         try:
             self._on_event(event)
-        except Exception as error:  # the caller's code may raise anything: damp, raise it at the end
+        except (
+            Exception
+        ) as error:  # the caller's code may raise anything: damp, raise it at the end
             self._error = self._error or error
             self.stop(f"its listener failed: {error}")

@@ -33,8 +33,8 @@ class FollowingMonitor:
         self._reference: Array | None = None
         # Ends of the reference's current stride and the joint's position at them; span of the reference without a
         # followed stride.
-        self._low, self._high, self._qpos_low, self._qpos_high, self._span_low, self._span_high = np.zeros(
-            (6, len(self.shown))
+        self._low, self._high, self._qpos_low, self._qpos_high, self._span_low, self._span_high = (
+            np.zeros((6, len(self.shown)))
         )
         self._state_time = -np.inf
 
@@ -51,13 +51,23 @@ class FollowingMonitor:
         command, qpos = output.expected(), state.qpos[joints]
         if self._reference is None:
             self._reference = command.copy()
-            self._low, self._high, self._span_low, self._span_high = (command.copy() for _ in range(4))
+            self._low, self._high, self._span_low, self._span_high = (
+                command.copy() for _ in range(4)
+            )
             self._qpos_low, self._qpos_high = qpos.copy(), qpos.copy()
-        reference = self._reference + (command - self._reference) * min(1.0, self.context.dt / REFERENCE_LAG_S)
+        reference = self._reference + (command - self._reference) * min(
+            1.0, self.context.dt / REFERENCE_LAG_S
+        )
         self._reference = reference
         lower, higher = reference < self._low, reference > self._high
-        self._low, self._qpos_low = np.where(lower, reference, self._low), np.where(lower, qpos, self._qpos_low)
-        self._high, self._qpos_high = np.where(higher, reference, self._high), np.where(higher, qpos, self._qpos_high)
+        self._low, self._qpos_low = (
+            np.where(lower, reference, self._low),
+            np.where(lower, qpos, self._qpos_low),
+        )
+        self._high, self._qpos_high = (
+            np.where(higher, reference, self._high),
+            np.where(higher, qpos, self._qpos_high),
+        )
         up, down = reference - self._low >= STRIDE_RAD, self._high - reference >= STRIDE_RAD
         distance = np.where(up, qpos - self._qpos_low, self._qpos_high - qpos)
         done = up | down
@@ -79,5 +89,10 @@ class FollowingMonitor:
 
     def fault(self, joint: int) -> Fault:
         """Return the fault of a joint that does not follow."""
-        name, causes = self.context.driver.commanded[joint], "in a mode that ignores commands, or to another joint's"
-        return Fault("obedience", f"{name} does not follow: blocked, limp or not listening ({causes})")
+        name, causes = (
+            self.context.driver.commanded[joint],
+            "in a mode that ignores commands, or to another joint's",
+        )
+        return Fault(
+            "obedience", f"{name} does not follow: blocked, limp or not listening ({causes})"
+        )

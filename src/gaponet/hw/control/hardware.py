@@ -21,13 +21,20 @@ from gaponet.sim.model import build_model, model_hash
 from gaponet.sysid.axes import MAX_ARMATURE_TIME_S
 
 ROBOT_OF_DRIVER = {"unitree": "h1_2", "so101": "so101"}
-MAX_OFFSET_RAD = 0.1  # of an identified command offset; a larger one is a wrong zero, which calibration removes
+MAX_OFFSET_RAD = (
+    0.1  # of an identified command offset; a larger one is a wrong zero, which calibration removes
+)
 KP_RATIO_BOUNDS = (0.25, 4.0)  # of identified kp to nominal kp
-MAX_WEIGHT_SHARE, POSTURES = 0.5, 64  # of the effort limit, for identified masses; postures in which they are compared
+MAX_WEIGHT_SHARE, POSTURES = (
+    0.5,
+    64,
+)  # of the effort limit, for identified masses; postures in which they are compared
 RELATIVE_TOLERANCE = 1e-6  # between values of two files
 MAX_KP = 300.0  # N·m/rad of any joint; the H1-2's legs have 200
 MAX_KD = 10.0  # N·m·s/rad
-MAX_BEYOND_RANGE_RAD = 0.051  # of a command: a joint may start 0.05 rad outside its range, and is commanded there
+MAX_BEYOND_RANGE_RAD = (
+    0.051  # of a command: a joint may start 0.05 rad outside its range, and is commanded there
+)
 
 
 def reference_robot(driver: str, limits_from: str | None) -> RobotSpec:
@@ -74,9 +81,16 @@ def _require_equal(robot: RobotSpec, reference: RobotSpec) -> None:
     use = f"Use a folder made from {reference.folder}, or --limits-from FOLDER with a folder whose values you have read"
     if robot.joint_names != reference.joint_names:
         raise RobotError(f"{robot.folder}: its joints are not those of {reference.folder}. {use}")
-    for name, unit in (("kp", "N·m/rad"), ("kd", "N·m·s/rad"), ("effort_limit", "N·m"), ("qpos_range", "rad")):
+    for name, unit in (
+        ("kp", "N·m/rad"),
+        ("kd", "N·m·s/rad"),
+        ("effort_limit", "N·m"),
+        ("qpos_range", "rad"),
+    ):
         theirs, ours = getattr(robot, name), getattr(reference, name)
-        differ = ~np.isclose(theirs, ours, rtol=RELATIVE_TOLERANCE, atol=1e-9).reshape(len(ours), -1).all(axis=1)
+        differ = ~np.isclose(theirs, ours, rtol=RELATIVE_TOLERANCE, atol=1e-9).reshape(
+            len(ours), -1
+        ).all(axis=1)
         if differ.any():
             i = int(differ.argmax())
             raise RobotError(
@@ -84,9 +98,13 @@ def _require_equal(robot: RobotSpec, reference: RobotSpec) -> None:
                 f"has {_text(ours[i])} ({reference.folder}). {use}"
             )
     if read_shapes(robot.folder) != read_shapes(reference.folder):
-        raise RobotError(f"{robot.folder}: collision.toml differs from that of {reference.folder}. {use}")
+        raise RobotError(
+            f"{robot.folder}: collision.toml differs from that of {reference.folder}. {use}"
+        )
     if model_hash(robot) != model_hash(reference):
-        raise RobotError(f"{robot.folder}: inertias or geometry of robot.xml differ from {reference.folder}. {use}")
+        raise RobotError(
+            f"{robot.folder}: inertias or geometry of robot.xml differ from {reference.folder}. {use}"
+        )
 
 
 def _text(value: Array | float) -> str:
@@ -100,15 +118,22 @@ def require_plausible(robot: RobotSpec) -> None:
         RobotError: With the folder, the joint and the bounds.
     """
     nominal = robot.before_identification
-    bounds = {"kp": np.outer(KP_RATIO_BOUNDS, nominal.kp), "armature": np.outer((0, MAX_ARMATURE_TIME_S**2), robot.kp)}
-    bounds |= dict.fromkeys(("offset", "zero"), np.outer((-MAX_OFFSET_RAD, MAX_OFFSET_RAD), np.ones(len(robot.kp))))
+    bounds = {
+        "kp": np.outer(KP_RATIO_BOUNDS, nominal.kp),
+        "armature": np.outer((0, MAX_ARMATURE_TIME_S**2), robot.kp),
+    }
+    bounds |= dict.fromkeys(
+        ("offset", "zero"), np.outer((-MAX_OFFSET_RAD, MAX_OFFSET_RAD), np.ones(len(robot.kp)))
+    )
     for name, field in SERVO_FIELDS.items():
         if field.bounds and field.axis in ("value", "over kp") and name not in bounds:
             scale = robot.kp if field.axis == "over kp" else np.ones(len(robot.kp))
             bounds[name] = np.outer(field.bounds[:2], scale)
     for name, (low, high) in bounds.items():
         values, field = getattr(robot, name), SERVO_FIELDS[name]
-        beyond = ~((values >= low) & (values <= high) | np.isnan(values))  # NaN: the MJCF's; other fields have none
+        beyond = ~(
+            (values >= low) & (values <= high) | np.isnan(values)
+        )  # NaN: the MJCF's; other fields have none
         if beyond.any():
             i = int(beyond.argmax())
             raise RobotError(
@@ -123,7 +148,9 @@ def _require_light(robot: RobotSpec, nominal: RobotSpec) -> None:
     """Refuse identified masses whose weight changes a joint's torque by more than a share of its effort limit."""
     low, high = np.clip(nominal.qpos_range.T, -np.pi, np.pi)
     postures = np.random.default_rng(0).uniform(low, high, (POSTURES, len(robot.kp)))
-    with_mass, without = (static_torque(build_model(replace(r, table=None)), postures) for r in (robot, nominal))
+    with_mass, without = (
+        static_torque(build_model(replace(r, table=None)), postures) for r in (robot, nominal)
+    )
     share = np.abs(with_mass - without).max(axis=0) / nominal.effort_limit
     if not share.max() <= MAX_WEIGHT_SHARE:
         joint = robot.joint_names[int(share.argmax())]

@@ -17,7 +17,9 @@ from gaponet.robot.spec import RobotSpec
 
 MAX_BEYOND_RANGE_RAD = 0.05  # at the start, where only the MJCF says where a joint's range ends
 MAX_SEND_DELAY_S = 0.001  # between the last reading of the clock and the sending of a command
-MAX_SUSPENDED_S = 0.05  # less than any suspend, more than two clocks that are read in turn differ by
+MAX_SUSPENDED_S = (
+    0.05  # less than any suspend, more than two clocks that are read in turn differ by
+)
 
 
 @dataclass(frozen=True)
@@ -71,14 +73,19 @@ class Output:
         """Return the limits with gains and ranges of the driver's servos."""
         driver = self.context.driver
         gains = (driver.kp, driver.kd)
-        return Limits.from_robot(self.context.robot, driver.commanded, self.context.safety, gains, driver.qpos_range)
+        return Limits.from_robot(
+            self.context.robot, driver.commanded, self.context.safety, gains, driver.qpos_range
+        )
 
     def suspended(self) -> Fault | None:
         """Return a fault if the computer was suspended: time stood still for this process, not for the robot."""
         duration = self.context.clock.suspended() - self.suspended_before
         if duration <= MAX_SUSPENDED_S:
             return None
-        return Fault("suspend", f"the computer was suspended for {duration:.1f} s; keep it awake while a robot moves")
+        return Fault(
+            "suspend",
+            f"the computer was suspended for {duration:.1f} s; keep it awake while a robot moves",
+        )
 
     def admit(self, qpos: Array) -> Fault | None:
         """Widen the limits to the measured position, (n) rad, so that it can be the first command; or refuse it."""
@@ -87,7 +94,10 @@ class Output:
         # Servos that know their own range cut goals beyond it.
         tolerance = MAX_BEYOND_RANGE_RAD if driver.qpos_range is None else MAX_START_DRIFT_RAD
         ends = ranges if driver.qpos_range is None else driver.qpos_range[joints]
-        low, high = np.minimum(ranges, ends)[:, 0] - tolerance, np.maximum(ranges, ends)[:, 1] + tolerance
+        low, high = (
+            np.minimum(ranges, ends)[:, 0] - tolerance,
+            np.maximum(ranges, ends)[:, 1] + tolerance,
+        )
         beyond = np.maximum(low - at, at - high)
         if beyond.max() > 0:
             i = int(beyond.argmax())
@@ -96,7 +106,9 @@ class Output:
                 f"{driver.commanded[i]} was found at {at[i]:.2f} rad, beyond its range of {low[i]:.2f} to "
                 f"{high[i]:.2f}; bring it there by hand, or calibrate",
             )
-        self.limits = replace(self.limits, low=np.minimum(self.limits.low, at), high=np.maximum(self.limits.high, at))
+        self.limits = replace(
+            self.limits, low=np.minimum(self.limits.low, at), high=np.maximum(self.limits.high, at)
+        )
         return None
 
     def begin(self, qpos: Array) -> None:
@@ -132,20 +144,25 @@ class Output:
         context, joints, before, last_look = self.context, self.context.joints, self.ctrl, -np.inf
         q, v = state.qpos[joints], state.qvel[joints]
         assert before is not None
-        if self.watchdog and not self.watchdog.beat(weight):  # before the command, so that it guards the first one too
+        if self.watchdog and not self.watchdog.beat(
+            weight
+        ):  # before the command, so that it guards the first one too
             return Fault("stop", "the watchdog ended")
         while (now := context.clock.now()) - last_look > MAX_SEND_DELAY_S:
             last_look = now
             fault = self.monitor.overrun(now - self.due) or self.suspended()
             if fault or (self.watchdog and self.watchdog.fired()):
                 return fault or Fault("overrun", "this process stood still")
-            out = limit_command(ctrl, before, q, v, context.dt, self.limits, now + MAX_SEND_DELAY_S - state.time)
+            out = limit_command(
+                ctrl, before, q, v, context.dt, self.limits, now + MAX_SEND_DELAY_S - state.time
+            )
         if not out.feasible.all():
             joint = context.driver.commanded[int(np.argmin(out.feasible))]
             if limit_command(ctrl, before, q, v, context.dt, self.limits).feasible.all():
                 age = f"{(now - state.time) * 1e3:.0f} ms"
                 return Fault(
-                    "stale", f"the newest state is {age} old; no command is safe wherever {joint} can be by now"
+                    "stale",
+                    f"the newest state is {age} old; no command is safe wherever {joint} can be by now",
                 )
             return Fault("torque", f"{joint}: no command is within range, rate and torque")
         self.ctrl, self.weight, full = out.ctrl, weight, state.qpos_with(joints, out.ctrl)

@@ -24,7 +24,9 @@ class Phase(StrEnum):
 class Trigger(Enum):
     """Event of the state machine, with its meaning."""
 
-    CONSENT = "the robot has answered, and `on_connect` (which shows the plan and asks) did not refuse"
+    CONSENT = (
+        "the robot has answered, and `on_connect` (which shows the plan and asks) did not refuse"
+    )
     READY = "five good states in a row, a first target, a clear way to it"
     ARRIVED = "at the first target and settled; weight 1"
     RETURN = "the motion is over, and the robot is to go back"
@@ -36,14 +38,18 @@ class Trigger(Enum):
     NOT_FOLLOWING = "a joint does not follow its commands, on rt/arm_sdk"
     FAULT = "any other fault, key, signal or call, after the first command"
     FAULT_BEFORE_COMMAND = "any fault, key, signal or call, before the first command"
-    FAULT_AFTER_WATCHDOG = "any fault, key, signal or call, after the watchdog began to damp the robot"
+    FAULT_AFTER_WATCHDOG = (
+        "any fault, key, signal or call, after the watchdog began to damp the robot"
+    )
 
 
 class Action(Enum):
     """Action of a controller in a transition and until the next one."""
 
     READ = "read states; send nothing"
-    BLEND_IN = "send positions, from the measured one to the first target; weight 0 → 1 on rt/arm_sdk"
+    BLEND_IN = (
+        "send positions, from the measured one to the first target; weight 0 → 1 on rt/arm_sdk"
+    )
     PLAY = "send the positions of the motion, corrected where a model is given"
     GO_BACK = "send positions, back to where the robot was at the start"
     RELEASE = "send the last position; weight 1 → 0"
@@ -60,7 +66,12 @@ MOVING = (Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT)
 COMMANDING = (*MOVING, Phase.RELEASE)
 ENDED = (Phase.DAMP, Phase.STOPPED)
 _WAITING = (Phase.CONNECT, Phase.IDLE)
-_FAULTS = (Trigger.FAULT, Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG, Trigger.NOT_FOLLOWING)
+_FAULTS = (
+    Trigger.FAULT,
+    Trigger.FAULT_BEFORE_COMMAND,
+    Trigger.FAULT_AFTER_WATCHDOG,
+    Trigger.NOT_FOLLOWING,
+)
 
 # Phases, triggers, next phase (None: the same one), action. Earlier rows take precedence.
 TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, Action], ...] = (
@@ -75,7 +86,12 @@ TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, A
     (MOVING, (Trigger.NOT_FOLLOWING,), Phase.RELEASE, Action.RELEASE_HERE),
     ((Phase.RELEASE,), (Trigger.NOT_FOLLOWING,), Phase.DAMP, Action.DAMP),
     (COMMANDING, (Trigger.FAULT,), Phase.DAMP, Action.DAMP),
-    (COMMANDING, (Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG), Phase.STOPPED, Action.SEND_NOTHING),
+    (
+        COMMANDING,
+        (Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG),
+        Phase.STOPPED,
+        Action.SEND_NOTHING,
+    ),
     (_WAITING, _FAULTS, Phase.STOPPED, Action.SEND_NOTHING),
     ((Phase.DAMP,), (Trigger.DAMPED,), Phase.STOPPED, Action.CONFIRM),
     (ENDED, tuple(Trigger), None, Action.IGNORE),

@@ -29,17 +29,25 @@ _T = TypeVar("_T")
 
 MAX_START_DRIFT_RAD = 0.02  # by which the robot may have moved since the plan was made
 MAX_APPROACH_M = 0.001  # by which shells that start nearer than the clearance may come nearer
-MAX_START_OVERLAP_M = 0.03  # of shells at the start: they are generous, and an arm rests on its table
+MAX_START_OVERLAP_M = (
+    0.03  # of shells at the start: they are generous, and an arm rests on its table
+)
 NO_MOVEMENT = 1e-3  # rad, or m of free space
-APPROACH_TIME_S = 0.1  # time constant with which a live target may use up the free space beyond the clearance
+APPROACH_TIME_S = (
+    0.1  # time constant with which a live target may use up the free space beyond the clearance
+)
 BACK_APPROACH_TIME_S = 1e-6  # the same on the way back, which is slow
 MAX_SAG_M = 0.05  # of the measured robot below its command that is added to the clearance
 STEP_SHARES = (1.0, 0.5, 0.2)  # of a step towards a live target that are tried
 MIN_SEARCH_PERIOD_S = 0.005  # shorter control periods have no time for going around
-COMMAND_CLEARANCE_SHARE = 0.5  # of the clearance that commands keep: they lead the joints by what these sag
+COMMAND_CLEARANCE_SHARE = (
+    0.5  # of the clearance that commands keep: they lead the joints by what these sag
+)
 GRADIENT_STEP_RAD = 1e-4  # of numerical gradients of the free space
 GOAL_SHARES = 41  # places on the straight line to a first live target that are tried as its goal
-MAX_TORQUE_EXCESS = 1.1  # of a plan's torque over the usable one, or over that of the start if this is larger
+MAX_TORQUE_EXCESS = (
+    1.1  # of a plan's torque over the usable one, or over that of the start if this is larger
+)
 
 
 class TargetCompensator(Protocol):
@@ -131,17 +139,23 @@ class Planner:
         """
         robot = self.robot
         named = tuple(name for name in motion.named(robot) if name in self.commanded)
-        wanted = Motion(motion.name, motion.level, motion.dt, motion.ctrl, named).held_at(start, robot)
+        wanted = Motion(motion.name, motion.level, motion.dt, motion.ctrl, named).held_at(
+            start, robot
+        )
         required = self._required_clearance(start)
         first, here = self.collision.along(wanted.ctrl[:1]), self.collision.along(start[None])
         need = np.where(np.abs(first - here) < NO_MOVEMENT, required, self.collision.clearance)
         if (first < np.minimum(need, 0.0)).any():
-            raise UsageError(f"motion '{motion.name}' begins with {self._describe(first)}. Begin it elsewhere")
+            raise UsageError(
+                f"motion '{motion.name}' begins with {self._describe(first)}. Begin it elsewhere"
+            )
         fitted = self._limit_acceleration(self.limits.fit(wanted, need=need))
         columns = robot.index(named)
         place = "where the robot is (bring it nearer by hand, or name more joints)"
         to_motion = f"to the motion's begin from {place}"
-        approach = finish_search(self._find_path(start, fitted.ctrl[0], columns, required, to_motion))
+        approach = finish_search(
+            self._find_path(start, fitted.ctrl[0], columns, required, to_motion)
+        )
         path = self._find_path(fitted.ctrl[-1], start, columns, required, f"back to {place}")
         retreat = finish_search(path) if self.config.blend_out else None
         plan = Plan(start, approach, fitted, retreat, changed=_describe_changes(wanted, fitted))
@@ -161,13 +175,17 @@ class Planner:
         free = self.collision.along(goal[None])
         if (free < np.minimum(required, 0.0)).any():
             raise UsageError(f"the first target brings {self._describe(free)}")
-        shares = np.linspace(1.0, 0.0, GOAL_SHARES)[:, None]  # a goal within the clearance is not gone to entirely
+        shares = np.linspace(1.0, 0.0, GOAL_SHARES)[
+            :, None
+        ]  # a goal within the clearance is not gone to entirely
         clear = (self.collision.distances(start + shares * (goal - start)) >= required).all(axis=1)
         goal = start + float(shares[int(clear.argmax()), 0]) * (goal - start)
         approach = yield from self._find_path(start, goal, moved, required, "to the first target")
         return self._check(Plan(start, approach), required)
 
-    def judge_commands(self, plan: Plan, compensator: TargetCompensator, masses: tuple[float, ...]) -> Plan:
+    def judge_commands(
+        self, plan: Plan, compensator: TargetCompensator, masses: tuple[float, ...]
+    ) -> Plan:
         """Return the plan with its largest correction and the clearance of the commands, for all `masses` (kg).
 
         The compensator is causal and is run without measured states. Its feedback is not included: that adds at most
@@ -179,7 +197,10 @@ class Planner:
         config, at = self.safety, self.robot.index(self.commanded)
         limits, dt = Limits.from_robot(self.robot, self.commanded, config), 1.0 / self.config.rate
         targets = plan.sample(dt)
-        floor = self._required_clearance(plan.start) - COMMAND_CLEARANCE_SHARE * self.collision.clearance
+        floor = (
+            self._required_clearance(plan.start)
+            - COMMAND_CLEARANCE_SHARE * self.collision.clearance
+        )
         correction, joint, least = 0.0, "", np.inf
         for mass in masses:
             compensator.reset(plan.start, mass)
@@ -188,7 +209,9 @@ class Planner:
                 wanted = compensator.step(target, None)[at]
                 if not np.isfinite(wanted).all():
                     joint = self.commanded[int(np.argmax(~np.isfinite(wanted)))]
-                    raise UsageError(f"compensation commands no number to {joint}; check the identified values")
+                    raise UsageError(
+                        f"compensation commands no number to {joint}; check the identified values"
+                    )
                 delta = limit_delta(wanted - target[at], delta, dt, limits)
                 commands[k, at] = np.clip(target[at] + delta, limits.low, limits.high)
             free = self.collision.along(commands)
@@ -210,7 +233,9 @@ class Planner:
         most = np.abs(np.diff(rows, 2, axis=0)).max(initial=0.0) * self.config.rate**2
         if most <= self.safety.acceleration:
             return motion
-        return replace(motion, ctrl=stretch(motion.ctrl, 1.02 * np.sqrt(most / self.safety.acceleration)))
+        return replace(
+            motion, ctrl=stretch(motion.ctrl, 1.02 * np.sqrt(most / self.safety.acceleration))
+        )
 
     def _required_clearance(self, start: Array) -> Array:
         """Return the free space (pairs + shells,) m that a robot must keep which starts in a posture."""
@@ -224,8 +249,14 @@ class Planner:
 
     def _describe(self, free: Array) -> str:
         at = float(free.min())
-        near = f"{100 * at:.1f} cm from each other" if at > 0 else f"{-100 * at:.1f} cm into each other"
-        return f"{self.collision.nearest(free)} {near}; {100 * self.collision.clearance:g} cm are kept"
+        near = (
+            f"{100 * at:.1f} cm from each other"
+            if at > 0
+            else f"{-100 * at:.1f} cm into each other"
+        )
+        return (
+            f"{self.collision.nearest(free)} {near}; {100 * self.collision.clearance:g} cm are kept"
+        )
 
     def back(self, end: Array, start: Array) -> Search[Trajectory]:
         """Search the path from where live targets ended back to the start, both (n,) rad, step by step.
@@ -233,34 +264,51 @@ class Planner:
         Raises:
             UsageError: No path keeps clear.
         """
-        required = np.minimum(self._required_clearance(start), self.collision.along(end[None]) - 1e-9)
-        return self._find_path(end, start, self.robot.index(self.commanded), required, "back to where it was found")
+        required = np.minimum(
+            self._required_clearance(start), self.collision.along(end[None]) - 1e-9
+        )
+        return self._find_path(
+            end, start, self.robot.index(self.commanded), required, "back to where it was found"
+        )
 
-    def _find_path(self, start: Array, goal: Array, columns: Array, required: Array, label: str) -> Search[Trajectory]:
+    def _find_path(
+        self, start: Array, goal: Array, columns: Array, required: Array, label: str
+    ) -> Search[Trajectory]:
         """Search a path from a posture (n,) rad to another by moving these joints."""
         low, high = start.copy(), start.copy()
         low[columns], high[columns] = self.limits.low[columns], self.limits.high[columns]
         home = np.clip(self.robot.qpos_home, low, high)
-        heavy = [np.abs(static_torque(m, np.stack([start, goal]))).max(axis=0) for m in self.limits.models]
+        heavy = [
+            np.abs(static_torque(m, np.stack([start, goal]))).max(axis=0)
+            for m in self.limits.models
+        ]
         most = np.maximum(self.limits.limit * MAX_STATIC_SHARE, np.max(heavy, axis=0) + 1e-6)
 
         def free(rows: Array) -> bool:
             if (self.collision.distances(rows) < required).any():
                 return False
-            return all((np.abs(static_torque(m, rows[::4])) <= most).all() for m in self.limits.models)
+            return all(
+                (np.abs(static_torque(m, rows[::4])) <= most).all() for m in self.limits.models
+            )
 
         points = yield from find_points(free, start, goal, low, high, home)
         if points is None:
             straight = self.collision.along(np.linspace(start, goal, 200))
-            raise UsageError(f"no clear way was found {label}: the straight one brings {self._describe(straight)}")
-        return Trajectory.minimum_jerk(points, self.config.blend_speed, self.safety.acceleration, self.config.blend)
+            raise UsageError(
+                f"no clear way was found {label}: the straight one brings {self._describe(straight)}"
+            )
+        return Trajectory.minimum_jerk(
+            points, self.config.blend_speed, self.safety.acceleration, self.config.blend
+        )
 
     def _check(self, plan: Plan, required: Array) -> Plan:
         """Check the whole plan again, however it was made; return it with its clearance and torque."""
         rows = plan.rows
         free = self.collision.along(rows)
         if (free < required).any():
-            raise UsageError(f"the plan brings {self._describe(np.where(free < required, free, np.inf))}")
+            raise UsageError(
+                f"the plan brings {self._describe(np.where(free < required, free, np.inf))}"
+            )
         demand = self.limits.demand(rows, GRID)
         here = self.limits.demand(np.stack([plan.start] * 2), GRID)
         if demand.torque > MAX_TORQUE_EXCESS * max(1.0, here.torque):
@@ -270,7 +318,13 @@ class Planner:
             )
         nearest = self.collision.nearest(free) if len(free) else ""
         clearance = float(free.min(initial=np.inf))
-        return replace(plan, clearance=clearance, nearest=nearest, torque=demand.torque, joint=demand.worst_joint)
+        return replace(
+            plan,
+            clearance=clearance,
+            nearest=nearest,
+            torque=demand.torque,
+            joint=demand.worst_joint,
+        )
 
 
 def advance(search: Search[_T], clock: Clock, seconds: float) -> _T | None:
@@ -306,7 +360,10 @@ class CollisionGuard:
         self.qpos, self.obstacle = np.array(qpos, float), ""
         # Free space now and at the start, to be kept, and its reduction by sagging, (pairs + shells,) m.
         self._free = self._start_free = self.collision.along(self.qpos[None])
-        self._keep, self._sag = np.full_like(self._free, self.collision.clearance), np.zeros_like(self._free)
+        self._keep, self._sag = (
+            np.full_like(self._free, self.collision.clearance),
+            np.zeros_like(self._free),
+        )
         self._cut, self._approach_time, self._max_sag = False, APPROACH_TIME_S, MAX_SAG_M
 
     def allow_start_clearance(self) -> None:
@@ -326,7 +383,10 @@ class CollisionGuard:
         speed = self.config.blend_speed if self._cut else self.safety.speed
         move = np.clip(target - self.qpos, -speed * dt, speed * dt)
         if self._try(move, STEP_SHARES[:1], dt):
-            self.obstacle, self._cut = "", self._cut and bool(np.abs(target - self.qpos).max() > speed * dt)
+            self.obstacle, self._cut = (
+                "",
+                self._cut and bool(np.abs(target - self.qpos).max() > speed * dt),
+            )
             return self.qpos
         self._cut = True
         free = self.collision.along((self.qpos + move)[None])
@@ -355,7 +415,9 @@ class CollisionGuard:
         """Return the step (n,) rad without its parts towards the obstacles, each in turn."""
         floor, moved = self._floor(dt), np.flatnonzero(move)
         rows = self.qpos + GRADIENT_STEP_RAD * np.eye(len(move))[moved]
-        slope = (self.collision.distances(rows) - self._free) / GRADIENT_STEP_RAD  # (moved, pairs + shells)
+        slope = (
+            self.collision.distances(rows) - self._free
+        ) / GRADIENT_STEP_RAD  # (moved, pairs + shells)
         step = move[moved]
         for _ in range(3):
             short = floor - self._free - step @ slope

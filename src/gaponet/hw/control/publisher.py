@@ -30,7 +30,9 @@ def sole_publisher(address: str) -> Iterator[int]:
     try:
         descriptor = lock_file(path, _open_lock)
     except OSError as error:
-        raise UsageError(f"{address}: its lock {path} cannot be opened ({error.strerror}); ask its owner") from None
+        raise UsageError(
+            f"{address}: its lock {path} cannot be opened ({error.strerror}); ask its owner"
+        ) from None
     if descriptor is None:
         raise UsageError(f"{address}: another process commands this robot ({path}); stop it first")
     try:

@@ -88,9 +88,13 @@ class Recording:
             LogError: The robot did not obey; the phase has fewer than two periods; or the disk was full.
         """
         if self.disobedience:
-            raise LogError(f"{source}: no data, the robot did not do what it was told: {self.disobedience}")
+            raise LogError(
+                f"{source}: no data, the robot did not do what it was told: {self.disobedience}"
+            )
         if self.rows.error:
-            raise LogError(f"{source}: not whole, {self.rows.error.strerror}; make room and record again")
+            raise LogError(
+                f"{source}: not whole, {self.rows.error.strerror}; make room and record again"
+            )
         return self._log(source)
 
     def _log(self, source: str) -> Log:
@@ -98,7 +102,9 @@ class Recording:
         if len(rows) < 2:
             last = self.events[-1] if self.events else None
             why = f"; it ended with: {last.text}" if last else ""
-            raise LogError(f"{source}: {len(rows)} periods of phase 'run', nothing to learn from{why}")
+            raise LogError(
+                f"{source}: {len(rows)} periods of phase 'run', nothing to learn from{why}"
+            )
         at = [self.joint_names.index(name) for name in self.commanded]
         time, values = np.array(rows["time"]), {"ctrl": rows["ctrl"][:, at]}
         for name in READINGS:
@@ -147,8 +153,16 @@ class Recording:
         import pyarrow.parquet as pq
 
         with lock_folder(folder, FOLDER_KIND):
-            taken = {file.name.removesuffix(end) for end in (".json", ROWS_SUFFIX) for file in folder.glob(f"*{end}")}
-            name = next(n for k in itertools.count(1) if (n := f"{name}-{k}" if k > 1 else name) not in taken)
+            taken = {
+                file.name.removesuffix(end)
+                for end in (".json", ROWS_SUFFIX)
+                for file in folder.glob(f"*{end}")
+            }
+            name = next(
+                n
+                for k in itertools.count(1)
+                if (n := f"{name}-{k}" if k > 1 else name) not in taken
+            )
             self.rows.save(folder / f"{name}{ROWS_SUFFIX}")
             path = folder / f"{name}.parquet"
             try:
@@ -156,11 +170,19 @@ class Recording:
                     log = self._log(str(path))
                     columns = {"time": log.channels["ctrl"].time}
                     for channel, (_, values) in log.channels.items():
-                        columns |= {f"{channel}.{j}": values[:, i] for i, j in enumerate(log.joint_names)}
-                    table = pa.table(columns, metadata={NOT_OBEYED: self.disobedience} if self.disobedience else None)
+                        columns |= {
+                            f"{channel}.{j}": values[:, i] for i, j in enumerate(log.joint_names)
+                        }
+                    table = pa.table(
+                        columns,
+                        metadata={NOT_OBEYED: self.disobedience} if self.disobedience else None,
+                    )
                     with atomic_write(path) as temporary:
                         pq.write_table(table, temporary)
-                write_text(folder / f"{name}.json", json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n")
+                write_text(
+                    folder / f"{name}.json",
+                    json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n",
+                )
             except OSError as error:
                 explanation = f"{error.strerror or error}; all periods that were written are in {name}{ROWS_SUFFIX}"
                 raise OSError(error.errno, explanation, error.filename) from error

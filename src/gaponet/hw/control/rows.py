@@ -47,11 +47,23 @@ class Rows:
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
         n = len(joint_names)
-        scalars = [("time", "<f8"), ("state_time", "<f8"), ("tilt", "<f8"), ("refused", "<i8"), ("phase", "<U9")]
+        scalars = [
+            ("time", "<f8"),
+            ("state_time", "<f8"),
+            ("tilt", "<f8"),
+            ("refused", "<i8"),
+            ("phase", "<U9"),
+        ]
         vectors = ("target", "ctrl", *READINGS)
         self._dtype = np.dtype([*scalars, *((name, "<f8", (n,)) for name in vectors)])
-        self._columns = scalars + [(f"{name}.{joint}", "<f8") for name in vectors for joint in joint_names]
-        self._chunk, self._count, self._absent = np.empty(CHUNK_ROWS, self._dtype), 0, np.full(n, np.nan)
+        self._columns = scalars + [
+            (f"{name}.{joint}", "<f8") for name in vectors for joint in joint_names
+        ]
+        self._chunk, self._count, self._absent = (
+            np.empty(CHUNK_ROWS, self._dtype),
+            0,
+            np.full(n, np.nan),
+        )
         self._file: IO[bytes] | None = None
         self.path: Path | None = None
         self.error: OSError | None = None
@@ -127,10 +139,17 @@ class Rows:
 
     def __getitem__(self, index: Any) -> Any:
         records = self.table()[index]
-        return [self._row(record) for record in records] if isinstance(index, slice) else self._row(records)
+        return (
+            [self._row(record) for record in records]
+            if isinstance(index, slice)
+            else self._row(records)
+        )
 
     def _row(self, record: Any) -> Row:
-        target, ctrl = (None if np.isnan(record[name]).all() else np.array(record[name]) for name in ("target", "ctrl"))
+        target, ctrl = (
+            None if np.isnan(record[name]).all() else np.array(record[name])
+            for name in ("target", "ctrl")
+        )
         qpos, qvel, tau, temperature = (np.array(record[name]) for name in READINGS)
         refused, tilt = int(record["refused"]), float(record["tilt"])
         state = State(float(record["state_time"]), qpos, qvel, tau, temperature, refused, tilt)
@@ -158,7 +177,9 @@ class Rows:
             except OSError as error:
                 self.error = error
             self._written += done // size
-            with suppress(OSError):  # overwrites, which works on a full disk unless its file system copies
+            with suppress(
+                OSError
+            ):  # overwrites, which works on a full disk unless its file system copies
                 os.pwrite(descriptor, self._header(self._written), 0)
             self._pending.task_done()
         self._pending.task_done()

@@ -26,12 +26,22 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Fault, State
 from gaponet.robot.spec import RobotSpec
 
-RELATIVE_ROUNDING = 1e-9  # of a bound: kept free, so that rounding does not exceed a limit that is computed back
-MIN_STILL_STATES = 4  # new states in which one joint must read the same; at a turn two may by chance
+RELATIVE_ROUNDING = (
+    1e-9  # of a bound: kept free, so that rounding does not exceed a limit that is computed back
+)
+MIN_STILL_STATES = (
+    4  # new states in which one joint must read the same; at a turn two may by chance
+)
 CHECKSUM_WINDOW_S = 1.0  # in which wrong checksums are counted
 # More is degrees, milliseconds or Fahrenheit, and would switch the check off.
-MAX_OPTIONS = dict.fromkeys(("delta", "frozen_travel", "frozen_joint", "tilt", "tracking"), (np.pi, "up to π rad"))
-MAX_OPTIONS |= {"tracking_time": (60, "up to 60 s"), "temperature": (150, "up to 150 °C"), "torque_share": (1, "to 1")}
+MAX_OPTIONS = dict.fromkeys(
+    ("delta", "frozen_travel", "frozen_joint", "tilt", "tracking"), (np.pi, "up to π rad")
+)
+MAX_OPTIONS |= {
+    "tracking_time": (60, "up to 60 s"),
+    "temperature": (150, "up to 150 °C"),
+    "torque_share": (1, "to 1"),
+}
 MIN_SPEED_RAD_S = 1e-6  # below it a joint counts as standing still for damping
 
 
@@ -132,11 +142,18 @@ class Limits:
         nominal = robot.nominal or robot
         kp, kd = gains or (nominal.kp, nominal.kd)
         at = robot.index(joints)
-        ranges = np.stack([robot.qpos_range, robot.qpos_range if qpos_range is None else qpos_range])[:, at]
-        low, high = ranges[..., 0].max(axis=0) + config.margin, ranges[..., 1].min(axis=0) - config.margin
+        ranges = np.stack(
+            [robot.qpos_range, robot.qpos_range if qpos_range is None else qpos_range]
+        )[:, at]
+        low, high = (
+            ranges[..., 0].max(axis=0) + config.margin,
+            ranges[..., 1].min(axis=0) - config.margin,
+        )
         if (low > high).any():
             joint = joints[int(np.argmax(low > high))]
-            raise UsageError(f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it smaller")
+            raise UsageError(
+                f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it smaller"
+            )
         full = lambda value: np.full(len(joints), value)  # noqa: E731
         return cls(
             low, high, full(config.speed), config.torque_share * nominal.effort_limit[at], kp[at], kd[at],
@@ -159,12 +176,20 @@ class LimitedCommand(NamedTuple):
 def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Array:
     """Return a correction (..., n) rad bounded in size and rate; NaN becomes the previous correction."""
     step = limits.delta_rate * dt
-    wanted = np.clip(np.where(np.isfinite(delta), delta, previous), previous - step, previous + step)
+    wanted = np.clip(
+        np.where(np.isfinite(delta), delta, previous), previous - step, previous + step
+    )
     return np.clip(wanted, -limits.delta, limits.delta)
 
 
 def limit_command(
-    target: Array, previous: Array, qpos: Array, qvel: Array, dt: float, limits: Limits, age: Array | float = 0.0
+    target: Array,
+    previous: Array,
+    qpos: Array,
+    qvel: Array,
+    dt: float,
+    limits: Limits,
+    age: Array | float = 0.0,
 ) -> LimitedCommand:
     """Return the nearest command to `target` within range, rate and torque, and if there is one.
 
@@ -179,12 +204,18 @@ def limit_command(
     step = limits.speed * dt * (1 - RELATIVE_ROUNDING)
     low, high = np.maximum(limits.low, before - step), np.minimum(limits.high, before + step)
     with np.errstate(divide="ignore", invalid="ignore"):
-        brake, half = limits.kd * qvel / limits.kp, limits.effort * (1 - RELATIVE_ROUNDING) / limits.kp
+        brake, half = (
+            limits.kd * qvel / limits.kp,
+            limits.effort * (1 - RELATIVE_ROUNDING) / limits.kp,
+        )
         # As measured, and where the joint can be by now: it went on and may have accelerated either way.
         spread = limits.acceleration * age * (age / 2 + limits.kd / limits.kp)
         for centre, width in ((qpos + brake, half), (qpos + qvel * age + brake, half - spread)):
             rounding = RELATIVE_ROUNDING * np.abs(centre)
-            low, high = np.maximum(low, centre - width + rounding), np.minimum(high, centre + width - rounding)
+            low, high = (
+                np.maximum(low, centre - width + rounding),
+                np.minimum(high, centre + width - rounding),
+            )
         finite = np.isfinite(target) & np.isfinite(previous) & np.isfinite(qpos) & np.isfinite(qvel)
         feasible = finite & (low <= high)
         ctrl = np.where(feasible, np.minimum(np.maximum(target, low), high), before)
@@ -203,7 +234,18 @@ def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
 EXTERNAL_FAULTS = (
     "stale", "overrun", "suspend", "checksum", "target", "silence", "driver", "obedience", "error", "stop",
 )  # fmt: skip
-FAULT_KINDS = (*EXTERNAL_FAULTS, "frozen", "nan", "jump", "temperature", "tracking", "torque", "plan", "robot", "tilt")
+FAULT_KINDS = (
+    *EXTERNAL_FAULTS,
+    "frozen",
+    "nan",
+    "jump",
+    "temperature",
+    "tracking",
+    "torque",
+    "plan",
+    "robot",
+    "tilt",
+)
 DISOBEDIENCE_FAULTS = ("obedience", "frozen", "jump", "tracking")
 
 
@@ -211,7 +253,12 @@ class StateMonitor:
     """Checks successive states; it returns the first fault of each and remembers none."""
 
     def __init__(
-        self, joint_names: tuple[str, ...], commanded: Array, dt: float, config: SafetyConfig, noisy: bool = True
+        self,
+        joint_names: tuple[str, ...],
+        commanded: Array,
+        dt: float,
+        config: SafetyConfig,
+        noisy: bool = True,
     ) -> None:
         """
         Args:
@@ -219,17 +266,28 @@ class StateMonitor:
             dt: Control period, s.
             noisy: Equal readings count as frozen at once; else only after the command has moved by frozen_travel.
         """
-        self.names, self.commanded, self.dt, self.config, self.noisy = joint_names, commanded, dt, config, noisy
+        self.names, self.commanded, self.dt, self.config, self.noisy = (
+            joint_names,
+            commanded,
+            dt,
+            config,
+            noisy,
+        )
         self._last: State | None = None
         self._last_ctrl: Array | None = None
-        self._equal_states, self._travel = 0, np.zeros(len(commanded))  # of all readings; rad of commands meanwhile
+        self._equal_states, self._travel = (
+            0,
+            np.zeros(len(commanded)),
+        )  # of all readings; rad of commands meanwhile
         # Of joints whose position stands still: the command then, the integral of the velocity since, states since.
         self._anchor: Array | None = None
         self._integral, self._still_states = np.zeros(len(commanded)), np.zeros(len(commanded), int)
         self._tracking_s = 0.0  # for which a joint has been far from its command
         self._refused: list[tuple[float, int]] = []  # time, s, and messages refused until then
 
-    def check(self, now: float, state: State, ctrl: Array | None, late: float = 0.0) -> Fault | None:
+    def check(
+        self, now: float, state: State, ctrl: Array | None, late: float = 0.0
+    ) -> Fault | None:
         """Return the first fault at the start of a control period.
 
         Args:
@@ -257,13 +315,19 @@ class StateMonitor:
     def overrun(self, late: float) -> Fault | None:
         """Return a fault if a period that was due `late` s ago may not send its command any more."""
         if late > self.config.overrun * self.dt:
-            return Fault("overrun", f"the period was {late * 1e3:.0f} ms late; make the loop lighter or slower")
+            return Fault(
+                "overrun",
+                f"the period was {late * 1e3:.0f} ms late; make the loop lighter or slower",
+            )
         return None
 
     def _stale(self, now: float, state: State) -> Fault | None:
         age = now - state.time
         if age > self.config.stale * self.dt * (1 + RELATIVE_ROUNDING):
-            return Fault("stale", f"the newest state is {age * 1e3:.0f} ms old, {age / self.dt:.1f} control periods")
+            return Fault(
+                "stale",
+                f"the newest state is {age * 1e3:.0f} ms old, {age / self.dt:.1f} control periods",
+            )
         return None
 
     def _finite(self, state: State) -> Fault | None:
@@ -285,20 +349,28 @@ class StateMonitor:
         moved = np.abs(state.qpos - self._last.qpos)
         worst = int(moved.argmax())
         if moved[worst] > self.config.joint_speed * passed + self.config.jump:
-            return Fault("jump", f"{self.names[worst]} moved {moved[worst]:.3f} rad in {passed * 1e3:.0f} ms")
+            return Fault(
+                "jump", f"{self.names[worst]} moved {moved[worst]:.3f} rad in {passed * 1e3:.0f} ms"
+            )
         return None
 
     def _hot(self, state: State) -> Fault | None:
         worst = int(np.nan_to_num(state.temperature, nan=-np.inf).argmax())
         if state.temperature[worst] > self.config.temperature:
-            return Fault("temperature", f"{self.names[worst]} is at {state.temperature[worst]:.0f} °C; let it cool")
+            return Fault(
+                "temperature",
+                f"{self.names[worst]} is at {state.temperature[worst]:.0f} °C; let it cool",
+            )
         return None
 
     def _frozen(self, state: State, ctrl: Array | None) -> Fault | None:
         last = self._last
         if last is None or state.time <= last.time or not self.config.frozen:
             return None
-        if any(not np.array_equal(getattr(state, name), getattr(last, name)) for name in ("qpos", "qvel", "tau")):
+        if any(
+            not np.array_equal(getattr(state, name), getattr(last, name))
+            for name in ("qpos", "qvel", "tau")
+        ):
             self._equal_states, self._travel[:] = 0, 0.0
             return None
         self._equal_states += 1
@@ -329,22 +401,34 @@ class StateMonitor:
             return None
         joint = self.names[int(self.commanded[worst])]
         far = f"{beyond[worst]:.2f} rad"
-        return Fault("frozen", f"the position of {joint} stands still while its command or velocity goes {far}")
+        return Fault(
+            "frozen",
+            f"the position of {joint} stands still while its command or velocity goes {far}",
+        )
 
     def _tracking(self, state: State, ctrl: Array | None) -> Fault | None:
         error = np.zeros(1) if ctrl is None else np.abs(ctrl - state.qpos[self.commanded])
         worst = int(error.argmax())
-        self._tracking_s = self._tracking_s + self.dt if error[worst] > self.config.tracking else 0.0
+        self._tracking_s = (
+            self._tracking_s + self.dt if error[worst] > self.config.tracking else 0.0
+        )
         if self._tracking_s > self.config.tracking_time:
             joint = self.names[int(self.commanded[worst])]
-            return Fault("tracking", f"{joint} is {error[worst]:.2f} rad from its command; is it blocked or unpowered?")
+            return Fault(
+                "tracking",
+                f"{joint} is {error[worst]:.2f} rad from its command; is it blocked or unpowered?",
+            )
         return None
 
     def _checksum(self, now: float, state: State) -> Fault | None:
-        self._refused = [*(r for r in self._refused if now - r[0] <= CHECKSUM_WINDOW_S), (now, state.refused)]
+        self._refused = [
+            *(r for r in self._refused if now - r[0] <= CHECKSUM_WINDOW_S),
+            (now, state.refused),
+        ]
         count = state.refused - self._refused[0][1]
         if count > self.config.refused:
             return Fault(
-                "checksum", f"{count} messages with a wrong checksum within a second; check cable and firmware"
+                "checksum",
+                f"{count} messages with a wrong checksum within a second; check cable and firmware",
             )
         return None

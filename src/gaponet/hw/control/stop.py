@@ -13,7 +13,9 @@ from types import FrameType
 from typing import Any
 
 # By name: Windows has only the first two.
-STOP_SIGNALS = tuple(s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP"))
+STOP_SIGNALS = tuple(
+    s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+)
 
 
 class StopRequest:
@@ -65,7 +67,9 @@ class StopKeys:
             self._settings_before = termios.tcgetattr(self._terminal)
             mode = termios.tcgetattr(self._terminal)
             mode[0] &= ~(termios.IXON | termios.IGNCR)  # input flags
-            mode[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG | termios.IEXTEN)  # local flags
+            mode[3] &= ~(
+                termios.ICANON | termios.ECHO | termios.ISIG | termios.IEXTEN
+            )  # local flags
             mode[6][termios.VMIN], mode[6][termios.VTIME] = 1, 0
             # TCSANOW: keys typed before this count, and output that Ctrl-S holds back is not waited for.
             termios.tcsetattr(self._terminal, termios.TCSANOW, mode)

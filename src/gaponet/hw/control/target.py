@@ -12,7 +12,13 @@ from gaponet.hw.control.driver import Fault, State
 from gaponet.hw.control.following import FollowingMonitor
 from gaponet.hw.control.output import Context, Output
 from gaponet.hw.control.phases import Phase, Trigger
-from gaponet.hw.control.plan import MAX_START_DRIFT_RAD, MIN_SEARCH_PERIOD_S, CollisionGuard, Plan, advance
+from gaponet.hw.control.plan import (
+    MAX_START_DRIFT_RAD,
+    MIN_SEARCH_PERIOD_S,
+    CollisionGuard,
+    Plan,
+    advance,
+)
 from gaponet.hw.targets.policy import NotYet, Policy
 from gaponet.sysid.motion.motion import blend
 from gaponet.sysid.motion.path_planner import Search, Trajectory
@@ -24,8 +30,14 @@ SEARCH_SHARE = 0.3  # of a period in which a search for a clear path is continue
 MAX_UNPROVEN_WEIGHT = 0.3  # until a joint has followed, where one goes …
 FAR_RAD = 0.4  # … this far to the first target: at that weight more than friction may hide
 FULL_WEIGHT = 1.0 - 1e-9
-PAYLOAD_CHECK_S = 2.0  # of the run, after which the estimated payload is compared with the stated one
-END_TEXTS = {"hand_over": "held while it is handed over", "hold": "hold", "damp": "damp"}  # by Driver.at_end
+PAYLOAD_CHECK_S = (
+    2.0  # of the run, after which the estimated payload is compared with the stated one
+)
+END_TEXTS = {
+    "hand_over": "held while it is handed over",
+    "hold": "hold",
+    "damp": "damp",
+}  # by Driver.at_end
 
 
 class Readiness:
@@ -54,7 +66,9 @@ class Readiness:
         if self._good_states < MIN_GOOD_STATES:
             never = Fault(self._fault.kind, f"never ready: {self._fault.text}")
             return never if now - self.since > MAX_WAIT_S else None
-        if compensator and not self._prepared:  # takes longer than a period; then wait for fresh states again
+        if (
+            compensator and not self._prepared
+        ):  # takes longer than a period; then wait for fresh states again
             compensator.reset(state.qpos, self.context.payload_mass)
             self._prepared, self._good_states = True, 0
             return None
@@ -81,12 +95,17 @@ class Readiness:
             if moved.max() <= MAX_START_DRIFT_RAD:
                 return None
             if self.plan.motion is not None:
-                return Fault("plan", f"{joint} moved by {moved.max():.2f} rad since the plan was made; run it again")
+                return Fault(
+                    "plan",
+                    f"{joint} moved by {moved.max():.2f} rad since the plan was made; run it again",
+                )
             self.plan = None
         if self.context.planner is not None:
             self._search = self._search or self.context.planner.begin(first, state.qpos)
             try:
-                self.plan = advance(self._search, self.context.clock, SEARCH_SHARE * self.context.dt)
+                self.plan = advance(
+                    self._search, self.context.clock, SEARCH_SHARE * self.context.dt
+                )
             except UsageError as error:
                 return Fault("plan", str(error))
             if self.plan:
@@ -113,21 +132,34 @@ class TargetGenerator:
     """
 
     def __init__(
-        self, context: Context, following: FollowingMonitor, plan: Plan | None, state: State, first: Array
+        self,
+        context: Context,
+        following: FollowingMonitor,
+        plan: Plan | None,
+        state: State,
+        first: Array,
     ) -> None:
         """Begin where the robot is and go to the first target, (n) rad: by the paths of a plan, or straight."""
         self.context, self.following, self.plan = context, following, plan
         self.start = self._last = self._origin = state.qpos[context.joints]
-        self.path = plan.approach if plan else self._straight(self.start, first[context.joints], state)
+        self.path = (
+            plan.approach if plan else self._straight(self.start, first[context.joints], state)
+        )
         live = context.planner and plan and plan.motion is None
-        self._guard = CollisionGuard(context.planner, state.qpos) if context.planner and live else None
+        self._guard = (
+            CollisionGuard(context.planner, state.qpos) if context.planner and live else None
+        )
         self._search: Search[Trajectory] | None = None  # for the way back
         self._back_since = 0  # period of blend_out in which the way back began
-        self.weight = self._handed = self._progress = 0.0  # weights; s on the path to the first target
+        self.weight = self._handed = self._progress = (
+            0.0  # weights; s on the path to the first target
+        )
         self._obstacle, self._release_text, self._checked_payload = "", "handed over", False
         self.remarks: list[str] = []
 
-    def step(self, phase: Phase, n: int, state: State, policy: Policy) -> Array | PhaseChange | Fault:
+    def step(
+        self, phase: Phase, n: int, state: State, policy: Policy
+    ) -> Array | PhaseChange | Fault:
         """Return the target of the n-th period of a phase, or the end of the phase."""
         if phase is Phase.BLEND_IN:
             out = self._blend_in(state, policy)
@@ -145,7 +177,9 @@ class TargetGenerator:
         """Begin the way back to the start."""
         planner, joints = self.context.planner, self.context.joints
         self._origin = self._last
-        self.path = (self.plan and self.plan.retreat) or self._straight(self._last, self.start, state)
+        self.path = (self.plan and self.plan.retreat) or self._straight(
+            self._last, self.start, state
+        )
         if self._guard and planner:
             self._guard.allow_start_clearance()
             ends = state.qpos_with(joints, self._last), state.qpos_with(joints, self.start)
@@ -153,7 +187,10 @@ class TargetGenerator:
 
     def hold(self, state: State) -> None:
         """Hold a robot that does not obey where it is: nothing moves, whatever listens again."""
-        self._last, self._release_text = state.qpos[self.context.joints], "let go; the robot did not obey"
+        self._last, self._release_text = (
+            state.qpos[self.context.joints],
+            "let go; the robot did not obey",
+        )
 
     def _blend_in(self, state: State, policy: Policy) -> Array | PhaseChange | Fault:
         config, dt, following = self.context.config, self.context.dt, self.following
@@ -184,7 +221,9 @@ class TargetGenerator:
             return target
         if not self._checked_payload and n * self.context.dt >= PAYLOAD_CHECK_S:
             self._checked_payload = True
-            if doubt := getattr(self.context.compensator, "doubt", ""):  # not every compensator estimates the payload
+            if doubt := getattr(
+                self.context.compensator, "doubt", ""
+            ):  # not every compensator estimates the payload
                 self.remarks.append(f"compensation: {doubt}")
         if target is not None:
             self._last = np.array(target[self.context.joints], float)
@@ -206,7 +245,9 @@ class TargetGenerator:
         if passed <= self.path.duration + self.context.config.settle:
             return self._on_path(passed, self._origin, self.start)
         if self._guard and np.abs(self._last - self.start).max() > MAX_START_DRIFT_RAD:
-            return self._end(f"where it is: {self._guard.obstacle} would come too near on the way back")
+            return self._end(
+                f"where it is: {self._guard.obstacle} would come too near on the way back"
+            )
         self._last = self.start
         return self._end("back where it was found")
 
@@ -225,7 +266,9 @@ class TargetGenerator:
         """Return the target as far as limbs and plane leave the way free."""
         joints = self.context.joints
         guard.qpos = state.qpos_with(joints, guard.qpos[joints])
-        self._last = guard.step(state.qpos_with(joints, target), state.qpos, self.context.dt)[joints]
+        self._last = guard.step(state.qpos_with(joints, target), state.qpos, self.context.dt)[
+            joints
+        ]
         if guard.obstacle and guard.obstacle != self._obstacle:
             self.remarks.append(f"targets are cut: {guard.obstacle} would come too near")
         self._obstacle = guard.obstacle or self._obstacle

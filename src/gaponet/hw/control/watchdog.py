@@ -27,7 +27,10 @@ RELEASE = b"\xff"  # from the controller: it has stopped, and the watchdog ends
 READY, ANSWER, FIRED = b"\x01", b"\x02", b"\x03"  # from the watchdog
 WEIGHT_STEPS = 200  # a heartbeat is the weight in steps of 1/200
 MAX_RETRY_S = 600.0  # for which it tries to damp a robot that does not confirm it
-DAMP_INTERVAL_S, RETRY_INTERVAL_S = 0.01, 0.1  # between two messages, and after a message that failed
+DAMP_INTERVAL_S, RETRY_INTERVAL_S = (
+    0.01,
+    0.1,
+)  # between two messages, and after a message that failed
 READY_TIMEOUT_S, END_TIMEOUT_S = 20.0, 5.0
 
 
@@ -53,7 +56,9 @@ class Watchdog:
         for pipe in (self._in, self._out):
             os.set_blocking(pipe.fileno(), False)
         self._fired, self._timeout = False, timeout
-        self._answer_time: float | None = None  # monotonic s of the last answer, or of the first heartbeat before it
+        self._answer_time: float | None = (
+            None  # monotonic s of the last answer, or of the first heartbeat before it
+        )
 
     def wait_ready(self) -> None:
         """Return when it could damp the robot.
@@ -70,7 +75,9 @@ class Watchdog:
         """Return why this watchdog cannot damp the robot: it ended or does not answer; empty if it can."""
         if self.fired() or self._process.poll() is not None:
             return "the watchdog ended"
-        hangs = self._answer_time is not None and time.monotonic() - self._answer_time > self._timeout
+        hangs = (
+            self._answer_time is not None and time.monotonic() - self._answer_time > self._timeout
+        )
         return "the watchdog does not answer" if hangs else ""
 
     def fired(self) -> bool:
@@ -167,7 +174,9 @@ def _damp(driver: Driver, seconds: float, weight: float) -> None:
                 last_error = str(error)
                 report(f"could NOT be damped: switch the supply off ({last_error}); trying again")
             if time.monotonic() - start > MAX_RETRY_S:
-                report(f"could NOT be damped: gave up after {MAX_RETRY_S:g} s; switch the supply off")
+                report(
+                    f"could NOT be damped: gave up after {MAX_RETRY_S:g} s; switch the supply off"
+                )
                 break
         time.sleep(wait)
     driver.close()

@@ -55,7 +55,10 @@ def make_struct(typename: str, **fields: Any) -> Any:
 def _struct(name: str, fields: hg.Fields, **parts: type[IdlStruct]) -> type[IdlStruct]:
     """Return the IDL type of a message of drivers.hg under its name in Unitree's IDL; parts: its structs, by field."""
     members = {field: (parts.get(field) or SCALARS[kind], count) for field, kind, count in fields}
-    hints = {field: kind if count == 1 else array[kind, count] for field, (kind, count) in members.items()}
+    hints = {
+        field: kind if count == 1 else array[kind, count]
+        for field, (kind, count) in members.items()
+    }
     return make_struct(f"unitree_hg.msg.dds_.{name}_", **hints)
 
 
@@ -114,7 +117,11 @@ class Reader:
             DriverError: DDS fails.
         """
         try:
-            return [sample for sample in self._reader.take(N=self._queue_length) if hasattr(sample, "data")]
+            return [
+                sample
+                for sample in self._reader.take(N=self._queue_length)
+                if hasattr(sample, "data")
+            ]
         except DDSException as error:
             raise DriverError(f"DDS does not give messages: {error}") from None
 
@@ -136,13 +143,17 @@ class Bus:
             DriverError: There is no such interface, or DDS does not start on it.
         """
         if interface not in _interfaces():
-            raise DriverError(f"no network interface '{interface}' here; there are {', '.join(_interfaces())}")
+            raise DriverError(
+                f"no network interface '{interface}' here; there are {', '.join(_interfaces())}"
+            )
         try:
             if domain not in _DOMAINS:
                 _DOMAINS[domain] = Domain(domain, _configuration(interface))
             self._participant = DomainParticipant(domain)
         except DDSException as error:
-            raise DriverError(f"DDS on {interface} does not start: {error}; is the interface up?") from None
+            raise DriverError(
+                f"DDS on {interface} does not start: {error}; is the interface up?"
+            ) from None
         self._topics: dict[str, Topic] = {}
 
     def writer(self, topic: str, kind: type[IdlStruct]) -> Writer:
@@ -161,7 +172,11 @@ class Bus:
 
     def publishers(self) -> defaultdict[str, list[str]]:
         """Return the other publishers, which takes DISCOVERY_S: topic → programs, as they call themselves."""
-        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication
+        from cyclonedds.builtin import (
+            BuiltinDataReader,
+            BuiltinTopicDcpsParticipant,
+            BuiltinTopicDcpsPublication,
+        )
 
         programs = BuiltinDataReader(self._participant, BuiltinTopicDcpsParticipant)
         publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
@@ -183,7 +198,9 @@ def _configuration(interface: str) -> str:
     """
     loopback = interface == "lo"
     multicast = ' multicast="true"' if loopback else ""
-    discovery = '<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="localhost"/></Peers>'
+    discovery = (
+        '<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="localhost"/></Peers>'
+    )
     return (
         f'<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="{interface}"{multicast}/>'
         f"</Interfaces><AllowMulticast>{'spdp' if loopback else 'true'}</AllowMulticast></General>"
@@ -197,7 +214,9 @@ def _configuration(interface: str) -> str:
 def _program(qos: Qos) -> str:
     """Return name, process and machine of a participant, as far as it tells them."""
     properties = {policy.key: policy.value for policy in qos if isinstance(policy, Policy.Property)}
-    name, pid, host = (properties.get(f"__{key}", "?") for key in ("ProcessName", "Pid", "Hostname"))
+    name, pid, host = (
+        properties.get(f"__{key}", "?") for key in ("ProcessName", "Pid", "Hostname")
+    )
     return f"{name} (process {pid} on {host})"
 
 

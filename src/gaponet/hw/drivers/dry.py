@@ -23,7 +23,9 @@ class DryRun:
     def __init__(self, driver: Driver) -> None:
         """Take the driver of the robot, which must publish nothing when it connects."""
         self.driver = driver
-        self.address = driver.address  # the same lock: a serial bus has one master, also one that only reads
+        self.address = (
+            driver.address
+        )  # the same lock: a serial bus has one master, also one that only reads
         self.joint_names, self.commanded = driver.joint_names, driver.commanded
         self.noisy, self.at_end, self.at_stop = driver.noisy, driver.at_end, driver.at_stop
         self.reads_back = True  # what was not sent cannot be checked
@@ -88,4 +90,7 @@ def summarize_commands(recording: Recording, limits: Limits) -> dict[str, dict[s
     torque = np.abs(limits.kp * (ctrl - qpos) - limits.kd * qvel).max(axis=0)
     values = np.stack([ctrl.min(axis=0), ctrl.max(axis=0), speed, torque], axis=1).tolist()
     names = ("lowest_rad", "highest_rad", "fastest_rad_s", "torque_nm")
-    return {joint: dict(zip(names, row, strict=True)) for joint, row in zip(recording.commanded, values, strict=True)}
+    return {
+        joint: dict(zip(names, row, strict=True))
+        for joint, row in zip(recording.commanded, values, strict=True)
+    }

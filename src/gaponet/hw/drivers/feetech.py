@@ -17,7 +17,14 @@ if TYPE_CHECKING:
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST = 0xFE
-ERRORS = ("voltage", "angle sensor", "overheat", "overcurrent", "", "overload")  # status bits; bit 4: torque is on
+ERRORS = (
+    "voltage",
+    "angle sensor",
+    "overheat",
+    "overcurrent",
+    "",
+    "overload",
+)  # status bits; bit 4: torque is on
 FAULTY = sum(1 << bit for bit, word in enumerate(ERRORS) if word)
 RETRIES = 2  # of a read, as LeRobot's num_read_retries
 REQUEST_TAGS = 8  # lengths of replies, by which the requests that they answer are told apart
@@ -105,7 +112,9 @@ class ServoBus:
         self.errors: dict[int, int] = {}
         self._tag = 0
 
-    def sync_read(self, servos: Iterable[int], block: Register, retries: int = RETRIES) -> dict[int, bytes]:
+    def sync_read(
+        self, servos: Iterable[int], block: Register, retries: int = RETRIES
+    ) -> dict[int, bytes]:
         """Return a block of each of several servos; servos without an intact reply are missing.
 
         What is missing after a silence is requested again. A reply does not name its request. So successive requests
@@ -128,14 +137,22 @@ class ServoBus:
 
     def sync_write(self, register: Register, values: dict[int, int]) -> None:
         """Write one register of several servos; they do not acknowledge it."""
-        parameters = b"".join(bytes([servo]) + register.encode(value) for servo, value in values.items())
-        self.stream.write(packet(BROADCAST, SYNC_WRITE, bytes([register.address, register.size]) + parameters))
+        parameters = b"".join(
+            bytes([servo]) + register.encode(value) for servo, value in values.items()
+        )
+        self.stream.write(
+            packet(BROADCAST, SYNC_WRITE, bytes([register.address, register.size]) + parameters)
+        )
 
     def broadcast(self, register: Register, value: int) -> None:
         """Write one register of all servos on the bus; they do not acknowledge it."""
-        self.stream.write(packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value)))
+        self.stream.write(
+            packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value))
+        )
 
-    def _replies(self, servos: list[int], expected: int, sizes: set[int], request: bytes) -> dict[int, bytes]:
+    def _replies(
+        self, servos: list[int], expected: int, sizes: set[int], request: bytes
+    ) -> dict[int, bytes]:
         """Return intact replies of these servos, in any order, until all have come or nothing more comes.
 
         An adapter with one wire for both directions echoes the request, which is then skipped.
@@ -144,7 +161,9 @@ class ServoBus:
         data, patience = b"", MAX_BYTES_RATIO * (expected + 6) * len(servos)  # bytes
         silent = time.monotonic() + self.timeout
         while len(replies) < len(servos) and patience > 0:
-            more = self.stream.read(max(1, (len(servos) - len(replies)) * (expected + 6) - len(data)))
+            more = self.stream.read(
+                max(1, (len(servos) - len(replies)) * (expected + 6) - len(data))
+            )
             if more:
                 silent = time.monotonic() + self.timeout
             elif time.monotonic() >= silent:

@@ -44,7 +44,9 @@ LOW_CMD: Fields = [
 ]  # fmt: skip
 
 
-def flatten(fields: Fields, start: int, padded: bool, prefix: str = "") -> tuple[list[tuple[str, str, int, int]], int]:
+def flatten(
+    fields: Fields, start: int, padded: bool, prefix: str = ""
+) -> tuple[list[tuple[str, str, int, int]], int]:
     """Return every scalar field as (path, type, count, offset), and the offset after the last.
 
     Args:
@@ -63,7 +65,9 @@ def flatten(fields: Fields, start: int, padded: bool, prefix: str = "") -> tuple
             continue
         for i in range(count):
             at += -at % 4 if padded else 0
-            part, at = flatten(kind, at, padded, f"{prefix}{name}[{i}]." if count > 1 else f"{prefix}{name}.")
+            part, at = flatten(
+                kind, at, padded, f"{prefix}{name}[{i}]." if count > 1 else f"{prefix}{name}."
+            )
             out += part
     return out, at + (-at % 4 if padded else 0)
 
@@ -77,10 +81,14 @@ class Message:
         self._at = {path: (kind, count, offset) for path, kind, count, offset in wire}
         names = [path.split(".")[-1] for path, *_ in wire if path.startswith(f"{motors}[1].")]
         # From the second motor on, slots repeat every `stride` bytes; the first may begin closer to what precedes it.
-        self.columns = {n: np.array([self._at[f"{motors}[{i}].{n}"][2] for i in range(MOTORS)]) for n in names}
+        self.columns = {
+            n: np.array([self._at[f"{motors}[{i}].{n}"][2] for i in range(MOTORS)]) for n in names
+        }
         self._gather = self._bytes(wire, packed)
 
-    def _bytes(self, wire: list[tuple[str, str, int, int]], packed: list[tuple[str, str, int, int]]) -> Array:
+    def _bytes(
+        self, wire: list[tuple[str, str, int, int]], packed: list[tuple[str, str, int, int]]
+    ) -> Array:
         """Return the wire offset of every byte of the padded struct; padding points behind the message, at a 0."""
         source = np.full(self.packed_size, self.wire_size)
         for (_, kind, count, at), (_, _, _, to) in zip(wire, packed, strict=True):
@@ -102,7 +110,9 @@ class Message:
         """Return a field of all motors, (35,) or (35, count), as a copy."""
         kind, count, _ = self._at[self._path(name)]
         size = np.dtype(kind).itemsize * count
-        values = np.ascontiguousarray(data[self.columns[name][:, None] + np.arange(size)]).view(kind)
+        values = np.ascontiguousarray(data[self.columns[name][:, None] + np.arange(size)]).view(
+            kind
+        )
         return values[:, 0] if count == 1 else values
 
     def set_motors(self, data: Array, name: str, values: Array) -> None:

@@ -12,7 +12,10 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Driver
 from gaponet.robot.spec import RobotSpec, load_robot
 
-DRIVERS = {"unitree": "gaponet.hw.drivers.unitree:UnitreeDriver", "so101": "gaponet.hw.drivers.so101:SO101Driver"}
+DRIVERS = {
+    "unitree": "gaponet.hw.drivers.unitree:UnitreeDriver",
+    "so101": "gaponet.hw.drivers.so101:SO101Driver",
+}
 
 
 def driver_names() -> tuple[str, ...]:
@@ -26,7 +29,9 @@ def supported_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         UsageError: There is no such driver, or its package is broken.
     """
-    parameters = inspect.signature(plugins.require(plugins.DRIVERS, name, DRIVERS, "driver")).parameters
+    parameters = inspect.signature(
+        plugins.require(plugins.DRIVERS, name, DRIVERS, "driver")
+    ).parameters
     return {option: value for option, value in options.items() if option in parameters}
 
 
@@ -43,7 +48,10 @@ def open_driver(kind: str, robot: RobotSpec | str | Path, **options: Any) -> Dri
     """
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     driver: Driver = plugins.require(plugins.DRIVERS, kind, DRIVERS, "driver")(spec, **options)
-    members = [*Driver.__annotations__, *(name for name in vars(Driver) if not name.startswith("_"))]
+    members = [
+        *Driver.__annotations__,
+        *(name for name in vars(Driver) if not name.startswith("_")),
+    ]
     if missing := [name for name in members if not hasattr(driver, name)]:
         raise UsageError(
             f"driver '{kind}' lacks {', '.join(missing)} (gaponet.hw.control.driver.Driver says what they do)"

@@ -44,7 +44,10 @@ except ImportError:  # Windows, where only one program can open a port
     PORT_ERRORS: tuple[type[Exception], ...] = (OSError,)
     EXCLUSIVE = SHARED = 0
 else:
-    PORT_ERRORS = (OSError, termios.error)  # pyserial's own errors are OSErrors; a removed port also raises the other
+    PORT_ERRORS = (
+        OSError,
+        termios.error,
+    )  # pyserial's own errors are OSErrors; a removed port also raises the other
     EXCLUSIVE, SHARED = termios.TIOCEXCL, termios.TIOCNXCL
 
 if TYPE_CHECKING:
@@ -64,8 +67,16 @@ GAINS = {
     "p": reg.P, "i": reg.I, "d": reg.D, "max_torque": reg.MAX_TORQUE, "protection_current": reg.PROTECTION_CURRENT,
     "mode": reg.MODE,
 }  # fmt: skip
-CALIBRATION = {"homing_offset": reg.HOMING_OFFSET, "range_min": reg.MIN_POSITION, "range_max": reg.MAX_POSITION}
-LIMITS = {"acceleration": reg.ACCELERATION, "goal_velocity": reg.GOAL_VELOCITY, "torque_limit": reg.TORQUE_LIMIT}
+CALIBRATION = {
+    "homing_offset": reg.HOMING_OFFSET,
+    "range_min": reg.MIN_POSITION,
+    "range_max": reg.MAX_POSITION,
+}
+LIMITS = {
+    "acceleration": reg.ACCELERATION,
+    "goal_velocity": reg.GOAL_VELOCITY,
+    "torque_limit": reg.TORQUE_LIMIT,
+}
 READINGS = {
     "qpos": reg.PRESENT_POSITION, "qvel": reg.PRESENT_VELOCITY, "load": reg.PRESENT_LOAD,
     "current": reg.PRESENT_CURRENT, "temperature": reg.PRESENT_TEMPERATURE,
@@ -104,7 +115,9 @@ class SO101Driver:
             RobotError: Gains or effort limits exceed those of the motors.
         """
         if set(robot.joint_names) != set(JOINTS):
-            raise UsageError(f"the so101 driver is for the joints {', '.join(JOINTS)}; {robot.name} has others")
+            raise UsageError(
+                f"the so101 driver is for the joints {', '.join(JOINTS)}; {robot.name} has others"
+            )
         require_motor_limits(robot, "so101")
         self.robot, self.port, self.calibration = robot, port, calibration
         self.timeout, self.silent = timeout, silent
@@ -120,11 +133,16 @@ class SO101Driver:
         self._bus: reg.ServoBus | None = None  # of the open port
         self._state: State | None = None
         self._torque_limit = torque_limit or [FULL_TORQUE] * len(self.joint_names)
-        self._goal: dict[int, int] | None = None  # in force; None: nothing was commanded, or the arm was let go
+        self._goal: dict[int, int] | None = (
+            None  # in force; None: nothing was commanded, or the arm was let go
+        )
         self._torque_on: set[int] = set()  # servos that have reported it
         self._mismatches: Counter[tuple[str, int]] = Counter()
         self._settings: dict[int, dict[str, int]] = {}  # at the start, by servo
-        self._settings_index, self._settings_time = 0, 0.0  # servo whose settings were read last, and when, s
+        self._settings_index, self._settings_time = (
+            0,
+            0.0,
+        )  # servo whose settings were read last, and when, s
         self._disobedience: Fault | None = None
 
     def connect(self) -> None:
@@ -141,7 +159,9 @@ class SO101Driver:
             while self._state is None:
                 self._poll(bus)
                 if self._state is None and time.monotonic() > deadline:
-                    raise DriverError(f"{self.port}: the servos' readings do not arrive whole; check the cable")
+                    raise DriverError(
+                        f"{self.port}: the servos' readings do not arrive whole; check the cable"
+                    )
             if self._state.fault:
                 raise DriverError(f"{self.port}: {self._state.fault.text}")
         except BaseException:
@@ -155,20 +175,29 @@ class SO101Driver:
         try:
             import serial
         except ImportError:
-            raise DriverError("pyserial is not installed; run: pip install 'gaponet[so101]'") from None
+            raise DriverError(
+                "pyserial is not installed; run: pip install 'gaponet[so101]'"
+            ) from None
         try:
             self._serial = serial.Serial(
-                self.port, BAUD, timeout=PORT_TIMEOUT_S, write_timeout=max(WRITE_TIMEOUT_S, self.timeout)
+                self.port,
+                BAUD,
+                timeout=PORT_TIMEOUT_S,
+                write_timeout=max(WRITE_TIMEOUT_S, self.timeout),
             )
         except (serial.SerialException, ValueError, OSError) as error:
-            hint = "is the arm plugged in, may you use the port, does another program command the arm?"
+            hint = (
+                "is the arm plugged in, may you use the port, does another program command the arm?"
+            )
             raise DriverError(f"{self.port}: {error}; {hint}") from None
         self._bus = reg.ServoBus(self._serial, self.timeout)
         return self._bus
 
     def _set_sharing(self, mode: int) -> None:
         """Let other programs open the port (SHARED), or not (EXCLUSIVE); who has it open, as our watchdog, keeps it."""
-        with contextlib.suppress(*PORT_ERRORS, AttributeError, ValueError):  # a port without a descriptor, or removed
+        with contextlib.suppress(
+            *PORT_ERRORS, AttributeError, ValueError
+        ):  # a port without a descriptor, or removed
             if mode:
                 fcntl.ioctl(self._serial.fileno(), mode)  # type: ignore[union-attr]
 
@@ -179,8 +208,13 @@ class SO101Driver:
         settings, running = (bus.sync_read(servos, block) for block in (reg.SETTINGS, reg.RUNNING))
         for joint, servo in numbers.items():
             if servo not in settings or servo not in running:
-                raise DriverError(f"{self.port}: servo {servo} ({joint}) does not answer; check power and cable")
-            model, mode = (register.value_in(reg.SETTINGS, settings[servo]) for register in (reg.MODEL, reg.MODE))
+                raise DriverError(
+                    f"{self.port}: servo {servo} ({joint}) does not answer; check power and cable"
+                )
+            model, mode = (
+                register.value_in(reg.SETTINGS, settings[servo])
+                for register in (reg.MODEL, reg.MODE)
+            )
             if model != reg.STS3215 or mode != 0:
                 raise DriverError(
                     f"{self.port}: servo {servo} ({joint}) is model {model} in mode {mode}; the driver needs an "
@@ -188,7 +222,11 @@ class SO101Driver:
                 )
         self._settings = {servo: _settings(settings[servo]) for servo in servos}
         stored = {
-            joint: ServoRow(id=servo, drive_mode=0, **{name: self._settings[servo][name] for name in CALIBRATION})
+            joint: ServoRow(
+                id=servo,
+                drive_mode=0,
+                **{name: self._settings[servo][name] for name in CALIBRATION},
+            )
             for joint, servo in numbers.items()
         }
         self.arm = resolve_calibration(self.file_calibration, stored, self.robot, self.port)
@@ -196,7 +234,10 @@ class SO101Driver:
         servo_facts = {name: [self._settings[servo][name] for servo in servos] for name in GAINS}
         for name, register in (LIMITS | {"voltage": reg.PRESENT_VOLTAGE}).items():
             servo_facts[name] = [register.value_in(reg.RUNNING, running[servo]) for servo in servos]
-        self.kp, self._torque_limit = STIFFNESS_PER_P * np.array(servo_facts["p"], float), servo_facts["torque_limit"]
+        self.kp, self._torque_limit = (
+            STIFFNESS_PER_P * np.array(servo_facts["p"], float),
+            servo_facts["torque_limit"],
+        )
         self.facts = {
             "servos": servo_facts,
             "calibration": {joint: asdict(row) for joint, row in stored.items()},
@@ -220,7 +261,9 @@ class SO101Driver:
             ("torque_limit", FULL_TORQUE, "the torque limit is below 100 %"),
             ("goal_velocity", 0, "the servo limits its speed"),
         ):
-            joints = ", ".join(j for j, x in zip(self.joint_names, facts[name], strict=True) if x != usual)
+            joints = ", ".join(
+                j for j, x in zip(self.joint_names, facts[name], strict=True) if x != usual
+            )
             notes += [f"{joints}: {what}"] if joints else []
         return notes
 
@@ -243,7 +286,9 @@ class SO101Driver:
             name: np.array([field.value_in(reg.RUNNING, blocks[s]) for s in servos], float)
             for name, field in READINGS.items()
         }
-        self._disobedience = self._disobedience or self._check_running(blocks) or self._check_next_settings(bus, now)
+        self._disobedience = (
+            self._disobedience or self._check_running(blocks) or self._check_next_settings(bus, now)
+        )
         sign = self.arm.sign
         share = np.abs(raw["current"]) / STALL_CURRENT_STEPS * np.sign(raw["load"])
         self._state = State(
@@ -257,13 +302,16 @@ class SO101Driver:
         for i, (servo, block) in enumerate(blocks.items()):
             if self._goal is not None:
                 on, goal = (
-                    register.value_in(reg.RUNNING, block) for register in (reg.TORQUE_ENABLE, reg.GOAL_POSITION)
+                    register.value_in(reg.RUNNING, block)
+                    for register in (reg.TORQUE_ENABLE, reg.GOAL_POSITION)
                 )
                 if on:
                     self._torque_on.add(servo)
                 sent = self._goal[servo]
                 if not on and (servo in self._torque_on or self._mismatch("torque", servo)):
-                    wrong.append((servo, "its torque is off, though it was switched on: it has reset itself"))
+                    wrong.append(
+                        (servo, "its torque is off, though it was switched on: it has reset itself")
+                    )
                 elif goal == sent:
                     self._mismatches["goal", servo] = 0
                 elif self._mismatch("goal", servo):
@@ -271,7 +319,9 @@ class SO101Driver:
             for name, register in LIMITS.items():
                 before, now = self.facts["servos"][name][i], register.value_in(reg.RUNNING, block)
                 if now != before and not (name == "torque_limit" and self._goal is None):
-                    wrong.append((servo, f"its {name.replace('_', ' ')} went from {before} to {now}"))
+                    wrong.append(
+                        (servo, f"its {name.replace('_', ' ')} went from {before} to {now}")
+                    )
         return self._disobedience_fault(wrong)
 
     def _mismatch(self, what: str, servo: int) -> bool:
@@ -287,7 +337,9 @@ class SO101Driver:
         self._settings_index, self._settings_time = (self._settings_index + 1) % len(servos), now
         return self._check_settings(bus, [servos[self._settings_index]], retries=0)
 
-    def _check_settings(self, bus: reg.ServoBus, servos: list[int], retries: int = reg.RETRIES) -> Fault | None:
+    def _check_settings(
+        self, bus: reg.ServoBus, servos: list[int], retries: int = reg.RETRIES
+    ) -> Fault | None:
         """Return a fault if gains, ranges or zeros have changed; a servo that does not answer has changed none."""
         settings = bus.sync_read(servos, reg.SETTINGS, retries)
         return self._disobedience_fault([
@@ -318,7 +370,9 @@ class SO101Driver:
             for servo, joint in numbers.items() if (errors := bus.errors.get(servo, 0) & reg.FAULTY)
         ]  # fmt: skip
         return (
-            Fault("robot", "; ".join(reports) + "; look at load, supply and cables") if reports else self._disobedience
+            Fault("robot", "; ".join(reports) + "; look at load, supply and cables")
+            if reports
+            else self._disobedience
         )
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
@@ -333,7 +387,9 @@ class SO101Driver:
         with self._port_errors():
             bus.sync_write(reg.GOAL_POSITION, goal)
             if not self._torque_on.issuperset(goal):
-                bus.sync_write(reg.TORQUE_ENABLE, {servo: 1 for servo in goal if servo not in self._torque_on})
+                bus.sync_write(
+                    reg.TORQUE_ENABLE, {servo: 1 for servo in goal if servo not in self._torque_on}
+                )
         self._goal = goal
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
@@ -361,7 +417,9 @@ class SO101Driver:
                 if servo not in blocks or any(blocks[servo])
             ]  # fmt: skip
             if stiff:
-                raise DriverError(f"{self.port}: no word that the torque is off in servo {', '.join(stiff)}")
+                raise DriverError(
+                    f"{self.port}: no word that the torque is off in servo {', '.join(stiff)}"
+                )
             bus.sync_write(reg.TORQUE_LIMIT, dict(zip(servos, self._torque_limit, strict=True)))
         return "let go: all servos say that their torque is off"
 
@@ -404,4 +462,7 @@ class SO101Driver:
 
 
 def _settings(block: bytes) -> dict[str, int]:
-    return {name: register.value_in(reg.SETTINGS, block) for name, register in (GAINS | CALIBRATION).items()}
+    return {
+        name: register.value_in(reg.SETTINGS, block)
+        for name, register in (GAINS | CALIBRATION).items()
+    }

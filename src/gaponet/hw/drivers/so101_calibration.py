@@ -17,7 +17,14 @@ from gaponet.robot.spec import RobotSpec
 
 STEPS_PER_TURN = 4096  # of an encoder
 STEP_RAD = 2 * np.pi / STEPS_PER_TURN
-JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")  # servo 1 to 6
+JOINTS = (
+    "shoulder_pan",
+    "shoulder_lift",
+    "elbow_flex",
+    "wrist_flex",
+    "wrist_roll",
+    "gripper",
+)  # servo 1 to 6
 CONTINUOUS_JOINT, GRIPPER = "wrist_roll", "gripper"  # without stops; with its zero at a stop
 USUAL_FILE = "~/.cache/huggingface/lerobot/calibration/robots/so_follower/ID.json"
 
@@ -53,7 +60,9 @@ class ArmCalibration:
         """Take the order of the joints and the gripper's lower limit from the robot."""
         ordered = [rows[joint] for joint in robot.joint_names]
         self.rows, self.servos = rows, [row.id for row in ordered]
-        self.low, self.high = (np.array([getattr(row, end) for row in ordered]) for end in ("range_min", "range_max"))
+        self.low, self.high = (
+            np.array([getattr(row, end) for row in ordered]) for end in ("range_min", "range_max")
+        )
         self.sign = np.array([-1.0 if row.drive_mode else 1.0 for row in ordered])
         self.zero = (self.low + self.high) / 2
         jaw = robot.index([GRIPPER])[0]
@@ -71,7 +80,9 @@ class ArmCalibration:
 
     def steps(self, qpos: Array) -> Array:
         """Return the nearest whole steps (n) within the calibrated range, of rad (n)."""
-        return np.clip(np.rint(qpos / (STEP_RAD * self.sign) + self.zero), self.low, self.high).astype(int)
+        return np.clip(
+            np.rint(qpos / (STEP_RAD * self.sign) + self.zero), self.low, self.high
+        ).astype(int)
 
 
 def read_calibration(path: str | Path, robot: RobotSpec) -> ArmCalibration:
@@ -84,7 +95,9 @@ def read_calibration(path: str | Path, robot: RobotSpec) -> ArmCalibration:
     rows = read_json(dict[str, ServoRow], Path(path), UsageError, hint)
     for joint in JOINTS:
         if joint not in rows:
-            raise UsageError(f"{path}: no joint '{joint}', only {', '.join(rows) or 'none'}; {hint}")
+            raise UsageError(
+                f"{path}: no joint '{joint}', only {', '.join(rows) or 'none'}; {hint}"
+            )
         if rows[joint].range_min >= rows[joint].range_max:
             raise UsageError(f"{path}: {joint}: range_min is not below range_max; calibrate again")
     if len({rows[joint].id for joint in JOINTS}) < len(JOINTS):
@@ -108,7 +121,9 @@ def resolve_calibration(
         DriverError: The two differ, or neither has the ends of the joints.
     """
     if file is None:
-        whole = {j for j in JOINTS if stored[j].range_max - stored[j].range_min >= STEPS_PER_TURN - 1}
+        whole = {
+            j for j in JOINTS if stored[j].range_max - stored[j].range_min >= STEPS_PER_TURN - 1
+        }
         blank = [j for j in JOINTS if j in whole and j != CONTINUOUS_JOINT]
         if blank:
             raise DriverError(

@@ -38,20 +38,45 @@ Topic = Literal["arm_sdk", "lowcmd"]
 Joints = Literal["arms", "upper_body", "all"]
 
 LEG = ("hip_yaw", "hip_pitch", "hip_roll", "knee", "ankle_pitch", "ankle_roll")
-ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
+ARM = (
+    "shoulder_pitch",
+    "shoulder_roll",
+    "shoulder_yaw",
+    "elbow",
+    "wrist_roll",
+    "wrist_pitch",
+    "wrist_yaw",
+)
 MOTOR_NAMES = (
     *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in LEG),
     "torso_joint",
     *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in ARM),
 )
 FIRST_MOTOR = {"arms": 13, "upper_body": 12, "all": 0}  # of the commanded ones
-MOTOR_FIELDS = ("mode", "q", "dq", "tau_est", "temperature", "vol", "motorstate")  # not all 0 in a slot with a motor
+MOTOR_FIELDS = (
+    "mode",
+    "q",
+    "dq",
+    "tau_est",
+    "temperature",
+    "vol",
+    "motorstate",
+)  # not all 0 in a slot with a motor
 WEIGHT_MOTOR = 27
-KD_FACTOR = 4.0  # of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
+KD_FACTOR = (
+    4.0  # of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
+)
 VIRTUAL_MARK = 0x54524956  # "VIRT" in LowState.reserve[0], written by our virtual robot
 TICK_PERIODS_S = (0.001, 0.002)  # that the robot's tick may have
 MAX_CLOCK_DRIFT = 2e-4  # of the robot's clock, relative to ours
-G1_MACHINES = (1, 2, 3, 4, 5, *range(10, 17))  # mode_machine of a G1 (unitree_ros); 6 may be either, slots decide
+G1_MACHINES = (
+    1,
+    2,
+    3,
+    4,
+    5,
+    *range(10, 17),
+)  # mode_machine of a G1 (unitree_ros); 6 may be either, slots decide
 SELECT, L2_B = 1 << 3, 1 << 5 | 1 << 9  # stop keys in bytes 2 and 3 of wireless_remote
 MAX_QUATERNION_ERROR = 0.1  # of its length
 CONNECT_TIMEOUT_S = 3.0
@@ -92,9 +117,13 @@ class UnitreeDriver:
             RobotError: Gains or effort limits exceed those of the motors.
         """
         if set(robot.joint_names) != set(MOTOR_NAMES):
-            raise UsageError(f"the unitree driver is for the 27 joints of h1_2; {robot.name} has others")
+            raise UsageError(
+                f"the unitree driver is for the 27 joints of h1_2; {robot.name} has others"
+            )
         if joints == "all" and topic != "lowcmd":
-            raise UsageError("rt/arm_sdk does not take the legs; use joints arms or upper_body, or topic lowcmd")
+            raise UsageError(
+                "rt/arm_sdk does not take the legs; use joints arms or upper_body, or topic lowcmd"
+            )
         require_motor_limits(robot, "h1_2")
         nominal = robot.before_identification
         self.robot, self.topic, self.joints = robot, topic, joints
@@ -107,16 +136,24 @@ class UnitreeDriver:
         self.virtual = False
         self.joint_names = robot.joint_names
         first = FIRST_MOTOR[joints]
-        self.commanded = tuple(name for name in robot.joint_names if MOTOR_NAMES.index(name) >= first)
+        self.commanded = tuple(
+            name for name in robot.joint_names if MOTOR_NAMES.index(name) >= first
+        )
         self._motor = np.array([MOTOR_NAMES.index(name) for name in robot.joint_names])
         self._at = robot.index(self.commanded)
         # As in Unitree's own arm_sdk example: with weight 1 the waist is ours, whether a motion moves it or not.
-        held = [n for n in robot.joint_names if n == "torso_joint" and n not in self.commanded and topic == "arm_sdk"]
+        held = [
+            n
+            for n in robot.joint_names
+            if n == "torso_joint" and n not in self.commanded and topic == "arm_sdk"
+        ]
         self._held = robot.index(held)
         self._held_qpos: Array | None = None  # of the held joints at the first command, rad
         self._command = hg.LowCmd.new()
         self._refused = self.received = self._machine = 0
-        self._fault: Fault | None = None  # the first one that the robot reported; it may be in one message only
+        self._fault: Fault | None = (
+            None  # the first one that the robot reported; it may be in one message only
+        )
         self._state: State | None = None
         self._clock: TickClock | None = None
         self._bus: Bus | None = None
@@ -140,7 +177,9 @@ class UnitreeDriver:
             )
         arrivals, messages = self._listen(self._reader)
         self._require_h1_2(messages)
-        self._clock = TickClock(arrivals, [int(hg.LowState.view(data, "tick")[0]) for data in messages])
+        self._clock = TickClock(
+            arrivals, [int(hg.LowState.view(data, "tick")[0]) for data in messages]
+        )
         self._state = self._decode(messages[-1], self._clock, arrivals[-1])
         hg.LowCmd.view(self._command, "mode_machine")[:] = self._machine
         self.facts = {"mode_machine": self._machine, "topic": self.topic}
@@ -157,7 +196,11 @@ class UnitreeDriver:
                     arrivals.append(now)
                     messages.append(data)
             if now - start > CONNECT_TIMEOUT_S and not arrivals:
-                wrong = f"; {self._refused} messages came, all damaged or of another type" if self._refused else ""
+                wrong = (
+                    f"; {self._refused} messages came, all damaged or of another type"
+                    if self._refused
+                    else ""
+                )
                 raise DriverError(
                     f"nobody speaks on rt/lowstate, domain {self.domain}, interface {self.interface}, within "
                     f"{CONNECT_TIMEOUT_S:g} s{wrong}. Is the robot on, the cable in, the interface right? A virtual "
@@ -178,7 +221,10 @@ class UnitreeDriver:
         fields = [hg.LowState.motors(data, name) for data in messages for name in MOTOR_FIELDS]
         values = np.concatenate([field.reshape(hg.MOTORS, -1) for field in fields], axis=1)
         used = np.abs(values).max(axis=1) != 0
-        strange, missing = np.flatnonzero(used[len(MOTOR_NAMES) :]), np.flatnonzero(~used[: len(MOTOR_NAMES)])
+        strange, missing = (
+            np.flatnonzero(used[len(MOTOR_NAMES) :]),
+            np.flatnonzero(~used[: len(MOTOR_NAMES)]),
+        )
         if self._machine in G1_MACHINES:
             reason = f"its mode_machine is {self._machine}, a G1's"
         elif len(strange):
@@ -187,7 +233,9 @@ class UnitreeDriver:
             reason = f"no motor in slot {missing[0]}, {MOTOR_NAMES[missing[0]]}"
         else:
             return
-        raise DriverError(f"the robot on {self.interface} is not an H1-2: {reason}; nothing was sent")
+        raise DriverError(
+            f"the robot on {self.interface} is not an H1-2: {reason}; nothing was sent"
+        )
 
     def read(self) -> State:
         """Return the newest state with a right checksum; its time is the robot's, mapped to ours (TickClock)."""
@@ -210,7 +258,10 @@ class UnitreeDriver:
         """Return what the robot itself reports: its operator's stop keys, motor errors, another mode_machine."""
         keys = int(hg.LowState.view(data, "wireless_remote")[2:4].view("<u2")[0])
         if keys & SELECT or keys & L2_B == L2_B:
-            return Fault("stop", f"asked to stop: {'select' if keys & SELECT else 'L2 + B'} on the robot's remote")
+            return Fault(
+                "stop",
+                f"asked to stop: {'select' if keys & SELECT else 'L2 + B'} on the robot's remote",
+            )
         machine = int(hg.LowState.view(data, "mode_machine")[0])
         if machine != self._machine:
             return Fault("robot", f"mode_machine changed from {self._machine} to {machine}")
@@ -224,8 +275,12 @@ class UnitreeDriver:
         message, at = hg.LowState, self._motor
         measured = clock.time(int(message.view(data, "tick")[0]), now)
         self.virtual = int(message.view(data, "reserve")[0]) == VIRTUAL_MARK
-        q, dq, tau = (message.motors(data, name)[at].astype(float) for name in ("q", "dq", "tau_est"))
-        temperature = message.motors(data, "temperature")[at].max(axis=1).astype(float)  # case and winding
+        q, dq, tau = (
+            message.motors(data, name)[at].astype(float) for name in ("q", "dq", "tau_est")
+        )
+        temperature = (
+            message.motors(data, "temperature")[at].max(axis=1).astype(float)
+        )  # case and winding
         _, x, y, _ = quaternion = message.view(data, "imu_state.quaternion").astype(float)
         # The vertical's component along the trunk; an invalid quaternion gives NaN, which counts as tilt.
         valid = abs(np.linalg.norm(quaternion) - 1.0) < MAX_QUATERNION_ERROR
@@ -300,7 +355,10 @@ class UnitreeDriver:
         """Return the other publishers on the bus: topic → programs; the robot's topics are always included."""
         assert self._bus is not None
         publishers = self._bus.publishers()
-        return {topic: publishers[topic] for topic in ("rt/lowstate", "rt/arm_sdk", "rt/lowcmd", *sorted(publishers))}
+        return {
+            topic: publishers[topic]
+            for topic in ("rt/lowstate", "rt/arm_sdk", "rt/lowcmd", *sorted(publishers))
+        }
 
     def watchdog(self) -> dict[str, object] | None:
         """Return the options of a second participant: connected from the start, and silent until it damps."""

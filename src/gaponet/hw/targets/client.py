@@ -70,7 +70,9 @@ class RemoteRobot:
         """
         if not isinstance(target, Mapping):
             if not self.joint_names:
-                raise DriverError("take a state first: only then the order of the joints is known; or name them")
+                raise DriverError(
+                    "take a state first: only then the order of the joints is known; or name them"
+                )
             named = dict(zip(self.joint_names, np.asarray(target, float).tolist(), strict=True))
             target = {name: named[name] for name in self.commanded}
         self._send({"target": {name: float(value) for name, value in target.items()}})
@@ -83,7 +85,9 @@ class RemoteRobot:
 
     def _send(self, message: dict[str, object]) -> None:
         with contextlib.suppress(zmq.Again):  # nobody reads; the next target is newer
-            self._socket.send(json.dumps({"time": time.monotonic()} | message).encode(), zmq.NOBLOCK)
+            self._socket.send(
+                json.dumps({"time": time.monotonic()} | message).encode(), zmq.NOBLOCK
+            )
 
     def _newest(self) -> State | None:
         if not self._socket.poll(round(1e3 * self.patience)):
@@ -96,6 +100,9 @@ class RemoteRobot:
                 self.ended = message.get("end", "")
                 if self.ended:
                     return None
-        self.joint_names, self.commanded = tuple(message["joint_names"]), tuple(message["commanded"])
+        self.joint_names, self.commanded = (
+            tuple(message["joint_names"]),
+            tuple(message["commanded"]),
+        )
         qpos, qvel, tau = (np.array(message[name], float) for name in ("qpos", "qvel", "tau"))
         return State(message["time"], qpos, qvel, tau, np.full_like(qpos, np.nan))

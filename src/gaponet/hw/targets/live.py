@@ -24,9 +24,18 @@ from gaponet.hw.targets.policy import NotYet
 from gaponet.robot.spec import RobotSpec
 
 MAX_MESSAGE_BYTES = 1 << 14  # a message of 27 joints with long names has 1,500
-MAX_BEYOND_RANGE_RAD = 0.2  # beyond a joint's range: up to this a target is clipped to the range, else rejected
-MAX_CATCH_UP_PERIODS = 5  # control periods for which the speed limit bounds the distance to the last target
-MAX_OPTIONS = {"hold": (60.0, "s"), "late": (60.0, "s"), "wait": (1e6, "s"), "acceleration": (1e6, "rad/s²")}
+MAX_BEYOND_RANGE_RAD = (
+    0.2  # beyond a joint's range: up to this a target is clipped to the range, else rejected
+)
+MAX_CATCH_UP_PERIODS = (
+    5  # control periods for which the speed limit bounds the distance to the last target
+)
+MAX_OPTIONS = {
+    "hold": (60.0, "s"),
+    "late": (60.0, "s"),
+    "wait": (1e6, "s"),
+    "acceleration": (1e6, "rad/s²"),
+}
 MAX_CLOCK_DRIFT = 2e-4  # of the sender's clock, relative to ours
 
 
@@ -46,7 +55,9 @@ class LiveConfig:
     def __post_init__(self) -> None:
         for name, (most, unit) in MAX_OPTIONS.items():
             if not 0 < getattr(self, name) <= most:
-                raise UsageError(f"live: {name} is {getattr(self, name)} {unit}; give a positive number up to {most:g}")
+                raise UsageError(
+                    f"live: {name} is {getattr(self, name)} {unit}; give a positive number up to {most:g}"
+                )
 
 
 @dataclass(frozen=True)
@@ -112,8 +123,12 @@ def next_step(step: Array, distance: Array, max_step: float, max_change: float) 
     # A step of u changes, u from m to m + 1, and the m smaller ones that end it go (m + 1) u - m (m + 1) / 2 changes.
     far = np.abs(distance)
     m = np.floor((np.sqrt(1 + 8 * far / max_change) - 1) / 2)
-    largest = np.where(far <= max_change, far, max_change * (far / max_change + m * (m + 1) / 2) / (m + 1))
-    return np.clip(np.copysign(np.minimum(largest, max_step), distance), step - max_change, step + max_change)
+    largest = np.where(
+        far <= max_change, far, max_change * (far / max_change + m * (m + 1) / 2) / (m + 1)
+    )
+    return np.clip(
+        np.copysign(np.minimum(largest, max_step), distance), step - max_change, step + max_change
+    )
 
 
 class LiveTargets:
@@ -151,8 +166,13 @@ class LiveTargets:
         self._sender: Hashable | None = None
         self._joints: tuple[str, ...] = ()
         self._target: Array | None = None  # the last accepted one, all joints, rad
-        self._position, self._step = np.zeros(0), np.zeros(0)  # on the way to the target, rad; the last step, rad
-        self._offset = self._offset_time = np.inf  # least arrival − time, s; our time of the last update
+        self._position, self._step = (
+            np.zeros(0),
+            np.zeros(0),
+        )  # on the way to the target, rad; the last step, rad
+        self._offset = self._offset_time = (
+            np.inf
+        )  # least arrival − time, s; our time of the last update
         self._sender_time = -np.inf  # of the last accepted target, sender's clock
         self._start: float | None = None
         self._accepted_time = 0.0  # our time of the last accepted target
@@ -171,16 +191,23 @@ class LiveTargets:
         self.transport.publish(self._sender, {"time": state.time, **names, **readings})
         if not (self._ended and k > 0):
             self._receive(now, state)
-        ending = self._ended and (k > 0 or self._target is None)  # row 0 is also the goal of the blend
+        ending = self._ended and (
+            k > 0 or self._target is None
+        )  # row 0 is also the goal of the blend
         if self._target is None:
             if ending:
                 return None
             waited = now - self._start
             kind = NotYet if waited < self.config.wait else Fault
-            return kind("silence", f"no target came on {self.transport.address} in {waited:.0f} s{self._rejection}")
+            return kind(
+                "silence",
+                f"no target came on {self.transport.address} in {waited:.0f} s{self._rejection}",
+            )
         silent = now - self._accepted_time
         if silent > self.config.hold and not ending:
-            return Fault("silence", f"no target was accepted for {silent * 1e3:.0f} ms{self._rejection}")
+            return Fault(
+                "silence", f"no target was accepted for {silent * 1e3:.0f} ms{self._rejection}"
+            )
         self._advance(self._target)
         if ending and not self._step.any():
             return None
@@ -196,7 +223,9 @@ class LiveTargets:
         if not self._position.size:
             self._position, self._step = target, np.zeros_like(target)
         distance = target - self._position
-        self._step = next_step(self._step, distance, self.speed * self.dt, self.config.acceleration * self.dt**2)
+        self._step = next_step(
+            self._step, distance, self.speed * self.dt, self.config.acceleration * self.dt**2
+        )
         self._position = np.where(self._step == distance, target, self._position + self._step)
 
     def _receive(self, now: float, state: State) -> None:
@@ -204,7 +233,9 @@ class LiveTargets:
         before, since, accepted = self._target, now - self._accepted_time, None
         for message in self.transport.receive():
             kind, why = self._reject(message, now)
-            target, kind, why = (None, kind, why) if kind else self._full_target(message, before, since, state)
+            target, kind, why = (
+                (None, kind, why) if kind else self._full_target(message, before, since, state)
+            )
             if kind:
                 self.counts["refused"][kind] += 1
                 self._rejection = f"; the last one was rejected: {why}"
@@ -222,7 +253,10 @@ class LiveTargets:
         if self._sender is None:
             self._sender = message.sender
         if message.sender != self._sender:
-            return "stranger", "it is from another sender than the first one; start a new run for a new sender"
+            return (
+                "stranger",
+                "it is from another sender than the first one; start a new run for a new sender",
+            )
         if message.end:
             self._ended = True
         if message.time is None:
@@ -244,10 +278,19 @@ class LiveTargets:
             return None, "", ""
         names = self._joints or tuple(message.target)
         if message.target.keys() != set(names) or not set(names) <= set(self.commanded):
-            odd = sorted(message.target.keys() ^ set(names)) or [n for n in names if n not in self.commanded]
-            return None, "joints", f"joint '{odd[0]}' is new, left out, or not one that is commanded"
+            odd = sorted(message.target.keys() ^ set(names)) or [
+                n for n in names if n not in self.commanded
+            ]
+            return (
+                None,
+                "joints",
+                f"joint '{odd[0]}' is new, left out, or not one that is commanded",
+            )
         at = self.robot.index(names)
-        wanted, (low, high) = np.array([message.target[name] for name in names], float), self.robot.qpos_range[at].T
+        wanted, (low, high) = (
+            np.array([message.target[name] for name in names], float),
+            self.robot.qpos_range[at].T,
+        )
         beyond = np.maximum(low - wanted, wanted - high)
         if not beyond.max() <= MAX_BEYOND_RANGE_RAD:  # NaN too
             worst = int(np.argmax(beyond))
@@ -257,7 +300,11 @@ class LiveTargets:
         allowed = self.speed * min(since + self.dt, MAX_CATCH_UP_PERIODS * self.dt)
         if before is not None and step.max() > allowed:
             worst = int(step.argmax())
-            return None, "speed", f"{names[worst]} goes {step[worst]:.2f} rad at once, {allowed:.2f} would be possible"
+            return (
+                None,
+                "speed",
+                f"{names[worst]} goes {step[worst]:.2f} rad at once, {allowed:.2f} would be possible",
+            )
         target[at] = np.clip(wanted, low, high)
         self._joints = names
         return target, "", ""

@@ -24,7 +24,9 @@ class PipeTransport:
             UsageError: Standard input is a terminal, where any key stops a run.
         """
         if descriptor is None and (sys.stdin is None or sys.stdin.isatty()):
-            raise UsageError("targets on stdin come through a pipe: PROGRAM | gaponet run --targets stdin --yes …")
+            raise UsageError(
+                "targets on stdin come through a pipe: PROGRAM | gaponet run --targets stdin --yes …"
+            )
         self.address = "stdin"
         self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
         self._partial_line = b""

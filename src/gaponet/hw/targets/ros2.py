@@ -70,24 +70,33 @@ def decode(kind: Any, data: bytes) -> Any:
 class ROS2Transport:
     """A `Transport` on a DDS domain."""
 
-    def __init__(self, domain: int = 0, interface: str = "lo", topic: str = TOPIC, states: str = STATES_TOPIC) -> None:
+    def __init__(
+        self, domain: int = 0, interface: str = "lo", topic: str = TOPIC, states: str = STATES_TOPIC
+    ) -> None:
         """Join the domain ROS_DOMAIN_ID. Topics, of JointTrajectory and of JointState, have the prefix rt/."""
         self.address = f"{topic}, domain {domain}, interface {interface}"
         self._bus = dds.Bus(domain, interface)
         self._reader = self._bus.reader(topic, JointTrajectory, QUEUE_LENGTH)
         self._writer = self._bus.writer(states, JointState)
-        point = JointTrajectoryPoint([0.0], [], [], [], Duration(0, 0))  # decoding the first one takes long
+        point = JointTrajectoryPoint(
+            [0.0], [], [], [], Duration(0, 0)
+        )  # decoding the first one takes long
         to_message("", encode(JointTrajectory(Header(Time(0, 0), ""), ["joint"], [point])))
 
     def receive(self) -> list[Message]:
         """Return the messages since the last call."""
         samples = self._reader.samples()
-        return [to_message(sample.sample_info.publication_handle, bytes(sample.data)) for sample in samples]
+        return [
+            to_message(sample.sample_info.publication_handle, bytes(sample.data))
+            for sample in samples
+        ]
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
         """Publish a JointState of all joints, stamped with the wall clock, as ROS does."""
         header = Header(Time(*divmod(time.time_ns(), 10**9)), "")
-        message = JointState(header, list(state["joint_names"]), state["qpos"], state["qvel"], state["tau"])
+        message = JointState(
+            header, list(state["joint_names"]), state["qpos"], state["qvel"], state["tau"]
+        )
         self._writer.send(encode(message))
 
     def close(self, reason: str) -> None:
@@ -109,7 +118,10 @@ def to_message(sender: Hashable, data: bytes) -> Message:
         return Message(sender, time_s, end=True)
     due = points[-1].time_from_start
     if len(points) > 1 or due.sec + 1e-9 * due.nanosec > MAX_TIME_FROM_START_S:
-        return Message(sender, error=f"a plan; send one point per message, due within {MAX_TIME_FROM_START_S:g} s")
+        return Message(
+            sender,
+            error=f"a plan; send one point per message, due within {MAX_TIME_FROM_START_S:g} s",
+        )
     positions = points[0].positions
     if len(positions) != len(names) or len(set(names)) != len(names):
         return Message(sender, error=f"{len(positions)} positions for {len(set(names))} joints")

@@ -41,7 +41,9 @@ class ZeroMQTransport:
             self._socket.bind(address)
         except zmq.ZMQError as error:
             self._context.destroy(linger=0)
-            raise UsageError(f"cannot listen at {address} ({error}); is another run there?") from None
+            raise UsageError(
+                f"cannot listen at {address} ({error}); is another run there?"
+            ) from None
         self._sender: Hashable | None = None
 
     def receive(self) -> list[Message]:

@@ -67,7 +67,9 @@ class Checkpoint:
         """Write checkpoint.pt and progress.jsonl. The first rank writes, after all ranks compared their networks."""
         ranks.require_equal(net.state_dict(), self.ppo["critic"] if self.ppo else {})
         state = vars(self) | {"net": net.state_dict(), "rng": torch.get_rng_state()}
-        others = ranks.gathered(_rank_state({name: state[name] for name in ("rng", "env", "ppo", "pretraining")}))[1:]
+        others = ranks.gathered(
+            _rank_state({name: state[name] for name in ("rng", "env", "ppo", "pretraining")})
+        )[1:]
         if not ranks.rank():
             content = io.BytesIO()  # torch does not report the error of a full disk
             torch.save(state | {"others": others}, content)
@@ -100,12 +102,18 @@ class Checkpoint:
             checkpoint = cls(**state)
         except Exception as error:  # torch and its unpickler have no common base of errors
             reason = next(iter(str(error).splitlines()), type(error).__name__)
-            raise ModelError(f"{out / CHECKPOINT}: does not fit this model or is damaged ({reason})") from None
+            raise ModelError(
+                f"{out / CHECKPOINT}: does not fit this model or is damaged ({reason})"
+            ) from None
         if len(others) + 1 != ranks.world():
             n = len(others) + 1
-            raise UsageError(f"{out}: was trained by {n} processes; resume with torchrun --nproc-per-node {n}")
+            raise UsageError(
+                f"{out}: was trained by {n} processes; resume with torchrun --nproc-per-node {n}"
+            )
         if checkpoint.dataset_hash != dataset_hash:
-            raise UsageError(f"{out}: was trained on other recordings than this dataset holds; train anew")
+            raise UsageError(
+                f"{out}: was trained on other recordings than this dataset holds; train anew"
+            )
         return checkpoint
 
 
@@ -121,7 +129,9 @@ def _rank_state(state: Any) -> Any:
 def _with_rank_state(state: Any, rank_state: Any) -> Any:
     """Replace the first rank's `_rank_state` by another rank's."""
     if isinstance(rank_state, dict):
-        return (state or {}) | {name: _with_rank_state((state or {}).get(name), x) for name, x in rank_state.items()}
+        return (state or {}) | {
+            name: _with_rank_state((state or {}).get(name), x) for name, x in rank_state.items()
+        }
     if isinstance(rank_state, list):
         return [_with_rank_state(x, y) for x, y in zip(state, rank_state, strict=True)]
     return rank_state

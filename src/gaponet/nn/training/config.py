@@ -156,7 +156,9 @@ class TrainConfig:
         import torch
 
         if not torch.cuda.is_available():
-            raise UsageError("--device cuda: torch sees no GPU, or is a build without; use --device cpu")
+            raise UsageError(
+                "--device cuda: torch sees no GPU, or is a build without; use --device cpu"
+            )
         return "cuda"
 
     @property
@@ -171,14 +173,22 @@ class TrainConfig:
         PPO settings that differ from the defaults stay.
         """
         default = PPOConfig()
-        changed = {f.name: x for f in fields(default) if (x := getattr(self.ppo, f.name)) != getattr(default, f.name)}
-        return replace(self, ppo=replace(PAPER_PPO, **changed), pretraining=replace(self.pretraining, rounds=0))
+        changed = {
+            f.name: x
+            for f in fields(default)
+            if (x := getattr(self.ppo, f.name)) != getattr(default, f.name)
+        }
+        return replace(
+            self, ppo=replace(PAPER_PPO, **changed), pretraining=replace(self.pretraining, rounds=0)
+        )
 
     def sized(self) -> TrainConfig:
         """Return this configuration with the device's number of simulations where num_envs is 0."""
         num = 4096 if self.device == "cuda" else 256
         pretraining = replace(self.pretraining, num_envs=self.pretraining.num_envs or num)
-        return replace(self, pretraining=pretraining, ppo=replace(self.ppo, num_envs=self.ppo.num_envs or num))
+        return replace(
+            self, pretraining=pretraining, ppo=replace(self.ppo, num_envs=self.ppo.num_envs or num)
+        )
 
     def options(self) -> list[str]:
         """Return the options of gaponet train for this configuration."""
@@ -195,7 +205,9 @@ def command(
     words = [*several, "gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
     words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
     words += ["--holdout-units", *holdout_units] if holdout_units else []
-    words += ["--model", "gaponet"] if config.model.kind == "gaponet" else []  # the command's default is auto
+    words += (
+        ["--model", "gaponet"] if config.model.kind == "gaponet" else []
+    )  # the command's default is auto
     return shlex.join(words + config.options())
 
 
@@ -233,10 +245,14 @@ class Budget:
         except ValueError:
             number = 0.0
         if not match or not 0 < number <= MAX_BUDGET:
-            raise UsageError(f"--budget {text}: give a time such as 90s, 10m or 2h, or a number of control steps")
+            raise UsageError(
+                f"--budget {text}: give a time such as 90s, 10m or 2h, or a number of control steps"
+            )
         unit = match.group(2).lower()
         if not unit and number < MIN_STEPS:
-            raise UsageError(f"--budget {text}: {number:g} control steps teach nothing; is it {text}s or {text}m?")
+            raise UsageError(
+                f"--budget {text}: {number:g} control steps teach nothing; is it {text}s or {text}m?"
+            )
         return cls(seconds=number * SECONDS[unit]) if unit else cls(steps=int(number))
 
     def part(self, share: float) -> Budget:
@@ -268,5 +284,9 @@ class Status:
         """Stage, reward, validation error and speed as text."""
         reward = "" if self.reward != self.reward else f", reward {self.reward:.4f}"
         best = f"(best {self.best_mpjae / self.nominal_mpjae:.2f} of nominal)"
-        error = "" if self.val_mpjae != self.val_mpjae else f", validation {self.val_mpjae * 1e3:.2f} mrad {best}"
+        error = (
+            ""
+            if self.val_mpjae != self.val_mpjae
+            else f", validation {self.val_mpjae * 1e3:.2f} mrad {best}"
+        )
         return f"{self.stage}{reward}{error}, {self.steps / max(self.seconds, 1e-9):,.0f} steps/s"

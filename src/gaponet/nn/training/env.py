@@ -42,7 +42,9 @@ class RecordedRows:
         group: Group of each environment, (num_envs,).
     """
 
-    def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec, min_rows: int, num_envs: int) -> None:
+    def __init__(
+        self, sequences: ListOf[Sequence], robot: RobotSpec, min_rows: int, num_envs: int
+    ) -> None:
         """
         Args:
             min_rows: Least number of rows of a recording.
@@ -56,11 +58,15 @@ class RecordedRows:
         free = [j for j in robot.joint_names if j not in self.locked]
         self.operated = np.array([free.index(j) for j in robot.operated])
         self.ctrl, self.qpos, self.qvel = (
-            np.ascontiguousarray(np.concatenate([getattr(s, name)[:, robot.index(free)] for s in sequences]))
+            np.ascontiguousarray(
+                np.concatenate([getattr(s, name)[:, robot.index(free)] for s in sequences])
+            )
             for name in ("ctrl", "qpos", "qvel")
         )
         operated = [x[:, self.operated] for x in (self.qpos, self.qvel, self.ctrl)]
-        self.track = np.ascontiguousarray(np.concatenate(operated, axis=1), np.float32)  # take() copies anything else
+        self.track = np.ascontiguousarray(
+            np.concatenate(operated, axis=1), np.float32
+        )  # take() copies anything else
         length = np.array([len(s) for s in sequences])
         if length.min() < min_rows:
             short = sequences[int(length.argmin())]
@@ -76,7 +82,9 @@ class RecordedRows:
         self.unobserved = np.array([[j in unrecorded for j in free] for _, unrecorded in groups])
         rows = np.bincount(sequence_group, length)
         if num_envs < len(rows):
-            raise UsageError(f"{num_envs} environments for {len(rows)} conditions of payload, rate and gains; use more")
+            raise UsageError(
+                f"{num_envs} environments for {len(rows)} conditions of payload, rate and gains; use more"
+            )
         quota = np.cumsum(rows) / rows.sum() * num_envs
         self.group = np.searchsorted(quota, np.arange(num_envs) + 0.5).astype(int)
         # Recordings by group, and the group number plus the cumulative share of rows in the group.
@@ -87,7 +95,9 @@ class RecordedRows:
 
     def sample(self, group: Array, rng: Any) -> tuple[Array, Array]:
         """Draw a recording for each of these groups, in proportion to its rows; return its first and last row, (k,)."""
-        drawn = np.minimum(group + rng.random(len(group)), np.nextafter(group + 1.0, 0.0))  # stay in the group
+        drawn = np.minimum(
+            group + rng.random(len(group)), np.nextafter(group + 1.0, 0.0)
+        )  # stay in the group
         sequence = self._members[np.searchsorted(self._cumulative, drawn, side="right")]
         return self.first[sequence], self.last[sequence]
 
@@ -139,7 +149,9 @@ class DeltaEnv:
         self.rows = rows = RecordedRows(sequences, robot, config.delta_hold + 1, num_envs)
         conditions = [rows.conditions[g] for g in rows.group]
         sim = BatchSim(robot, conditions, nthread, rows.locked)
-        if rows.unobserved.any():  # these joints stay where the recording says, as in identification
+        if (
+            rows.unobserved.any()
+        ):  # these joints stay where the recording says, as in identification
             held = IMMOVABLE_ARMATURE * rows.unobserved[rows.group]
             sim.batch.expand("dof_armature")[:] += held
             if sim.servo_model is not None:
@@ -151,29 +163,43 @@ class DeltaEnv:
 
             self.sim = WarpSim(sim, device)
         place = self.sim.array
-        self.ctrl, self.qpos, self.qvel, self.track = map(place, (rows.ctrl, rows.qpos, rows.qvel, rows.track))
+        self.ctrl, self.qpos, self.qvel, self.track = map(
+            place, (rows.ctrl, rows.qpos, rows.qvel, rows.track)
+        )
         payload = np.array([c[0] for c in conditions], np.float32)
         rate = np.array([1 / c[2] for c in conditions], np.float32)
         self.payload = place(payload)
-        self.condition_features = place(np.stack([payload / config.payload_max, rate / 100], axis=1))
+        self.condition_features = place(
+            np.stack([payload / config.payload_max, rate / 100], axis=1)
+        )
         unobserved = rows.unobserved[rows.group][:, rows.operated]
         self.nan_where_unobserved = place(np.where(unobserved, np.nan, 0).astype(np.float32))
         self.operated, self.preview = place(rows.operated), place(CRITIC_PREVIEW)
         self.low, self.high = place(sim.range[rows.operated].T)
-        self.row, self.first, self.last, self.elapsed = (np.zeros(num_envs, np.int64) for _ in COUNTERS)
-        self.row_on_device, self.last_on_device = (copy_array(place(x)) for x in (self.row, self.last))
+        self.row, self.first, self.last, self.elapsed = (
+            np.zeros(num_envs, np.int64) for _ in COUNTERS
+        )
+        self.row_on_device, self.last_on_device = (
+            copy_array(place(x)) for x in (self.row, self.last)
+        )
         self.recorded = zeros_like(self.track, num_envs, self.track.shape[1])
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
-        self.real_state_visible = zeros_like(self.track, num_envs, 1)  # 1 where the actor observes the recorded state
+        self.real_state_visible = zeros_like(
+            self.track, num_envs, 1
+        )  # 1 where the actor observes the recorded state
         self.loop = DeltaLoop(config, sim.range[rows.operated], num_envs, like=self.recorded)
         if config.needs_simulator:
             if device != "cpu":
-                raise UsageError(f"--model.sensor-source fixed asks C MuJoCo: use --device cpu, not {device}")
+                raise UsageError(
+                    f"--model.sensor-source fixed asks C MuJoCo: use --device cpu, not {device}"
+                )
             self.oracle = ProbeOracle(robot, config, conditions, nthread, rows.locked)
         if config.needs_simulator or config.real_state:
             self.loop.extra = self._extra_inputs
         max_delay_periods = int(np.ceil(sim.robot.delay.max() / min(c[2] for c in rows.conditions)))
-        self.depth = max(self.loop.history.depth, 1 + max_delay_periods)  # rows before the start that are used
+        self.depth = max(
+            self.loop.history.depth, 1 + max_delay_periods
+        )  # rows before the start that are used
         self.reward_sum, self.reward_count = 0.0, 0
         self.reset()
 
@@ -186,13 +212,19 @@ class DeltaEnv:
         self.first[ids], self.last[ids], self.row[ids], self.elapsed[ids] = first, last, t, 0
         t, last, before = (self.sim.array(x) for x in (t, last, before))
         ids = ids if isinstance(ids, slice) else self.sim.array(ids)
-        self.row_on_device[ids], self.last_on_device[ids], self.recorded[ids] = t, last, self.track[t]
+        self.row_on_device[ids], self.last_on_device[ids], self.recorded[ids] = (
+            t,
+            last,
+            self.track[t],
+        )
         if self.config.real_state:
             visible = (self.rng.random((len(group), 1)) < 0.5).astype(np.float32)
             self.real_state_visible[ids] = self.sim.array(visible)
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
         before = before[:, : self.loop.history.depth]
-        self.loop.begin(ids, *(x[before][..., self.operated] for x in (self.qpos, self.qvel, self.ctrl)))
+        self.loop.begin(
+            ids, *(x[before][..., self.operated] for x in (self.qpos, self.qvel, self.ctrl))
+        )
 
     def get_observations(self) -> dict[str, torch.Tensor]:
         """Return the observations of actor and critic, float32."""
@@ -222,7 +254,9 @@ class DeltaEnv:
         if self.config.real_state:
             state = concatenate([sim.qpos[:, self.operated], sim.qvel[:, self.operated]], 1)
             difference = self.recorded[:, : 2 * self.num_actions] - state
-            parts.append(concatenate([difference, self.real_state_visible], 1) * self.real_state_visible)
+            parts.append(
+                concatenate([difference, self.real_state_visible], 1) * self.real_state_visible
+            )
         return concatenate(parts, 1)
 
     def step(self, delta: Any) -> tuple[Any, Any]:
@@ -243,7 +277,9 @@ class DeltaEnv:
 
     def restart(self) -> Array:
         """Reset the environments whose recording or time has ended. Return their mask, (num_envs,), on the host."""
-        done = (self.row > self.last - self.config.delta_hold) | (self.elapsed >= self.max_episode_length)
+        done = (self.row > self.last - self.config.delta_hold) | (
+            self.elapsed >= self.max_episode_length
+        )
         if done.any():
             self.reset(np.flatnonzero(done))
         return done
@@ -288,7 +324,9 @@ class DeltaEnv:
 
     def state(self) -> dict[str, Any]:
         """Return rows, simulations (with delayed commands), histories and random numbers."""
-        arrays = {name: getattr(self, name) for name in COUNTERS} | {"frames": self.loop.history.frames}
+        arrays = {name: getattr(self, name) for name in COUNTERS} | {
+            "frames": self.loop.history.frames
+        }
         arrays |= self.sim.state()
         arrays |= {"shown": self.real_state_visible} if self.config.real_state else {}
         arrays |= {"age": self.loop.age, "x": self.loop.x} if self.loop.holds else {}
@@ -303,7 +341,10 @@ class DeltaEnv:
         arrays = {name: x.numpy() for name, x in state["arrays"].items()}
         for name in COUNTERS:
             getattr(self, name)[:] = arrays[name]
-        self.row_on_device[:], self.last_on_device[:] = self.sim.array(self.row), self.sim.array(self.last)
+        self.row_on_device[:], self.last_on_device[:] = (
+            self.sim.array(self.row),
+            self.sim.array(self.last),
+        )
         self.recorded[:] = self.track[self.row_on_device]
         self.loop.history.frames[:] = array_like(self.loop.history.frames, arrays["frames"])
         for name in ("age", "x") if self.loop.holds else ():

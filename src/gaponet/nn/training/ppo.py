@@ -30,7 +30,10 @@ class Critic(nn.Module):
 
     def __init__(self, features: int, observations: int, hidden: tuple[int, ...], n: int) -> None:
         super().__init__()
-        self.standardise, self.net = Standardise(observations), dense(features + observations, hidden, n)
+        self.standardise, self.net = (
+            Standardise(observations),
+            dense(features + observations, hidden, n),
+        )
 
     def forward(self, features: Tensor, observations: Tensor) -> Tensor:
         standardised = self.standardise(observations).clamp(-MAX_FEATURE, MAX_FEATURE)
@@ -65,7 +68,9 @@ class Batch:
 class Update:
     """Metrics of one update."""
 
-    explained_variance: float = float("nan")  # share of the variance of the returns that the critic explains
+    explained_variance: float = float(
+        "nan"
+    )  # share of the variance of the returns that the critic explains
     kl: float = float("nan")  # KL divergence of the actor's step, per joint
     learning_rate: float = float("nan")
     critic_learning_rate: float = float("nan")
@@ -85,12 +90,20 @@ class PPO:
         observations = env.get_observations()["critic"]
         device = observations.device
         width = observations.shape[1]
-        self.critic = Critic(net.features.dim, width, config.critic_hidden, env.num_actions).to(device)
+        self.critic = Critic(net.features.dim, width, config.critic_hidden, env.num_actions).to(
+            device
+        )
         ranks.broadcast(self.critic)
-        self.optimiser = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], lr=config.learning_rate)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
+        self.optimiser = torch.optim.Adam(
+            [p for p in net.parameters() if p.requires_grad], lr=config.learning_rate
+        )
+        self.critic_optimiser = torch.optim.Adam(
+            self.critic.parameters(), lr=config.critic_learning_rate
+        )
         decision_s = env.robot.dt * env.config.delta_hold
-        self.noise_correlation = math.exp(-decision_s / config.noise_time) if config.noise_time else 0.0
+        self.noise_correlation = (
+            math.exp(-decision_s / config.noise_time) if config.noise_time else 0.0
+        )
         self.noise = torch.zeros(env.num_envs, env.num_actions, device=device)
         self.updates, self.actor_enabled, self.metrics = 0, False, Update()
 
@@ -136,16 +149,24 @@ class PPO:
                 self.noise = correlated + self.innovation_std * mask * torch.randn_like(correlated)
                 delta = row["mean"] + self.noise
                 reward, done = (torch.as_tensor(x) for x in env.step(delta))
-                row |= {"actions": delta - correlated, "exploration_mask": mask, "done": done.float()[:, None]}
+                row |= {
+                    "actions": delta - correlated,
+                    "exploration_mask": mask,
+                    "done": done.float()[:, None],
+                }
                 # The end of a recording is a time-out: the value of the last state stands for the rewards to come.
                 row["reward"] = (1 - gamma) * reward + gamma * row["value"] * row["done"]
                 rows.append(row)
             steps = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
             last = self.observe()["value"]
-            steps["advantage"] = advantages(steps["reward"], steps["value"], last, steps["done"], gamma, config.lam)
+            steps["advantage"] = advantages(
+                steps["reward"], steps["value"], last, steps["done"], gamma, config.lam
+            )
             steps["returns"] = steps["advantage"] + steps["value"]
             self._measure(steps)
-        return Batch(**{name: steps[name].flatten(0, 1).clone() for name in Batch.__dataclass_fields__})
+        return Batch(
+            **{name: steps[name].flatten(0, 1).clone() for name in Batch.__dataclass_fields__}
+        )
 
     def _measure(self, steps: dict[str, Tensor]) -> None:
         residual = (steps["returns"] - steps["value"]).flatten(0, 1).var(0)
@@ -153,10 +174,17 @@ class PPO:
         size = steps["mean"].abs()
         at_limit = (size >= self.env.config.delta_max).float().mean()
         explained, delta, limited, reward = ranks.mean(
-            1 - float(unexplained.mean()), float(size.mean()), float(at_limit), self.env.mean_reward()
+            1 - float(unexplained.mean()),
+            float(size.mean()),
+            float(at_limit),
+            self.env.mean_reward(),
         )
-        self.metrics = Update(explained_variance=explained, mean_delta=delta, at_limit=limited, reward=reward)
-        self.actor_enabled |= self.updates >= self.config.critic_warmup and explained >= self.config.explained
+        self.metrics = Update(
+            explained_variance=explained, mean_delta=delta, at_limit=limited, reward=reward
+        )
+        self.actor_enabled |= (
+            self.updates >= self.config.critic_warmup and explained >= self.config.explained
+        )
 
     def learn(self, batch: Batch) -> None:
         """Fit the critic, and the actor once the critic explains the returns."""
@@ -166,24 +194,38 @@ class PPO:
         batch.advantage = centred / ((mask * centred**2).sum(0) / count).sqrt().clamp_min(1e-8)
         divergences = []
         for _ in range(config.epochs):
-            for rows in torch.randperm(len(centred), device=centred.device).chunk(config.mini_batches):
+            for rows in torch.randperm(len(centred), device=centred.device).chunk(
+                config.mini_batches
+            ):
                 value = self.critic(batch.features[rows], batch.critic_observations[rows])
                 self._descend(self.critic_optimiser, (value - batch.returns[rows]).square().mean())
                 if self.actor_enabled:
                     divergences.append(self._actor_step(batch, rows))
         self.metrics.kl = sum(divergences) / max(len(divergences), 1)
-        self.metrics.learning_rate = self.optimiser.param_groups[0]["lr"] if self.actor_enabled else 0.0
+        self.metrics.learning_rate = (
+            self.optimiser.param_groups[0]["lr"] if self.actor_enabled else 0.0
+        )
         self.metrics.critic_learning_rate = self.config.critic_learning_rate
 
     def _actor_step(self, batch: Batch, rows: Tensor) -> float:
         """Take one gradient step; return the KL divergence from the collecting network, per exploring joint."""
-        mean, old, actions = self.net.correct(batch.prepared[rows]), batch.mean[rows], batch.actions[rows]
+        mean, old, actions = (
+            self.net.correct(batch.prepared[rows]),
+            batch.mean[rows],
+            batch.actions[rows],
+        )
         weight = batch.exploration_mask[rows] / batch.exploration_mask[rows].sum().clamp_min(1.0)
-        ratio = (((actions - old) ** 2 - (actions - mean) ** 2) / (2 * self.innovation_std**2)).exp()
+        ratio = (
+            ((actions - old) ** 2 - (actions - mean) ** 2) / (2 * self.innovation_std**2)
+        ).exp()
         clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
         advantage = batch.advantage[rows]
-        self._descend(self.optimiser, -(weight * torch.minimum(ratio * advantage, clipped * advantage)).sum())
-        kl = ranks.mean(float((weight * (mean.detach() - old) ** 2).sum()) / (2 * self.innovation_std**2))[0]
+        self._descend(
+            self.optimiser, -(weight * torch.minimum(ratio * advantage, clipped * advantage)).sum()
+        )
+        kl = ranks.mean(
+            float((weight * (mean.detach() - old) ** 2).sum()) / (2 * self.innovation_std**2)
+        )[0]
         lowest, highest = LEARNING_RATE_BOUNDS
         for group in self.optimiser.param_groups:
             if kl > 2 * self.config.desired_kl:
@@ -218,7 +260,9 @@ class PPO:
         self.updates, self.actor_enabled = state["updates"], state["ready"]
 
 
-def advantages(reward: Tensor, value: Tensor, last: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
+def advantages(
+    reward: Tensor, value: Tensor, last: Tensor, done: Tensor, gamma: float, lam: float
+) -> Tensor:
     """Return generalised advantage estimates (Schulman et al. 2016), (T, N, n).
 
     Args:

@@ -41,7 +41,11 @@ TABLE_CLEARANCE_M = 0.01  # below it, a tip is taken to touch the table
 
 
 def trajectory_labels(
-    sequences: ListOf[Sequence], robot: RobotSpec, limit: float, nthread: int = 0, tick: Callable[[], object] = bool
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    limit: float,
+    nthread: int = 0,
+    tick: Callable[[], object] = bool,
 ) -> Array:
     """Return Δa* of the operated joints within ±limit rad, (rows of all recordings, n), by iterative learning control.
 
@@ -63,18 +67,25 @@ def trajectory_labels(
         tick()
         commanded = [_commanded(s, d, op) for s, d in zip(sequences, deltas, strict=True)]
         rollouts = replay(commanded, robot, nthread=nthread, lock_idle=True)
-        errors = [(s.qpos - r.qpos)[:, op].astype(float) for s, r in zip(sequences, rollouts, strict=True)]
+        errors = [
+            (s.qpos - r.qpos)[:, op].astype(float) for s, r in zip(sequences, rollouts, strict=True)
+        ]
         costs = [float(np.nan_to_num(np.abs(e), nan=np.pi).mean()) for e in errors]
         candidates = zip(costs, deltas, strict=True)
         best = [min(pair, key=lambda x: x[0]) for pair in zip(best, candidates, strict=True)]
         if iteration < ITERATIONS:
-            deltas = [_improved(*x, limit) for x in zip(deltas, errors, (s.dt for s in sequences), strict=True)]
+            deltas = [
+                _improved(*x, limit)
+                for x in zip(deltas, errors, (s.dt for s in sequences), strict=True)
+            ]
     labels = np.concatenate([d for _, d in best]).astype(np.float32)
     unlabelled = np.concatenate(
         [np.tile([j in s.meta.unrecorded for j in robot.operated], (len(s), 1)) for s in sequences]
     )
     if robot.table is not None:
-        unlabelled[np.concatenate(tip_heights(sequences, robot)) < robot.table.height + TABLE_CLEARANCE_M] = True
+        unlabelled[
+            np.concatenate(tip_heights(sequences, robot)) < robot.table.height + TABLE_CLEARANCE_M
+        ] = True
     return np.where(unlabelled, np.nan, labels).astype(np.float32)
 
 
@@ -82,7 +93,9 @@ def _improved(delta: Array, error: Array, dt: float, limit: float) -> Array:
     """Return Δa of the next iteration, (T, n) rad."""
     later = np.minimum(np.arange(len(error)) + round(LEAD_S / dt), len(error) - 1)
     raised = delta + LEARNING_GAIN * np.nan_to_num(error)[later]
-    return np.clip(gaussian_filter1d(raised, SMOOTHING_S / dt, axis=0, mode="nearest"), -limit, limit)
+    return np.clip(
+        gaussian_filter1d(raised, SMOOTHING_S / dt, axis=0, mode="nearest"), -limit, limit
+    )
 
 
 def _commanded(sequence: Sequence, delta: Array, op: Array) -> Sequence:
@@ -100,7 +113,13 @@ class Pretraining:
     """Pool of visited states, and the optimiser. `round` extends the pool and fits the network to it."""
 
     def __init__(
-        self, net: DeltaNet, env: DeltaEnv, labels: Array, config: PretrainingConfig, seed: int, nthread: int = 0
+        self,
+        net: DeltaNet,
+        env: DeltaEnv,
+        labels: Array,
+        config: PretrainingConfig,
+        seed: int,
+        nthread: int = 0,
     ) -> None:
         """labels: Δa* of each row of the environment's recordings, (rows, n) rad."""
         self.net, self.env, self.config, self.seed, self.nthread = net, env, config, seed, nthread
@@ -110,9 +129,15 @@ class Pretraining:
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[Tensor] = []
         self.pool_labels: list[Tensor] = []
-        self.parameters = [p for name, p in net.named_parameters() if not name.startswith(("predictor", "probes"))]
-        self.optimiser = torch.optim.AdamW(self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
-        self.rollout_states: list[dict[str, Any]] = []  # network and random numbers before the rollouts of each round
+        self.parameters = [
+            p for name, p in net.named_parameters() if not name.startswith(("predictor", "probes"))
+        ]
+        self.optimiser = torch.optim.AdamW(
+            self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.rollout_states: list[
+            dict[str, Any]
+        ] = []  # network and random numbers before the rollouts of each round
 
     @property
     def rounds_done(self) -> int:
@@ -167,7 +192,10 @@ class Pretraining:
             RMSE of the labels, rad, in the last quarter of the gradient steps and in the quarter before. The fit has
             converged if both are equal.
         """
-        before = {"net": {k: x.clone() for k, x in self.net.state_dict().items()}, "rng": self.env.rng_state}
+        before = {
+            "net": {k: x.clone() for k, x in self.net.state_dict().items()},
+            "rng": self.env.rng_state,
+        }
         self._extend_pool(follow_labels=self.rounds_done == 0)
         self.rollout_states.append(before)
         squares = self._fit_trees(self.net) if isinstance(self.net, TreesNet) else self._fit(tick)
@@ -178,7 +206,10 @@ class Pretraining:
     def _extend_pool(self, follow_labels: bool) -> None:
         x, labels = self.rollout(follow_labels)
         # One tensor each: the pool is in memory once.
-        self.pool_x, self.pool_labels = [torch.cat([*self.pool_x, x])], [torch.cat([*self.pool_labels, labels])]
+        self.pool_x, self.pool_labels = (
+            [torch.cat([*self.pool_x, x])],
+            [torch.cat([*self.pool_labels, labels])],
+        )
 
     def _fit_trees(self, net: TreesNet) -> Array:
         """Fit trees to the first rank's pool; return the mean squared label error, (1,) rad²."""
@@ -189,7 +220,9 @@ class Pretraining:
     def _fit(self, tick: Callable[[], object]) -> Array:
         """Fit the network to the pool; return the mean squared label error of each gradient step, rad²."""
         config, net, (x,), (labels,) = self.config, self.net, self.pool_x, self.pool_labels
-        squares = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)  # read after the last step
+        squares = torch.zeros(
+            config.gradient_steps, dtype=torch.double, device=x.device
+        )  # read after the last step
         net.train()
         net.features.noise_std = config.noise
         for step in range(config.gradient_steps):
@@ -241,7 +274,11 @@ def _mean_over_hold(labels: Array, hold: int) -> Array:
 
     Averages across the end of a recording are not used.
     """
-    return np.mean([labels[i : len(labels) - hold + 1 + i] for i in range(hold)], axis=0) if hold > 1 else labels
+    return (
+        np.mean([labels[i : len(labels) - hold + 1 + i] for i in range(hold)], axis=0)
+        if hold > 1
+        else labels
+    )
 
 
 def _rms(squares: Array) -> float:

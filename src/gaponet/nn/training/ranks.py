@@ -31,9 +31,14 @@ from gaponet.nn.layers import Standardise
 from gaponet.nn.training.config import TrainConfig
 
 T = TypeVar("T")
-HEARTBEAT_S, HEARTBEAT_TIMEOUT_S = 2.0, 25.0  # period of the heartbeat; after the timeout, a rank counts as dead
+HEARTBEAT_S, HEARTBEAT_TIMEOUT_S = (
+    2.0,
+    25.0,
+)  # period of the heartbeat; after the timeout, a rank counts as dead
 FIRST_HEARTBEAT_TIMEOUT_S = 120.0
-COLLECTIVE_TIMEOUT = timedelta(hours=24)  # ranks wait for one that works alone; the heartbeat detects a dead one
+COLLECTIVE_TIMEOUT = timedelta(
+    hours=24
+)  # ranks wait for one that works alone; the heartbeat detects a dead one
 SEED_STEP = 1_000_003  # between the seeds of two ranks; the seeds of a study are consecutive
 
 _interrupted = False  # Ctrl-C was pressed
@@ -72,13 +77,20 @@ def joined(device: str) -> Iterator[None]:
     if not dist.is_available() or not dist.is_torchelastic_launched() or dist.is_initialized():
         yield
         return
-    local, gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count() if device == "cuda" else 0
+    local, gpus = (
+        int(os.environ["LOCAL_RANK"]),
+        torch.cuda.device_count() if device == "cuda" else 0,
+    )
     if 0 < gpus <= local:
-        raise UsageError(f"--device cuda: torchrun --nproc-per-node asks for more than the {gpus} GPUs of this machine")
+        raise UsageError(
+            f"--device cuda: torchrun --nproc-per-node asks for more than the {gpus} GPUs of this machine"
+        )
     if gpus:
         torch.cuda.set_device(local)
     finished = threading.Event()
-    heartbeat = threading.Thread(target=_heartbeat, args=(started(), int(os.environ["WORLD_SIZE"]), finished))
+    heartbeat = threading.Thread(
+        target=_heartbeat, args=(started(), int(os.environ["WORLD_SIZE"]), finished)
+    )
     heartbeat.daemon = True
     heartbeat.start()
     dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo", timeout=COLLECTIVE_TIMEOUT)
@@ -100,7 +112,9 @@ def _heartbeat(own: int, ranks: int, finished: threading.Event) -> None:
         try:
             if store is None:
                 host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-                store = dist.TCPStore(host, port, is_master=False, timeout=timedelta(seconds=HEARTBEAT_S))
+                store = dist.TCPStore(
+                    host, port, is_master=False, timeout=timedelta(seconds=HEARTBEAT_S)
+                )
             store.add(f"gaponet/{own}", 1)
             received = [store.add(f"gaponet/{other}", 0) for other in range(ranks)]
         except RuntimeError:  # torchrun, which owns the store, has ended
@@ -112,11 +126,17 @@ def _heartbeat(own: int, ranks: int, finished: threading.Event) -> None:
             store = None
             continue
         now = last_contact = time.monotonic()
-        changed_at = [t if new == old else now for t, new, old in zip(changed_at, received, beats, strict=True)]
+        changed_at = [
+            t if new == old else now
+            for t, new, old in zip(changed_at, received, beats, strict=True)
+        ]
         beats = received
         if not finished.is_set() and (silent := now - min(changed_at)) > HEARTBEAT_TIMEOUT_S:
             dead = changed_at.index(min(changed_at))
-            os.write(2, f"rank {own}: rank {dead} has been silent for {silent:.0f} s; --resume goes on\n".encode())
+            os.write(
+                2,
+                f"rank {own}: rank {dead} has been silent for {silent:.0f} s; --resume goes on\n".encode(),
+            )
             os._exit(1)
 
 
@@ -236,7 +256,9 @@ def require_equal(*states: dict[str, Tensor]) -> None:
     with _collective():
         dist.all_gather_object(digests, digest.hexdigest()[:16])
     if len(set(digests)) > 1:
-        raise ModelError(f"the ranks' networks differ ({', '.join(digests)}), a bug; --resume goes on from before")
+        raise ModelError(
+            f"the ranks' networks differ ({', '.join(digests)}), a bug; --resume goes on from before"
+        )
 
 
 def share(config: TrainConfig) -> TrainConfig:
@@ -250,7 +272,9 @@ def share(config: TrainConfig) -> TrainConfig:
 
     def part(option: str, total: int) -> int:
         if total % world():
-            raise UsageError(f"{option} {total}: {world()} ranks cannot share them evenly; give a multiple")
+            raise UsageError(
+                f"{option} {total}: {world()} ranks cannot share them evenly; give a multiple"
+            )
         return total // world()
 
     pretraining, ppo = config.pretraining, config.ppo

@@ -40,7 +40,13 @@ class TrainingData:
         val: Validation recordings, at most MAX_VALIDATION_ROLLOUTS.
     """
 
-    def __init__(self, dataset: Dataset, robot: RobotSpec, config: TrainConfig, holdout_units: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        robot: RobotSpec,
+        config: TrainConfig,
+        holdout_units: tuple[str, ...],
+    ) -> None:
         """Split a dataset and read what training needs.
 
         Raises:
@@ -56,7 +62,9 @@ class TrainingData:
         self.train = dataset.sequences(self.splits["train"], optional=False)
         val = stratified_subset(self.splits["val"], MAX_VALIDATION_ROLLOUTS)
         self.val = dataset.sequences(val, optional=False)
-        if not config.mixed_gains and (other := next((c for c in self.conditions if c.kp or c.kd), None)):
+        if not config.mixed_gains and (
+            other := next((c for c in self.conditions if c.kp or c.kd), None)
+        ):
             raise UsageError(
                 f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says others: write there "
                 "what the robot runs with, or add --mixed-gains to train in simulators of the recordings' own gains"
@@ -81,28 +89,53 @@ def require_suitable(run: Path, robot: RobotSpec, resume: bool) -> None:
         UsageError: The folder does not fit.
     """
     if not resume and any((run / name).exists() for name in (CHECKPOINT, "model/card.json")):
-        raise UsageError(f"{run}: holds a run already; add --resume to go on with it, or choose another --out")
+        raise UsageError(
+            f"{run}: holds a run already; add --resume to go on with it, or choose another --out"
+        )
     if resume and not (run / CHECKPOINT).is_file():
         raise UsageError(f"{run}: nothing to resume (no {CHECKPOINT}); train without --resume")
-    if resume and has_stored_robot(run) and model_hash(load_stored_robot(run, robot.name)) != model_hash(robot):
-        raise UsageError(f"{run}: was trained in another simulator; resume with --robot {run / STORED_ROBOT}")
+    if (
+        resume
+        and has_stored_robot(run)
+        and model_hash(load_stored_robot(run, robot.name)) != model_hash(robot)
+    ):
+        raise UsageError(
+            f"{run}: was trained in another simulator; resume with --robot {run / STORED_ROBOT}"
+        )
 
 
-def write_setup(run: Path, data: TrainingData, config: TrainConfig, budget: Budget, resume: bool) -> None:
+def write_setup(
+    run: Path, data: TrainingData, config: TrainConfig, budget: Budget, resume: bool
+) -> None:
     """Write config.json, split.json and the robot."""
     dataset, robot = data.dataset, data.robot
-    words = command(dataset.address or dataset.path, run, budget, config, robot, data.holdout_units, ranks.world())
+    words = command(
+        dataset.address or dataset.path,
+        run,
+        budget,
+        config,
+        robot,
+        data.holdout_units,
+        ranks.world(),
+    )
     write_json(run / "config.json", asdict(config) | {
         "budget": asdict(budget), "holdout_units": data.holdout_units, "robot": robot.name, "command": words,
         "dataset": dataset.address or os.path.relpath(dataset.path, run), "dataset_hash": dataset_hash(dataset.entries),
     })  # fmt: skip
-    if robot.folder.resolve() != (run / STORED_ROBOT).resolve() and not (resume and has_stored_robot(run)):
+    if robot.folder.resolve() != (run / STORED_ROBOT).resolve() and not (
+        resume and has_stored_robot(run)
+    ):
         save_robot(robot, run / STORED_ROBOT)
-    write_json(run / "split.json", {part: {e.id: e.hash for e in entries} for part, entries in data.splits.items()})
+    write_json(
+        run / "split.json",
+        {part: {e.id: e.hash for e in entries} for part, entries in data.splits.items()},
+    )
 
 
 LOG_KINDS = ("tensorboard", "wandb")
-Writer = tuple[Callable[[dict[str, float], int], None], Callable[[], None]]  # write(numbers, steps), close()
+Writer = tuple[
+    Callable[[dict[str, float], int], None], Callable[[], None]
+]  # write(numbers, steps), close()
 
 
 class Loggers:
@@ -121,13 +154,21 @@ class Loggers:
         self.writers: list[Writer] = []
         for kind in kinds:
             try:
-                self.writers.append(_tensorboard(out) if kind == "tensorboard" else _wandb(out, config))
+                self.writers.append(
+                    _tensorboard(out) if kind == "tensorboard" else _wandb(out, config)
+                )
             except ImportError:
-                raise UsageError(f"--log {kind}: not installed; run: pip install 'gaponet[{kind}]'") from None
+                raise UsageError(
+                    f"--log {kind}: not installed; run: pip install 'gaponet[{kind}]'"
+                ) from None
 
     def write(self, line: dict[str, Any]) -> None:
         """Log one line of progress.jsonl."""
-        numbers = {k: float(v) for k, v in line.items() if isinstance(v, (int, float)) and v == v and k != "steps"}
+        numbers = {
+            k: float(v)
+            for k, v in line.items()
+            if isinstance(v, (int, float)) and v == v and k != "steps"
+        }
         for write, _ in self.writers:
             write(numbers, line["steps"])
 

@@ -19,10 +19,17 @@ from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import CHECKPOINT
 from gaponet.nn.trees import trees_available
 
-CANDIDATES: tuple[ModelKind, ...] = ("gaponet", "shared_mlp", "mlp", "trees")  # trees if scikit-learn is installed
+CANDIDATES: tuple[ModelKind, ...] = (
+    "gaponet",
+    "shared_mlp",
+    "mlp",
+    "trees",
+)  # trees if scikit-learn is installed
 SHARE = 0.2  # of the budget, for each candidate
 FOLDER, ERRORS = "candidates", "candidates.json"
-Train = Callable[[ModelKind, Path, float, float, bool], GapModel]  # kind, run, share of the budget, share spent, resume
+Train = Callable[
+    [ModelKind, Path, float, float, bool], GapModel
+]  # kind, run, share of the budget, share spent, resume
 
 
 def train_best(out: Path, resume: bool, train: Train) -> GapModel:
@@ -37,7 +44,11 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     if resume and present and not begun:
         return train(present, out, 1.0, 0.0, True)
     if resume != begun or (not resume and present):
-        problem = "nothing to resume; train without --resume" if resume else "holds a run already; add --resume"
+        problem = (
+            "nothing to resume; train without --resume"
+            if resume
+            else "holds a run already; add --resume"
+        )
         raise UsageError(f"{out}: {problem}, or choose another --out")
     errors = ranks.once(lambda: candidate_errors(out))
     kinds = [kind for kind in CANDIDATES if kind != "trees" or trees_available()]
@@ -67,7 +78,11 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
 
 def candidate_errors(run: Path) -> dict[ModelKind, float]:
     """Return the validation error of each candidate of a run, rad; empty if one kind was given."""
-    return read_json(dict[ModelKind, float], run / ERRORS, ModelError) if (run / ERRORS).is_file() else {}
+    return (
+        read_json(dict[ModelKind, float], run / ERRORS, ModelError)
+        if (run / ERRORS).is_file()
+        else {}
+    )
 
 
 def _kind(run: Path) -> ModelKind | None:

@@ -23,7 +23,9 @@ BATCH_SIZE = 256
 LEARNING_RATE = 1e-3
 MIN_STATES = 8
 POSITION_NOISE_RAD, VELOCITY_NOISE_RAD_S = 0.05, 0.3  # σ of the states near recorded ones
-SensorReport = dict[str, Any]  # R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}
+SensorReport = dict[
+    str, Any
+]  # R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}
 
 NEAR, RANDOM = 1, 2  # origin of a state; 0 for one that was visited
 
@@ -56,7 +58,9 @@ def fit_sensors(
     device = next(net.parameters()).device
     net.cpu()  # C MuJoCo answers the probes
     report = ranks.once(
-        lambda: _fit_predictor(net, *_probe(net, env, states, seed, nthread, refit), env.robot.operated, seed, refit)
+        lambda: _fit_predictor(
+            net, *_probe(net, env, states, seed, nthread, refit), env.robot.operated, seed, refit
+        )
     )
     net.predictor.requires_grad_(False)
     ranks.broadcast(net.predictor)
@@ -64,7 +68,9 @@ def fit_sensors(
     return report
 
 
-def _probe(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool) -> tuple[Tensor, Tensor]:
+def _probe(
+    net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool
+) -> tuple[Tensor, Tensor]:
     """Probe the simulator at recorded start states, or on `refit` at the environment's present states.
 
     A third of the states stays there. A third is moved by noise. A third is moved to a random posture within the joint
@@ -89,7 +95,9 @@ def _probe(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, r
     env_of_state = np.tile(np.arange(env.num_envs), len(visited))
     chosen = rng.permutation(np.sort(rng.permutation(len(x))[:states]))
     origin = rng.integers(0, 3, len(x))
-    if refit:  # the same states repeat: the copies are moved, so that none is both fitted and held out
+    if (
+        refit
+    ):  # the same states repeat: the copies are moved, so that none is both fitted and held out
         origin[env.num_envs :] = NEAR + origin[env.num_envs :] % 2
     conditions = [env.rows.conditions[g] for g in env.rows.group[env_of_state[chosen]]]
     oracle = ProbeOracle(env.robot, net.config, conditions, nthread, env.rows.locked)
@@ -110,9 +118,13 @@ def _probe(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, r
     offsets, m = None, net.config.num_probes
     if net.config.sensor_source == "learned":
         # Each probe moves a random subset of the joints.
-        probes = rng.uniform(-1, 1, (len(q), m, n)) * (rng.random((len(q), m, n)) < rng.random((len(q), m, 1)))
+        probes = rng.uniform(-1, 1, (len(q), m, n)) * (
+            rng.random((len(q), m, n)) < rng.random((len(q), m, 1))
+        )
         offsets = net.config.probe_limit * probes
-        inputs = torch.cat([inputs.repeat_interleave(m, 0), torch.from_numpy(probes).float().flatten(0, 1)], dim=1)
+        inputs = torch.cat(
+            [inputs.repeat_interleave(m, 0), torch.from_numpy(probes).float().flatten(0, 1)], dim=1
+        )
     return inputs.clone(), torch.from_numpy(oracle(q, v, offsets).reshape(len(inputs), -1))
 
 
@@ -144,6 +156,12 @@ def _fit_predictor(
         truth = predictor.outputs(answers[:held_out])
         residual = ((predictor(inputs[:held_out])[0] - truth) ** 2).mean(0)
         variance = ((truth - truth.mean(0)) ** 2).mean(0).clamp_min(1e-9)
-        r2 = (1 - residual / variance).reshape(-1, 2, len(joints))  # (m, positions and velocities, n)
+        r2 = (1 - residual / variance).reshape(
+            -1, 2, len(joints)
+        )  # (m, positions and velocities, n)
         by_joint = dict(zip(joints, r2.mean((0, 1)).tolist(), strict=True))
-        return {"mean": float(r2.mean()), "by_joint": by_joint, "by_probe": r2.mean((1, 2)).tolist()}
+        return {
+            "mean": float(r2.mean()),
+            "by_joint": by_joint,
+            "by_probe": r2.mean((1, 2)).tolist(),
+        }

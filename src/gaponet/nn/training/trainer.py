@@ -77,7 +77,10 @@ class Trainer:
         config = validated(TrainConfig, asdict(config), "training options", UsageError).sized()
         require_suitable(out, robot, resume)
         self.robot, self.out, self.config, self.budget, self.show = robot, out, config, budget, show
-        self.data, self.rank_config = TrainingData(dataset, robot, config, holdout_units), ranks.share(config)
+        self.data, self.rank_config = (
+            TrainingData(dataset, robot, config, holdout_units),
+            ranks.share(config),
+        )
         torch.manual_seed(config.seed)
         torch.set_num_threads(self.rank_config.learner_threads)
         self.net = net = build_network(config.model, len(robot.operated))
@@ -133,7 +136,9 @@ class Trainer:
 
     def _run_stages(self) -> None:
         state, rounds = self.state, self.config.pretraining.rounds
-        if not np.isfinite(state.best_error):  # the untrained network corrects nothing: the error to improve on
+        if not np.isfinite(
+            state.best_error
+        ):  # the untrained network corrects nothing: the error to improve on
             self._save_if_best(self.net, self.validator.errors(None).mean())
         if state.ppo is None and state.pretraining_rounds < rounds:
             self._pretrain()
@@ -166,8 +171,12 @@ class Trainer:
         sequences = self.data.labelled_subset(config.rows)
         env = self._env(config.num_envs, UNLIMITED, self.config.seed, sequences=sequences)
         largest = 0.99 * self.config.model.delta_max
-        labels = self._once("labels", lambda: trajectory_labels(sequences, self.robot, largest, threads, self._tick))
-        pretraining = Pretraining(self.net, env, labels, config, _rank_seed(self.config.seed), threads)
+        labels = self._once(
+            "labels", lambda: trajectory_labels(sequences, self.robot, largest, threads, self._tick)
+        )
+        pretraining = Pretraining(
+            self.net, env, labels, config, _rank_seed(self.config.seed), threads
+        )
         if state.pretraining_rounds == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
             self._tick()
@@ -178,7 +187,10 @@ class Trainer:
             torch.set_rng_state(self.rng_state)
         while pretraining.rounds_done < config.rounds and self._spent() < 1:
             fit = pretraining.round(self._tick)
-            state.pretraining_rounds, state.pretraining = pretraining.rounds_done, pretraining.state_dict()
+            state.pretraining_rounds, state.pretraining = (
+                pretraining.rounds_done,
+                pretraining.state_dict(),
+            )
             state.steps += ranks.world() * config.num_envs * config.steps
             self._validate_and_save(fit)
 
@@ -210,10 +222,17 @@ class Trainer:
         while self._spent() < 1:
             self.update = ppo.update()
             state.ppo_updates += 1
-            state.steps += ranks.world() * config.num_envs * config.num_steps * self.config.model.delta_hold
+            state.steps += (
+                ranks.world() * config.num_envs * config.num_steps * self.config.model.delta_hold
+            )
             if config.refit_sensors and state.ppo_updates % config.refit_sensors == 0:
-                states, seed = self.rank_config.pretraining.sensor_states, self.config.seed + state.ppo_updates
-                state.sensor_r2 = fit_sensors(self.net, env, states, seed, self.rank_config.threads, refit=True)
+                states, seed = (
+                    self.rank_config.pretraining.sensor_states,
+                    self.config.seed + state.ppo_updates,
+                )
+                state.sensor_r2 = fit_sensors(
+                    self.net, env, states, seed, self.rank_config.threads, refit=True
+                )
             self._tick()
             if state.ppo_updates % self.config.validate_every == 0:
                 state.ppo, state.env = ppo.state_dict(), env.state()
@@ -231,18 +250,29 @@ class Trainer:
         with torch.random.fork_rng():
             torch.manual_seed(self.config.seed)
             untrained = build_network(self.config.model, self.net.n).state_dict()
-        parameters = {name for name, _ in self.net.named_parameters() if not name.startswith("predictor.")}
-        return {k: untrained[k] if k in parameters else v for k, v in state.best_trained_state.items()}
+        parameters = {
+            name for name, _ in self.net.named_parameters() if not name.startswith("predictor.")
+        }
+        return {
+            k: untrained[k] if k in parameters else v for k, v in state.best_trained_state.items()
+        }
 
     def _choose_gain(self) -> None:
         """Reduce the correction if that reduces the validation error. A resumed run continues with gain 1."""
         state = self.state
-        if not np.isfinite(state.best_trained_error) or self.config.model.kind == "paper":  # it has no gain
+        if (
+            not np.isfinite(state.best_trained_error) or self.config.model.kind == "paper"
+        ):  # it has no gain
             return
         self.stage = "gain"
         self._tick()
         net = self._network(state.best_trained_state)
-        if choose_gain(net, lambda: float(self.validator.errors(net).mean()), state.best_trained_error) < 1.0:
+        if (
+            choose_gain(
+                net, lambda: float(self.validator.errors(net).mean()), state.best_trained_error
+            )
+            < 1.0
+        ):
             self._save_if_best(net, self.validator.errors(net).mean())
 
     def _finish(self) -> GapModel:
@@ -287,10 +317,15 @@ class Trainer:
         """Validate the network in training, and save it with these metrics of its stage."""
         state, error = self.state, float(self.validator.errors(self.net).mean())
         if error < state.best_trained_error:
-            state.best_trained_error, state.best_trained_state = error, copy.deepcopy(self.net.state_dict())
+            state.best_trained_error, state.best_trained_state = (
+                error,
+                copy.deepcopy(self.net.state_dict()),
+            )
         self._save_if_best(self.net, error, metrics)
 
-    def _save_if_best(self, net: DeltaNet, error: float, metrics: dict[str, float] | None = None) -> None:
+    def _save_if_best(
+        self, net: DeltaNet, error: float, metrics: dict[str, float] | None = None
+    ) -> None:
         """Store a network if it is the best so far; write progress.jsonl and the checkpoint."""
         state = self.state
         state.val_error = float(error)
@@ -313,7 +348,9 @@ class Trainer:
         """Report the state of the run."""
         state, share = self.state, min(self._spent(), 1.0)
         errors = state.val_error, state.best_error, self.nominal_error
-        self.show(Status(self.stage, share, state.steps, self.seconds(), self.update.reward, *errors))
+        self.show(
+            Status(self.stage, share, state.steps, self.seconds(), self.update.reward, *errors)
+        )
 
     def _card(self, improvement: dict[str, float]) -> dict[str, Any]:
         data, state = self.data, self.state
@@ -329,8 +366,15 @@ class Trainer:
             virtual=any(m.virtual for m in metas),
             dataset_hash=dataset_hash(data.dataset.entries),
             hours=round(sum(s.duration for s in data.train) / 3600, 3),
-            motions={part: sorted({e.meta.motion for e in entries}) for part, entries in data.splits.items()},
-            val_mpjae={"model": state.best_error, "nominal": self.nominal_error, "start": state.untrained_error}
+            motions={
+                part: sorted({e.meta.motion for e in entries})
+                for part, entries in data.splits.items()
+            },
+            val_mpjae={
+                "model": state.best_error,
+                "nominal": self.nominal_error,
+                "start": state.untrained_error,
+            }
             | improvement,
             sensor_r2=state.sensor_r2,
             seed=self.config.seed,
@@ -356,7 +400,11 @@ def _recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, li
     """
     recorded: dict[str, list[float] | None] = {}
     for name in ("kp", "kd"):
-        gains = {tuple(round(g[i], 9) for i in robot.operated_index) for m in metas if (g := getattr(m, name))}
+        gains = {
+            tuple(round(g[i], 9) for i in robot.operated_index)
+            for m in metas
+            if (g := getattr(m, name))
+        }
         recorded[name] = list(gains.pop()) if len(gains) == 1 else None
     return recorded
 

@@ -30,7 +30,9 @@ GAINS = (0.75, 0.5, 0.25)  # candidates below 1
 class Validator:
     """Rollout errors of networks on the validation recordings. Each network is simulated once."""
 
-    def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec, config: ModelConfig, nthread: int) -> None:
+    def __init__(
+        self, sequences: ListOf[Sequence], robot: RobotSpec, config: ModelConfig, nthread: int
+    ) -> None:
         """robot: The simulator that the network corrects."""
         self.sequences, self.robot, self.config, self.nthread = sequences, robot, config, nthread
         self._cache: dict[bytes, Array] = {}
@@ -44,7 +46,9 @@ class Validator:
         """
         key = self._key(net, robot)
         if key not in self._cache:
-            self._cache[key] = ranks.each(self.sequences, lambda own: self._rollout_errors(own, net, robot))
+            self._cache[key] = ranks.each(
+                self.sequences, lambda own: self._rollout_errors(own, net, robot)
+            )
         return self._cache[key]
 
     def improvement(self, net: DeltaNet) -> tuple[float, float]:
@@ -53,10 +57,14 @@ class Validator:
 
     @staticmethod
     def _key(net: DeltaNet | None, robot: RobotSpec | None = None) -> bytes:
-        weights = [] if net is None else [x.cpu().numpy().tobytes() for x in net.state_dict().values()]
+        weights = (
+            [] if net is None else [x.cpu().numpy().tobytes() for x in net.state_dict().values()]
+        )
         return hashlib.sha256(b"".join([repr(robot).encode(), *weights])).digest()
 
-    def _rollout_errors(self, sequences: ListOf[Sequence], net: DeltaNet | None, robot: RobotSpec | None) -> Array:
+    def _rollout_errors(
+        self, sequences: ListOf[Sequence], net: DeltaNet | None, robot: RobotSpec | None
+    ) -> Array:
         robot, corrector = robot or self.robot, None
         if net is not None:  # on onnxruntime, as it ships; torch needs twice the time
             network = OnnxNetwork(onnx_content(copy.deepcopy(net).cpu().eval()))

@@ -88,7 +88,9 @@ def joint_ranges(dataset: Dataset, robot: RobotSpec) -> Figure:
 
 
 @styled
-def draw_joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, float]], title: str) -> Figure:
+def draw_joint_ranges(
+    positions: dict[str, Array], limits: dict[str, tuple[float, float]], title: str
+) -> Figure:
     """Draw a raincloud of each joint: density, quartiles with 1 % and 99 %, single rows; grey: the joint's range.
 
     Args:
@@ -101,7 +103,9 @@ def draw_joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float
     for row, (joint, values) in enumerate(positions.items()):
         y, tint = -row, SIDES[next((s for s in ("left", "right") if joint.startswith(s)), "")]
         if np.isfinite(limits[joint]).all():
-            ax.barh(y, np.ptp(limits[joint]), 0.86, limits[joint][0], color="#000000", alpha=0.05, lw=0)
+            ax.barh(
+                y, np.ptp(limits[joint]), 0.86, limits[joint][0], color="#000000", alpha=0.05, lw=0
+            )
         x, density = _density(values)
         ax.fill_between(x, y + 0.06, y + 0.06 + 0.36 * density, color=tint, alpha=0.75, lw=0)
         low, q1, middle, q3, high = np.percentile(values, [1, 25, 50, 75, 99])
@@ -109,7 +113,15 @@ def draw_joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float
         ax.plot([q1, q3], [y, y], color=tint, lw=4, solid_capstyle="butt")
         ax.plot(middle, y, "o", ms=3.2, mfc="white", mec=tint, mew=1)
         rain = rng.choice(values, min(SINGLE_POINTS, len(values)), replace=False)
-        ax.plot(rain, y - 0.23 + rng.uniform(-0.12, 0.12, len(rain)), ".", ms=1.6, mew=0, color=tint, alpha=0.5)
+        ax.plot(
+            rain,
+            y - 0.23 + rng.uniform(-0.12, 0.12, len(rain)),
+            ".",
+            ms=1.6,
+            mew=0,
+            color=tint,
+            alpha=0.5,
+        )
     ax.set_yticks(-np.arange(len(positions)), [joint_label(j, wrapped=False) for j in positions])
     ax.tick_params(axis="y", length=0)
     ax.grid(axis="y", visible=False)
@@ -157,15 +169,26 @@ def composition(dataset: Dataset, robot: RobotSpec) -> Figure:
         base = np.zeros(len(values))
         for level in present:
             part = [e for e in entries if e.meta.level == level]
-            hours = np.array([sum(e.rows * e.dt for e in part if key(e) == v) / 3600 for v in values])
-            ax.bar(range(len(values)), hours, 0.72, base, color=LEVEL_COLOURS[level], label=level.replace("_", " "))
+            hours = np.array(
+                [sum(e.rows * e.dt for e in part if key(e) == v) / 3600 for v in values]
+            )
+            ax.bar(
+                range(len(values)),
+                hours,
+                0.72,
+                base,
+                color=LEVEL_COLOURS[level],
+                label=level.replace("_", " "),
+            )
             base = base + hours
         for x, v in enumerate(values):
             ax.annotate(f"{sum(key(e) == v for e in entries):,}", (x, base[x]), (0, 2), textcoords="offset points",
                         ha="center", fontsize=7.5)  # fmt: skip
         ticks = [v if isinstance(v, str) else f"{v:g}" for v in values]
         long = max(map(len, ticks)) > 5
-        ax.set_xticks(range(len(values)), ticks, rotation=30 if long else 0, ha="right" if long else "center")
+        ax.set_xticks(
+            range(len(values)), ticks, rotation=30 if long else 0, ha="right" if long else "center"
+        )
         ax.set_xlim(-0.6, len(values) - 0.4)
         ax.set_xlabel(label)
         ax.grid(axis="x", visible=False)
@@ -189,10 +212,16 @@ def torque_temperature(dataset: Dataset, robot: RobotSpec) -> Figure:
     size = swing(heaviest.tau[:, robot.operated_index])
     joints = [robot.operated[i] for i in sorted(np.argsort(-size)[:MAX_JOINTS])]
     meta = heaviest.meta
-    return draw_torque_temperature(takes, joints, f"{robot_label(group)}: {meta.motion}, {meta.unit_id}")
+    return draw_torque_temperature(
+        takes, joints, f"{robot_label(group)}: {meta.motion}, {meta.unit_id}"
+    )
 
 
-FIGURES = {"joint_ranges": joint_ranges, "composition": composition, "torque_temperature": torque_temperature}
+FIGURES = {
+    "joint_ranges": joint_ranges,
+    "composition": composition,
+    "torque_temperature": torque_temperature,
+}
 
 
 @styled
@@ -210,7 +239,9 @@ def draw_torque_temperature(takes: dict[float, Sequence], joints: list[str], tit
     for ax in axes[1:, 1:].flat:  # one scale for a row, so that joints can be compared
         ax.sharey(axes[ax.get_subplotspec().rowspan.start, 0])
         ax.tick_params(labelleft=False)
-    colours = mpl.colormaps["plasma"](np.linspace(0.85, 0.05, len(takes)) if len(takes) > 1 else [0.4])
+    colours = mpl.colormaps["plasma"](
+        np.linspace(0.85, 0.05, len(takes)) if len(takes) > 1 else [0.4]
+    )
     for colour, (payload, take) in zip(colours, takes.items(), strict=True):
         time = np.arange(len(take)) * take.dt
         for column, joint in enumerate(joints):
@@ -232,7 +263,9 @@ def draw_torque_temperature(takes: dict[float, Sequence], joints: list[str], tit
 
 def largest_torque_change(dataset: Dataset, robot: RobotSpec) -> list[Entry]:
     """Return the entries of the motion with the largest change of torque, among those with the most payloads."""
-    takes: dict[tuple[Any, ...], list[Entry]] = defaultdict(list)  # that differ only in payload and repetition
+    takes: dict[tuple[Any, ...], list[Entry]] = defaultdict(
+        list
+    )  # that differ only in payload and repetition
     for e in dataset.entries:
         takes[e.meta.motion, e.meta.unit_id, e.meta.payload_side, round(e.dt, 7)].append(e)
     groups = [g for g in takes.values() if all("tau" in e.channels for e in g)]
@@ -255,13 +288,19 @@ def swing(values: Array) -> Array:
     return high - low
 
 
-def draw_findings(dataset: Dataset, robot: RobotSpec, findings: list[Finding], out: Path) -> list[Path]:
+def draw_findings(
+    dataset: Dataset, robot: RobotSpec, findings: list[Finding], out: Path
+) -> list[Path]:
     """Write a figure (SVG, PNG) for each warning, error, and note about a joint. Return the files."""
-    shown = [f for f in findings if f.level in ("warning", "error") or (f.level == "note" and f.joints)]
+    shown = [
+        f for f in findings if f.level in ("warning", "error") or (f.level == "note" and f.joints)
+    ]
     written = []
     for number, finding in enumerate(shown, 1):
         sequence = dataset.read(_entry(dataset.entries, finding))
-        joints = [j for j in finding.joints or robot.operated if j in robot.joint_names][:MAX_JOINTS]
+        joints = [j for j in finding.joints or robot.operated if j in robot.joint_names][
+            :MAX_JOINTS
+        ]
         fig = _draw_finding(finding, sequence, robot.index(joints))
         written += save(fig, out / f"{number:02d}-{finding.check}")
     return written
@@ -291,7 +330,11 @@ def _draw_finding(finding: Finding, sequence: Sequence, joints: Array) -> Figure
         ax.set_ylabel(f"{joint_label(sequence.joint_names[j])}, {unit}")
     axes[-1].set_xlabel(f"time in {sequence.meta.motion}, s")
     legend(fig)
-    axes[0].set_title(fill(f"{finding.level}, {finding.check}: {finding.message}", 105), fontsize=8, weight="normal")
+    axes[0].set_title(
+        fill(f"{finding.level}, {finding.check}: {finding.message}", 105),
+        fontsize=8,
+        weight="normal",
+    )
     return fig
 
 

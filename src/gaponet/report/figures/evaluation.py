@@ -17,13 +17,24 @@ from gaponet.base.result_table import MeanStd
 from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.signals import busiest_window
 from gaponet.report.candidate import is_robot
-from gaponet.report.figures.style import DASHED, DOTTED, bars, figure, joint_label, legend, save, styled
+from gaponet.report.figures.style import (
+    DASHED,
+    DOTTED,
+    bars,
+    figure,
+    joint_label,
+    legend,
+    save,
+    styled,
+)
 from gaponet.report.methods import colour, shade, title
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
 
 SHOWN_S = 20.0  # of each motion, so that details are visible
-MIN_POSITION_SPAN = 0.06  # rad of a position axis, so that encoder steps of a joint at rest are not magnified
+MIN_POSITION_SPAN = (
+    0.06  # rad of a position axis, so that encoder steps of a joint at rest are not magnified
+)
 MIN_CORRECTION = 1e-5  # rad; smaller corrections are noise
 MAX_COLUMNS = 4
 FLOOR_COLOUR = "#1f7a56"
@@ -46,7 +57,10 @@ def by_group(methods: dict[str, Any], group: str, label: Callable[[str], str]) -
 def by_horizon(methods: dict[str, Any]) -> Figure:
     """Draw the MPJAE of each method against the time since the common start."""
     horizons = [k for k in methods["nominal"]["by_horizon"] if k != "whole"]
-    ticks = {**{float(k): f"{float(k):g} s" for k in horizons}, 4 * float(horizons[-1]): "whole\nmotion"}
+    ticks = {
+        **{float(k): f"{float(k):g} s" for k in horizons},
+        4 * float(horizons[-1]): "whole\nmotion",
+    }
     fig = figure(4.2, 3.2)
     ax = fig.subplots()
     for name, metrics in methods.items():
@@ -79,7 +93,10 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
     steps = np.array([p["steps"] for p in progress]) / 1e6
     value = np.array([p["val_mpjae"] for p in progress]) * 1e3
     ax.plot(steps, value, "-", color="#555555", lw=0.8)
-    for stage, tint, label in (("pretraining", colour("mlp"), "pre-training"), ("ppo", colour("gaponet"), "PPO")):
+    for stage, tint, label in (
+        ("pretraining", colour("mlp"), "pre-training"),
+        ("ppo", colour("gaponet"), "PPO"),
+    ):
         at = [i for i, p in enumerate(progress) if p["stage"] == stage]
         if at:
             ax.plot(steps[at], value[at], "o", ms=3.5, color=tint, label=label)
@@ -97,7 +114,10 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
 
 
 def trajectories(
-    arrays: dict[str, Array], shown: list[dict[str, Any]], joints: tuple[str, ...], methods: list[str]
+    arrays: dict[str, Array],
+    shown: list[dict[str, Any]],
+    joints: tuple[str, ...],
+    methods: list[str],
 ) -> dict[int, Figure]:
     """Draw commanded, recorded and simulated positions of three joints for each stored motion.
 
@@ -113,7 +133,9 @@ def trajectories(
 
 
 @styled
-def _trajectory(arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], dt: float) -> Figure:
+def _trajectory(
+    arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], dt: float
+) -> Figure:
     """Draw the three joints with the largest nominal error, a column each; moving joints come first.
 
     From top to bottom: positions, positions around the largest turn of the command, errors, and corrections.
@@ -123,29 +145,53 @@ def _trajectory(arrays: dict[str, Array], row: int, joints: tuple[str, ...], met
     time, command = np.arange(len(recorded))[window] * dt, arrays[f"{row}/command"][window]
     still = np.ptp(command, axis=0) <= MIN_MOTION_RAD
     columns = np.lexsort((-np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0), still))[:3]
-    learned = [n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > MIN_CORRECTION]
-    heights = {"position, rad": 1.8, "zoom, rad": 1.6, "error, mrad": 1.1} | ({"Δa, mrad": 0.9} if learned else {})
+    learned = [
+        n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > MIN_CORRECTION
+    ]
+    heights = {"position, rad": 1.8, "zoom, rad": 1.6, "error, mrad": 1.1} | (
+        {"Δa, mrad": 0.9} if learned else {}
+    )
     fig = figure(3.6 * len(columns), 1.0 + 1.1 * sum(heights.values()))
-    axes = fig.subplots(len(heights), len(columns), squeeze=False, height_ratios=list(heights.values()))
+    axes = fig.subplots(
+        len(heights), len(columns), squeeze=False, height_ratios=list(heights.values())
+    )
     for column, j in zip(axes.T, sorted(columns.tolist()), strict=True):
         zoom, real = _turn(command[:, j], dt), recorded[window, j]
         for ax, part in zip(column, (slice(None), zoom), strict=False):
             ax.step(time[part], command[part, j], where="post", color=colour("command"), ls=DOTTED, lw=1.1,
                     label=title("command"))  # fmt: skip
             for n in methods:
-                ax.plot(time[part], arrays[f"{row}/{n}"][window, j][part], color=colour(n), label=title(n))
-            ax.plot(time[part], real[part], color=colour("recorded"), ls=DASHED, lw=1.0, label=title("recorded"))
+                ax.plot(
+                    time[part],
+                    arrays[f"{row}/{n}"][window, j][part],
+                    color=colour(n),
+                    label=title(n),
+                )
+            ax.plot(
+                time[part],
+                real[part],
+                color=colour("recorded"),
+                ls=DASHED,
+                lw=1.0,
+                label=title("recorded"),
+            )
             low, high = ax.get_ylim()
             if high - low < MIN_POSITION_SPAN:
-                ax.set_ylim((low + high - MIN_POSITION_SPAN) / 2, (low + high + MIN_POSITION_SPAN) / 2)
+                ax.set_ylim(
+                    (low + high - MIN_POSITION_SPAN) / 2, (low + high + MIN_POSITION_SPAN) / 2
+                )
         column[0].axvspan(*time[zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
         for n in methods:
-            column[2].plot(time, (arrays[f"{row}/{n}"][window, j] - real) * 1e3, color=colour(n), lw=1.0)
+            column[2].plot(
+                time, (arrays[f"{row}/{n}"][window, j] - real) * 1e3, color=colour(n), lw=1.0
+            )
         column[2].axhline(0, color="#111111", lw=0.6)
         for n in learned:
             delta = arrays[f"{row}/delta/{n}"][window, j]
             column[3].plot(time[: len(delta)], delta * 1e3, color=colour(n), lw=0.9)
-        column[0].set_title(joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else ""))
+        column[0].set_title(
+            joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else "")
+        )
         column[-1].set_xlabel("time, s")
         for ax in (column[0], *column[2:]):
             ax.set_xlim(time[0], time[-1])
@@ -165,7 +211,9 @@ def _turn(command: Array, dt: float) -> slice:
     half = round(1 / dt)
     if len(command) <= 2 * half:
         return slice(0, len(command))
-    start = int(np.abs(2 * command[half:-half] - command[: -2 * half] - command[2 * half :]).argmax())
+    start = int(
+        np.abs(2 * command[half:-half] - command[: -2 * half] - command[2 * half :]).argmax()
+    )
     return slice(start, start + 2 * half)
 
 
@@ -188,7 +236,9 @@ def waterfall(gap: dict[str, Any]) -> Figure:
     for ax in axes.flat[len(panels) :]:
         ax.set_visible(False)
     for i, (ax, (name, panel)) in enumerate(zip(axes.flat, panels.items(), strict=False)):
-        _waterfall_panel(ax, steps, {k: 1e3 * v for k, v in panel["left"].items()}, panel["floor"]["both"])
+        _waterfall_panel(
+            ax, steps, {k: 1e3 * v for k, v in panel["left"].items()}, panel["floor"]["both"]
+        )
         ax.set_title(joint_label(name, wrapped=False))
         ax.xaxis.set_tick_params(labelbottom=i + columns >= len(panels))
         if i + columns >= len(panels):
@@ -197,7 +247,10 @@ def waterfall(gap: dict[str, Any]) -> Figure:
     for ax in axes[:, 0]:
         ax.tick_params(axis="y", labelsize=7)
     axes[0, 0].invert_yaxis()
-    robot, end = f"{'VIRTUAL' if gap['virtual'] else 'real'} {gap['robot']}", "s" * (gap["sequences"] != 1)
+    robot, end = (
+        f"{'VIRTUAL' if gap['virtual'] else 'real'} {gap['robot']}",
+        "s" * (gap["sequences"] != 1),
+    )
     fig.suptitle(
         f"{robot}, {gap['sequences']} {'test ' if gap['unseen'] else ''}recording{end}: reduction "
         "of the error by each step (hollow: increase)\ndashed: floor, by encoder and repeatability (– unknown)",
@@ -206,7 +259,9 @@ def waterfall(gap: dict[str, Any]) -> Figure:
     return fig
 
 
-def _waterfall_panel(ax: Axes, steps: list[str], errors: dict[str, float], floor: float | None) -> None:
+def _waterfall_panel(
+    ax: Axes, steps: list[str], errors: dict[str, float], floor: float | None
+) -> None:
     """Draw one panel; errors after each step in mrad, floor in rad."""
     start = before = errors[steps[0]]
     ax.barh(0, before, color=colour("nominal"))
@@ -221,7 +276,15 @@ def _waterfall_panel(ax: Axes, steps: list[str], errors: dict[str, float], floor
     ax.plot([before, before], [len(steps) - 0.6, len(steps) + 0.4], color="#555555", lw=0.6)
     ax.barh(len(steps), before, color="#333333")
     for k, error in ((len(steps), before), (0, start)):
-        ax.annotate(f"{error:.1f}", (error, k), (2, 0), ha="left", va="center", textcoords="offset points", fontsize=7)
+        ax.annotate(
+            f"{error:.1f}",
+            (error, k),
+            (2, 0),
+            ha="left",
+            va="center",
+            textcoords="offset points",
+            fontsize=7,
+        )
     label = "floor –"
     if floor is not None and not np.isnan(floor):  # an absent number is read as NaN
         ax.barh(len(steps), min(1e3 * floor, before), color=FLOOR_COLOUR)
@@ -251,9 +314,22 @@ def draw_uncertainty(uncertainty: ParameterUncertainty, heading: str) -> Figure:
         half = np.array([QUANTILE_90 * s.errors[field] * factor for s in summaries])
         span = max(float(np.ptp(values)), float(np.abs(values).max()) * 0.1, 1e-9)
         shown = half < MAX_INTERVAL * span
-        ax.errorbar(values[shown], y[shown], xerr=half[shown], fmt="o", ms=3.5, capsize=2, lw=1.2, color="#1f5fa8")
+        ax.errorbar(
+            values[shown],
+            y[shown],
+            xerr=half[shown],
+            fmt="o",
+            ms=3.5,
+            capsize=2,
+            lw=1.2,
+            color="#1f5fa8",
+        )
         ax.plot(values[~shown], y[~shown], "o", ms=4, mfc="none", color="#999999")
-        labels = [joint_label(j, wrapped=False) for j in joints] if place % columns == 0 else [""] * len(joints)
+        labels = (
+            [joint_label(j, wrapped=False) for j in joints]
+            if place % columns == 0
+            else [""] * len(joints)
+        )
         ax.set_yticks(y, labels)
         ax.set_title(name)
         ax.set_ylim(-0.6, len(joints) - 0.4)

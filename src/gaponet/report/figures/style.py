@@ -74,12 +74,16 @@ def _printable(fig: Figure) -> Figure:
 
     def lines(text: str, limit: int) -> str:
         every = map(escape, text.split("\n"))
-        return "\n".join(s if len(s) <= limit else f"{s[: limit // 2]}…{s[-limit // 2 :]}" for s in every)
+        return "\n".join(
+            s if len(s) <= limit else f"{s[: limit // 2]}…{s[-limit // 2 :]}" for s in every
+        )
 
     for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
         ticks = axis.get_major_formatter()
         if isinstance(ticks, (FixedFormatter, FuncFormatter)):
-            axis.set_major_formatter(FuncFormatter(lambda at, i, ticks=ticks: lines(ticks(at, i), MAX_LABEL)))
+            axis.set_major_formatter(
+                FuncFormatter(lambda at, i, ticks=ticks: lines(ticks(at, i), MAX_LABEL))
+            )
     entries = {text for legend in fig.findobj(Legend) for text in legend.get_texts()}
     for text in fig.findobj(Text):
         text.set_text(lines(text.get_text(), MAX_LABEL if text in entries else MAX_LINE))
@@ -117,7 +121,12 @@ def draw_curves(time: Array, curves: Mapping[str, tuple[Array, str]], label: str
 def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
     """Draw bars with error bars, the methods of each group side by side."""
     word = max((len(word) for group in groups for word in group.split()), default=0)
-    fig = figure(max(5.2, 0.17 * len(groups) * len(methods) + 1.7, (LETTER * word + 0.05) * len(groups) + 1.3), 3.3)
+    fig = figure(
+        max(
+            5.2, 0.17 * len(groups) * len(methods) + 1.7, (LETTER * word + 0.05) * len(groups) + 1.3
+        ),
+        3.3,
+    )
     ax = fig.subplots()
     draw_bars(ax, groups, methods)
     ax.set_ylabel(axis)

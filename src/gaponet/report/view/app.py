@@ -62,7 +62,9 @@ class App:
         self.status, self.bar = self.gui.add_markdown(""), self.gui.add_progress_bar(0.0)
         self.cancel = self._button("Cancel", lambda _: self.jobs.cancel())
         tabs = self.gui.add_tab_group()
-        for number, step in enumerate((self._robot, self._logs, self._check, self._gap, self._identify, self._use), 1):
+        for number, step in enumerate(
+            (self._robot, self._logs, self._check, self._gap, self._identify, self._use), 1
+        ):
             with tabs.add_tab(f"{number} {step.__name__.strip('_').capitalize()}"):
                 step()
         self._attempt(self.refresh)
@@ -81,40 +83,74 @@ class App:
     def _robot(self) -> None:
         self.model = self.gui.add_dropdown("robot", packaged_robots())
         self._upload("Upload a model: MJCF, URDF, or a .zip with its meshes", "model")
-        hints = {"joints": "names; empty: all that are driven", "kp": "80 joint2=120, N·m/rad", "kd": "N·m·s/rad"}
-        self.options = {name: self.gui.add_text(name, "", hint=hint) for name, hint in hints.items()}
+        hints = {
+            "joints": "names; empty: all that are driven",
+            "kp": "80 joint2=120, N·m/rad",
+            "kd": "N·m·s/rad",
+        }
+        self.options = {
+            name: self.gui.add_text(name, "", hint=hint) for name, hint in hints.items()
+        }
         self._button("Use this robot", self._use_robot)
         self._text("robot", "Choose a robot of the package, or upload a model of yours.")
 
     def _use_robot(self, _: Any) -> None:
-        given = {f"--{name}": box.value.split() for name, box in self.options.items() if box.value.split()}
+        given = {
+            f"--{name}": box.value.split()
+            for name, box in self.options.items()
+            if box.value.split()
+        }
         if any(word.startswith("-") for words in given.values() for word in words):
             raise UsageError("joints, kp and kd are names and numbers, without a dash in front")
         if (name := str(self.model.value)) in packaged_robots():
             self.jobs.start("robot", "robot", "check", name)
         else:
-            self.jobs.start("robot", "robot", "new", name, "--out", OUT, *(w for k in given for w in (k, *given[k])))
+            self.jobs.start(
+                "robot",
+                "robot",
+                "new",
+                name,
+                "--out",
+                OUT,
+                *(w for k in given for w in (k, *given[k])),
+            )
 
     def _logs(self) -> None:
         self._upload("Upload a log, or a .zip of logs", "logs")
         self.gui.add_markdown(f"Or copy them into {escape_markdown(str(self.folder / 'logs'))}.")
-        self.unit, self.mass = self.gui.add_text("unit", "lab"), self.gui.add_number("payload, kg", 0.0, min=0.0)
+        self.unit, self.mass = (
+            self.gui.add_text("unit", "lab"),
+            self.gui.add_number("payload, kg", 0.0, min=0.0),
+        )
         self.position = self.gui.add_dropdown("positions in", POSITION_UNITS)
-        self.cut = self.gui.add_number("cut into pieces, s", 0.0, min=0.0, hint="0: not cut; 3 motions are needed")
-        self.described = self.gui.add_text("logs.toml", "", multiline=True, hint="empty: the logs.toml of the folder")
+        self.cut = self.gui.add_number(
+            "cut into pieces, s", 0.0, min=0.0, hint="0: not cut; 3 motions are needed"
+        )
+        self.described = self.gui.add_text(
+            "logs.toml", "", multiline=True, hint="empty: the logs.toml of the folder"
+        )
         self._button("Guess logs.toml from the logs", self._guess)
         self._button("Set these logs aside", self._set_aside)
         self._button("Read the logs", self._read)
         self._text("import", "Choose the robot first. Then upload logs, and read them.")
-        self.recording, self.joint = (self.gui.add_dropdown(name, ("–",)) for name in ("recording", "joint"))
-        lines = {name: (np.zeros(2), colour(key)) for name, key in (("target", "target"), ("measured", "gaponet"))}
+        self.recording, self.joint = (
+            self.gui.add_dropdown(name, ("–",)) for name in ("recording", "joint")
+        )
+        lines = {
+            name: (np.zeros(2), colour(key))
+            for name, key in (("target", "target"), ("measured", "gaponet"))
+        }
         self.curves = draw_curves(self.gui, np.arange(2), lines, "rad")
         for choice in (self.recording, self.joint):
             choice.on_update(lambda _: self._draw_recording())
 
     def _set_aside(self, _: Any, place: str = "logs") -> None:
         self.jobs.require_idle()
-        aside = next(name for n in range(1, 1 << 20) if not (self.folder / (name := f"{place}_aside{n}")).exists())
+        aside = next(
+            name
+            for n in range(1, 1 << 20)
+            if not (self.folder / (name := f"{place}_aside{n}")).exists()
+        )
         (self.folder / place).rename(self.folder / aside)
         (self.folder / place).mkdir()
         self.status.content = f"The logs are in {aside} now; {place} is empty."
@@ -131,13 +167,24 @@ class App:
         self.jobs.require_idle()
         if self.described.value.strip():  # otherwise a file of the user's stays as it is
             write_text(self.folder / logs / "logs.toml", self.described.value)
-        words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}", "--out", OUT]
-        words += [f"--position-unit={self.position.value}"] * (self.position.value in POSITION_UNITS[1:])
+        words = [
+            f"--unit-id={self.unit.value}",
+            f"--payload-mass={self.mass.value:g}",
+            "--out",
+            OUT,
+        ]
+        words += [f"--position-unit={self.position.value}"] * (
+            self.position.value in POSITION_UNITS[1:]
+        )
         words += [f"--cut={self.cut.value:g}"] * (self.cut.value > 0)
         self.jobs.start(step, "import", logs, f"--robot={robot.out}", *words)
 
     def _check(self) -> None:
-        self._run("Check the recordings", "doctor", lambda: ("doctor", self._need("import").out, "--figures", OUT))
+        self._run(
+            "Check the recordings",
+            "doctor",
+            lambda: ("doctor", self._need("import").out, "--figures", OUT),
+        )
         self.proposal = self._button("Write a proposal for logs.toml into step Logs", self._propose)
         self._text("doctor", "Read the logs first. Then check them.")
 
@@ -151,11 +198,15 @@ class App:
         self._run("Measure the error", "gap", lambda: ("gap", self._need("import").out))
         self._button("Show the recording of step Logs beside its simulation", self._show)
         self.stage = self.gui.add_folder(None)
-        self._text("gap", "Read the logs first. Then measure how far the simulator is from the robot.")
+        self._text(
+            "gap", "Read the logs first. Then measure how far the simulator is from the robot."
+        )
 
     def _show(self, _: Any) -> None:
         data, identified = self._dataset(), self.jobs.result("identify")
-        robot = dataset_robot(data) if identified is None else load_robot(self.folder / identified.out)
+        robot = (
+            dataset_robot(data) if identified is None else load_robot(self.folder / identified.out)
+        )
         entry = next(e for e in data.entries if e.id == self.recording.value)
         runs = [self.folder / network.out] if (network := self._network()) else []
         self.play(side_by_side(data, entry, robot, runs))
@@ -164,13 +215,18 @@ class App:
         self.limit = self.gui.add_text("time limit", "4m", hint="such as 60s or 4m; empty for none")
         self.table = self.gui.add_checkbox("look for a table under the robot", True)
         self.fit = self._run("Identify", "identify", self._fit)
-        self._text("identify", "Check the recordings first. Identification is locked while the check finds an error.")
+        self._text(
+            "identify",
+            "Check the recordings first. Identification is locked while the check finds an error.",
+        )
         self._text("causes", "")
 
     def _fit(self) -> list[str]:
         if reason := self._locked():
             raise UsageError(reason)
-        words = [f"--budget={time}" for time in self.limit.value.split()[:1]] + ["--no-table"] * (not self.table.value)
+        words = [f"--budget={time}" for time in self.limit.value.split()[:1]] + ["--no-table"] * (
+            not self.table.value
+        )
         return ["identify", self._need("import").out, "--out", OUT, *words]
 
     def _locked(self) -> str:
@@ -178,13 +234,21 @@ class App:
         job = self.jobs.result("doctor")
         if job is None:
             return self.texts["identify"][1]
-        errors = ", ".join(f["check"] for f in (job.result or {})["findings"] if f["level"] == "error")
-        return errors and f"Locked: the check finds an error ({errors}). Step Check says what to do."
+        errors = ", ".join(
+            f["check"] for f in (job.result or {})["findings"] if f["level"] == "error"
+        )
+        return (
+            errors and f"Locked: the check finds an error ({errors}). Step Check says what to do."
+        )
 
     def _use(self) -> None:
         out, self.target = lambda step: self._need(step).out, self.gui.add_dropdown("for", TARGETS)
         robot = lambda: (self.jobs.result("adapt") or self._need("identify")).out  # noqa: E731
-        engines = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}  # that apply parameter sets
+        engines = {
+            "mjcf": "mujoco",
+            "mjlab": "mjlab",
+            "isaaclab": "isaaclab",
+        }  # that apply parameter sets
         network = lambda: str(self.target.value) in NETWORK_TARGETS  # noqa: E731
         self._run("Export", "export", lambda: (
             "export", out("train") if network() else robot(), "--to", str(self.target.value), "--out", OUT
@@ -194,14 +258,32 @@ class App:
             "export", robot(), "--to", "randomization", "--engine", engines.get(str(self.target.value), "json"),
             "--out", OUT,
         ))  # fmt: skip
-        self._text("randomization", "A policy is then trained on robots that these logs cannot tell from yours.")
+        self._text(
+            "randomization",
+            "A policy is then trained on robots that these logs cannot tell from yours.",
+        )
         self._upload("Upload new logs, of another day or unit", "new_logs")
         self._button("Set these new logs aside", lambda _: self._set_aside(_, "new_logs"))
-        self._button("Read the new logs", lambda _: self._read(self._need("identify"), "new", "new_logs"))
-        self._text("new", "Identify the robot first. Unit, payload, positions and logs.toml are those of step Logs.")
-        self._run("Check whether the robot changed", "check", lambda: ("check", out("identify"), out("new")))
-        self._text("check", "Read new logs first. Then check whether the identified robot still fits them.")
-        self._run("Calibrate with the new logs", "adapt", lambda: ("adapt", out("identify"), out("new"), "--out", OUT))
+        self._button(
+            "Read the new logs", lambda _: self._read(self._need("identify"), "new", "new_logs")
+        )
+        self._text(
+            "new",
+            "Identify the robot first. Unit, payload, positions and logs.toml are those of step Logs.",
+        )
+        self._run(
+            "Check whether the robot changed",
+            "check",
+            lambda: ("check", out("identify"), out("new")),
+        )
+        self._text(
+            "check", "Read new logs first. Then check whether the identified robot still fits them."
+        )
+        self._run(
+            "Calibrate with the new logs",
+            "adapt",
+            lambda: ("adapt", out("identify"), out("new"), "--out", OUT),
+        )
         self._text("adapt", "Read new logs first. The calibrated robot is then exported.")
         self.budget = self.gui.add_text("training time", "10m")
         self._run("Train a network", "train", lambda: (
@@ -213,7 +295,9 @@ class App:
         """Return the training if its network helps on validation motions."""
         job = self.jobs.result("train")
         error = (job.result or {})["val_mpjae"] if job is not None else {}
-        gain = NetworkGain("", error.get("added", 0.0), error.get("error") or np.nan, error.get("start", 0.0))
+        gain = NetworkGain(
+            "", error.get("added", 0.0), error.get("error") or np.nan, error.get("start", 0.0)
+        )
         return job if gain.helps else None
 
     # What the page shows: only what the files say.
@@ -225,9 +309,18 @@ class App:
         self.bar.visible = self.cancel.visible = running is not None
         if running is not None:
             self.bar.value, note = running.progress()
-            self.status.content = f"**gaponet {running.words[0]}**, {self.bar.value:.0f} %. {escape_markdown(note)}"
-        models = [f for f in sorted((self.folder / "model").rglob("*")) if f.suffix.lower() in MODEL_SUFFIXES]
-        self.model.options = [*packaged_robots(), *(f.relative_to(self.folder).as_posix() for f in models)]
+            self.status.content = (
+                f"**gaponet {running.words[0]}**, {self.bar.value:.0f} %. {escape_markdown(note)}"
+            )
+        models = [
+            f
+            for f in sorted((self.folder / "model").rglob("*"))
+            if f.suffix.lower() in MODEL_SUFFIXES
+        ]
+        self.model.options = [
+            *packaged_robots(),
+            *(f.relative_to(self.folder).as_posix() for f in models),
+        ]
         if self.seen == (state := (len(every), running is None)):
             return
         if running is None:
@@ -235,20 +328,35 @@ class App:
         for step, (text, hint, pictures) in self.texts.items():
             job = self.jobs.result(step)
             hint = (step == "identify" and self._locked()) or hint
-            text.content, pictures.content = _report(job) if job else hint, self._pictures(step, job)
+            text.content, pictures.content = (
+                _report(job) if job else hint,
+                self._pictures(step, job),
+            )
         self.target.options = TARGETS + NETWORK_TARGETS * (self._network() is not None)
-        self.fit.disabled, self.proposal.visible = bool(self._locked()), self.jobs.result("doctor") is not None
+        self.fit.disabled, self.proposal.visible = (
+            bool(self._locked()),
+            self.jobs.result("doctor") is not None,
+        )
         if self.jobs.result("import"):
             data = self._dataset()
-            self.recording.options, self.joint.options = [e.id for e in data.entries], data.joint_names
+            self.recording.options, self.joint.options = (
+                [e.id for e in data.entries],
+                data.joint_names,
+            )
             self._draw_recording()
-        if running is None and (last := self.jobs.result("identify")) and last.number == every[-1].number:
+        if (
+            running is None
+            and (last := self.jobs.result("identify"))
+            and last.number == every[-1].number
+        ):
             self.jobs.start("causes", "gap", self._need("import").out, "--robot", last.out)
         elif self.player is None and self.jobs.result("robot"):
             self.play(standing(self._chosen_robot()))
         self.seen = state  # last: after an error all is shown again
 
-    def play(self, shown: Scene | SideBySide, clip: Clip | None = None, magnify: float = 1.0) -> None:
+    def play(
+        self, shown: Scene | SideBySide, clip: Clip | None = None, magnify: float = 1.0
+    ) -> None:
         """Show a scene, or motions, in place of what was shown before."""
         scene = shown if isinstance(shown, Scene) else Scene(shown)
         clip = clip or Clip.from_start(scene.shown, 0.0, 3600.0)
@@ -265,19 +373,28 @@ class App:
         if entry is None or self.joint.value not in data.joint_names:
             return  # the choices are being replaced
         real, j = data.read(entry), data.joint_names.index(self.joint.value)
-        self.curves.data = (real.dt * np.arange(len(real)), *(x[:, j].astype(float) for x in (real.ctrl, real.qpos)))
+        self.curves.data = (
+            real.dt * np.arange(len(real)),
+            *(x[:, j].astype(float) for x in (real.ctrl, real.qpos)),
+        )
 
     def _pictures(self, step: str, job: Job | None) -> str:
         """Return the figures of a result as HTML, with links that save them."""
         files = [] if job is None else (job.result or {}).get("figures", [])
         if job is not None and step == "causes":
             files = [f"{self._need('identify').out}/gap.{kind}" for kind in ("svg", "png")]
-        sources = {p: base64.b64encode(p.read_bytes()).decode() for f in files if (p := self.folder / f).is_file()}
+        sources = {
+            p: base64.b64encode(p.read_bytes()).decode()
+            for f in files
+            if (p := self.folder / f).is_file()
+        }
         html, saved = "", '<a download="{}" href="data:image/{};base64,{}">save {}</a> '
         for file, data in sources.items():
             if file.suffix == ".svg":
                 html += f'<img alt="{step}" style="width:100%;background:white" src="data:image/svg+xml;base64,{data}">'
-            html += saved.format(file.name, file.suffix[1:].replace("svg", "svg+xml"), data, file.suffix[1:].upper())
+            html += saved.format(
+                file.name, file.suffix[1:].replace("svg", "svg+xml"), data, file.suffix[1:].upper()
+            )
         return html
 
     def _text(self, step: str, hint: str) -> None:
@@ -299,7 +416,9 @@ class App:
         def store(event: Any) -> None:
             self.jobs.require_idle()
             store_upload(event.target.value.name, event.target.value.content, self.folder / place)
-            self.status.content = f"{escape_markdown(event.target.value.name)} is stored in {place}."
+            self.status.content = (
+                f"{escape_markdown(event.target.value.name)} is stored in {place}."
+            )
 
         self.gui.add_upload_button(label).on_upload(lambda event: self._attempt(store, event))
 
@@ -308,7 +427,11 @@ class App:
         try:
             act(*arguments)
         except Exception as error:  # whatever it is, the page and the running command go on
-            kind = "" if isinstance(error, (GAPONetError, OSError)) else f"Unexpected {type(error).__name__}: "
+            kind = (
+                ""
+                if isinstance(error, (GAPONetError, OSError))
+                else f"Unexpected {type(error).__name__}: "
+            )
             self.status.content = f"**Not done.** {kind}{escape_markdown(str(error))}"
 
     def _need(self, step: str) -> Job:
@@ -327,21 +450,33 @@ class App:
 
 def store_upload(name: str, content: bytes, folder: Path) -> None:
     """Write an uploaded file, or what a .zip holds, below a folder: all or nothing, inside it, and over no file."""
-    with tempfile.TemporaryDirectory(prefix=f"{FOLDER_MARKER}-{os.getpid()}-", dir=folder.parent) as temporary:
+    with tempfile.TemporaryDirectory(
+        prefix=f"{FOLDER_MARKER}-{os.getpid()}-", dir=folder.parent
+    ) as temporary:
         if name.lower().endswith(".zip"):
             try:
                 with zipfile.ZipFile(io.BytesIO(content)) as archive:
                     if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
-                        raise UsageError(f"{name}: holds more than {MAX_UNPACKED_BYTES >> 30} GiB; give it in parts")
+                        raise UsageError(
+                            f"{name}: holds more than {MAX_UNPACKED_BYTES >> 30} GiB; give it in parts"
+                        )
                     archive.extractall(temporary)  # which drops .. and a leading / from names
             except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
-                raise UsageError(f"{name}: is not readable ({error}); pack it again, without a password") from None
+                raise UsageError(
+                    f"{name}: is not readable ({error}); pack it again, without a password"
+                ) from None
         else:
-            Path(temporary, re.split(r"[/\\:]", name)[-1].lstrip(".") or "file").write_bytes(content)
-        places = {f: folder / f.relative_to(temporary) for f in Path(temporary).rglob("*") if f.is_file()}
+            Path(temporary, re.split(r"[/\\:]", name)[-1].lstrip(".") or "file").write_bytes(
+                content
+            )
+        places = {
+            f: folder / f.relative_to(temporary) for f in Path(temporary).rglob("*") if f.is_file()
+        }
         for place in places.values():
             if place.exists() or not place.resolve().is_relative_to(folder.resolve()):
-                raise UsageError(f"{place}: exists, or a link leads out of here; nothing is stored; move it away")
+                raise UsageError(
+                    f"{place}: exists, or a link leads out of here; nothing is stored; move it away"
+                )
         for file, place in places.items():
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(file, place)
@@ -368,12 +503,16 @@ def _report(job: Job) -> str:
         elif text and not line.startswith(("┏", "└", "     ok ")) and not PROGRESS_LINE.match(line):
             bold = "**" * text.startswith(("error ", "warning "))
             lines += ["", f"{bold}{text}{bold}"]
-    return "\n".join([*lines, "", f"To repeat it in the folder of this page: {escape_markdown(job.command)}"])
+    return "\n".join(
+        [*lines, "", f"To repeat it in the folder of this page: {escape_markdown(job.command)}"]
+    )
 
 
 def serve(page: App, say: Callable[[str], None], step: str = "") -> None:
     """Serve a page until Ctrl-C; `step` is the number of the step that is shown first."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # otherwise the running command would stay
+    signal.signal(
+        signal.SIGTERM, lambda *_: sys.exit(143)
+    )  # otherwise the running command would stay
     say(f"open {page.address}{step and '?step=' + step} in a browser; Ctrl-C ends")
     try:
         run_until_interrupt(page.server, page.tick)

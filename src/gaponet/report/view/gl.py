@@ -21,12 +21,20 @@ def choose_gl() -> None:
     Raises:
         UsageError: No backend works; the message says what to install.
     """
-    display = not sys.platform.startswith("linux") or any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
+    display = not sys.platform.startswith("linux") or any(
+        os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
     ours = not display and not os.environ.get("MUJOCO_GL")
     if ours:
-        installed = [name for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")) if find_library(library)]
+        installed = [
+            name
+            for name, library in (("egl", "EGL"), ("osmesa", "OSMesa"))
+            if find_library(library)
+        ]
         if not installed:
-            raise UsageError(f"no display and no OpenGL library for rendering off screen. {INSTALL_HINT}")
+            raise UsageError(
+                f"no display and no OpenGL library for rendering off screen. {INSTALL_HINT}"
+            )
         os.environ["MUJOCO_GL"] = installed[0]
     try:
         import mujoco  # noqa: F401

@@ -74,12 +74,17 @@ class Jobs:
     @property
     def running(self) -> Job | None:
         """The job that runs now."""
-        return Job(self.started) if self.process is not None and self.process.poll() is None else None
+        return (
+            Job(self.started) if self.process is not None and self.process.poll() is None else None
+        )
 
     def result(self, step: str) -> Job | None:
         """Return the last successful job of a step with its folder, unless what it was made from is newer."""
         jobs = (job for job in reversed(self.all) if job.step == step and job.result is not None)
-        last = next((job for job in jobs if "--out" not in job.words or (self.folder / job.out).exists()), None)
+        last = next(
+            (job for job in jobs if "--out" not in job.words or (self.folder / job.out).exists()),
+            None,
+        )
         if last is None or step not in NEEDS:
             return last
         before = self.result(NEEDS[step])
@@ -90,7 +95,9 @@ class Jobs:
         number = max((job.number for job in self.all), default=0) + 1
         folder = self.folder / "jobs" / f"{number:03d}-{step}"
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "command.json", [f"{step}{number}" if word == OUT else word for word in words])
+        write_json(
+            folder / "command.json", [f"{step}{number}" if word == OUT else word for word in words]
+        )
         write_text(folder / "result.json", result)
         write_text(folder / "log.txt", "")
         return folder

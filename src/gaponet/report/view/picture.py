@@ -55,7 +55,9 @@ class Camera:
         letters, tall = max(width / 960, 0.5), scene.box[3] - scene.box[2]
         self.head, labels = round(34 * letters), round(60 * letters)  # pixels
         room = MAX_HEIGHT * self.width - self.head - labels
-        self.scale = min(self.width / (scene.spacing * len(scene.base)), room / tall)  # pixels per metre
+        self.scale = min(
+            self.width / (scene.spacing * len(scene.base)), room / tall
+        )  # pixels per metre
         self.robots = round(1.1 * tall * self.scale)
         self.robots += (self.head + self.robots + labels) % 2  # h264 wants even sizes
         self.height = self.head + self.robots + labels
@@ -86,7 +88,9 @@ class Camera:
         """Return an orthographic camera, which shows every copy from the same side."""
         scene = self.scene
         lens = mujoco.MjvCamera()
-        lens.orthographic = scene.model.vis.global_.orthographic = 1  # MuJoCo 3 reads the model only
+        lens.orthographic = scene.model.vis.global_.orthographic = (
+            1  # MuJoCo 3 reads the model only
+        )
         lens.azimuth, lens.elevation = scene.view.azimuth, scene.view.elevation
         lens.lookat[:] = scene.middle
         lens.distance = 4 * scene.extent
@@ -97,11 +101,23 @@ class Camera:
     def _write(self, draw: ImageDraw, time: float) -> None:
         row, small, large = self.scene.row(time), self.fonts[13], self.fonts[17]
         self._head(draw, time)
-        top, pitch, k = self.head + self.robots, self.scene.spacing * self.scale, len(self.scene.base)
+        top, pitch, k = (
+            self.head + self.robots,
+            self.scene.spacing * self.scale,
+            len(self.scene.base),
+        )
         for i, m in enumerate(self.scene.shown.motions):
             x = self.width / 2 + (i - (k - 1) / 2) * pitch
             tint = colour(m.method)
-            draw.text((x, top), title(m.method), tint, large, anchor="ma", stroke_width=0.3, stroke_fill=tint)
+            draw.text(
+                (x, top),
+                title(m.method),
+                tint,
+                large,
+                anchor="ma",
+                stroke_width=0.3,
+                stroke_fill=tint,
+            )
             if m.method != "recorded":
                 text = f"{m.error[row] * 1e3:.1f} mrad now, {m.mpjae * 1e3:.1f} mean"
                 draw.text((x, top + 1.5 * large.size), text, FAINT, small, anchor="ma")
@@ -110,7 +126,12 @@ class Camera:
         """Write VIRTUAL where it applies, the recording on the left, and the time on the right."""
         shown, pad, font = self.scene.shown, self.head // 3, self.fonts[15]
         meta = shown.real.meta
-        facts = [meta.robot, meta.motion, f"unit {meta.unit_id}", _payload(meta.payload_mass, meta.payload_side)]
+        facts = [
+            meta.robot,
+            meta.motion,
+            f"unit {meta.unit_id}",
+            _payload(meta.payload_mass, meta.payload_side),
+        ]
         facts += [] if shown.seen is None else ["seen in training" if shown.seen else "new motion"]
         clock = [f"speed {self.clip.speed:g}x"] if self.clip.speed != 1 else []
         clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
@@ -124,7 +145,11 @@ class Camera:
 
 
 def _payload(mass: float, side: str) -> str:
-    return "empty-handed" if mass == 0 else f"{mass:g} kg " + ("in each hand" if side == "both" else f"in {side} hand")
+    return (
+        "empty-handed"
+        if mass == 0
+        else f"{mass:g} kg " + ("in each hand" if side == "both" else f"in {side} hand")
+    )
 
 
 def font(size: float) -> Any:
@@ -145,7 +170,9 @@ def renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
             warnings.simplefilter("ignore")
             return mujoco.Renderer(model, height, width)
     except Exception as error:  # GL libraries raise exceptions of any type
-        raise UsageError(f"cannot render off screen ({type(error).__name__}: {error}). {INSTALL_HINT}") from None
+        raise UsageError(
+            f"cannot render off screen ({type(error).__name__}: {error}). {INSTALL_HINT}"
+        ) from None
 
 
 def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
@@ -204,8 +231,12 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
         whole[method] = np.tile(robot.qpos_home, (len(q), 1))
         whole[method][:, robot.operated_index] = q
     base = whole["recorded"]
-    motions = tuple(Copy(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items())
-    shown = SideBySide(Sequence(meta, robot.joint_names, dt, base, base, 0 * base), robot, motions, None)
+    motions = tuple(
+        Copy(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items()
+    )
+    shown = SideBySide(
+        Sequence(meta, robot.joint_names, dt, base, base, 0 * base), robot, motions, None
+    )
     clip = Clip.from_start(shown, None, 8.0)
     moment = largest_error_time(shown, clip)
     row = min(round(moment / dt), len(base) - 2)
@@ -228,7 +259,9 @@ def require_writable(path: Path) -> None:
         _ffmpeg()
 
 
-def write(camera: Camera, path: Path, progress: Callable[[int, int], None] = lambda i, n: None) -> int:
+def write(
+    camera: Camera, path: Path, progress: Callable[[int, int], None] = lambda i, n: None
+) -> int:
     """Render to a file; a PNG shows the moment of the largest error of the first simulated copy.
 
     Returns:
@@ -236,7 +269,9 @@ def write(camera: Camera, path: Path, progress: Callable[[int, int], None] = lam
     """
     require_writable(path)
     clip, suffix = camera.clip, path.suffix.lower()
-    hundredths = max(round(100 / clip.fps), 2)  # a GIF counts in 1/100 s, and viewers slow down below 2
+    hundredths = max(
+        round(100 / clip.fps), 2
+    )  # a GIF counts in 1/100 s, and viewers slow down below 2
     times = clip.times(hundredths / 100 if suffix == ".gif" else 1 / clip.fps)
 
     def pictures() -> Iterator[Image]:
@@ -261,7 +296,9 @@ def _write_gif(pictures: list[Image], path: Path, milliseconds: int) -> None:
     sample = np.concatenate([np.asarray(p) for p in pictures[:: max(len(pictures) // 4, 1)]])
     palette = fromarray(sample).quantize(GIF_COLOURS, Quantize.MAXCOVERAGE)
     frames = [p.quantize(palette=palette, dither=Dither.NONE) for p in pictures]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True)
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True
+    )
 
 
 def _write_mp4(pictures: Iterator[Image], path: Path, fps: float, size: tuple[int, int]) -> None:
@@ -278,5 +315,7 @@ def _ffmpeg() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError:
-        raise UsageError("MP4 needs imageio-ffmpeg; run: pip install 'gaponet[view]', or render a .gif") from None
+        raise UsageError(
+            "MP4 needs imageio-ffmpeg; run: pip install 'gaponet[view]', or render a .gif"
+        ) from None
     return imageio_ffmpeg

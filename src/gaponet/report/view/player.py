@@ -17,7 +17,10 @@ from gaponet.report.view.scene import Scene
 from gaponet.report.view.side_by_side import Clip, largest_error_time
 
 CURVE_ROWS = 1000  # of a chart
-DARK, LIGHTER = 0.22, np.array([0.20, 0.26, 0.38])  # rgb; a body darker than that cannot be seen on a dark page
+DARK, LIGHTER = (
+    0.22,
+    np.array([0.20, 0.26, 0.38]),
+)  # rgb; a body darker than that cannot be seen on a dark page
 
 
 class Player:
@@ -41,15 +44,23 @@ class Player:
         self.folder = gui.add_folder(None, visible=len(shown.real) > 2)  # otherwise nothing moves
         with self.folder:
             heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
-            heading += escape_markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
-            self.title = gui.add_markdown(heading + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
+            heading += escape_markdown(
+                f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg"
+            )
+            self.title = gui.add_markdown(
+                heading + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else "")
+            )
             self.playing = gui.add_checkbox("play", self.folder.visible)
-            self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, shown.real.dt, clip.start)
+            self.time: Any = gui.add_slider(
+                "time, s", clip.start, clip.stop, shown.real.dt, clip.start
+            )
             self.worst = gui.add_button(f"Worst moment: {worst:.2f} s")
             self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
             self.table = gui.add_markdown("")
             curves = {name: (1e3 * m.error, colour(m.method)) for name, m in self.copies.items()}
-            draw_curves(gui, np.arange(len(shown.real)) * shown.real.dt, curves, "mean |error|, mrad")
+            draw_curves(
+                gui, np.arange(len(shown.real)) * shown.real.dt, curves, "mean |error|, mrad"
+            )
 
         @self.worst.on_click
         def _(_: Any) -> None:
@@ -66,8 +77,13 @@ class Player:
             for body, frame in self.frames.items():
                 frame.position, frame.wxyz = scene.data.xpos[body], scene.data.xquat[body]
         row = scene.row(now)
-        rows = "\n".join(f"| {n} | {1e3 * m.error[row]:.1f} | {1e3 * m.mpjae:.1f} |" for n, m in self.copies.items())
-        self.table.content = f"| mean error, mrad | now | whole motion |\n| --- | ---: | ---: |\n{rows}"
+        rows = "\n".join(
+            f"| {n} | {1e3 * m.error[row]:.1f} | {1e3 * m.mpjae:.1f} |"
+            for n, m in self.copies.items()
+        )
+        self.table.content = (
+            f"| mean error, mrad | now | whole motion |\n| --- | ---: | ---: |\n{rows}"
+        )
 
     def advance(self, elapsed: float) -> None:
         """Advance by `elapsed` s of wall time; the clip repeats."""
@@ -84,7 +100,9 @@ class Player:
 
     def _bodies(self) -> dict[int, Any]:
         model, frames = self.scene.model, {}
-        seen = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
+        seen = np.flatnonzero(
+            (model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+        )
         for body in range(model.nbody):
             geoms = [g for g in seen if model.geom_bodyid[g] == body]
             if not geoms:
@@ -98,16 +116,26 @@ class Player:
                     opacity=float(model.geom_rgba[g, 3]), position=model.geom_pos[g], wxyz=model.geom_quat[g],
                 )  # fmt: skip
         across = float(2.5 * self.scene.extent)
-        self.server.scene.add_grid("/robots/floor", across, across, position=(0, 0, self.scene.floor))
+        self.server.scene.add_grid(
+            "/robots/floor", across, across, position=(0, 0, self.scene.floor)
+        )
         above = self.scene.view.axes[1] * 1.08 * self.scene.box[3]
         for m, base in zip(self.scene.shown.motions, self.scene.base, strict=True):
-            self.server.scene.add_label(f"/robots/label_{m.method}", title(m.method), position=base + above)
+            self.server.scene.add_label(
+                f"/robots/label_{m.method}", title(m.method), position=base + above
+            )
         return frames
 
     def _aim(self) -> None:
-        (across, up), far = self.scene.view.axes, 2.2 + 1.2 / len(self.scene.base)  # one robot may point at the camera
+        (across, up), far = (
+            self.scene.view.axes,
+            2.2 + 1.2 / len(self.scene.base),
+        )  # one robot may point at the camera
         self.server.initial_camera.fov = np.radians(45)
-        for camera in (self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())):
+        for camera in (
+            self.server.initial_camera,
+            *(c.camera for c in self.server.get_clients().values()),
+        ):
             camera.look_at = self.scene.middle
             camera.position = self.scene.middle + far * self.scene.extent * np.cross(across, up)
 
@@ -121,7 +149,10 @@ def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], 
     """Return a new chart over time (T), s, above a button that saves it; curves: name → values (T) and colour."""
     from viser.uplot import Scale, Series
 
-    rows, colours = np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int)), [c for _, c in curves.values()]
+    rows, colours = (
+        np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int)),
+        [c for _, c in curves.values()],
+    )
     chart = gui.add_uplot(
         (time[rows], *(values[rows] for values, _ in curves.values())),
         (Series(label="time, s"), *(Series(label=n, stroke=c, width=2) for n, c in zip(curves, colours, strict=True))),
@@ -132,7 +163,9 @@ def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], 
         from gaponet.report.figures.style import draw_curves, save
 
         now, *values = chart.data
-        figure = draw_curves(now, dict(zip(curves, zip(values, colours, strict=True), strict=True)), chart.title)
+        figure = draw_curves(
+            now, dict(zip(curves, zip(values, colours, strict=True), strict=True)), chart.title
+        )
         with TemporaryDirectory() as folder:
             for file in save(figure, Path(folder) / "curves"):
                 event.client.send_file_download(file.name, file.read_bytes())
@@ -150,7 +183,9 @@ def _surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
         case mujoco.mjtGeom.mjGEOM_MESH:
             mesh = model.mesh(model.geom_dataid[geom])
             first, face = mesh.vertadr[0], mesh.faceadr[0]
-            return model.mesh_vert[first : first + mesh.vertnum[0]], model.mesh_face[face : face + mesh.facenum[0]]
+            return model.mesh_vert[first : first + mesh.vertnum[0]], model.mesh_face[
+                face : face + mesh.facenum[0]
+            ]
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
             shape = creation.capsule(2 * b, a, count=[12, 12])
             shape.apply_translation(-shape.bounds.mean(axis=0))

@@ -76,14 +76,20 @@ class Scene:
         self.base = (np.arange(k) - (k - 1) / 2)[:, None] * self.spacing * view.axes[0]
         self.extent = max(0.5 * k * self.spacing, self.box[3] - self.box[2])
         across, up = view.axes
-        behind = GHOST_DISTANCE * (self.box[3] - self.box[2]) * np.cross(up, across) if flat else np.zeros(3)
+        behind = (
+            GHOST_DISTANCE * (self.box[3] - self.box[2]) * np.cross(up, across)
+            if flat
+            else np.zeros(3)
+        )
         self.model = self._compose(self.base, behind)
         self.data = mujoco.MjData(self.model)
         self.address = [(i, self._address(m.method)) for i, m in enumerate(shown.motions)]
         if self.ghosts:
             last = next(i for i, m in enumerate(shown.motions) if m.method == "recorded")
             self.address += [
-                (last, self._address(f"{m.method}-ghost")) for m in shown.motions if m.method != "recorded"
+                (last, self._address(f"{m.method}-ghost"))
+                for m in shown.motions
+                if m.method != "recorded"
             ]
 
     def pose(self, time: float) -> None:
@@ -117,9 +123,13 @@ class Scene:
         robot, meta = self.shown.robot, self.shown.real.meta
         model = visual_spec(robot, "#808080", meta.payload_mass, meta.payload_side).compile()
         data = mujoco.MjData(model)
-        seen = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
+        seen = np.flatnonzero(
+            (model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+        )
         if not len(seen):
-            raise UsageError(f"{robot.mjcf}: has no visible geom; add one to each body to look at it")
+            raise UsageError(
+                f"{robot.mjcf}: has no visible geom; add one to each body to look at it"
+            )
         near = _operated_bodies(model, robot) if closeup else set(range(model.nbody))
         fits = np.array([model.geom_bodyid[g] in near for g in seen])
         middle, half = model.geom_aabb[seen, None, :3], model.geom_aabb[seen, None, 3:]
@@ -132,10 +142,15 @@ class Scene:
             for q in part[np.unique(np.linspace(0, len(part) - 1, FITTED_FRAMES).astype(int))]:
                 data.qpos[address] = q
                 mujoco.mj_kinematics(model, data)
-                points = data.geom_xpos[seen, None] + corners @ data.geom_xmat[seen].reshape(-1, 3, 3).mT
+                points = (
+                    data.geom_xpos[seen, None] + corners @ data.geom_xmat[seen].reshape(-1, 3, 3).mT
+                )
                 floor = min(floor, float(points[..., 2].min()))
                 places = points[fits].reshape(-1, 3) @ axes.T
-                low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+                low, high = (
+                    np.minimum(low, places.min(axis=0)),
+                    np.maximum(high, places.max(axis=0)),
+                )
         return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), floor
 
     def _compose(self, base: Array, behind: Array) -> mujoco.MjModel:
@@ -148,16 +163,28 @@ class Scene:
                 parts[f"{motion.method}-ghost"] = ("", place + behind)
             for prefix, (colour, pos) in parts.items():
                 spec = visual_spec(self.shown.robot, colour, meta.payload_mass, meta.payload_side)
-                scene.nuser_actuator = spec.nuser_actuator  # of the servo model; MuJoCo warns of a difference
+                scene.nuser_actuator = (
+                    spec.nuser_actuator
+                )  # of the servo model; MuJoCo warns of a difference
                 scene.attach(spec, prefix=f"{prefix}/", frame=scene.worldbody.add_frame(pos=pos))
         return scene.compile()
 
 
-def visual_spec(robot: RobotSpec, colour: str, payload_mass: float, payload_side: str = "both") -> mujoco.MjSpec:
+def visual_spec(
+    robot: RobotSpec, colour: str, payload_mass: float, payload_side: str = "both"
+) -> mujoco.MjSpec:
     """Return the robot in one colour with housings, shells and payload; colour "" gives a ghost."""
     spec = build_spec(robot, payload_mass, payload_side)
     spec.option = mujoco.MjSpec().option  # nothing is simulated; all copies must agree
-    for part in (*spec.actuators, *spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.pairs, *spec.excludes):
+    for part in (
+        *spec.actuators,
+        *spec.lights,
+        *spec.cameras,
+        *spec.sensors,
+        *spec.keys,
+        *spec.pairs,
+        *spec.excludes,
+    ):
         spec.delete(part)
     for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
         spec.delete(geom)  # the scene has its own ground
@@ -167,7 +194,9 @@ def visual_spec(robot: RobotSpec, colour: str, payload_mass: float, payload_side
     meshes = any(g.type == mujoco.mjtGeom.mjGEOM_MESH for g in spec.geoms)
     for geom in spec.geoms:
         geom.material = ""
-        geom.rgba = (PAYLOAD_RGBA if colour else GHOST_RGBA) if geom.parent.name in payload else rgba
+        geom.rgba = (
+            (PAYLOAD_RGBA if colour else GHOST_RGBA) if geom.parent.name in payload else rgba
+        )
     if not meshes:
         for body in spec.bodies[1:]:  # asked for the world's parent, MuJoCo 3.10 ends the process
             _add_housings(body, dark)
@@ -193,8 +222,13 @@ def _add_housings(body: mujoco.MjsBody, rgba: tuple[float, ...]) -> None:
         return
     radius = 1.35 * max(sizes)
     for joint in body.joints:
-        middle, half = np.array(joint.pos), 1.1 * radius * np.array(joint.axis) / np.linalg.norm(joint.axis)
-        _add(body, mujoco.mjtGeom.mjGEOM_CYLINDER, [*(middle - half), *(middle + half)], radius, rgba)
+        middle, half = (
+            np.array(joint.pos),
+            1.1 * radius * np.array(joint.axis) / np.linalg.norm(joint.axis),
+        )
+        _add(
+            body, mujoco.mjtGeom.mjGEOM_CYLINDER, [*(middle - half), *(middle + half)], radius, rgba
+        )
 
 
 def _add_shells(spec: mujoco.MjSpec, robot: RobotSpec, rgba: tuple[float, ...]) -> None:
@@ -208,16 +242,36 @@ def _add_shells(spec: mujoco.MjSpec, robot: RobotSpec, rgba: tuple[float, ...]) 
                     raise RobotError(f"{path}: names body '{part}', which {robot.mjcf.name} lacks")
             for c in table.capsule:
                 ends = [*c["from"], *c["to"]]
-                _add(spec.body(c["body"]), mujoco.mjtGeom.mjGEOM_CAPSULE, ends, share * c["radius"], rgba)
+                _add(
+                    spec.body(c["body"]),
+                    mujoco.mjtGeom.mjGEOM_CAPSULE,
+                    ends,
+                    share * c["radius"],
+                    rgba,
+                )
             for b in table.box:
                 spec.body(b.body).add_geom(
-                    type=mujoco.mjtGeom.mjGEOM_BOX, pos=b.pos, size=b.size, mass=0, contype=0, conaffinity=0, rgba=rgba
+                    type=mujoco.mjtGeom.mjGEOM_BOX,
+                    pos=b.pos,
+                    size=b.size,
+                    mass=0,
+                    contype=0,
+                    conaffinity=0,
+                    rgba=rgba,
                 )
             return
 
 
-def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, ends: list[float], radius: float, rgba: tuple[float, ...]) -> None:
-    body.add_geom(type=kind, fromto=ends, size=(radius, 0, 0), mass=0, contype=0, conaffinity=0, rgba=rgba)
+def _add(
+    body: mujoco.MjsBody,
+    kind: mujoco.mjtGeom,
+    ends: list[float],
+    radius: float,
+    rgba: tuple[float, ...],
+) -> None:
+    body.add_geom(
+        type=kind, fromto=ends, size=(radius, 0, 0), mass=0, contype=0, conaffinity=0, rgba=rgba
+    )
 
 
 def _operated_bodies(model: mujoco.MjModel, robot: RobotSpec) -> set[int]:
@@ -254,7 +308,11 @@ def _light(scene: mujoco.MjSpec, floor: float, extent: float) -> None:
     scene.visual.headlight.diffuse = [0.1] * 3
     scene.visual.headlight.specular = [0.0] * 3
     scene.visual.map.shadowclip = 1.2
-    scene.visual.quality.shadowsize, scene.visual.quality.numslices, scene.visual.quality.numstacks = 2048, 18, 10
+    (
+        scene.visual.quality.shadowsize,
+        scene.visual.quality.numslices,
+        scene.visual.quality.numstacks,
+    ) = 2048, 18, 10
     scene.visual.global_.offwidth = scene.visual.global_.offheight = 4096
     scene.stat.extent = extent
     scene.stat.center = [0, 0, floor]

@@ -48,7 +48,9 @@ def open_server(label: str, port: int) -> tuple[Any, str]:
         transport.serve = serve
     if not guarded:
         server.stop()
-        raise UsageError(f"viser {viser.__version__} cannot be protected; run: pip install 'viser>=1.1,<1.2'")
+        raise UsageError(
+            f"viser {viser.__version__} cannot be protected; run: pip install 'viser>=1.1,<1.2'"
+        )
     server.request_share_url = lambda *_, **__: None  # would publish the page on the internet
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()  # beside the robots, not in front of them
@@ -77,7 +79,9 @@ def _guard(token: str, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any]
         own = own and all(origin == f"http://{hosts[0]}" for origin in origins)
         first, _, rest = request.path.lstrip("/").partition("?")[0].partition("/")
         if not own or not secrets.compare_digest(first.encode(), token.encode()):
-            return connection.respond(HTTPStatus.FORBIDDEN, "Open the address that gaponet printed.\n")
+            return connection.respond(
+                HTTPStatus.FORBIDDEN, "Open the address that gaponet printed.\n"
+            )
         response = answer(connection, dataclasses.replace(request, path=f"/{rest}"))
         if response is not None:
             for name, value in HEADERS.items():

@@ -41,7 +41,9 @@ class SideBySide:
     real: Sequence
     robot: RobotSpec
     motions: tuple[Copy, ...]  # target, nominal, identified, models and recording, in this order
-    seen: bool | None  # True if a model was trained or validated on this recording; None without a model
+    seen: (
+        bool | None
+    )  # True if a model was trained or validated on this recording; None without a model
 
     def only(self, methods: tuple[str, ...]) -> SideBySide:
         """Return some motions in this order; "aligned" stands for the motions of all models.
@@ -53,7 +55,9 @@ class SideBySide:
         models = [m for m in have if m not in ("target", "nominal", "recorded")]
         wanted = [m for name in methods for m in (models if name == "aligned" else [name])]
         if unknown := [name for name in wanted if name not in have]:
-            raise UsageError(f"--show {unknown[0]}: here are {', '.join(have)}; models are given with --model RUN")
+            raise UsageError(
+                f"--show {unknown[0]}: here are {', '.join(have)}; models are given with --model RUN"
+            )
         if not wanted:
             raise UsageError("--show: nothing is selected; aligned motion needs --model RUN")
         return replace(self, motions=tuple(have[name] for name in dict.fromkeys(wanted)))
@@ -82,13 +86,20 @@ class Clip:
 
     @classmethod
     def from_start(
-        cls, shown: SideBySide, start: float | None, duration: float, speed: float = 1.0, fps: float = 20.0
+        cls,
+        shown: SideBySide,
+        start: float | None,
+        duration: float,
+        speed: float = 1.0,
+        fps: float = 20.0,
     ) -> Clip:
         """Return the part from start on, or the part with the most motion, cut at the recording's end."""
         real, dt = shown.real, shown.real.dt
         recorded_s = (len(real) - 1) * dt
         if start is None:
-            start = dt * busiest_window(real.qpos[:, shown.robot.operated_index], max(round(duration / dt), 1))
+            start = dt * busiest_window(
+                real.qpos[:, shown.robot.operated_index], max(round(duration / dt), 1)
+            )
         if not 0 <= start < recorded_s:
             raise UsageError(f"--start is {start:g} s; the recording lasts {recorded_s:.1f} s")
         return cls(start, min(duration, recorded_s - start), speed, fps)
@@ -107,12 +118,18 @@ class Clip:
 def largest_error_time(shown: SideBySide, clip: Clip) -> float:
     """Return the time of the largest error of the first simulated copy, s."""
     first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
-    simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(shown.motions)
+    simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(
+        shown.motions
+    )
     return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt
 
 
 def select_entry(
-    dataset: Dataset, runs: ListOf[Path], motion: str = "", unit: str = "", payload_mass: float | None = None
+    dataset: Dataset,
+    runs: ListOf[Path],
+    motion: str = "",
+    unit: str = "",
+    payload_mass: float | None = None,
 ) -> Entry:
     """Return the first matching recording; recordings that no run was fitted to come first.
 
@@ -135,7 +152,11 @@ def select_entry(
 
 
 def side_by_side(
-    dataset: Dataset, entry: Entry, robot: RobotSpec, runs: ListOf[Path] = (), progress: Progress = no_progress
+    dataset: Dataset,
+    entry: Entry,
+    robot: RobotSpec,
+    runs: ListOf[Path] = (),
+    progress: Progress = no_progress,
 ) -> SideBySide:
     """Replay a recording in the nominal simulator, in identified ones, and with each run's exported model.
 
@@ -145,7 +166,9 @@ def side_by_side(
     """
     dataset.require_robot(robot)
     real = dataset.read(entry)
-    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {"nominal": (robot.before_identification, None)}
+    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {
+        "nominal": (robot.before_identification, None)
+    }
     if robot.nominal is not None:
         simulators["identified"] = (robot, None)
     for run in runs:
@@ -153,9 +176,13 @@ def side_by_side(
         if candidate.model is not None:
             candidate.model.require(candidate.robot, real.dt)
         if candidate.method in simulators:
-            raise UsageError(f"{run}: a second run of {title(candidate.method)}; give runs of different methods")
+            raise UsageError(
+                f"{run}: a second run of {title(candidate.method)}; give runs of different methods"
+            )
         simulators[candidate.method] = (candidate.robot, candidate.corrector())
-    target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # the command of row t is the target at t + 1
+    target = np.concatenate(
+        [real.qpos[:1], real.ctrl[:-1]]
+    )  # the command of row t is the target at t + 1
     shown = {"target": target}
     for name, (simulator, corrector) in simulators.items():
         report = with_note(progress, name)
@@ -170,7 +197,14 @@ def side_by_side(
 def standing(robot: RobotSpec) -> SideBySide:
     """Return a robot at home."""
     home, still = np.tile(robot.qpos_home, (2, 1)), np.zeros(2)
-    real = Sequence(SequenceMeta(robot.name, "home", "home", 0.0), robot.joint_names, robot.dt, home, home, 0 * home)
+    real = Sequence(
+        SequenceMeta(robot.name, "home", "home", 0.0),
+        robot.joint_names,
+        robot.dt,
+        home,
+        home,
+        0 * home,
+    )
     return SideBySide(real, robot, (Copy("nominal", home, still),), None)
 
 

@@ -22,7 +22,13 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.axes import identified_joints
-from gaponet.sysid.evidence.evidence import Evidence, evidence, gradient_covariance, inverted, widened
+from gaponet.sysid.evidence.evidence import (
+    Evidence,
+    evidence,
+    gradient_covariance,
+    inverted,
+    widened,
+)
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.uncertainty import PLAY, ParameterUncertainty
 
@@ -35,8 +41,12 @@ MAX_SET_ASIDE = 0.4  # of the recordings; more of them contradict the others
 COMMON_FIELDS = ("delay",)  # of one bus: those of all joints change together
 EVERY_JOINT = "every joint"
 FRICTION_FIELDS = ("damping", "frictionloss", "stribeck")
-FAR_RATIO = 2.5  # of half of the windows' errors over the residual of the identification: another robot
-MAX_CHANGED_JOINTS = 0.4  # of all joints: more with another kp or several changes are another robot's
+FAR_RATIO = (
+    2.5  # of half of the windows' errors over the residual of the identification: another robot
+)
+MAX_CHANGED_JOINTS = (
+    0.4  # of all joints: more with another kp or several changes are another robot's
+)
 
 Verdict = Literal["same", "drifted", "contradictory"]
 
@@ -103,7 +113,12 @@ class Drift:
     far: Mapping[str, float]
 
 
-def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf[Sequence], nthread: int = 0) -> Drift:
+def drift(
+    robot: RobotSpec,
+    uncertainty: ParameterUncertainty,
+    sequences: ListOf[Sequence],
+    nthread: int = 0,
+) -> Drift:
     """Compare recordings of a robot that should be the same with the stored uncertainty of an identified robot.
 
     Raises:
@@ -111,7 +126,9 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     """
     own = evidence(robot, sequences, uncertainty.fields, nthread=nthread)
     if not own.rows.any():
-        raise UsageError("no recording moves an operated joint away from what it may touch; record gaponet excite's")
+        raise UsageError(
+            "no recording moves an operated joint away from what it may touch; record gaponet excite's"
+        )
     fields, joints = (*uncertainty.fields, PLAY), robot.operated
     held = {j for j, rows in zip(joints, own.rows, strict=True) if rows}
     if not held & identified_joints(robot):
@@ -120,7 +137,8 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
             "Identify these joints first"
         )
     repeatability = {
-        j: uncertainty.joints[j].repeatability or float(today)  # today's may itself have become worse
+        j: uncertainty.joints[j].repeatability
+        or float(today)  # today's may itself have become worse
         for j, today in zip(joints, repetition_difference(sequences, joints), strict=True)
     }
     times = {
@@ -128,9 +146,16 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
         for j, e in zip(joints, own.window_rms, strict=True)
     }
     far = {j: by for j, by in times.items() if by > FAR_RATIO}
-    overdispersion = np.stack([np.maximum(uncertainty.array(j, "overdispersion"), 1.0) for j in joints])
-    against, rest = list[Contradiction](), own.by_recording()  # the farthest first; each is left out of the others
-    while len(rest.names) > 1 and (worst := _farthest(rest, overdispersion, uncertainty, joints, fields)):
+    overdispersion = np.stack(
+        [np.maximum(uncertainty.array(j, "overdispersion"), 1.0) for j in joints]
+    )
+    against, rest = (
+        list[Contradiction](),
+        own.by_recording(),
+    )  # the farthest first; each is left out of the others
+    while len(rest.names) > 1 and (
+        worst := _farthest(rest, overdispersion, uncertainty, joints, fields)
+    ):
         against.append(worst)
         rest = rest.without({worst.recording})
     aside = {a.recording for a in against}
@@ -141,13 +166,27 @@ def drift(robot: RobotSpec, uncertainty: ParameterUncertainty, sequences: ListOf
     tests = len(joints) * len(fields) + len(COMMON_FIELDS)
     threshold = float(student.isf(FALSE_ALARM_RATE / tests / 2, trusted + clusters - 1))
     information, freedom = grouped.information.sum(axis=1), trusted + clusters - 1
-    scatter = trusted * widened(information, overdispersion) + (clusters - 1) * gradient_covariance(grouped.gradients)
+    scatter = trusted * widened(information, overdispersion) + (clusters - 1) * gradient_covariance(
+        grouped.gradients
+    )
     gradients, rows = grouped.gradients.sum(axis=1), own.rows.astype(int).tolist()
     each = [
-        _Joint(j, uncertainty, information[i], gradients[i], scatter[i] / freedom, rows[i], repeatability[j])
+        _Joint(
+            j,
+            uncertainty,
+            information[i],
+            gradients[i],
+            scatter[i] / freedom,
+            rows[i],
+            repeatability[j],
+        )
         for i, j in enumerate(joints)
     ]
-    moved = [m for f in COMMON_FIELDS if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))]
+    moved = [
+        m
+        for f in COMMON_FIELDS
+        if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))
+    ]
     largest: dict[str, ParameterChange] = {m.joint: m for m in moved}
     for one in each:
         changes, first = one.explained(threshold)
@@ -185,10 +224,14 @@ class _Joint:
         step_covariance = uncertainty.array(name, "gauss_newton_covariance")
         variance = scatter + information @ step_covariance @ information
         size = np.sqrt(np.maximum(np.diag(variance), 1e-30))
-        self.weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
+        self.weight = np.linalg.inv(
+            variance / np.outer(size, size) + 1e-9 * np.eye(len(size))
+        ) / np.outer(size, size)
         squares = np.maximum(np.diag(by_field.T @ information @ by_field), 0.0) / max(rows, 1)
         self.effect = ERROR_SCALE_RAD * np.sqrt(squares)
-        self.min_effect = max(MIN_EFFECT_RATIO * uncertainty.joints[name].residual_rms, repeatability)
+        self.min_effect = max(
+            MIN_EFFECT_RATIO * uncertainty.joints[name].residual_rms, repeatability
+        )
         self.gradient = -gradient - information @ uncertainty.array(name, "gauss_newton_step")
         self.columns = information @ by_field
 
@@ -201,7 +244,9 @@ class _Joint:
             for k in np.flatnonzero(self.effect > 0).tolist():
                 if k not in chosen:
                     tried = self._moved([*chosen, k])
-                    what = tried if not what or abs(tried[-1].sigmas) > abs(what[-1].sigmas) else what
+                    what = (
+                        tried if not what or abs(tried[-1].sigmas) > abs(what[-1].sigmas) else what
+                    )
             first = first or (what[-1] if what else None)
             if not what or abs(what[-1].sigmas) < threshold or what[-1].moves < self.min_effect:
                 break
@@ -211,7 +256,9 @@ class _Joint:
     def _moved(self, numbers: list[int]) -> list[ParameterChange]:
         by, error = _solved(self.columns[:, numbers], self.weight, self.gradient)
         return [
-            ParameterChange(self.name, self.fields[i], float(b), float(e), float(abs(b) * self.effect[i]))
+            ParameterChange(
+                self.name, self.fields[i], float(b), float(e), float(abs(b) * self.effect[i])
+            )
             for i, b, e in zip(numbers, by, error, strict=True)
         ]
 
@@ -226,7 +273,9 @@ def _together(joints: ListOf[_Joint], number: int, threshold: float) -> Paramete
     moves = float(np.sqrt(np.mean([(by * j.effect[number]) ** 2 for j in joints])))
     change = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
     alone = max((abs(m.sigmas) for j in joints if (m := j.explained(np.inf)[1])), default=0.0)
-    if abs(change.sigmas) < max(threshold, alone) or moves < np.mean([j.min_effect for j in joints]):
+    if abs(change.sigmas) < max(threshold, alone) or moves < np.mean(
+        [j.min_effect for j in joints]
+    ):
         return None
     for j in joints:
         j.gradient = j.gradient - by * j.columns[:, number]
@@ -240,7 +289,11 @@ def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
 
 
 def _farthest(
-    own: Evidence, overdispersion: Array, uncertainty: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
+    own: Evidence,
+    overdispersion: Array,
+    uncertainty: ParameterUncertainty,
+    joints: ListOf[str],
+    fields: ListOf[str],
 ) -> Contradiction | None:
     """Return the recording that differs most from the others, by more than recordings scatter, and its field."""
     count, worst = len(own.names), None
@@ -252,14 +305,21 @@ def _farthest(
             mine, rest = own.information[i, r], information - own.information[i, r]
             carried = mine @ inverted(rest[None])[0]
             difference = carried @ (gradient - own.gradients[i, r]) - own.gradients[i, r]
-            variance = widened(mine, overdispersion[i]) + carried @ widened(rest, overdispersion[i]) @ carried.T
+            variance = (
+                widened(mine, overdispersion[i])
+                + carried @ widened(rest, overdispersion[i]) @ carried.T
+            )
             weight = np.linalg.pinv(variance, rcond=1e-9, hermitian=True)
             for k in range(len(fields)):
                 if mine[k, k] <= 0 or rest[k, k] < 0.5 * mine[k, k]:
                     continue
                 by, error = _solved(mine[:, [k]], weight, difference)
                 sigmas = float(by[0] / error[0])
-                effect = ERROR_SCALE_RAD * abs(by[0]) * np.sqrt(mine[k, k] * count / max(float(own.rows[i]), 1))
+                effect = (
+                    ERROR_SCALE_RAD
+                    * abs(by[0])
+                    * np.sqrt(mine[k, k] * count / max(float(own.rows[i]), 1))
+                )
                 farther = abs(sigmas) > max(limit, abs(worst.sigmas) if worst else 0)
                 if farther and effect > uncertainty.joints[joint].residual_rms:
                     worst = Contradiction(own.names[r], joint, fields[k], float(by[0]), sigmas)

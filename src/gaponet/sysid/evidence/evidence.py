@@ -23,7 +23,13 @@ from gaponet.sysid.least_squares import slopes
 from gaponet.sysid.problem import MIN_CLUSTERS, cluster_sums
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.table_contact import contact_height, tip_heights
-from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, Provenance, prior_std, to_axes
+from gaponet.sysid.uncertainty import (
+    JointUncertainty,
+    ParameterUncertainty,
+    Provenance,
+    prior_std,
+    to_axes,
+)
 
 WINDOWS = 40  # of 8 s
 PLAY_TURN_RAD = 0.002  # servo error at which play has changed sides
@@ -58,7 +64,9 @@ class Evidence:
         rest = tuple(name for name in self.names if name not in names)
         order = np.array([rest.index(self.names[r]) for r in self.recording[keep]])
         rows = self.rows * keep.mean()  # windows are as long as each other
-        return Evidence(self.gradients[:, keep], self.information[:, keep], rows, order, rest, self.window_rms)
+        return Evidence(
+            self.gradients[:, keep], self.information[:, keep], rows, order, rest, self.window_rms
+        )
 
 
 def widened(information: Array, overdispersion: Array) -> Array:
@@ -70,7 +78,9 @@ def widened(information: Array, overdispersion: Array) -> Array:
 def gradient_covariance(gradients: Array) -> Array:
     """Return the covariance of the sum of gradients (n, C, Q) from their scatter over clusters, (n, Q, Q)."""
     each = gradients - gradients.mean(axis=1, keepdims=True)
-    return np.asarray(np.swapaxes(each, -1, -2) @ each * (gradients.shape[1] / max(gradients.shape[1] - 1, 1)))
+    return np.asarray(
+        np.swapaxes(each, -1, -2) @ each * (gradients.shape[1] / max(gradients.shape[1] - 1, 1))
+    )
 
 
 def inverted(information: Array) -> Array:
@@ -78,12 +88,17 @@ def inverted(information: Array) -> Array:
     size = np.sqrt(np.maximum(np.einsum("...kk->...k", information), 1e-12))
     both = size[..., :, None] * size[..., None, :]
     return np.asarray(
-        np.linalg.inv(information / both + MIN_RELATIVE_INFORMATION * np.eye(information.shape[-1])) / both
+        np.linalg.inv(information / both + MIN_RELATIVE_INFORMATION * np.eye(information.shape[-1]))
+        / both
     )
 
 
 def evidence(
-    robot: RobotSpec, sequences: ListOf[Sequence], fields: ListOf[str], windows: int = WINDOWS, nthread: int = 0
+    robot: RobotSpec,
+    sequences: ListOf[Sequence],
+    fields: ListOf[str],
+    windows: int = WINDOWS,
+    nthread: int = 0,
 ) -> Evidence:
     """Compute the evidence of recordings by rollouts of every joint by itself, at the robot's own values."""
     contact = contact_height(robot, tip_heights(sequences, robot))
@@ -95,14 +110,22 @@ def evidence(
     here, jac = (y[0] for y in slopes(x[None], axes.high, scaled_errors))
     jac = jac / axes.unit[:, None] * (axes.low < axes.high)[:, None]
     late = np.round(bounds.first["delay"][:, None] / rollouts.periods).astype(int)
-    aim = np.array([[np.roll(c, d) for c, d in zip(*j, strict=True)] for j in zip(rollouts.ctrl, late, strict=True)])
+    aim = np.array(
+        [
+            [np.roll(c, d) for c, d in zip(*j, strict=True)]
+            for j in zip(rollouts.ctrl, late, strict=True)
+        ]
+    )
     servo_error = aim + bounds.first["offset"][:, None, None].astype(np.float32) - rollouts.qpos
     side = np.tanh(servo_error / PLAY_TURN_RAD)[..., :: rollouts.thin]
     play = 0.5 / ERROR_SCALE_RAD * side * (rollouts.counted & rollouts.recorded[..., None])
     jac = np.concatenate([jac, play.reshape(bounds.n, -1, 1)], axis=-1)
     weight = 1 / np.sqrt(1 + here**2)
     gradients, window = cluster_sums(jac * (weight * here)[..., None], rollouts.window)
-    each = ((j[None, :, :, None], (w[:, None] * j)[None, :, None, :]) for j, w in zip(jac, weight, strict=True))
+    each = (
+        (j[None, :, :, None], (w[:, None] * j)[None, :, None, :])
+        for j, w in zip(jac, weight, strict=True)
+    )
     # A joint at a time, for memory.
     information = np.concatenate([cluster_sums(a * b, rollouts.window)[0] for a, b in each])
     names = [f"{p.meta.motion}{f' ({p.meta.repetition})' * bool(p.meta.repetition)}" for p in parts]
@@ -134,34 +157,48 @@ def estimate_uncertainty(
             them as well.
     """
     first = first_values(robot)
-    fitted_fields = (*CLASSIC, *(f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()))
+    fitted_fields = (
+        *CLASSIC,
+        *(f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()),
+    )
     fields = before.fields if before else fitted_fields
     own, values = evidence(robot, sequences, fields, nthread=nthread), to_axes(robot, fields)
     grouped = own.by_recording() if len(own.names) >= MIN_CLUSTERS // 4 else own
     clusters, independent = grouped.gradients.shape[1], np.einsum("nckk->nk", grouped.information)
     scatter = np.einsum("nkk->nk", gradient_covariance(grouped.gradients))
-    overdispersion = np.divide(scatter, independent, out=np.zeros_like(independent), where=independent > 0)
+    overdispersion = np.divide(
+        scatter, independent, out=np.zeros_like(independent), where=independent > 0
+    )
     if before:
         old = np.stack([before.array(j, "overdispersion") for j in robot.operated])
-        overdispersion = (before.clusters * old + clusters * overdispersion) / (before.clusters + clusters)
+        overdispersion = (before.clusters * old + clusters * overdispersion) / (
+            before.clusters + clusters
+        )
     information = own.information.sum(axis=1)
     inverse = inverted(information)
     step = -(inverse @ own.gradients.sum(axis=1)[..., None])[..., 0]
     step_covariance = inverse @ widened(information, np.maximum(overdispersion, 1.0)) @ inverse
     repeatability = repetition_difference(sequences, robot.operated)
-    errors, joints = _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread), {}
+    errors, joints = (
+        _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread),
+        {},
+    )
     for i, joint in enumerate(robot.operated):
         covariance = step_covariance[i, :-1, :-1]
         if before:
             was, at = before.array(joint, "covariance"), before.array(joint, "values")
             moved = np.square(values[joint] - at) - np.diag(covariance) - np.diag(was)
-            covariance = inverted(inverted(was + np.diag(np.maximum(moved, 0.0))) + inverted(covariance))
+            covariance = inverted(
+                inverted(was + np.diag(np.maximum(moved, 0.0))) + inverted(covariance)
+            )
         if joint in covariances:
             names, whole = covariances[joint]
             at = np.array([names.index(f) for f in fields])
             covariance = whole[np.ix_(at, at)]
         if not before:
-            covariance = inverted(inverted(covariance) + np.diag(prior_std(fields, values[joint]) ** -2))
+            covariance = inverted(
+                inverted(covariance) + np.diag(prior_std(fields, values[joint]) ** -2)
+            )
         variance = max(np.trace(covariance @ information[i, :-1, :-1]), 0.0) / max(own.rows[i], 1)
         rms = float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2)))
         old_joint = before.joints[joint] if before and not (judges or held_out) else None
@@ -182,7 +219,11 @@ def estimate_uncertainty(
         "values": {j: joints[j].values for j in joints}, "covariance": {j: joints[j].covariance for j in joints},
     }  # fmt: skip
     return ParameterUncertainty(
-        fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges or held_out)
+        fields,
+        joints,
+        (*(before.sources if before else ()), source),
+        clusters,
+        bool(judges or held_out),
     )
 
 
@@ -191,7 +232,10 @@ def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Arr
     pairs, robot = [], folds[0].robot
     for sequences, judged in folds:
         replays = replay(sequences, judged, nthread=nthread, lock_idle=True)
-        pairs += [(s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:]) for s, t in zip(sequences, replays, strict=True)]
+        pairs += [
+            (s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:])
+            for s, t in zip(sequences, replays, strict=True)
+        ]
     errors = {}
     for j, i in zip(robot.operated, robot.operated_index, strict=True):
         if mine := [error[:, i] for unrecorded, error in pairs if j not in unrecorded]:
@@ -206,7 +250,10 @@ def _error_bound(motions: ListOf[Array]) -> float:
 
     It is wider than the bound of these by one standard error (Student's t) of the mean of their RMS errors.
     """
-    rms, freedom = np.array([np.sqrt(np.square(error).mean()) for error in motions]), len(motions) - 1
+    rms, freedom = (
+        np.array([np.sqrt(np.square(error).mean()) for error in motions]),
+        len(motions) - 1,
+    )
     wider = 0.0
     if freedom:
         wider = confidence_factor(freedom) * standard_error(rms) / max(float(rms.mean()), 1e-12)

@@ -25,7 +25,9 @@ from gaponet.sysid.motion.motion import GRID, fade, through
 Sides = tuple[str, ...]
 MAX_IK_ITERATIONS = 80
 DURATION_S = 8.0  # of most whole-body motions
-KNOT_ROWS = 10  # between postures on a path of the hands that are computed; a spline goes through them
+KNOT_ROWS = (
+    10  # between postures on a path of the hands that are computed; a spline goes through them
+)
 ROLES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll")
 
 
@@ -43,7 +45,9 @@ def arms(robot: RobotSpec) -> dict[str, Arm]:
     """The robot's arms by side; empty for a robot that is not built like that."""
     by_side = {}
     for mount in robot.payload_mounts:
-        names = [[n for n in robot.joint_names if n.startswith(f"{mount.side}_{role}")] for role in ROLES]
+        names = [
+            [n for n in robot.joint_names if n.startswith(f"{mount.side}_{role}")] for role in ROLES
+        ]
         if all(len(n) == 1 for n in names):
             sign = -1.0 if mount.side == "right" else 1.0
             columns = robot.index([n[0] for n in names])
@@ -82,7 +86,9 @@ class HandIK:
             inverse = J.T @ np.linalg.inv(J @ J.T + 1e-3 * np.eye(3))
             pull = (np.eye(len(rest)) - inverse @ J) @ (rest - q[self.arm.columns])
             step = inverse @ error + 0.1 * pull
-            q[self.arm.columns] = np.clip(q[self.arm.columns] + np.clip(step, -0.3, 0.3), self.low, self.high)
+            q[self.arm.columns] = np.clip(
+                q[self.arm.columns] + np.clip(step, -0.3, 0.3), self.low, self.high
+            )
         return q
 
     def path(self, qpos: Array, targets: Array) -> Array:
@@ -111,7 +117,9 @@ class Kit:
         """The ready posture with some arms at left-arm angles (ROLES), mirrored where needed; (n,) rad."""
         q = self.ready.copy()
         for side, angles in values.items():
-            q[self.arms[side].columns] = np.asarray(angles) * (MIRROR if self.arms[side].sign < 0 else 1.0)
+            q[self.arms[side].columns] = np.asarray(angles) * (
+                MIRROR if self.arms[side].sign < 0 else 1.0
+            )
         return np.clip(q, self.limits.low, self.limits.high)
 
     def at(self, q: Array, sides: Sides, point: Array | list[float], roll: float = 0.0) -> Array:
@@ -128,7 +136,12 @@ def reach(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     for _ in range(4):
         q = kit.ready
         for side in sides:
-            q = kit.at(q, (side,), rng.uniform([0.25, 0.08, 0.95], [0.5, 0.45, 1.45]), rng.uniform(-1.2, 1.2))
+            q = kit.at(
+                q,
+                (side,),
+                rng.uniform([0.25, 0.08, 0.95], [0.5, 0.45, 1.45]),
+                rng.uniform(-1.2, 1.2),
+            )
         stops.append(q)
     return _stops(stops, rng.uniform(0.8, 1.4), 0.4)
 
@@ -140,7 +153,14 @@ def pick_and_place(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     for _ in range(2):
         start, stop = (rng.uniform([0.3, 0.1], [0.45, 0.4]) for _ in range(2))
         roll = rng.uniform(-1.0, 1.0)
-        for xy, z in ((start, 0.15), (start, 0.0), (start, 0.18), (stop, 0.18), (stop, 0.0), (stop, 0.15)):
+        for xy, z in (
+            (start, 0.15),
+            (start, 0.0),
+            (start, 0.18),
+            (stop, 0.18),
+            (stop, 0.0),
+            (stop, 0.15),
+        ):
             stops.append(kit.at(stops[-1], sides, [*xy, height + z], roll))
     return _stops(stops, 0.7, 0.15)
 
@@ -166,7 +186,9 @@ def punch(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
 
 def wave(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     """Upper arm out and up, then forearm from side to side."""
-    raised = kit.posture(**{s: [rng.uniform(-0.6, -0.2), rng.uniform(1.0, 1.4), 0.0, -0.5, 0.0] for s in sides})
+    raised = kit.posture(
+        **{s: [rng.uniform(-0.6, -0.2), rng.uniform(1.0, 1.4), 0.0, -0.5, 0.0] for s in sides}
+    )
     ctrl = _stops([kit.ready, raised], 1.6, 0.4)
     steps = round(rng.uniform(4.0, 5.0) / GRID)
     phase = 2 * np.pi * rng.uniform(0.5, 0.9) * np.arange(steps) * GRID
@@ -183,7 +205,9 @@ def stir(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     centre = rng.uniform([0.32, 0.15, 1.0], [0.4, 0.3, 1.15])
     phase = 2 * np.pi * rng.uniform(0.4, 0.7) * np.arange(steps) * GRID
     radius = rng.uniform(0.07, 0.11) * fade(steps, GRID, 1.5)
-    circle = centre + radius[:, None] * np.stack([np.cos(phase), np.sin(phase), 0.2 * np.sin(phase / 2)], axis=1)
+    circle = centre + radius[:, None] * np.stack(
+        [np.cos(phase), np.sin(phase), 0.2 * np.sin(phase / 2)], axis=1
+    )
     return _along(kit, dict.fromkeys(sides, circle))
 
 
@@ -197,7 +221,9 @@ def mirror(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     paths = {}
     for i, side in enumerate(sides):
         p = phase + i * lag
-        paths[side] = centre + size[:, None] * np.stack([0.5 * np.cos(p), 0.6 * np.sin(p), np.cos(p)], axis=1)
+        paths[side] = centre + size[:, None] * np.stack(
+            [0.5 * np.cos(p), 0.6 * np.sin(p), np.cos(p)], axis=1
+        )
     return _along(kit, paths)
 
 
@@ -217,7 +243,9 @@ def carry(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
         columns = kit.arms[side].columns
         ctrl[:, columns[0]] += bounce
         ctrl[:, columns[3]] -= 0.7 * bounce
-    return np.concatenate([_stops([kit.ready, held], 1.2, 0.3), ctrl, _stops([held, kit.ready], 1.2, 0.3)])
+    return np.concatenate(
+        [_stops([kit.ready, held], 1.2, 0.3), ctrl, _stops([held, kit.ready], 1.2, 0.3)]
+    )
 
 
 def wander(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
@@ -240,7 +268,9 @@ BUILDERS: dict[str, Callable[[Kit, Sides, np.random.Generator], Array]] = {
 def _sines(time: Array, most: float, rng: np.random.Generator) -> Array:
     """Mean of three sines of random phases and frequencies from 0.1 to `most` Hz, (T,)."""
     frequency = rng.uniform(0.1, most, 3)
-    return np.asarray(np.sin(2 * np.pi * np.outer(time, frequency) + rng.uniform(0, 2 * np.pi, 3)).mean(axis=1))
+    return np.asarray(
+        np.sin(2 * np.pi * np.outer(time, frequency) + rng.uniform(0, 2 * np.pi, 3)).mean(axis=1)
+    )
 
 
 def _stops(stops: list[Array], move: float, hold: float) -> Array:
@@ -258,9 +288,13 @@ def _along(kit: Kit, paths: dict[str, Array]) -> Array:
     q = np.repeat(kit.ready[None], len(knots), axis=0)
     for side, path in paths.items():
         arm: Arm = kit.arms[side]
-        q[:, arm.columns] = kit.ik[side].path(kit.ready, path[knots] * [1.0, arm.sign, 1.0])[:, arm.columns]
+        q[:, arm.columns] = kit.ik[side].path(kit.ready, path[knots] * [1.0, arm.sign, 1.0])[
+            :, arm.columns
+        ]
     middle = CubicSpline(knots, q)(np.arange(rows))
-    return np.concatenate([_stops([kit.ready, q[0]], 1.2, 0.3), middle, _stops([q[-1], kit.ready], 1.2, 0.3)])
+    return np.concatenate(
+        [_stops([kit.ready, q[0]], 1.2, 0.3), middle, _stops([q[-1], kit.ready], 1.2, 0.3)]
+    )
 
 
 def squat(kit: Kit, rng: np.random.Generator) -> Array:
@@ -322,18 +356,26 @@ def limber(kit: Kit, rng: np.random.Generator) -> Array:
     low, high = _box(kit, 0.3)
     for j in range(ctrl.shape[1]):
         wave = _sines(time, 0.5, rng)
-        ctrl[:, j] += ((low[j] + high[j]) / 2 - kit.ready[j] + wave * (high[j] - low[j]) / 2) * window
+        ctrl[:, j] += (
+            (low[j] + high[j]) / 2 - kit.ready[j] + wave * (high[j] - low[j]) / 2
+        ) * window
     return ctrl
 
 
 LEGGED, ANY = (squat, march, sway), (tour, limber)
 _LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
-WHOLE_BODY: dict[str, Callable[[Kit, np.random.Generator], Array]] = {f.__name__: f for f in LEGGED + ANY}
+WHOLE_BODY: dict[str, Callable[[Kit, np.random.Generator], Array]] = {
+    f.__name__: f for f in LEGGED + ANY
+}
 
 
 def available(kit: Kit) -> list[str]:
     """Names of the whole-body motions that this robot can play."""
-    legs = all(any(n.startswith(f"{s}_{j}") for n in kit.robot.joint_names) for s in ("left", "right") for j in _LEG)
+    legs = all(
+        any(n.startswith(f"{s}_{j}") for n in kit.robot.joint_names)
+        for s in ("left", "right")
+        for j in _LEG
+    )
     return [f.__name__ for f in (LEGGED if legs else ()) + ANY]
 
 
@@ -346,7 +388,11 @@ def _add(ctrl: Array, kit: Kit, start: str, values: Array | float) -> None:
 
 def _start(kit: Kit) -> tuple[Array, Array, Array]:
     steps = round(DURATION_S / GRID)
-    return np.arange(steps) * GRID, np.repeat(kit.ready[None], steps, axis=0), fade(steps, GRID, 1.5)
+    return (
+        np.arange(steps) * GRID,
+        np.repeat(kit.ready[None], steps, axis=0),
+        fade(steps, GRID, 1.5),
+    )
 
 
 def _box(kit: Kit, share: float) -> tuple[Array, Array]:

@@ -27,10 +27,16 @@ from gaponet.sysid.motion.library import SIGNALS, Library, short
 from gaponet.sysid.motion.motion import GRID, Motion
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
-MOTIONS_OF_ALL_JOINTS, VARIANTS = 24, 4  # candidates with a signal in every joint; of tours and the like
+MOTIONS_OF_ALL_JOINTS, VARIANTS = (
+    24,
+    4,
+)  # candidates with a signal in every joint; of tours and the like
 MAX_SINGLE_JOINTS = 8  # of a robot with more, no joint moves by itself
 RANGE_SHARE = 0.5  # of a joint's interval, from home, beside others
-WORTH_INTERVAL_S, MIN_WORTH = 30.0, 0.05  # time that must reduce the errors by this share to be worth playing
+WORTH_INTERVAL_S, MIN_WORTH = (
+    30.0,
+    0.05,
+)  # time that must reduce the errors by this share to be worth playing
 MAX_KP_ERROR = 0.1  # relative, after all motions; more means that they do not determine it
 EPSILON = 1e-9
 
@@ -53,7 +59,12 @@ class ExperimentDesign:
         covariance = np.stack([uncertainty.array(j, "covariance") for j in robot.operated])
         overdispersion = np.stack([uncertainty.array(j, "overdispersion") for j in robot.operated])
         seconds = np.array([s.duration for s in recordings])
-        return cls(own.information[..., :-1, :-1], seconds, covariance, np.maximum(overdispersion[:, :-1], 1.0))
+        return cls(
+            own.information[..., :-1, :-1],
+            seconds,
+            covariance,
+            np.maximum(overdispersion[:, :-1], 1.0),
+        )
 
     def after(self, picks: ListOf[int]) -> Array:
         """Return the covariance after these recordings, (n, P, P)."""
@@ -62,7 +73,9 @@ class ExperimentDesign:
     def _covariance_with(self, normal: Array) -> Array:
         """Return the covariance after recordings with this information, (…, n, P, P)."""
         size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), EPSILON))
-        share = normal / (size[..., :, None] * size[..., None, :]) + EPSILON * np.eye(normal.shape[-1])
+        share = normal / (size[..., :, None] * size[..., None, :]) + EPSILON * np.eye(
+            normal.shape[-1]
+        )
         scaled = share / np.sqrt(self.overdispersion)[:, None, :]
         added = scaled @ np.linalg.solve(share, np.swapaxes(scaled, -1, -2))
         added = size[..., :, None] * added * size[..., None, :]
@@ -76,13 +89,19 @@ class ExperimentDesign:
     def choose(self, seconds: float) -> list[int]:
         """Return the best recordings in so much time, s: greedily by gain per second, then by exchanges."""
         picks = [i for i, _ in self.greedy(seconds)]
-        best = float(self._mean_log_error(self.information[:, picks].sum(axis=1))) if picks else np.inf
+        best = (
+            float(self._mean_log_error(self.information[:, picks].sum(axis=1))) if picks else np.inf
+        )
         for _ in range(2 * len(picks)):
             tried = [
                 (float(e), k, int(i))
                 for k in range(len(picks))
                 for rest in [[*picks[:k], *picks[k + 1 :]]]
-                for fits in [np.setdiff1d(np.flatnonzero(self.seconds <= seconds - self.seconds[rest].sum()), picks)]
+                for fits in [
+                    np.setdiff1d(
+                        np.flatnonzero(self.seconds <= seconds - self.seconds[rest].sum()), picks
+                    )
+                ]
                 for i, e in zip(fits, self._with(rest, fits), strict=True)
             ]
             if not tried or min(tried)[0] > best - EPSILON:
@@ -95,7 +114,11 @@ class ExperimentDesign:
         """Yield the recording with the largest gain per second, one after another, and the mean log error after it."""
         picks = list[int]()
         now = float(self._mean_log_error(np.zeros_like(self.information[:, 0])))
-        while len(fits := np.setdiff1d(np.flatnonzero(self.seconds <= seconds - self.seconds[picks].sum()), picks)):
+        while len(
+            fits := np.setdiff1d(
+                np.flatnonzero(self.seconds <= seconds - self.seconds[picks].sum()), picks
+            )
+        ):
             then = self._with(picks, fits)
             best = int(((now - then) / self.seconds[fits]).argmax())
             picks, now = [*picks, int(fits[best])], float(then[best])
@@ -128,11 +151,15 @@ def candidate_motions(library: Library, progress: Progress = no_progress) -> lis
     for k in range(len(names) + MOTIONS_OF_ALL_JOINTS):
         progress(k, len(names) + MOTIONS_OF_ALL_JOINTS, "which motions fit the robot's limits")
         try:
-            motions.append(library.make(names[k]) if k < len(names) else _at_once(library, k - len(names)))
+            motions.append(
+                library.make(names[k]) if k < len(names) else _at_once(library, k - len(names))
+            )
         except UsageError:  # does not fit this robot's limits: no candidate
             continue
     if not motions:
-        raise UsageError(f"{robot.name}: no motion fits its limits; lighten --payloads, or look at collision.toml")
+        raise UsageError(
+            f"{robot.name}: no motion fits its limits; lighten --payloads, or look at collision.toml"
+        )
     return motions
 
 
@@ -153,18 +180,26 @@ def _at_once(library: Library, variant: int) -> Motion:
     return library.limits.fit(made)
 
 
-def simulated_recordings(robot: RobotSpec, motions: ListOf[Motion], payload: float) -> list[Sequence]:
+def simulated_recordings(
+    robot: RobotSpec, motions: ListOf[Motion], payload: float
+) -> list[Sequence]:
     """Return recordings of motions that the robot would make as it is identified."""
     commanded = []
     for motion in motions:
         ctrl = motion.sample(robot.dt).astype(np.float32)
-        meta = SequenceMeta(robot.name, "expected", f"{motion.name} {payload:g} kg", payload, virtual=True)
-        commanded.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl)))
+        meta = SequenceMeta(
+            robot.name, "expected", f"{motion.name} {payload:g} kg", payload, virtual=True
+        )
+        commanded.append(
+            Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl))
+        )
     replays = replay(commanded, robot, lock_idle=True)
     return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(commanded, replays, strict=True)]
 
 
-def undetermined_gains(uncertainty: ParameterUncertainty, design: ExperimentDesign) -> dict[str, str]:
+def undetermined_gains(
+    uncertainty: ParameterUncertainty, design: ExperimentDesign
+) -> dict[str, str]:
     """Return joint → advice for joints whose kp all recordings of the design together do not determine."""
     kp, after = uncertainty.fields.index("kp"), design.after(range(len(design.seconds)))
     errors = dict(zip(uncertainty.joints, np.sqrt(after[:, kp, kp]).tolist(), strict=True))

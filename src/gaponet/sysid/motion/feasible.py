@@ -51,17 +51,28 @@ class Feasibility:
     """Limits of one robot at payloads from zero to max_payload."""
 
     def __init__(
-        self, robot: RobotSpec, max_payload: float = MAX_PAYLOAD, height: float | None = None, unchecked: bool = False
+        self,
+        robot: RobotSpec,
+        max_payload: float = MAX_PAYLOAD,
+        height: float | None = None,
+        unchecked: bool = False,
     ) -> None:
         """Take the floor's or table's height, m, instead of collision.toml's; `unchecked` ignores all shapes."""
         self.robot = robot
-        self.low, self.high = robot.qpos_range[:, 0] + RANGE_MARGIN, robot.qpos_range[:, 1] - RANGE_MARGIN
+        self.low, self.high = (
+            robot.qpos_range[:, 0] + RANGE_MARGIN,
+            robot.qpos_range[:, 1] - RANGE_MARGIN,
+        )
         self.max_payload = max_payload if robot.payload_mounts else 0.0
-        self.models: list[mujoco.MjModel] = [build_model(robot, p, dt=GRID) for p in sorted({0.0, self.max_payload})]
+        self.models: list[mujoco.MjModel] = [
+            build_model(robot, p, dt=GRID) for p in sorted({0.0, self.max_payload})
+        ]
         self.limit = TORQUE_SHARE * robot.effort_limit
         self.collision = Collision(robot, self.models[0], height, unchecked)
 
-    def demand(self, ctrl: Array, dt: float, named: Array | slice = slice(None), need: Array | None = None) -> Demand:
+    def demand(
+        self, ctrl: Array, dt: float, named: Array | slice = slice(None), need: Array | None = None
+    ) -> Demand:
         """Return the demand of a command (T, n) rad at period dt.
 
         Joints `named` must be within their ranges; `need` is the free space to keep, (pairs + shells,) m, if it is not
@@ -70,13 +81,21 @@ class Feasibility:
         qvel = np.gradient(ctrl, dt, axis=0)
         qacc = np.gradient(qvel, dt, axis=0)
         zero = np.zeros_like(ctrl)
-        share = np.max([np.abs(inverse_dynamics(m, ctrl, qvel, qacc)) for m in self.models], axis=0) / self.limit
-        still = np.max([np.abs(inverse_dynamics(m, ctrl, zero, zero)) for m in self.models], axis=0) / self.limit
+        share = (
+            np.max([np.abs(inverse_dynamics(m, ctrl, qvel, qacc)) for m in self.models], axis=0)
+            / self.limit
+        )
+        still = (
+            np.max([np.abs(inverse_dynamics(m, ctrl, zero, zero)) for m in self.models], axis=0)
+            / self.limit
+        )
         free = self.collision.along(ctrl)
         least = float(free.min(initial=np.inf))
         centre, half = (self.low + self.high) / 2, (self.high - self.low) / 2
         with np.errstate(invalid="ignore"):
-            position = np.nan_to_num(np.abs(ctrl - centre) / half, nan=0.0)  # unlimited joints: inf / inf
+            position = np.nan_to_num(
+                np.abs(ctrl - centre) / half, nan=0.0
+            )  # unlimited joints: inf / inf
         return Demand(
             position=float(position[:, named].max()),
             speed=float(np.abs(qvel).max() / MAX_SPEED),
@@ -137,7 +156,9 @@ def stretch(ctrl: Array, factor: float) -> Array:
 
 GRID_POINTS = 41  # across the range
 MAX_POSTURES = 400
-ENOUGH_RANGE_SHARE = 0.91  # of the joint's range: stop looking; the margins to the stops take 1 or 2 %
+ENOUGH_RANGE_SHARE = (
+    0.91  # of the joint's range: stop looking; the margins to the stops take 1 or 2 %
+)
 GRAVITY_SHARE = 0.9  # of the usable torque: leaves some to accelerate
 
 
@@ -168,7 +189,9 @@ def find_excitation_range(limits: Feasibility, joint: str, seed: int = 0) -> Exc
         if best.share >= ENOUGH_RANGE_SHARE:
             break
         posture = home.copy()
-        reach = min(1.0, 1.5 * i / MAX_POSTURES) * rng.uniform(0, 1, len(columns))  # near home first
+        reach = min(1.0, 1.5 * i / MAX_POSTURES) * rng.uniform(
+            0, 1, len(columns)
+        )  # near home first
         posture[columns] += reach * (rng.uniform(low[columns], high[columns]) - home[columns])
         stage = _span(limits, posture, int(j))
         if stage.share > best.share:
@@ -209,7 +232,9 @@ def _limb(model: mujoco.MjModel, operated: tuple[str, ...], joint: str) -> list[
     """Return the operated joints on the chain of `joint`: those that it carries and those that carry it."""
     body = {name: int(model.joint(name).bodyid[0]) for name in operated}
     mine = body[joint]
-    return [name for name, b in body.items() if b in carriers(model, mine) or mine in carriers(model, b)]
+    return [
+        name for name, b in body.items() if b in carriers(model, mine) or mine in carriers(model, b)
+    ]
 
 
 def carriers(model: mujoco.MjModel, body: int) -> set[int]:

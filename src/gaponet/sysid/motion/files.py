@@ -40,7 +40,9 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
         raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
     if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
-        raise LogError(f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}")
+        raise LogError(
+            f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}"
+        )
     joints = tuple(robot.resolve(name, str(path)) for name in names)
     columns = robot.index(joints)
     if len(set(joints)) != len(joints):
@@ -58,7 +60,9 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
         UsageError: No robot has this rate; or a .txt, which has no time column, at another than 50 Hz.
     """
     if not 1 / MAX_PERIOD_S <= rate <= 1 / MIN_PERIOD_S:
-        raise UsageError(f"--rate {rate:g}: give the rate of the commands in Hz, 1 to {1 / MIN_PERIOD_S:g}")
+        raise UsageError(
+            f"--rate {rate:g}: give the rate of the commands in Hz, 1 to {1 / MIN_PERIOD_S:g}"
+        )
     names = list(motion.named(robot))
     rows = motion.sample(1 / rate)[:, robot.index(names)]
     if path.suffix == ".npz":
@@ -66,7 +70,9 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
             np.savez(file, joint_names=np.array(names), ctrl=rows, dt=1 / rate)
         return
     if path.suffix == ".txt" and abs(rate * SAGE_DT - 1) > 1e-9:
-        raise UsageError(f"{path}: SAGE motion files are at {1 / SAGE_DT:g} Hz; write csv or npz at {rate:g} Hz")
+        raise UsageError(
+            f"{path}: SAGE motion files are at {1 / SAGE_DT:g} Hz; write csv or npz at {rate:g} Hz"
+        )
     if path.suffix == ".csv":
         rows, names = np.column_stack([np.arange(len(rows)) / rate, rows]), ["time", *names]
     text = "\n".join([", ".join(names), *(", ".join(f"{x:.6f}" for x in row) for row in rows)])
@@ -75,11 +81,23 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
 
 def _level_of(ctrl: Array, robot: RobotSpec) -> str:
     """joint when one joint moves, upper_body when only operated joints and torso move, else whole_body."""
-    moved = [name for name, span in zip(robot.joint_names, np.ptp(ctrl, axis=0), strict=True) if span > 1e-6]
+    moved = [
+        name
+        for name, span in zip(robot.joint_names, np.ptp(ctrl, axis=0), strict=True)
+        if span > 1e-6
+    ]
     if len(moved) <= 1:
         return "joint"
-    upper = {name for name in robot.joint_names if name in robot.operated or name.startswith(("torso", "waist"))}
-    return "upper_body" if set(moved) <= upper and len(upper) < len(robot.joint_names) else "whole_body"
+    upper = {
+        name
+        for name in robot.joint_names
+        if name in robot.operated or name.startswith(("torso", "waist"))
+    }
+    return (
+        "upper_body"
+        if set(moved) <= upper and len(upper) < len(robot.joint_names)
+        else "whole_body"
+    )
 
 
 def _text(path: Path) -> tuple[list[str], Array, float]:
@@ -98,10 +116,14 @@ def _text(path: Path) -> tuple[list[str], Array, float]:
         except ValueError:
             raise LogError(f"{path}:{number}: not a row of numbers: {line[:60]}") from None
         if len(row) != len(names) or not np.isfinite(row).all():
-            raise LogError(f"{path}:{number}: {len(row)} values for {len(names)} names, or one is not finite")
+            raise LogError(
+                f"{path}:{number}: {len(row)} values for {len(names)} names, or one is not finite"
+            )
         rows.append(row)
     if len(rows) < 2:
-        raise LogError(f"{path}: {len(rows)} rows after the line of joint names; a motion needs two or more")
+        raise LogError(
+            f"{path}: {len(rows)} rows after the line of joint names; a motion needs two or more"
+        )
     table = np.array(rows)
     if "time" not in names:
         if path.suffix == ".csv":
@@ -110,19 +132,29 @@ def _text(path: Path) -> tuple[list[str], Array, float]:
     at = names.index("time")
     period = np.diff(table[:, at])
     if not (period > 0).all() or np.ptp(period) > 0.01 * period.mean():
-        raise LogError(f"{path}: time must rise evenly; it steps by {period.min():.4g} to {period.max():.4g} s")
+        raise LogError(
+            f"{path}: time must rise evenly; it steps by {period.min():.4g} to {period.max():.4g} s"
+        )
     return names[:at] + names[at + 1 :], np.delete(table, at, axis=1), float(period.mean())
 
 
 def _npz(path: Path) -> tuple[list[str], Array, float]:
-    arrays = read_npz(path, LogError, "give a motion of at most 10 hours, as gaponet excite writes it", LARGEST)
+    arrays = read_npz(
+        path, LogError, "give a motion of at most 10 hours, as gaponet excite writes it", LARGEST
+    )
     for name, kind, dimensions in (("joint_names", "U", 1), ("ctrl", "fiu", 2), ("dt", "fiu", 0)):
         if name not in arrays:
-            raise LogError(f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'nothing'}")
+            raise LogError(
+                f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'nothing'}"
+            )
         if arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions:
             what = "text" if kind == "U" else "numbers"
-            raise LogError(f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again")
+            raise LogError(
+                f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again"
+            )
     names, rows = arrays["joint_names"].tolist(), arrays["ctrl"].astype(float)
     if rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
-        raise LogError(f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names")
+        raise LogError(
+            f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names"
+        )
     return names, rows, float(arrays["dt"])

@@ -12,10 +12,17 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.coordinated import BUILDERS, WHOLE_BODY, Kit, available
-from gaponet.sysid.motion.feasible import MAX_PAYLOAD, ExcitationRange, Feasibility, find_excitation_range
+from gaponet.sysid.motion.feasible import (
+    MAX_PAYLOAD,
+    ExcitationRange,
+    Feasibility,
+    find_excitation_range,
+)
 from gaponet.sysid.motion.motion import GRID, Motion, fade, move_time, through
 
-Signal = Callable[[float, float, np.random.Generator, float], Array]  # (low, high, rng, dt) → (T,) rad
+Signal = Callable[
+    [float, float, np.random.Generator, float], Array
+]  # (low, high, rng, dt) → (T,) rad
 
 
 def sweep(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
@@ -63,7 +70,9 @@ def multisine(low: float, high: float, rng: np.random.Generator, dt: float) -> A
     time = np.arange(round(8.0 / dt)) * dt
     frequency = 0.1 * 1.59 ** np.arange(7) * rng.uniform(0.95, 1.05, 7)
     phase = rng.uniform(0, 2 * np.pi, 7)
-    wave = (np.sin(2 * np.pi * np.outer(time, frequency) + phase) / (1 + frequency / 0.2)).sum(axis=1)
+    wave = (np.sin(2 * np.pi * np.outer(time, frequency) + phase) / (1 + frequency / 0.2)).sum(
+        axis=1
+    )
     return _about(low, high, wave * min(0.45, (high - low) / 2) / np.abs(wave).max(), rng, dt)
 
 
@@ -74,10 +83,14 @@ def holds(low: float, high: float, rng: np.random.Generator, dt: float) -> Array
     return _line(levels, move_time(np.diff(levels), 2.0), [0.6] * len(levels), dt)
 
 
-SIGNALS: dict[str, Signal] = {f.__name__: f for f in (sweep, creep, steps, trapezoids, chirp, multisine, holds)}
+SIGNALS: dict[str, Signal] = {
+    f.__name__: f for f in (sweep, creep, steps, trapezoids, chirp, multisine, holds)
+}
 
 
-def _line(levels: Array | list[float], moves: Array | list[float], rests: list[float], dt: float) -> Array:
+def _line(
+    levels: Array | list[float], moves: Array | list[float], rests: list[float], dt: float
+) -> Array:
     return through(np.asarray(levels)[:, None], np.asarray(moves), np.asarray(rests), dt)[:, 0]
 
 
@@ -87,7 +100,9 @@ def _ramps(levels: Array | list[float], speeds: Array | list[float], dt: float) 
     out = [np.full(round(0.5 / dt), levels[0])]
     for a, b, speed in zip(levels[:-1], levels[1:], speeds, strict=True):
         line = np.linspace(a, b, max(2, round(abs(b - a) / speed / dt)))
-        ramp = np.concatenate([np.full(len(kernel), a), line, np.full(len(kernel) + round(0.2 / dt), b)])
+        ramp = np.concatenate(
+            [np.full(len(kernel), a), line, np.full(len(kernel) + round(0.2 / dt), b)]
+        )
         out.append(np.convolve(ramp, kernel / kernel.sum(), "valid"))
     return np.concatenate(out)
 
@@ -95,7 +110,11 @@ def _ramps(levels: Array | list[float], speeds: Array | list[float], dt: float) 
 def _about(low: float, high: float, wave: Array, rng: np.random.Generator, dt: float) -> Array:
     """The wave, faded in and out, about a random centre that keeps it inside the interval."""
     wave = wave * fade(len(wave), dt, 1.0)
-    centre = rng.uniform(low - wave.min(), high - wave.max()) if high - low > np.ptp(wave) else (low + high) / 2
+    centre = (
+        rng.uniform(low - wave.min(), high - wave.max())
+        if high - low > np.ptp(wave)
+        else (low + high) / 2
+    )
     rest = np.zeros(round(0.5 / dt))
     return centre + np.concatenate([rest, wave, rest])
 
@@ -139,10 +158,16 @@ class Library:
         if name in self._given:
             return self._given[name]
         parts = name.split("-")
-        rng = np.random.default_rng([self.seed, int(hashlib.sha256(name.encode()).hexdigest()[:8], 16)])
+        rng = np.random.default_rng(
+            [self.seed, int(hashlib.sha256(name.encode()).hexdigest()[:8], 16)]
+        )
         if parts[0] in SIGNALS and len(parts) == 2:
             return self._joint(name, parts[0], parts[1], rng)
-        if parts[0] in BUILDERS and len(parts) == 3 and (parts[1] in self.kit.arms or parts[1] == "both"):
+        if (
+            parts[0] in BUILDERS
+            and len(parts) == 3
+            and (parts[1] in self.kit.arms or parts[1] == "both")
+        ):
             sides = tuple(self.kit.arms) if parts[1] == "both" else (parts[1],)
             return self._fitted(name, "upper_body", BUILDERS[parts[0]](self.kit, sides, rng))
         if parts[0] in available(self.kit) and len(parts) == 3 and parts[1] == "all":
@@ -178,7 +203,9 @@ class Library:
         """Make commands feasible; the motion names the operated joints and those that move."""
         fitted, robot = self.limits.fit(Motion(name, level, GRID, ctrl)), self.robot
         moved = fitted.moved(robot)
-        return replace(fitted, joints=tuple(n for n in robot.joint_names if n in robot.operated or n in moved))
+        return replace(
+            fitted, joints=tuple(n for n in robot.joint_names if n in robot.operated or n in moved)
+        )
 
 
 def short(joint: str) -> str:

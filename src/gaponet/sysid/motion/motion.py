@@ -35,9 +35,13 @@ class Motion:
     def __post_init__(self) -> None:
         ctrl = np.ascontiguousarray(self.ctrl, float)
         if ctrl.ndim != 2 or len(ctrl) < 2 or not np.isfinite(ctrl).all():
-            raise UsageError(f"motion '{self.name}': ctrl must be (T ≥ 2, n) finite numbers, got shape {ctrl.shape}")
+            raise UsageError(
+                f"motion '{self.name}': ctrl must be (T ≥ 2, n) finite numbers, got shape {ctrl.shape}"
+            )
         if self.level not in LEVELS:
-            raise UsageError(f"motion '{self.name}': level '{self.level}' is not one of {', '.join(LEVELS)}")
+            raise UsageError(
+                f"motion '{self.name}': level '{self.level}' is not one of {', '.join(LEVELS)}"
+            )
         ctrl.flags.writeable = False
         object.__setattr__(self, "ctrl", ctrl)
 

@@ -32,7 +32,9 @@ class Trajectory:
     times: Array  # when each is reached, (k,) s; the first is 0
 
     @classmethod
-    def minimum_jerk(cls, points: Array, speed: float, acceleration: float, least: float) -> Trajectory:
+    def minimum_jerk(
+        cls, points: Array, speed: float, acceleration: float, least: float
+    ) -> Trajectory:
         """Return the fastest trajectory within peak speed (rad/s) and acceleration (rad/s²), of at least `least` s."""
         far = np.abs(np.diff(points, axis=0)).max(axis=1)
         legs = move_time(far, speed, least if len(points) == 2 else MIN_LEG_S)
@@ -102,12 +104,19 @@ def find_points(
 
 
 def _connect(
-    straight: _Straight, start: Array, goal: Array, low: Array, high: Array, rng: np.random.Generator
+    straight: _Straight,
+    start: Array,
+    goal: Array,
+    low: Array,
+    high: Array,
+    rng: np.random.Generator,
 ) -> Search[list[Array] | None]:
     trees = [([start], [-1]), ([goal], [-1])]  # postures, and from which each was reached
     for growth in range(MAX_GROWTHS):
         (here, came), (there, _) = trees
-        reached = yield from _grow(straight, here, came, rng.uniform(low, high), once=growth % 8 > 0)
+        reached = yield from _grow(
+            straight, here, came, rng.uniform(low, high), once=growth % 8 > 0
+        )
         if reached is not None:
             met = yield from _grow(straight, there, trees[1][1], here[reached], once=False)
             if met is not None and np.abs(there[met] - here[reached]).max() < 1e-9:
@@ -119,7 +128,9 @@ def _connect(
     return None
 
 
-def _grow(straight: _Straight, tree: list[Array], came: list[int], aim: Array, once: bool) -> Search[int | None]:
+def _grow(
+    straight: _Straight, tree: list[Array], came: list[int], aim: Array, once: bool
+) -> Search[int | None]:
     """Grow a tree towards `aim`, by one step or as far as possible; return the index of the last node, or None."""
     at = int(np.argmin(np.abs(np.array(tree) - aim).max(axis=1)))
     reached = None

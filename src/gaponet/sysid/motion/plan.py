@@ -14,7 +14,15 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.library import Library, short
 from gaponet.sysid.motion.motion import Motion
 
-SIGNAL_ORDER = ("multisine", "steps", "holds", "chirp", "sweep", "trapezoids", "creep")  # most informative first
+SIGNAL_ORDER = (
+    "multisine",
+    "steps",
+    "holds",
+    "chirp",
+    "sweep",
+    "trapezoids",
+    "creep",
+)  # most informative first
 MAX_ROUNDS = 50
 RECOMMENDED_MINUTES, MIN_TRAINING_MINUTES = 41.0, 9.0
 
@@ -48,7 +56,9 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
         UsageError: Too little time for one motion of each joint at each payload, or a payload that cannot be carried.
     """
     if not payloads or min(payloads) < 0 or (max(payloads) > 0 and not robot.payload_mounts):
-        raise UsageError(f"--payloads {payloads}: give kg ≥ 0; {robot.name} has {len(robot.payload_mounts)} mounts")
+        raise UsageError(
+            f"--payloads {payloads}: give kg ≥ 0; {robot.name} has {len(robot.payload_mounts)} mounts"
+        )
     library = Library(robot, seed, max(payloads))
     first = [library.make(f"{SIGNAL_ORDER[0]}-{short(joint)}") for joint in robot.operated]
     least = len(payloads) * sum(m.duration for m in first) / 60
@@ -83,7 +93,9 @@ def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
             yield from (f"{SIGNAL_ORDER[k + 1]}-{short(joint)}" for joint in robot.operated)
 
 
-def sheet(robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, known: Path | None = None) -> str:
+def sheet(
+    robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, known: Path | None = None
+) -> str:
     """Return instructions, and a table to fill in, as Markdown.
 
     Args:
@@ -91,14 +103,18 @@ def sheet(robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, know
         known: Folder of a robot of which there are logs already.
     """
     gains = "; ".join(
-        f"{short(j)} {robot.kp[i]:g}/{robot.kd[i]:g}" for i, j in enumerate(robot.joint_names) if j in robot.operated
+        f"{short(j)} {robot.kp[i]:g}/{robot.kd[i]:g}"
+        for i, j in enumerate(robot.joint_names)
+        if j in robot.operated
     )
     masses = ", ".join(f"{p:g}" for p in plan.payloads)
     size = (
         f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's error, "
         f"{RECOMMENDED_MINUTES:g} came within a tenth of the best."
     )
-    size += " Enough to identify gains, friction and delay; little to train on." * (plan.minutes < MIN_TRAINING_MINUTES)
+    size += " Enough to identify gains, friction and delay; little to train on." * (
+        plan.minutes < MIN_TRAINING_MINUTES
+    )
     lines = [
         f"# Recording sheet: {robot.name}",
         "",
@@ -120,11 +136,17 @@ def sheet(robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, know
         "| ---: | --- | ---: | ---: | --- | --- | --- |",
     ]
     for number, (mass, motion) in enumerate(plan.played, 1):
-        lines.append(f"| {number} | {files[motion.name]} | {mass:g} | {motion.duration:.0f} | | | |")
+        lines.append(
+            f"| {number} | {files[motion.name]} | {mass:g} | {motion.duration:.0f} | | | |"
+        )
     lines += ["", "Then, for each payload:", ""]
     lines += [
         f"    gaponet import LOGS/{p:g}kg --robot ROBOT --unit-id UNIT --payload-mass {p:g} --out data"
         for p in plan.payloads
     ]
-    then = [f"    gaponet check {known} data", f"    gaponet adapt {known} data --out ROBOT_2"] if known else []
+    then = (
+        [f"    gaponet check {known} data", f"    gaponet adapt {known} data --out ROBOT_2"]
+        if known
+        else []
+    )
     return "\n".join([*lines, "    gaponet doctor data", *then, ""])

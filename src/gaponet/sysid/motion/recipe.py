@@ -41,7 +41,9 @@ class Recipe:
     units: Annotated[Names, Len(1, 1000)]
     motions: Names = ()
     files: Names = ()
-    rates: Annotated[tuple[Annotated[float, Interval(ge=1, le=10_000)], ...], Len(1, 1000)] = (50.0,)
+    rates: Annotated[tuple[Annotated[float, Interval(ge=1, le=10_000)], ...], Len(1, 1000)] = (
+        50.0,
+    )
     repetitions: Count = 1
     variants: Count = 1
     payload_side: Name = "both"
@@ -92,9 +94,17 @@ def takes(recipe: Recipe, names: list[str]) -> list[Take]:
         motions += matches or [pattern]
     motions += [Path(file).stem for file in recipe.files]
     motions = list(dict.fromkeys(motions))
-    count = len(motions) * len(recipe.rates) * len(recipe.payloads) * len(recipe.units) * recipe.repetitions
+    count = (
+        len(motions)
+        * len(recipe.rates)
+        * len(recipe.payloads)
+        * len(recipe.units)
+        * recipe.repetitions
+    )
     if count > MOST_TAKES:
-        raise UsageError(f"recipe '{recipe.name}': {count} sequences; at most {MOST_TAKES} in one recipe")
+        raise UsageError(
+            f"recipe '{recipe.name}': {count} sequences; at most {MOST_TAKES} in one recipe"
+        )
     return [
         Take(motion, unit, float(payload), float(rate), repetition)
         for motion in motions
