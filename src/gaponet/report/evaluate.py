@@ -79,9 +79,8 @@ class Evaluation:
                 arrays[f"{row}/delta/{name}"] = delta[i]
         with lock_folder(folder, "robot" if is_robot(folder) else "run"):
             with atomic_write(folder / "trajectories.npz") as temporary:
-                np.savez_compressed(
-                    temporary, **{k: v.astype(np.float32) for k, v in arrays.items()}
-                )  # type: ignore[arg-type]
+                single = {name: array.astype(np.float32) for name, array in arrays.items()}
+                np.savez_compressed(temporary, **single)  # type: ignore[arg-type]
             write_json(folder / "metrics.json", result)
 
 

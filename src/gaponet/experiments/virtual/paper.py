@@ -269,9 +269,8 @@ def claim_table(
     heavy = payloads(errors)[-1:]
     for a, axis in enumerate(AXES if heavy and "mlp" in methods(errors) else ()):
         error = delivery.mean_offset(errors, "mlp", heavy[0], a)
-        values = reductions(
-            select(errors, payload=heavy[0]), error, lambda e, a=a: float(e.offset[a])
-        )  # type: ignore[misc]
+        along: Callable[[HoldError], float] = lambda e, a=a: float(e.offset[a])  # type: ignore[misc]
+        values = reductions(select(errors, payload=heavy[0]), error, along)
         rows.append(
             (
                 f"delivery: {axis} at {heavy[0]:g} kg, less than {title('mlp')}",
