@@ -269,7 +269,7 @@ def claim_table(
     heavy = payloads(errors)[-1:]
     for a, axis in enumerate(AXES if heavy and "mlp" in methods(errors) else ()):
         error = delivery.mean_offset(errors, "mlp", heavy[0], a)
-        along: Callable[[HoldError], float] = lambda e, a=a: float(e.offset[a])  # type: ignore[misc]
+        along: Callable[[HoldError], float] = lambda e, a=a: float(e.offset[a])  # type: ignore[misc]  # noqa: E731
         values = reductions(select(errors, payload=heavy[0]), error, along)
         rows.append(
             (
