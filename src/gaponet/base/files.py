@@ -32,9 +32,6 @@ LOCKED_BYTE = (
 UNMARKED_FOLDERS = {
     "dataset": ("dataset.json",),
     "run": ("split.json",),
-    "experiments": tuple(
-        f"{place}cells/*/setup.json" for place in ("", "rehearsal/", "without-*/")
-    ),
     "model": ("card.json",),
 }
 

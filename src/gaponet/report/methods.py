@@ -1,11 +1,9 @@
 """One title and one colour per method, in every figure, table and scene.
 
-A method is a key of METHODS, or a word of experiments/variant.py: [identified+]KIND[:FIELD=VALUE]…
+A method is a key of METHODS, with identified+ in front where a network corrects an identified simulator.
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterable
 
 from gaponet.robot.spec import RobotSpec
 
@@ -37,11 +35,7 @@ METHODS = {  # title, colour
     "contact": ("table, stops, zeros", "#6b4f2a"),
     "hand": ("where payloads hang, the hand", "#8d6e44"),
     "links": ("masses of the links", "#7a9a4d"),
-    "raw": ("raw targets", "#5c5c5c"),
-    "feedforward": ("nominal model's feed-forward alone", "#c9b28f"),
-    "identified feedforward": ("identified model's feed-forward alone", "#2a9d6f"),
 }
-CHANGE_TITLES = {"mlp_match=on": "as many weights", "payload_input=off": "payload unobserved"}
 IDENTIFIED = "identified+"  # in front of the kind of a model that corrects an identified simulator
 OTHER_COLOUR = "#777777"
 
@@ -52,29 +46,16 @@ def method(kind: str, simulator: RobotSpec) -> str:
 
 
 def title(method: str) -> str:
-    """Return the method's name for people: identification + MLP, as many weights (history 8)."""
-    kind, *changes = method.removeprefix(IDENTIFIED).split(":")
-    start = f"{METHODS['identified'][0]} + " if method.startswith(IDENTIFIED) else ""
-    titled = [CHANGE_TITLES[c] for c in changes if c in CHANGE_TITLES]
-    name = ", ".join([start + METHODS.get(kind, (kind,))[0], *titled])
-    others = ", ".join(c.replace("=", " ") for c in changes if c not in CHANGE_TITLES)
-    return f"{name} ({others})" if others else name
+    """Return the method's name for people."""
+    kind = method.removeprefix(IDENTIFIED)
+    name = METHODS.get(kind, (kind,))[0]
+    return f"{METHODS['identified'][0]} + {name}" if method.startswith(IDENTIFIED) else name
 
 
 def colour(method: str) -> str:
-    """Return the colour of the method's kind, #rrggbb, darker where it corrects an identified simulator."""
-    base = METHODS.get(method.removeprefix(IDENTIFIED).split(":")[0], ("", OTHER_COLOUR))[1]
+    """Return the colour of the method, #rrggbb, darker where it corrects an identified simulator."""
+    base = METHODS.get(method.removeprefix(IDENTIFIED), ("", OTHER_COLOUR))[1]
     return shade(base, -0.4) if method.startswith(IDENTIFIED) else base
-
-
-def palette(methods: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each method; several models of one kind get shades of its colour."""
-    colours: dict[str, str] = {}
-    for method in methods:
-        base = colour(method)
-        before = sum(colour(other) == base for other in colours)
-        colours[method] = shade(base, 1 - 0.62**before)
-    return colours
 
 
 def shade(base: str, share: float) -> str:

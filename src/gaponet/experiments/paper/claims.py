@@ -1,0 +1,191 @@
+"""The paper's claims, and what each method reaches here.
+
+A network is credited with what it adds: to the nominal simulator, to targets as they are, or to the feed-forward. So an
+untrained network, whose correction is zero, has 0 % in every row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.result_table import ResultTable
+from gaponet.experiments.paper.commands import REFERENCE_WAY, WAY_TITLES
+from gaponet.experiments.paper.printed import (
+    AXES,
+    CLAIM_ALL_PAYLOADS,
+    CLAIM_BY_AXIS,
+    CLAIM_HEAVIEST_PAYLOAD,
+)
+from gaponet.experiments.paper.results import Results
+from gaponet.experiments.paper.statistics import Reduction, reduction
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, Block
+
+BLOCKS: tuple[Block, ...] = ("labels", "ppo")
+JUDGED = "GAPONet"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim, measured for every method of a block.
+
+    Attributes:
+        text: What is reduced, against what.
+        printed: The paper's claim, %; None where the paper claims nothing.
+        reductions: Method → reduction.
+    """
+
+    block: Block
+    text: str
+    printed: float | None
+    reductions: dict[str, Reduction]
+
+    @property
+    def verdict(self) -> str:
+        """Verdict on our GAPONet."""
+        if self.printed is None or JUDGED not in self.reductions:
+            return ""
+        return self.reductions[JUDGED].verdict(self.printed)
+
+
+def claims(results: Results) -> list[Claim]:
+    """Return all claims for both blocks, in the order of the page."""
+    found = []
+    for block in BLOCKS:
+        if not results.networks(block):
+            continue
+        found += _alignment_claims(results, block)
+        if results.study.virtual:
+            found += _command_claims(results, block)
+            found += _delivery_claims(results, block)
+    return found
+
+
+def _alignment_claims(results: Results, block: Block) -> list[Claim]:
+    nominal = results.over_joints(results.baseline_q_dis("nominal"))
+    identified = results.over_joints(results.baseline_q_dis("identified"))
+    heaviest = results.masses[-1]
+    found = []
+    rows: list[tuple[str, float, float | None]] = [("all payloads", CLAIM_ALL_PAYLOADS, None)]
+    if len(results.masses) > 1:
+        rows.append((f"{heaviest:g} kg", CLAIM_HEAVIEST_PAYLOAD, heaviest))
+    for label, printed, payload in rows:
+        kept = _with_payload(results, payload)
+        reductions = {"identification": _reduction(results, [identified], nominal, kept)}
+        for name in results.networks(block):
+            errors = [results.over_joints(q_dis) for q_dis in results.q_dis(block, name)]
+            reductions[name] = _reduction(results, errors, nominal, kept)
+        text = f"simulator + Δa to robot, {label}: less Q_dis than the nominal simulator"
+        found.append(Claim(block, text, printed, reductions))
+    return found
+
+
+def _command_claims(results: Results, block: Block) -> list[Claim]:
+    heaviest = results.masses[-1]
+    found = []
+    for way, reference in REFERENCE_WAY.items():
+        baseline = results.over_joints(results.plain_command_q_dis(reference))
+        for label, payload in (("all payloads", None), (f"{heaviest:g} kg", heaviest)):
+            kept = _with_payload(results, payload)
+            reductions = {}
+            for name in results.networks(block):
+                errors = [
+                    results.over_joints(q_dis) for q_dis in results.command_q_dis(block, name, way)
+                ]
+                reductions[name] = _reduction(results, errors, baseline, kept)
+            printed = None
+            if way == "delta":
+                printed = CLAIM_ALL_PAYLOADS if payload is None else CLAIM_HEAVIEST_PAYLOAD
+            text = (
+                f"robot to target, {WAY_TITLES[way]}, {label}: less Q_dis than "
+                f"{WITHOUT_NETWORK[reference]}"
+            )
+            found.append(Claim(block, text, printed, reductions))
+    return found
+
+
+WITHOUT_NETWORK = {
+    "raw": "targets as they are",
+    "feedforward": "feed-forward alone",
+    "integral": "feed-forward and integral alone",
+}
+
+
+def _delivery_claims(results: Results, block: Block) -> list[Claim]:
+    """Offsets at the heaviest payload, against the MLP as the paper has it, and against what needs no network."""
+    found = []
+    heaviest = f"{results.masses[-1]:g} kg"
+    for way in ("delta", "both"):
+        reference = REFERENCE_WAY[way]
+        plain = results.plain_offsets(reference)[-1]  # (goals, 3) m
+        offsets = {}
+        for name in results.networks(block):
+            offsets[name] = [seed[-1] for seed in results.offsets(block, name, way)]
+        for axis, letter in enumerate(AXES):
+            reductions = {
+                name: _offset_reduction(seeds, plain, axis) for name, seeds in offsets.items()
+            }
+            text = f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than {WITHOUT_NETWORK[reference]}"
+            found.append(Claim(block, text, None, reductions))
+        if "MLP" not in offsets:
+            continue
+        mlp = np.mean(offsets["MLP"], axis=0)
+        for axis, letter in enumerate(AXES):
+            reductions = {
+                name: _offset_reduction(seeds, mlp, axis)
+                for name, seeds in offsets.items()
+                if name != "MLP"
+            }
+            text = f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than the MLP"
+            printed = CLAIM_BY_AXIS[letter] if way == "delta" else None
+            found.append(Claim(block, text, printed, reductions))
+    return found
+
+
+def _offset_reduction(seeds: list[Array], baseline: Array, axis: int) -> Reduction:
+    """Return the reduction along an axis; goals are independent of each other.
+
+    Args:
+        seeds: (goals, 3) m for each seed.
+        baseline: (goals, 3) m.
+    """
+    goals = [str(goal) for goal in range(len(baseline))]
+    return reduction([offsets[:, axis] for offsets in seeds], baseline[:, axis], goals)
+
+
+def _with_payload(results: Results, payload: float | None) -> Array:
+    """Return the mask of the recordings with a payload, kg; None: all."""
+    if payload is None:
+        return np.ones(len(results.payloads), bool)
+    return np.asarray(results.payloads == payload)
+
+
+def _reduction(results: Results, errors: list[Array], baseline: Array, kept: Array) -> Reduction:
+    motions = [motion for motion, keep in zip(results.motions, kept, strict=True) if keep]
+    return reduction([error[kept] for error in errors], baseline[kept], motions)
+
+
+def claim_table(found: list[Claim], block: Block) -> ResultTable:
+    """Return the claims of a block as a table; one column for each method."""
+    of_block = [claim for claim in found if claim.block == block]
+    methods = list(dict.fromkeys(name for claim in of_block for name in claim.reductions))
+    rows = []
+    for claim in of_block:
+        cells = [
+            str(claim.reductions[name]) if name in claim.reductions else "" for name in methods
+        ]
+        printed = "" if claim.printed is None else f"{claim.printed:g}"
+        rows.append((claim.text, printed, *cells, claim.verdict))
+    seeds = max((one.seeds for claim in of_block for one in claim.reductions.values()), default=0)
+    motions = max(
+        (one.motions for claim in of_block for one in claim.reductions.values()), default=0
+    )
+    caption = (
+        f"Trained by {BLOCK_TITLES[block]}. Per cent less, ± the standard error over {seeds} seeds and over motions "
+        f"or goals (paired, jackknife; {motions} at most). The verdict is on GAPONet: reached or not by two standard "
+        "errors. An untrained network has 0 in every row."
+    )
+    columns = ("claim", "the paper", *methods, "verdict")
+    return ResultTable(f"claims_{block}", columns, tuple(rows), caption, 0)

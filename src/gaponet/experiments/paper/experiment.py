@@ -1,0 +1,231 @@
+"""The paper's experiment from top to bottom.
+
+1. Motions that are in no recording, played by a unit that no network sees.
+2. Identification of the nominal robot, and every network: equal recordings, inputs, training and seeds.
+3. Each is measured on these motions: the simulator with Δa against the robot (equation 5), commands on the robot, and
+   delivery of payloads.
+4. The paper's claims, Figures 2 and 3, Tables 1 and 2, on one page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gaponet.base.errors import ModelError
+from gaponet.base.files import lock_folder
+from gaponet.base.progress import Running
+from gaponet.base.result_table import ResultTable
+from gaponet.data.store import Dataset
+from gaponet.experiments.paper.claims import Claim, claim_table, claims
+from gaponet.experiments.paper.figure3 import draw_figure_3, figure_3_table
+from gaponet.experiments.paper.jobs import Job, run_jobs
+from gaponet.experiments.paper.measure import ShareDone, record_unit
+from gaponet.experiments.paper.options import PaperOptions
+from gaponet.experiments.paper.page import Section, write_page
+from gaponet.experiments.paper.results import Results
+from gaponet.experiments.paper.study import Study, quick_dataset
+from gaponet.experiments.paper.tables import (
+    commands_table,
+    large_gaps_table,
+    method_table,
+    sensor_table,
+    table_1,
+    table_2,
+)
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, Block, Budget, all_trainings
+from gaponet.experiments.paper.unseen_motions import require_unseen
+from gaponet.robot.spec import RobotSpec
+
+KIND = "experiments"  # of the results folder
+BLOCKS: tuple[Block, ...] = ("labels", "ppo")
+
+OpenBar = Callable[[str], AbstractContextManager[ShareDone]]
+OpenBars = Callable[[str, int], AbstractContextManager[Callable[[Running, int], None]]]
+
+
+@dataclass(frozen=True)
+class PaperResult:
+    """Result of the experiment.
+
+    Attributes:
+        page: The page with all figures and tables.
+        claims: The paper's claims, and what each method reaches.
+        tables: Tables by name.
+        sentences: Conclusions.
+        failures: A sentence for each training that failed.
+    """
+
+    page: Path
+    claims: list[Claim]
+    tables: dict[str, ResultTable]
+    sentences: list[str]
+    failures: list[str]
+
+
+def run_paper_experiment(
+    dataset: Dataset,
+    robot: RobotSpec,
+    out: Path,
+    options: PaperOptions,
+    open_bar: OpenBar,
+    open_bars: OpenBars,
+) -> PaperResult:
+    """Run the experiment, or continue it, and write its page.
+
+    Args:
+        dataset: Recordings of a VIRTUAL fleet, or of a real robot.
+        robot: The dataset's robot.
+        out: Folder of the results; an interrupted experiment continues there.
+        open_bar: Opens a progress bar, title → update(share).
+        open_bars: Opens the bars of the trainings, title and number → show(running, done).
+
+    Raises:
+        UsageError: The dataset or the folder does not fit, or a motion of the experiment was recorded.
+        ModelError: Every training failed.
+    """
+    with lock_folder(out, KIND):
+        study = prepare(dataset, robot, out, options, open_bar)
+        jobs = all_jobs(study)
+        with open_bars("trainings", len(jobs)) as show:
+            failures = run_jobs(jobs, show)
+        if not jobs[0].result_file.is_file() or not any(
+            job.result_file.is_file() for job in jobs[1:]
+        ):
+            raise ModelError(f"{out}: nothing could be trained; the first: {failures[0]}")
+        return summarise(study, jobs, failures)
+
+
+def prepare(
+    dataset: Dataset, robot: RobotSpec, out: Path, options: PaperOptions, open_bar: OpenBar
+) -> Study:
+    """Check all inputs, and record the unit that no network sees. Nothing is trained yet."""
+    nominal = robot.before_identification
+    dataset.require_robot(nominal)
+    study = Study(dataset.address or str(dataset.path.resolve()), nominal, out, options)
+    if options.quick:
+        options = options.for_quick_run()
+        study = replace(study, options=options)
+    if study.virtual:
+        unit = study.virtual_unit()
+        require_unseen(unit.motions, dataset, nominal, study.dt)
+    if options.quick:
+        unseen_unit = study.unit_name if study.virtual else ""
+        small = quick_dataset(dataset, nominal, out / "data", unseen_unit)
+        study = replace(study, dataset=str(small.path.resolve()))
+    study.splits()  # refuses what cannot be split
+    study.require_same_setup()
+    if study.virtual:
+        for rate in {study.rates[0], study.rates[-1]}:
+            with open_bar(f"the unseen {study.unit_name} at {rate:g} Hz") as update:
+                record_unseen(study, rate, update)
+    return study
+
+
+def record_unseen(study: Study, rate: float, progress: ShareDone) -> None:
+    """Store the recordings of the unit that no network sees in OUT/unseen, unless they are there."""
+    unseen = Dataset.create(study.out / "unseen", study.robot)
+    unit = study.virtual_unit(1.0 / rate)
+    present = [entry for entry in unseen.entries if round(1 / entry.dt) == rate]
+    if len(present) == len(unit.motion_runs()):
+        return
+    for sequence in record_unit(unit, progress).sequences:
+        if unseen.find(sequence.content_hash()) is None:
+            unseen.append(sequence)
+
+
+def all_jobs(study: Study) -> list[Job]:
+    """Return all jobs, identification and baselines first."""
+    options = study.options
+    budget = Budget(options.steps, options.seeds, options.quick)
+    trainings = all_trainings(budget, study.rates, study.payloads, table_2=not options.only)
+    jobs = [Job(study)]
+    for training in trainings:
+        if not options.only or training.name in options.only:
+            jobs.append(Job(study, training))
+    return jobs
+
+
+def summarise(study: Study, jobs: list[Job], failures: list[str]) -> PaperResult:
+    """Read all results, and write the page."""
+    results = Results.read(study, jobs)
+    found = claims(results)
+    sections = [Section("", "The paper's claims", tables=_claim_tables(found))]
+    sections.append(_figure_2(study))
+    sections += _figure_3(results)
+    if study.virtual:
+        sections += _table_1(results)
+    if any(run["block"] == "table2" for run in results.trainings):
+        sections.append(Section("Table 2", "One setting at a time", tables=[table_2(results)]))
+        title = "What the Sensor Predictor saves"
+        sections.append(Section("", title, tables=[sensor_table(results)]))
+    sections.append(Section("", "Methods", tables=[method_table(results)]))
+    gaps = [large_gaps_table(results, block) for block in BLOCKS if results.networks(block)]
+    sections.append(Section("", "Large gaps by payload", tables=gaps))
+    sentences = [*_conclusions(found), *failures]
+    page = write_page(study, sections, sentences)
+    tables = {table.name: table for section in sections for table in section.tables}
+    return PaperResult(page, found, tables, sentences, failures)
+
+
+def _claim_tables(found: list[Claim]) -> list[ResultTable]:
+    blocks = dict.fromkeys(claim.block for claim in found)
+    return [claim_table(found, block) for block in blocks]
+
+
+def _figure_2(study: Study) -> Section:
+    from gaponet.report.figures.dataset_figures import draw_figures
+
+    figures, _ = draw_figures(study.data, study.robot)
+    return Section("Figure 2", "The recordings", figures=figures)
+
+
+def _figure_3(results: Results) -> list[Section]:
+    sections = []
+    for block in BLOCKS:
+        if not results.networks(block):
+            continue
+        sections.append(
+            Section(
+                "Figure 3",
+                f"Simulator against robot, by joint and payload ({BLOCK_TITLES[block]})",
+                "Q_dis is the area between the positions of the simulator, under a + Δa, and of the robot, under a. "
+                "No network has seen these motions.",
+                {f"figure3_{block}": draw_figure_3(results, block)},
+                [figure_3_table(results, block)],
+            )
+        )
+    return sections
+
+
+def _table_1(results: Results) -> list[Section]:
+    sections = []
+    for block in BLOCKS:
+        if not results.networks(block):
+            continue
+        title = f"Delivery: offsets of the hands ({BLOCK_TITLES[block]})"
+        sections.append(Section("Table 1", title, tables=[table_1(results, block)]))
+        title = f"Commands on the robot ({BLOCK_TITLES[block]})"
+        sections.append(Section("", title, tables=[commands_table(results, block)]))
+    return sections
+
+
+def _conclusions(found: list[Claim]) -> list[str]:
+    """Return a sentence for each claim of the paper."""
+    sentences = []
+    for claim in found:
+        if claim.printed is None or not claim.verdict:
+            continue
+        ours = claim.reductions["GAPONet"]
+        others = [
+            f"{name} {reduction}"
+            for name, reduction in claim.reductions.items()
+            if name != "GAPONet"
+        ]
+        sentences.append(
+            f"{claim.text} ({BLOCK_TITLES[claim.block]}): the paper claims {claim.printed:g} %; GAPONet {ours} %, "
+            f"{claim.verdict}. Beside it: {', '.join(others)}."
+        )
+    return sentences

@@ -1,0 +1,74 @@
+"""Reductions of an error, with the uncertainty over training seeds and over motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.result_table import format_cell
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """Reduction of an error by a method, %.
+
+    Attributes:
+        mean: Over all seeds and motions: 100 (1 − Σ error / Σ error of the baseline).
+        seed_error: Standard error over training seeds; 0 for one seed or none, because nothing is known of it.
+        motion_error: Standard error over motions.
+        seeds, motions: Their numbers.
+    """
+
+    mean: float
+    seed_error: float
+    motion_error: float
+    seeds: int
+    motions: int
+
+    @property
+    def error(self) -> float:
+        """Standard error over seeds and motions."""
+        return float(np.hypot(self.seed_error, self.motion_error))
+
+    def verdict(self, claim: float) -> str:
+        """Say if a reduction of `claim` % is reached, by two standard errors."""
+        if self.mean - 2 * self.error >= claim:
+            return "reached"
+        if self.mean + 2 * self.error < claim:
+            return "not reached"
+        return "not decided"
+
+    def __str__(self) -> str:
+        mean = format_cell(self.mean, 0)
+        return f"{mean} ± {format_cell(self.error, 0)}" if self.error > 0 else mean
+
+
+def reduction(errors: ListOf[Array], baseline: Array, motions: ListOf[str]) -> Reduction:
+    """Return the reduction of an error.
+
+    The standard error over motions is that of a delete-one-motion jackknife (Efron & Stein 1981): the reduction is a
+    ratio of sums, whose terms are paired by motion.
+
+    Args:
+        errors: Error of each recording, (recordings,), one array for each training seed.
+        baseline: Error of each recording by the baseline, (recordings,).
+        motions: Motion of each recording: recordings of one motion are not independent.
+    """
+    by_seed = np.array([100 * (1 - error.sum() / baseline.sum()) for error in errors])
+    mean_error = np.mean(errors, axis=0)  # (recordings,)
+    names = list(dict.fromkeys(motions))
+    left_out = []
+    for name in names:
+        kept = np.array([motion != name for motion in motions])
+        left_out.append(100 * (1 - mean_error[kept].sum() / baseline[kept].sum()))
+    count = len(names)
+    motion_error = 0.0
+    if count > 1:
+        motion_error = float(np.sqrt((count - 1) * np.var(left_out)))
+    seed_error = 0.0
+    if len(by_seed) > 1:
+        seed_error = float(by_seed.std(ddof=1) / np.sqrt(len(by_seed)))
+    return Reduction(float(by_seed.mean()), seed_error, motion_error, len(by_seed), count)

@@ -1,0 +1,160 @@
+"""What is trained: a plain list. All networks of a block have equal data, inputs and training.
+
+Block "labels": supervised pre-training on labels, then PPO. Block "ppo": PPO from an untrained network, the paper's
+recipe. Block "table2": the paper's network in its own form, one setting changed in each row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from gaponet.nn.config import ModelConfig, ModelKind
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
+
+Block = Literal["labels", "ppo", "table2"]
+BLOCK_TITLES: dict[Block, str] = {
+    "labels": "labels, then PPO",
+    "ppo": "PPO alone",
+    "table2": "Table 2",
+}
+
+# Method → kind of network. The order is that of all tables.
+NETWORKS: dict[str, ModelKind] = {
+    "MLP": "mlp",  # ASAP's form, the paper's baseline
+    "shared MLP": "shared_mlp",  # the inputs and the number of weights of GAPONet
+    "literal": "paper",  # equations 1 to 4 of the paper, with its widths
+    "GAPONet": "gaponet",  # ours
+}
+
+PRETRAINING = PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800)
+TABLE_2_MODEL = ModelConfig(kind="paper", payload_input=False)  # the paper's own row has no payload
+
+# Row of Table 2 → what differs from TABLE_2_MODEL. Rows without a change share one training.
+TABLE_2_CHANGES: dict[str, dict[str, object]] = {
+    "payload out": {},
+    "payload in": {"payload_input": True},
+    "100 Hz": {},  # the recordings differ, see `table_2_trainings`
+    "history 2": {"history": 2},
+    "history 6": {"history": 6},
+    "history 8": {"history": 8},
+    "correction held 3": {"delta_hold": 3},
+    "correction held 5": {"delta_hold": 5},
+    "sensors held 3": {"sensor_hold": 3},
+    "sensors held 5": {"sensor_hold": 5},
+    "predict S(t+1)": {"sensor_target": "absolute"},
+    "equation 1 as written": {"payload_input": True, "predictor_inputs": "equation_1"},
+    "stepped probes": {"sensor_source": "fixed"},
+    "without sensors": {"sensor_source": "none"},
+}
+
+# A quick run shows that everything works: every network takes steps, and its numbers mean nothing.
+QUICK_PRETRAINING = PretrainingConfig(
+    rounds=1, num_envs=16, steps=40, gradient_steps=30, batch_size=128, sensor_states=128
+)
+QUICK_PPO = PPOConfig(
+    num_envs=16, num_steps=16, epochs=1, mini_batches=1, critic_warmup=1, explained=-1e9
+)
+QUICK_STEPS = 1_500
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training.
+
+    Attributes:
+        block: Which comparison it belongs to.
+        name: Method, or row of Table 2.
+        seed: Seed of everything random.
+        config: All settings.
+        steps: Length, control steps; pre-training counts.
+    """
+
+    block: Block
+    name: str
+    seed: int
+    config: TrainConfig
+    steps: int
+
+    @property
+    def folder(self) -> str:
+        """Name of its folder in OUT/trainings."""
+        words = f"{self.block}-{self.name}-{self.seed}"
+        return "".join(letter if letter.isalnum() or letter in "-+" else "_" for letter in words)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Lengths of the trainings.
+
+    Attributes:
+        steps: Control steps of one training.
+        seeds: Trainings of each setting.
+        quick: Tiny networks' worth of work, to see that everything runs.
+    """
+
+    steps: int
+    seeds: int
+    quick: bool = False
+
+
+def all_trainings(
+    budget: Budget, rates: tuple[float, ...], payloads: tuple[float, ...], *, table_2: bool
+) -> list[Training]:
+    """Return all trainings, the most important first, so that an interrupted night has every method.
+
+    Args:
+        rates: Control rates of the dataset, Hz, ascending. The first one is used wherever the rate is not the question.
+        payloads: Payloads of the dataset, kg.
+    """
+    base = TrainConfig(rates=rates[:1])
+    trainings = []
+    for seed in range(budget.seeds):
+        trainings += _methods("labels", _recipe(base, "labels", budget), seed, budget.steps)
+    for seed in range(budget.seeds):
+        trainings += _methods("ppo", _recipe(base, "ppo", budget), seed, budget.steps)
+    if table_2:
+        for seed in range(budget.seeds):
+            trainings += table_2_trainings(budget, seed, rates, payloads)
+    return trainings
+
+
+def table_2_trainings(
+    budget: Budget, seed: int, rates: tuple[float, ...], payloads: tuple[float, ...]
+) -> list[Training]:
+    """Return the rows of Table 2 that the dataset allows."""
+    trainings = []
+    for row, changes in TABLE_2_CHANGES.items():
+        if row == "100 Hz" and len(rates) < 2:
+            continue
+        if row == "payload in" and len(payloads) < 2:
+            continue
+        row_rates = rates[-1:] if row == "100 Hz" else rates[:1]
+        model = replace(TABLE_2_MODEL, **changes)  # type: ignore[arg-type]
+        config = TrainConfig(model=model, rates=row_rates)
+        config = _recipe(config, "labels", budget)
+        trainings.append(Training("table2", row, seed, _seeded(config, seed), budget.steps))
+    return trainings
+
+
+def _methods(block: Block, config: TrainConfig, seed: int, steps: int) -> list[Training]:
+    """Return one training of each network with the same settings."""
+    trainings = []
+    for name, kind in NETWORKS.items():
+        model = replace(config.model, kind=kind)
+        trainings.append(
+            Training(block, name, seed, _seeded(replace(config, model=model), seed), steps)
+        )
+    return trainings
+
+
+def _recipe(config: TrainConfig, block: Block, budget: Budget) -> TrainConfig:
+    """Return the settings with the training of a block."""
+    config = replace(config, threads=1, pretraining=PRETRAINING)
+    if budget.quick:
+        config = replace(config, pretraining=QUICK_PRETRAINING, ppo=QUICK_PPO, validate_every=2)
+    return config.paper_recipe() if block == "ppo" else config
+
+
+def _seeded(config: TrainConfig, seed: int) -> TrainConfig:
+    return replace(config, seed=seed)

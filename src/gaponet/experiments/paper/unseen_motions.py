@@ -1,0 +1,106 @@
+"""The motions of Figure 3: made for the experiment, and checked against every recorded motion before any training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.data.split import hash_order
+from gaponet.data.store import Dataset
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.model import idle_joints
+from gaponet.sysid.motion.coordinated import BUILDERS
+from gaponet.sysid.motion.library import Library
+from gaponet.sysid.motion.motion import Motion
+
+VARIANT = 90  # recipes count variants from 0 and never get this far
+LIBRARY_SEED = 2026  # recipes have others
+MIN_RMS_DIFFERENCE_RAD = 0.01  # between the targets of two motions that count as different
+
+
+@dataclass(frozen=True)
+class UnseenMotion:
+    """A motion at a control period.
+
+    Attributes:
+        ctrl: Targets, (T, n) rad; limbs without an operated joint stay at home.
+    """
+
+    name: str
+    ctrl: Array
+
+
+def make_unseen_motions(
+    robot: RobotSpec, count: int, max_payload: float, dt: float
+) -> list[UnseenMotion]:
+    """Make coordinated motions of all kinds, both hands first; single-joint motions for a robot without arms.
+
+    Args:
+        count: Number of motions.
+        dt: Control period, s.
+        max_payload: Payload with which every motion must be feasible, kg in each hand.
+
+    Raises:
+        UsageError: The robot has fewer motions.
+    """
+    library = Library(robot, LIBRARY_SEED, max_payload)
+    sides = list(library.kit.arms)
+    if len(sides) == 2:
+        sides = ["both", *sides]
+    names = [f"{kind}-{side}-{VARIANT}" for side in sides for kind in BUILDERS]
+    if not names:
+        names = hash_order(library.names())
+    if count > len(names):
+        raise UsageError(f"--motions {count}: {robot.name} has {len(names)} for this experiment")
+    # With a fixed base, limbs without an operated joint share no dynamics with the others.
+    idle = robot.index(idle_joints(robot, robot.operated))
+    motions = []
+    for name in names[:count]:
+        ctrl = library.make(name).sample(dt)
+        ctrl[:, idle] = robot.qpos_home[idle]
+        motions.append(UnseenMotion(name, ctrl))
+    return motions
+
+
+def require_unseen(
+    motions: ListOf[UnseenMotion], dataset: Dataset, robot: RobotSpec, dt: float
+) -> None:
+    """Refuse motions that the dataset holds, by name or by their targets, at a control period of dt s.
+
+    Motions are compared over the whole length of the longer one: punches that begin alike are different motions.
+
+    Raises:
+        UsageError: A motion is in the dataset.
+    """
+    recorded = {entry.meta.motion: entry for entry in reversed(dataset.entries)}
+    operated = robot.operated_index
+    targets = {}
+    for name, entry in recorded.items():
+        ctrl = dataset.channels(entry, ("ctrl",))["ctrl"]
+        resampled = Motion(name, entry.meta.level, entry.dt, ctrl).sample(dt)
+        targets[name] = resampled[:, operated]
+    for motion in motions:
+        for name, ctrl in targets.items():
+            difference = rms_difference(motion.ctrl[:, operated], ctrl)
+            if name == motion.name or difference < MIN_RMS_DIFFERENCE_RAD:
+                raise UsageError(
+                    f"motion '{motion.name}' of the experiment is '{name}' of the dataset "
+                    f"({1e3 * difference:.1f} mrad RMS apart); the experiment needs motions that no "
+                    f"network has seen: gaponet data remove {dataset.path} '{name}'"
+                )
+
+
+def rms_difference(first: Array, second: Array) -> float:
+    """Return the RMS difference of two motions, (T, n) rad each; the shorter one stands at its end meanwhile."""
+    rows = max(len(first), len(second))
+    difference = _extended(first, rows) - _extended(second, rows)
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+def _extended(ctrl: Array, rows: int) -> Array:
+    """Return a motion of this many rows, with its last row repeated."""
+    return np.concatenate([ctrl, np.repeat(ctrl[-1:], rows - len(ctrl), axis=0)])
