@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from gaponet.base.errors import UsageError
 from gaponet.base.result_table import MeanStd, ResultTable
-from gaponet.data.card import count_entries
+from gaponet.data.paper_counts import PAPER, count_as_paper, table_beside_paper
 from gaponet.data.store import Dataset
 from gaponet.experiments.cells import Cell
 from gaponet.experiments.outcomes import StudyOutcomes, summarize
@@ -23,20 +23,9 @@ from gaponet.experiments.virtual.session import Session, UnitExperiment
 from gaponet.experiments.virtual.statistics import methods, over_seeds, payloads, reduction, select
 from gaponet.experiments.virtual.tracking import Score
 from gaponet.report.methods import title
-from gaponet.robot.spec import RobotSpec
 
 # Numbers printed in the paper, whose robots are real.
-PAYLOADS = (0.0, 1.0, 2.0, 3.0)  # kg per hand
-# Counts of its dataset.
-CARD = {
-    "hours": 28.46,
-    "sequences": 11_198,
-    "frames": 257_493,
-    "units": 4,
-    "joints": 10,
-    "repetitions": 3,
-    "signals": 6,
-}
+PAYLOADS = PAPER.payloads_kg  # kg per hand
 # Its claims: reduction of the error, %.
 CLAIMS = {"Q_dis, all payloads": 40, "Q_dis, heaviest payload": 50, "X": 40, "Y": 40, "Z": 70}
 
@@ -167,7 +156,7 @@ class Paper(UnitExperiment):
         outcomes = StudyOutcomes.read(session.cells, study)
         own = self.paper_study(study)
         supervised = Table2Row("training", RECIPES["labels"], SUPERVISED, None)
-        tables = [card_table(data, robot), claim_table(scores, errors, joints[0])]
+        tables = [table_beside_paper(count_as_paper(data)), claim_table(scores, errors, joints[0])]
         tables += [tracking.by_payload(scores, part, joints) for part in parts]
         tables += (
             [f(errors) for f in (delivery.paper_table, delivery.offset_table)] if virtual else []
@@ -211,34 +200,6 @@ def table_2_rows(study: Study) -> list[Table2Row]:
                     )
                 )
     return allowed_rows
-
-
-def card_table(data: Dataset, robot: RobotSpec) -> ResultTable:
-    """Counts of the dataset beside the paper's."""
-    entries = data.entries
-    here = count_entries(entries) | {
-        "units": len({e.meta.unit_id for e in entries}), "joints": len(robot.operated),
-        "repetitions": len({e.meta.repetition for e in entries}),
-        "signals": len({c for e in entries for c in e.channels}),
-    }  # fmt: skip
-    rows: list[tuple[Any, ...]] = [(name, printed, here[name]) for name, printed in CARD.items()]
-    rows.append(
-        (
-            "payloads, kg",
-            ", ".join(f"{p:g}" for p in PAYLOADS),
-            _listed(e.meta.payload_mass for e in entries),
-        )
-    )
-    rows.append(("rates, Hz", "50, 100", _listed(round(1 / e.dt) for e in entries)))
-    caption = (
-        "The paper's counts do not agree with each other: 28.46 h at 50 Hz are 5.1 million frames, and 257,493 frames "
-        "of 11,198 sequences are 23 frames each. Signals: channels that any sequence holds."
-    )
-    return ResultTable("card", ("what", "the paper", "here"), tuple(rows), caption)
-
-
-def _listed(values: Iterable[float]) -> str:
-    return ", ".join(f"{v:g}" for v in sorted(set(values)))
 
 
 def claim_table(
