@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from logs import arm_sequence, late, wave
+from logs import arm_sequence, late, repeated_motions, wave
 
 from gaponet.base.errors import DatasetError
-from gaponet.data.card import card_markdown, headline, make_card, write_card
+from gaponet.data.card import beside_paper, card_markdown, headline, make_card, write_card
+from gaponet.data.paper_counts import PAPER, count_as_paper
 from gaponet.data.store import Dataset
 
 
@@ -100,3 +101,56 @@ def test_the_card_is_written_beside_the_data(dataset):
     assert "| 0.2 | 1 | 0.00 | 100 | 1 |" in text
     assert "No motion was repeated with the same command" in text
     assert len(Dataset(dataset.path)) == 3
+
+
+def test_the_paper_s_counts_are_those_that_it_prints():
+    assert (PAPER.hours, PAPER.sequences, PAPER.frames) == (28.46, 11_198, 257_493)
+    assert (PAPER.units, PAPER.joints, PAPER.repetitions, PAPER.signals) == (4, 10, 3, 6)
+    assert (PAPER.payloads_kg, PAPER.rates_hz) == ((0, 1, 2, 3), (50, 100))
+
+
+def test_a_dataset_is_counted_as_the_paper_counts(dataset):
+    here = count_as_paper(dataset)
+    assert (here.sequences, here.frames, here.units) == (3, 250, 2)
+    assert here.hours == pytest.approx(250 * 0.02 / 3600)
+    assert here.joints == 2
+    assert (here.payloads_kg, here.rates_hz) == ((0, 0.2), (50,))
+
+
+def test_repetitions_are_of_one_motion_unit_payload_and_rate(dataset, arm, tmp_path):
+    """Three sequences that differ in motion, unit or payload are no repetitions."""
+    assert count_as_paper(dataset).repetitions == 1
+    assert count_as_paper(repeated_motions(tmp_path / "repeated", arm)).repetitions == 3
+
+
+def test_signals_are_the_channels_of_every_sequence_without_the_command(arm, tmp_path):
+    data = Dataset.create(tmp_path / "six", arm)
+    ctrl = ramp(20, 0.3)
+    derived = dict.fromkeys(("qacc", "tau", "tau_eq", "temperature"), 0 * ctrl)
+    data.append(arm_sequence(arm, ctrl, ctrl, **derived))
+    assert count_as_paper(data).signals == 6
+    data.append(arm_sequence(arm, 2 * ctrl, ctrl, "without"))
+    assert count_as_paper(data).signals == 2
+
+
+def test_an_empty_dataset_has_no_counts(arm, tmp_path):
+    with pytest.raises(DatasetError, match="holds no sequences yet"):
+        count_as_paper(Dataset.create(tmp_path / "empty", arm))
+
+
+def test_the_card_beside_the_paper_has_both_counts_and_says_that_the_paper_s_do_not_reconcile(
+    dataset,
+):
+    card = make_card(dataset) | {"beside_paper": beside_paper(dataset)}
+    write_card(dataset, card)
+    text = (dataset.path / "CARD.md").read_text(encoding="utf-8")
+    assert "| sequences | 11,198 | 3 |" in text
+    assert "| payloads, kg per hand | 0, 1, 2, 3 | 0, 0.2 |" in text
+    assert "28.46 h at 50 Hz are 5.1 million frames" in text
+    stored = json.loads((dataset.path / "card.json").read_text(encoding="utf-8"))["beside_paper"]
+    assert (stored["paper"]["hours"], stored["here"]["frames"]) == (28.46, 250)
+    assert "do not reconcile" in stored["note"]
+
+
+def test_a_card_that_was_not_asked_for_the_paper_does_not_name_it(dataset):
+    assert "paper" not in card_markdown(make_card(dataset))

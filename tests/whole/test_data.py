@@ -54,6 +54,17 @@ def test_the_card_says_virtual_first_asks_for_the_licence_and_keeps_it(place, ca
     assert json.loads((place / "set" / "dataset.json").read_text())["licence"] == "CC-BY-4.0"
 
 
+def test_the_card_beside_the_paper_is_printed(place, capsys):
+    told = run(place, capsys, "data", "card", "{}/set", "--beside", "paper").out
+    assert "Beside the paper's counts" in told
+    assert "257,493" in told
+    assert "do not reconcile" in " ".join(told.split())
+    out = run(place, capsys, "data", "card", "{}/set", "--beside", "paper", "--json").out
+    beside = json.loads(out)["beside_paper"]
+    assert beside["here"]["sequences"] == 6
+    assert beside["paper"]["sequences"] == 11_198
+
+
 def test_a_split_is_printed_and_written(place, capsys):
     result = json.loads(
         run(

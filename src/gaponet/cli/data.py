@@ -16,15 +16,20 @@ from gaponet.share.reading import open_dataset
 
 
 def _card(
-    dataset: Data, licence: str | None = None, source: str | None = None, json: Json = False
+    dataset: Data,
+    licence: str | None = None,
+    source: str | None = None,
+    beside: Literal["paper"] | None = None,
+    json: Json = False,
 ) -> None:
     """Count and measure what a dataset holds; writes card.json and CARD.md into it.
 
     Args:
         licence: Record this licence in dataset.json, such as CC-BY-4.0; "" removes it.
         source: Record where the data come from: a paper, a laboratory, an address.
+        beside: "paper" adds the counts of the SimLifter and GAPONet paper's dataset beside those of this one.
     """
-    from gaponet.data.card import make_card, write_card
+    from gaponet.data.card import beside_paper, make_card, write_card
 
     out, data = Out(json), Dataset(dataset)
     stated = {k: v for k, v in (("licence", licence), ("source", source)) if v is not None}
@@ -32,6 +37,8 @@ def _card(
         data.set_provenance(**stated)
     with progress_bar("reading") as update:
         made = make_card(data, update)
+    if beside == "paper":
+        made["beside_paper"] = beside_paper(data)
     _show_card(out, made)
     if data.read_only:
         out.say("nothing may be written into that folder, so the card is only shown")
@@ -193,11 +200,15 @@ def data(action: None) -> None:
 
 def _show_card(out: Out, made: dict[str, Any]) -> None:
     """Counts, repeatability and licence; ranges of all signals stand in CARD.md."""
-    from gaponet.data.card import NOT_STATED, PROPERTIES, count_table, headline
+    from gaponet.data.card import NOT_STATED, PROPERTIES, count_table, headline, paper_table
 
     out.say("", headline(made))
     for name in PROPERTIES:
         out.show("", count_table(made, name))
+    if "beside_paper" in made:
+        counts = paper_table(made)
+        out.show("Beside the paper's counts", counts)
+        out.say(counts.caption)
     repeated = made["repeatability"]
     if repeated["channels"]:
         spread = ", ".join(

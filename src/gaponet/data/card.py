@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,13 @@ from gaponet.base.result_table import ResultTable
 from gaponet.base.structure import read_json
 from gaponet.base.text import escape_markdown
 from gaponet.data.log import UNITS
+from gaponet.data.paper_counts import (
+    NOT_RECONCILED,
+    PAPER,
+    DatasetCounts,
+    count_as_paper,
+    table_beside_paper,
+)
 from gaponet.data.repeatability import Repetitions
 from gaponet.data.sequence import ARRAYS
 from gaponet.data.statistics import Statistics, pool, statistics
@@ -77,6 +85,20 @@ def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, A
             if stats[name]
         },
         "repeatability": Repetitions.summary(repeated, dataset.joint_names),
+    }
+
+
+def beside_paper(dataset: Dataset) -> dict[str, Any]:
+    """Return the paper's counts and those of a dataset, for the card's key "beside_paper".
+
+    Raises:
+        DatasetError: It is empty.
+        RobotError: It stores no robot, and the package has none of that name.
+    """
+    return {
+        "paper": asdict(PAPER),
+        "here": asdict(count_as_paper(dataset)),
+        "note": NOT_RECONCILED,
     }
 
 
@@ -164,6 +186,11 @@ def count_table(card: dict[str, Any], by: str) -> ResultTable:
     return ResultTable(by, (PROPERTIES[by][0], "sequences", "hours", "frames", "motions"), rows)
 
 
+def paper_table(card: dict[str, Any]) -> ResultTable:
+    """Return the table of a card with the key "beside_paper"."""
+    return table_beside_paper(DatasetCounts(**card["beside_paper"]["here"]))
+
+
 def card_markdown(card: dict[str, Any]) -> str:
     """Return the card as Markdown; the first line says if robots were virtual."""
     tables = [line for by in PROPERTIES for line in (count_table(card, by).markdown(), "")]
@@ -172,6 +199,7 @@ def card_markdown(card: dict[str, Any]) -> str:
         "",
         *_facts(card),
         *tables,
+        *_beside_paper(card),
         *_repeatability(card),
         *_signals(card),
     ]
@@ -191,6 +219,12 @@ def _facts(card: dict[str, Any]) -> Iterator[str]:
     yield f"- {total['frames']:,} frames of {len(card['joints'])} joints, {total['motions']} motions"
     yield f"- {card['bytes'] / 1e6:,.1f} MB, dataset hash {card['dataset_hash']}, gaponet {card['gaponet']}"
     yield "\nEvery number was counted or measured from the files; `gaponet data card DIR` writes this page again.\n"
+
+
+def _beside_paper(card: dict[str, Any]) -> Iterator[str]:
+    if "beside_paper" in card:
+        yield "## Beside the paper's counts\n"
+        yield paper_table(card).markdown() + "\n"
 
 
 def _repeatability(card: dict[str, Any]) -> Iterator[str]:
