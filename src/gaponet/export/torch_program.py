@@ -90,9 +90,10 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
         raise ModelError(
             f"{model.path}: holds corrections or sensors, which torch exports do not; train without"
         )
-    if model.config.real_state:
+    if model.config.observes_real_state:
         raise ModelError(
-            f"{model.path}: real_state is an input that torch exports lack; train without"
+            f"{model.path}: the recorded state is an input that torch exports lack; train without real_state, and "
+            "with predictor_inputs observation"
         )
     return DeltaStep(trained_network(run, model.config, len(model.card["joint_names"])), model)
 

@@ -15,7 +15,7 @@ Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 
 POSITIVE = ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max")
 PAPER_ONLY = (  # options of kind "paper" alone
     "payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target", "branch_observation",
-    "relative_action", "real_state",
+    "relative_action", "real_state", "predictor_inputs",
 )  # fmt: skip
 
 
@@ -42,10 +42,16 @@ class ModelConfig:
     """Largest correction, rad."""
     delta_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """paper: number of control periods for which a correction is held (action duration)."""
-    sensor_source: Literal["predicted", "fixed", "learned"] = "predicted"
+    sensor_source: Literal["predicted", "fixed", "learned", "none"] = "predicted"
     """paper: origin of the sensor values. predicted: the sensor predictor, for the num_probes fixed probes. fixed: the
     simulator, stepped once for each fixed probe; only in training and gaponet eval, because a robot has no simulator.
-    learned: the sensor predictor, for probes that start at the fixed ones and are trained by PPO."""
+    learned: the sensor predictor, for probes that start at the fixed ones and are trained by PPO. none: there are no
+    sensor values, and the branch sees the observation that the sensor predictor would see."""
+    predictor_inputs: Literal["observation", "equation_1"] = "observation"
+    """paper: inputs of the sensor predictor. observation: positions, velocities, past targets and the payload.
+    equation_1: also the present target, the joint index and the recorded state relative to the simulated one, as the
+    paper writes it. Training hides the recorded state in half of the episodes. gaponet eval never gives it; a control
+    loop can (DeltaLoop.extra)."""
     sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """paper: number of control periods for which the sensor values are held."""
     sensor_target: Literal["delta", "absolute"] = "delta"
@@ -93,6 +99,39 @@ class ModelConfig:
             raise UsageError(
                 f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them"
             )
+        if self.sensor_source == "none":
+            self._require_options_without_sensors()
+        if self.predictor_inputs == "equation_1":
+            self._require_options_of_equation_1()
+
+    def _require_options_without_sensors(self) -> None:
+        """Refuse options of sensor values where there are none."""
+        if self.sensor_hold > 1:
+            raise UsageError(
+                f"sensor_source none with sensor_hold {self.sensor_hold}: there are no sensor values to hold"
+            )
+        if self.sensor_target != "delta":
+            raise UsageError(
+                f"sensor_source none with sensor_target {self.sensor_target}: there are no sensor values"
+            )
+
+    def _require_options_of_equation_1(self) -> None:
+        """Refuse options under which the predictor does not have the inputs of equation 1."""
+        if self.sensor_source != "predicted":
+            raise UsageError(
+                f"predictor_inputs equation_1 with sensor_source {self.sensor_source}: equation 1 predicts the answers "
+                "to fixed probes; use sensor_source predicted"
+            )
+        if not self.payload_input:
+            raise UsageError(
+                "predictor_inputs equation_1 without payload_input: the payload is one of its inputs; "
+                "leave payload_input on"
+            )
+        if self.sensor_hold > 1:
+            raise UsageError(
+                f"predictor_inputs equation_1 with sensor_hold {self.sensor_hold}: the predictor sees the present "
+                "target, so its sensor values cannot be held; use delta_hold"
+            )
 
     def require_kind(self) -> None:
         """Refuse options of the paper's network in another one. The command line sets the kind after these options.
@@ -116,6 +155,17 @@ class ModelConfig:
         """True if the simulator gives the sensor values. They are then columns of x."""
         return self.sensor_source == "fixed"
 
+    @property
+    def observes_real_state(self) -> bool:
+        """True if the network observes the recorded state. It then has columns of x, which can be zero (hidden)."""
+        return self.real_state or self.predictor_inputs == "equation_1"
+
+    def real_state_dim(self, n: int) -> int:
+        """Return the length of [q_real − q | q̇_real − q̇ | visible]: 2n + 1, or 0 if it is not observed."""
+        if self.observes_real_state:
+            return 2 * n + 1
+        return 0
+
     def observation_dim(self, n: int) -> int:
         """Return the length of o_t: 2n + 3nH, and 1 more with payload."""
         return 2 * n + 3 * n * self.history + int(self.payload_input)
@@ -130,6 +180,8 @@ class ModelConfig:
         return self.num_probes * 2 * n
 
     def input_dim(self, n: int) -> int:
-        """Return the length of x = [o_t | a_t | the simulator's answers | 2n + 1 of real_state] (nn/observation.py)."""
-        extra = self.sensor_dim(n) * self.needs_simulator + (2 * n + 1) * self.real_state
-        return self.observation_dim(n) + n + extra
+        """Return the length of x = [o_t | a_t | the simulator's answers | recorded state] (nn/observation.py)."""
+        inputs = self.observation_dim(n) + n + self.real_state_dim(n)
+        if self.needs_simulator:
+            inputs += self.sensor_dim(n)
+        return inputs

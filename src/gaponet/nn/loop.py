@@ -27,8 +27,8 @@ class DeltaLoop:
 
     Attributes:
         x: Input of the network, (num_envs, dim) float32; `observe` updates it.
-        extra: Returns the columns of x after [o_t | a_t], (num_envs, k): the simulator's answers, then real_state's
-            2n + 1 numbers (nn/observation.py). Missing columns stay zero; all do if extra is None.
+        extra: Returns the columns of x after [o_t | a_t], (num_envs, k): the simulator's answers, then the recorded
+            state's 2n + 1 numbers (nn/observation.py). Missing columns stay zero; all do if extra is None.
         held: The correction that is held, (num_envs, n) rad, or (n,) for one robot.
         age: Control periods since the start, (num_envs,).
         fresh: Robots without a history, (num_envs,).

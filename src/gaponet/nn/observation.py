@@ -4,7 +4,7 @@ o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q�
 [s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
 
 x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more columns: with fixed probes
-S_t, then with real_state [ q_real − q | q̇_real − q̇ | 1 ], which are all zero where the recorded state is hidden.
+S_t, then, if it observes the recorded state, [ q_real − q | q̇_real − q̇ | 1 ], all zero where that state is hidden.
 """
 
 from __future__ import annotations
@@ -29,10 +29,8 @@ class Layout:
     def __init__(self, config: ModelConfig, n: int) -> None:
         self.n, self.history = n, config.history
         o = config.observation_dim(n)
-        answers, real = (
-            config.sensor_dim(n) * config.needs_simulator,
-            (2 * n + 1) * config.real_state,
-        )
+        answers = config.sensor_dim(n) if config.needs_simulator else 0
+        real = config.real_state_dim(n)
         sizes = (n, n, 3 * n * config.history, int(config.payload_input), n, answers, real)
         parts = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
         self.q, self.v, self.past, self.payload, self.action, self.sensors, self.real = parts

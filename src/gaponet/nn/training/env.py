@@ -106,9 +106,9 @@ class DeltaEnv:
     """num_envs simulations; each follows one recording from a random row on.
 
     Observation groups: "actor" is x = [o_t | a_t]. "critic" has the recorded state, recorded positions and commands
-    ahead, payload and rate. The actor observes the recorded state only with model.real_state, and then in a random
-    half of the episodes. An environment never changes its payload, rate and gains. The end of a recording is a
-    time-out, not a failure.
+    ahead, payload and rate. The actor observes the recorded state only with model.real_state or equation 1 as written
+    (model.predictor_inputs), and then in a random half of the episodes. An environment never changes its payload, rate
+    and gains. The end of a recording is a time-out, not a failure.
 
     Arrays are numpy's on device "cpu", where C MuJoCo steps. Elsewhere they are tensors on the device, and
     mujoco_warp steps (sim/warp.py).
@@ -194,7 +194,7 @@ class DeltaEnv:
                     f"--model.sensor-source fixed asks C MuJoCo: use --device cpu, not {device}"
                 )
             self.oracle = ProbeOracle(robot, config, conditions, nthread, rows.locked)
-        if config.needs_simulator or config.real_state:
+        if config.needs_simulator or config.observes_real_state:
             self.loop.extra = self._extra_inputs
         max_delay_periods = int(np.ceil(sim.robot.delay.max() / min(c[2] for c in rows.conditions)))
         self.depth = max(
@@ -217,7 +217,7 @@ class DeltaEnv:
             last,
             self.track[t],
         )
-        if self.config.real_state:
+        if self.config.observes_real_state:
             visible = (self.rng.random((len(group), 1)) < 0.5).astype(np.float32)
             self.real_state_visible[ids] = self.sim.array(visible)
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
@@ -251,7 +251,7 @@ class DeltaEnv:
         sim, concatenate, parts = self.sim, array_module(self.recorded).concatenate, []
         if self.config.needs_simulator:
             parts.append(self.oracle(sim.qpos, sim.qvel).reshape(self.num_envs, -1))
-        if self.config.real_state:
+        if self.config.observes_real_state:
             state = concatenate([sim.qpos[:, self.operated], sim.qvel[:, self.operated]], 1)
             difference = self.recorded[:, : 2 * self.num_actions] - state
             parts.append(
@@ -328,7 +328,7 @@ class DeltaEnv:
             "frames": self.loop.history.frames
         }
         arrays |= self.sim.state()
-        arrays |= {"shown": self.real_state_visible} if self.config.real_state else {}
+        arrays |= {"shown": self.real_state_visible} if self.config.observes_real_state else {}
         arrays |= {"age": self.loop.age, "x": self.loop.x} if self.loop.holds else {}
         return {
             "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
@@ -349,7 +349,7 @@ class DeltaEnv:
         self.loop.history.frames[:] = array_like(self.loop.history.frames, arrays["frames"])
         for name in ("age", "x") if self.loop.holds else ():
             getattr(self.loop, name)[:] = array_like(getattr(self.loop, name), arrays[name])
-        if self.config.real_state:
+        if self.config.observes_real_state:
             self.real_state_visible[:] = array_like(self.real_state_visible, arrays["shown"])
         self.sim.set_state(arrays)
         self.reward_sum, self.reward_count = state["reward"]

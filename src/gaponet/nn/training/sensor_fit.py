@@ -73,8 +73,9 @@ def _probe(
 ) -> tuple[Tensor, Tensor]:
     """Probe the simulator at recorded start states, or on `refit` at the environment's present states.
 
-    A third of the states stays there. A third is moved by noise. A third is moved to a random posture within the joint
-    limits, with history and action. So the predictor also learns gravity and inertia where no motion was recorded.
+    A third of the states stays there. A third is moved by noise, away from its recorded state. A third is moved to a
+    random posture within the joint limits, with history, action and recorded state. So the predictor also learns
+    gravity and inertia where no motion was recorded.
 
     Returns:
         Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm), or (k, 2n) for learned probes: each is
@@ -106,8 +107,16 @@ def _probe(
     rng = np.random.default_rng(seed)
     n, layout, op = net.n, net.features.layout, oracle.operated
     near, far = np.flatnonzero(origin == NEAR), np.flatnonzero(origin == RANDOM)
-    q[np.ix_(near, op)] += rng.normal(0, POSITION_NOISE_RAD, (len(near), n))
-    v[np.ix_(near, op)] += rng.normal(0, VELOCITY_NOISE_RAD_S, (len(near), n))
+    position_noise = rng.normal(0, POSITION_NOISE_RAD, (len(near), n))
+    velocity_noise = rng.normal(0, VELOCITY_NOISE_RAD_S, (len(near), n))
+    q[np.ix_(near, op)] += position_noise
+    v[np.ix_(near, op)] += velocity_noise
+    if net.config.observes_real_state:
+        # These columns are relative to q and v. They stay zero where the recorded state is hidden.
+        real = x[near, layout.real]
+        visible = real[:, -1:]
+        real[:, :-1] -= visible * np.hstack([position_noise, velocity_noise])
+        x[near, layout.real] = real
     x[:, layout.q], x[:, layout.v] = q[:, op], v[:, op]
     low, high = np.clip(env.robot.qpos_range[env.robot.operated_index].T, -np.pi, np.pi)
     shift = rng.uniform(low, high, (len(far), n)) - q[np.ix_(far, op)]
