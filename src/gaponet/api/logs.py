@@ -171,7 +171,7 @@ def collect(
         out: Dataset folder.
         robot: A robot of the package, or a folder with robot.toml.
         fleet: Virtual units: hard, easy, shifted, unnamed, firm (hard at nine times the gains), or a .toml file.
-        recipe: demo (under a minute), small (about two), simlifter (30 h: a quarter of an hour), arm (any robot), or a
+        recipe: demo (under a minute), small (about two), simlifter (30 h: 48 min on one core), arm (any robot), or a
             .toml file.
         payloads: kg per hand instead of the recipe's.
         units: Units of the fleet instead of the recipe's.
