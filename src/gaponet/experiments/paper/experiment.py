@@ -18,6 +18,7 @@ from gaponet.base.errors import ModelError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Running
 from gaponet.base.result_table import ResultTable
+from gaponet.data.paper_counts import count_as_paper, table_beside_paper
 from gaponet.data.store import Dataset
 from gaponet.experiments.paper.claims import Claim, claim_table, claims
 from gaponet.experiments.paper.figure3 import draw_figure_3, figure_3_table
@@ -179,7 +180,8 @@ def _figure_2(study: Study) -> Section:
     from gaponet.report.figures.dataset_figures import draw_figures
 
     figures, _ = draw_figures(study.data, study.robot)
-    return Section("Figure 2", "The recordings", figures=figures)
+    counts = table_beside_paper(count_as_paper(study.data))
+    return Section("Figure 2", "The recordings", figures=figures, tables=[counts])
 
 
 def _figure_3(results: Results) -> list[Section]:
