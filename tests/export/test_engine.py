@@ -448,7 +448,15 @@ def test_every_kind_of_network_ships(tmp_path, kind):
     assert export_model(model, tmp_path / "run", tmp_path / "torch") <= 1e-5
 
 
-@pytest.mark.parametrize("how", [{"delta_hold": 2}, {"real_state": True}])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"delta_hold": 2},
+        {"real_state": True},
+        {"predictor_inputs": "equation_1"},
+        {"sensor_source": "fixed"},
+    ],
+)
 def test_a_model_with_inputs_or_memory_that_a_program_lacks_is_refused(tmp_path, how):
     model = SimpleNamespace(config=ModelConfig(kind="paper", **how), path=tmp_path)
     with pytest.raises(ModelError, match="train without"):

@@ -21,6 +21,7 @@ LIMITS = np.array([[-10.0, 10.0]] * 2)
         ModelConfig(),
         ModelConfig(payload_input=False),
         ModelConfig(kind="paper", sensor_source="fixed", real_state=True),
+        ModelConfig(kind="paper", predictor_inputs="equation_1"),
     ],
 )
 def test_the_parts_of_x_touch_and_fill_it(config):

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,11 @@ from arm import recordings, write_arm, write_dataset
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.cli.main import main
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.config import ModelConfig
-from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.config import PAPER_ONLY, ModelConfig
+from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.networks import build_network
-from gaponet.nn.onnx_export import export, sample_inputs
+from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, export, onnx_content, sample_inputs
+from gaponet.nn.onnx_network import OnnxNetwork
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.config import (
     Budget,
@@ -26,12 +28,13 @@ from gaponet.nn.training.config import (
 )
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO
-from gaponet.nn.training.sensor_fit import fit_inputs
+from gaponet.nn.training.sensor_fit import _probe, fit_inputs
 from gaponet.nn.training.trainer import Trainer
 from gaponet.report.evaluate import evaluate
 from gaponet.sim.replay import replay
 
 PAPER = ModelConfig(kind="paper", num_probes=4, history=2)
+EQUATION_1 = replace(PAPER, predictor_inputs="equation_1")
 
 
 def network(config=PAPER, n=2):
@@ -214,6 +217,156 @@ def test_options_add_the_observation_to_the_branch_and_the_lag_to_the_trunk():
     assert net.branch[0].in_features == net.config.observation_dim(2) + 16
 
 
+def test_without_sensors_the_branch_sees_what_the_predictor_would_see():
+    net, with_sensors = network(replace(PAPER, sensor_source="none")), network()
+    x = torch.randn(5, PAPER.input_dim(2))
+    seen = net.prepare(x)[:, net.queries :]
+    assert torch.equal(seen, with_sensors.sensor_inputs(x))
+    assert net.predictor is None
+    assert net.branch[0].in_features == PAPER.observation_dim(2)
+
+
+def test_without_sensors_nothing_is_sampled():
+    net = network(replace(PAPER, sensor_source="none"))
+    x = torch.randn(5, PAPER.input_dim(2))
+    assert torch.equal(net.train()(x), net(x))
+
+
+def test_equation_1_has_all_inputs_of_the_paper():
+    net = build_network(ModelConfig(kind="paper", predictor_inputs="equation_1"), 10)
+    state_with_history_and_payload = 141
+    target, recorded_state, joint_index = 10, 2 * 10 + 1, 10
+    inputs = state_with_history_and_payload + target + recorded_state + joint_index
+    assert net.predictor.net[0].in_features == inputs
+    mean_and_variance_of_one_joint = 2 * (20 * 2)
+    assert net.predictor.net[-1].out_features == mean_and_variance_of_one_joint
+
+
+def test_in_equation_1_each_joint_s_sensor_values_are_one_network_s_answer_to_its_index():
+    net, x = network(EQUATION_1), torch.randn(9, EQUATION_1.input_dim(2))
+    z = net.sensor_inputs(x)
+    mean, log_var = net.predictor(z)
+    by_probe = mean.reshape(9, 4, 2, 2)  # (B, m, positions and velocities, n)
+    for joint, index in enumerate(torch.eye(2)):
+        answer = net.predictor.net(torch.cat([z, index.expand(9, 2)], dim=1))
+        assert torch.allclose(by_probe[..., joint].flatten(1), answer[:, :8], atol=1e-5)
+        spread = log_var.reshape(9, 8, 2)[..., joint]
+        assert torch.allclose(spread, answer[:, 8:], atol=1e-5)
+    assert torch.allclose(net.predictor.mean(z), mean, atol=1e-5)
+
+
+@pytest.mark.parametrize("part", ["action", "payload", "real"])
+def test_in_equation_1_the_sensor_values_depend_on_target_payload_and_recorded_state(part):
+    net, x = network(EQUATION_1), torch.randn(5, EQUATION_1.input_dim(2))
+    moved = x.clone()
+    moved[:, getattr(net.features.layout, part)] += 1.0
+    before, after = (net.prepare(inputs)[:, net.queries :] for inputs in (x, moved))
+    assert not torch.allclose(before, after, atol=1e-4)
+
+
+@pytest.mark.parametrize("config", [replace(PAPER, real_state=True), EQUATION_1])
+def test_a_rollout_never_observes_the_recorded_state(tmp_path, config):
+    robot, seen = write_arm(tmp_path), []
+
+    def remember(x):
+        seen.append(x.copy())
+        return np.zeros((len(x), 2), np.float32)
+
+    replay(recordings(robot, 1, rows=20), robot, DeltaCorrector(remember, config, robot), nthread=1)
+    recorded_state = np.array(seen)[..., -5:]
+    assert not recorded_state.any()
+
+
+def test_on_a_robot_the_measured_state_reaches_the_predictor_of_equation_1(tmp_path):
+    net, robot = network(EQUATION_1), write_arm(tmp_path / "arm")
+    export(net, tmp_path / "run", make_card(EQUATION_1, robot, dt=[0.02]), sample_inputs(net))
+    hidden, measured = (GapModel.load(tmp_path / "run").loop() for _ in range(2))
+    measured.extra = lambda: np.array([[0.05, -0.05, 0.1, 0.1, 1.0]])
+    state = np.full((3, 2), 0.1)
+    assert np.abs(measured.delta(*state, 0.0) - hidden.delta(*state, 0.0)).max() > 1e-4
+
+
+def test_the_fit_moves_a_simulated_state_away_from_its_recorded_state(tmp_path):
+    robot = write_arm(tmp_path)
+    motions = recordings(robot, 2, rows=60, kp=0.5)
+    env = DeltaEnv(motions, robot, EQUATION_1, 64, 1000, RewardConfig(), nthread=1)
+    net = build_network(EQUATION_1, 2)
+    inputs, _ = _probe(net, env, 64, 0, 1, False)
+    *_, visible = inputs.T
+    shown = inputs[visible == 1]
+    simulated = shown[:, net.features.layout.v]
+    recorded = simulated + 0.3 * shown[:, -3:-1]  # rad/s, in units of 0.3 rad/s
+    measured = torch.from_numpy(np.concatenate([motion.qvel for motion in motions])).float()
+    nearest = torch.cdist(recorded, measured).amin(1)
+    assert len(shown) > 10
+    assert nearest.max() < 1e-3  # the noise has 0.3 rad/s
+
+
+def test_the_predictor_of_equation_1_is_fitted_and_ppo_does_not_train_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 300)
+    robot = write_arm(tmp_path)
+    motions = recordings(robot, 2, rows=60, kp=0.5)
+    env = DeltaEnv(motions, robot, EQUATION_1, 64, 1000, RewardConfig(), nthread=1)
+    net = network(EQUATION_1)
+    branch, learner = net.branch[0].weight.clone(), PPO(env, net, TRAINING.ppo)
+    assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
+    fitted = copy.deepcopy(net.predictor.state_dict())
+    learner.update()
+    assert not torch.equal(net.branch[0].weight, branch)
+    assert all(torch.equal(x, fitted[name]) for name, x in net.predictor.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("how", "word"),
+    [({"sensor_source": "none", "sensor_hold": 3}, "no sensor values to hold"),
+     ({"sensor_source": "none", "sensor_target": "absolute"}, "no sensor values"),
+     ({"predictor_inputs": "equation_1", "sensor_hold": 3}, "cannot be held"),
+     ({"predictor_inputs": "equation_1", "payload_input": False}, "leave payload_input on"),
+     ({"predictor_inputs": "equation_1", "sensor_source": "none"}, "use sensor_source predicted"),
+     ({"predictor_inputs": "equation_1", "sensor_source": "fixed"}, "use sensor_source predicted"),
+     ({"predictor_inputs": "equation_1", "sensor_source": "learned"}, "use sensor_source predicted")],
+)  # fmt: skip
+def test_switches_that_contradict_each_other_are_refused(how, word):
+    with pytest.raises(UsageError, match=word):
+        replace(PAPER, **how)
+
+
+NETWORK_SWITCHES = {
+    "sensor_source": ("predicted", "fixed", "learned", "none"),
+    "predictor_inputs": ("observation", "equation_1"),
+    "payload_input": (True, False),
+    "payload_trunk": (True, False),
+    "branch_observation": (True, False),
+    "relative_action": (True, False),
+    "real_state": (True, False),
+}
+OTHER_SWITCHES = {"delta_hold", "sensor_hold", "sensor_target"}  # they do not change the network
+
+
+def test_every_switch_of_the_paper_is_among_the_combinations():
+    assert NETWORK_SWITCHES.keys() | OTHER_SWITCHES == {*PAPER_ONLY, "payload_input"}
+
+
+@pytest.mark.parametrize("values", list(product(*NETWORK_SWITCHES.values())), ids=str)
+def test_every_combination_of_switches_ships_or_is_refused(values):
+    how = dict(zip(NETWORK_SWITCHES, values, strict=True))
+    lacks_inputs = how["sensor_source"] != "predicted" or not how["payload_input"]
+    if how["predictor_inputs"] == "equation_1" and lacks_inputs:
+        with pytest.raises(UsageError, match="predictor_inputs equation_1 with"):
+            replace(PAPER, **how)
+        return
+    net = network(replace(PAPER, **how))
+    x = torch.randn(5, net.config.input_dim(2))
+    with torch.inference_mode():
+        sampled = net.train()(x)
+        expected = net.eval()(x).numpy()
+    assert sampled.shape == (5, 2)
+    assert torch.isfinite(sampled).all()
+    assert np.abs(expected).max() > 1e-4
+    shipped = OnnxNetwork(onnx_content(net))(x.numpy())
+    np.testing.assert_allclose(shipped, expected, atol=MAX_DIFFERENCE_RAD)
+
+
 def test_a_hidden_recorded_state_has_no_effect_and_a_visible_one_has():
     net, plain = network(replace(PAPER, real_state=True)), network()
     state = net.state_dict()
@@ -225,8 +378,9 @@ def test_a_hidden_recorded_state_has_no_effect_and_a_visible_one_has():
     assert not torch.allclose(net(known), net(hidden), atol=1e-4)
 
 
-def test_half_of_the_episodes_show_the_recorded_state(tmp_path):
-    config, robot = replace(PAPER, real_state=True), write_arm(tmp_path)
+@pytest.mark.parametrize("config", [replace(PAPER, real_state=True), EQUATION_1])
+def test_half_of_the_episodes_show_the_recorded_state(tmp_path, config):
+    robot = write_arm(tmp_path)
     env = DeltaEnv(
         recordings(robot, 2, rows=30), robot, config, 200, 1000, RewardConfig(), nthread=1
     )
@@ -263,6 +417,7 @@ def test_other_networks_refuse_the_paper_s_switches():
         {"branch_observation": True},
         {"relative_action": True},
         {"real_state": True},
+        {"predictor_inputs": "equation_1"},
     ):
         with pytest.raises(UsageError, match="use --model paper"):
             build_network(ModelConfig(**how), 2)
@@ -295,8 +450,8 @@ def world(tmp_path_factory):
 @pytest.mark.parametrize(
     "how",
     [{"delta_hold": 3, "branch_observation": True, "real_state": True}, {"sensor_source": "fixed", "sensor_hold": 3},
-     {"sensor_source": "learned"}],
-    ids=["held correction and more inputs", "held fixed probes", "learned probes"],
+     {"sensor_source": "learned"}, {"sensor_source": "none"}, {"predictor_inputs": "equation_1"}],
+    ids=["held correction and more inputs", "held fixed probes", "learned probes", "no sensors", "equation 1"],
 )  # fmt: skip
 def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(
     world, tmp_path, how

@@ -90,6 +90,11 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
         raise ModelError(
             f"{model.path}: holds corrections or sensors, which torch exports do not; train without"
         )
+    if model.config.needs_simulator:
+        raise ModelError(
+            f"{model.path}: the simulator's answers are an input that torch exports lack; "
+            "train without sensor_source fixed"
+        )
     if model.config.observes_real_state:
         raise ModelError(
             f"{model.path}: the recorded state is an input that torch exports lack; train without real_state, and "

@@ -37,7 +37,8 @@ Three switches add inputs that the paper's branch and trunk do not have. `branch
 its history, relative to q, to the branch. `relative_action` gives A − q instead of A to the trunk. `real_state` adds
 Q_real − Q and V_real − V to the branch. The critic of PPO always observes the recorded state (nn/training/env.py).
 
-Δ_max is a safety limit: exact clipping in evaluation and export. Training reports the share of corrections at the limit.
+Δ_max is a safety limit: exact clipping in evaluation and export. Training reports how many corrections are at
+the limit.
 """
 
 from __future__ import annotations
