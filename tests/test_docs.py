@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import gaponet as gp
-from gaponet.experiments.study import TRAINING
+from gaponet.experiments.paper.options import PaperOptions
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import TrainConfig
 from gaponet.nn.training.validation import GAINS
@@ -20,7 +20,7 @@ SOURCE = ROOT / "src" / "gaponet"
 FOLDERS = sorted(p.name for p in SOURCE.iterdir() if p.is_dir() and any(p.glob("*.py")))
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 ALL_PAGES = sorted((ROOT / "docs").glob("**/*.md"))
-MODEL, TRAIN, START = ModelConfig(), TrainConfig(), TRAINING.pretraining
+MODEL, TRAIN = ModelConfig(), TrainConfig()
 ONLINE = (
     "https://github.com/gaponet/gaponet/blob/main/",
     "https://raw.githubusercontent.com/gaponet/gaponet/main/",
@@ -49,7 +49,7 @@ def widths(layers: tuple[int, ...]) -> str:
         ("network.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
         ("reference/paper-network.md", f"own answers at {TRAIN.pretraining.sensor_states} states"),
         ("identification.md", f"an error of {PRIOR_RAD} rad"),
-        ("paper.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
+        ("paper.md", f"{PaperOptions().steps:,} control steps"),
     ],
 )  # fmt: skip
 def test_a_default_that_a_page_states_is_that_of_the_code(page, said):

@@ -66,7 +66,7 @@ def test_an_unknown_executor_is_refused_with_the_alternatives(where):
 
 
 def test_ray_is_imported_on_request_and_a_missing_ray_is_named(tmp_path, capsys, monkeypatch):
-    code = "import sys, gaponet.base.executor, gaponet.experiments.outcomes; print('ray' in sys.modules)"
+    code = "import sys, gaponet.base.executor, gaponet.experiments.paper.jobs; print('ray' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "False\n"
     monkeypatch.setitem(sys.modules, "ray", None)

@@ -114,8 +114,7 @@ def test_the_next_writer_removes_unfinished_files_of_a_killed_one(tmp_path):
     ("kind", "file"),
     [
         ("dataset", "dataset.json"),
-        ("experiments", "cells/a/setup.json"),
-        ("experiments", "without-b/cells/a/setup.json"),
+        ("model", "card.json"),
     ],
 )
 def test_a_folder_of_an_older_version_is_recognised_by_its_files(tmp_path, kind, file):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.experiments.virtual.goals import GoalPlanner
+from gaponet.experiments.paper.goals import GoalPlanner
 from gaponet.robot.spec import load_robot
 from gaponet.testing.fleet import FLEETS, load_fleet
 from gaponet.testing.physics import Physics, neutral

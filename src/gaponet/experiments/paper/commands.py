@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,8 @@ WAY_TITLES = {
 PLAIN_TITLES = {**WAY_TITLES, "integral": "feed-forward and slow integral"}
 
 START_WARMING_K = 12.0  # above ambient: a robot that has been working
+
+MIN_PAYLOAD_KG = 1e-3  # a compensator needs a largest payload above zero
 
 ShareDone = Callable[[float], None]
 
@@ -112,10 +114,14 @@ def play(
 
 
 def make_compensator(
-    robot: RobotSpec, model: GapModel | None, config: CompensatorConfig, count: int
+    robot: RobotSpec, model: GapModel | None, config: CompensatorConfig, payloads: ListOf[float]
 ) -> Compensator:
-    """Return a compensator for `count` robots that knows their payloads."""
-    return Compensator(robot, model, config, num_envs=count, nthread=1, extrapolate=True)
+    """Return a compensator for one robot for each payload, which knows it.
+
+    With and without a network, its simulators carry the same masses.
+    """
+    config = replace(config, payload_max=max(*payloads, MIN_PAYLOAD_KG))
+    return Compensator(robot, model, config, num_envs=len(payloads), nthread=1)
 
 
 def _padded(target: Array, rows: int) -> Array:

@@ -12,11 +12,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, ModelError
 from gaponet.base.executor import open_pool
-from gaponet.base.files import lock_folder, write_json
+from gaponet.base.files import atomic_write, lock_folder, write_json
 from gaponet.base.progress import Running
 from gaponet.base.structure import read_json
+from gaponet.experiments.paper.commands import ShareDone
 from gaponet.experiments.paper.measure import (
     Delivery,
     Measurement,
@@ -28,10 +32,14 @@ from gaponet.experiments.paper.measure import (
 from gaponet.experiments.paper.study import SETUP_HINT, Study
 from gaponet.experiments.paper.trainings import Training
 from gaponet.nn.artifact import GapModel
+from gaponet.nn.delay_offset import DelayOffset
+from gaponet.nn.training.config import TrainConfig
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 
 BASELINES_FILE, RESULT_FILE = "baselines.json", "result.json"
+DELAY_OFFSET_FILE, LABELS_FILE = "delay_offset.json", "labels.npy"
+LABEL_SHARE_OF_BOUND = 0.99  # largest label, as a share of the largest correction
 STOP_FILE = (
     "stop"  # exists while the experiment is to end: running trainings store a checkpoint and end
 )
@@ -39,6 +47,48 @@ LOCK_TIMEOUT_S = 60.0  # trainings of an experiment that was killed end within t
 QUICK_IDENTIFY_WINDOWS = 2
 
 Show = Callable[[Running, int], None]
+
+
+@dataclass(frozen=True)
+class SharedInputs:
+    """What all trainings at the slowest rate have in common: made once, because it takes as long as a training.
+
+    Attributes:
+        delay_offset: Delay and offset of the training recordings, a baseline of every run.
+        labels: Δa of each labelled row, (rows, n) rad.
+    """
+
+    delay_offset: DelayOffset
+    labels: Array
+
+    @classmethod
+    def make(cls, study: Study, config: TrainConfig, progress: ShareDone) -> None:
+        """Make and store what is missing in OUT, for trainings with this configuration."""
+        from gaponet.nn.training.pretraining import ITERATIONS, trajectory_labels
+        from gaponet.nn.training.run_folder import TrainingData
+
+        labels_file = study.out / LABELS_FILE
+        if labels_file.is_file():
+            return
+        data = TrainingData(study.data, study.robot, config, study.holdout_units)
+        write_json(study.out / DELAY_OFFSET_FILE, DelayOffset.fit(data.train, study.robot, 0))
+        iterations = 0
+
+        def tick() -> None:
+            nonlocal iterations
+            iterations += 1
+            progress(iterations / (ITERATIONS + 2))
+
+        sequences = data.labelled_subset(config.pretraining.rows)
+        largest = LABEL_SHARE_OF_BOUND * config.model.delta_max
+        labels = trajectory_labels(sequences, study.robot, largest, 0, tick)
+        with atomic_write(labels_file) as temporary, temporary.open("wb") as file:
+            np.save(file, labels)
+
+    @classmethod
+    def read(cls, study: Study) -> SharedInputs:
+        """Read them."""
+        return cls(DelayOffset.read(study.out), np.load(study.out / LABELS_FILE))
 
 
 @dataclass(frozen=True)
@@ -216,6 +266,10 @@ def train(job: Job, training: Training) -> dict[str, Any]:
             ending = True  # once: the trainer then stores what it has
             raise KeyboardInterrupt
 
+    shared: dict[str, Any] = {}
+    if training.config.rates == study.rates[:1]:
+        inputs = SharedInputs.read(study)
+        shared = {"baseline": (inputs.delay_offset, 0.0), "labels": (inputs.labels, 0.0)}
     began = time.process_time()
     with lock_folder(job.run_folder, "run", wait=LOCK_TIMEOUT_S):
         trainer = Trainer(
@@ -227,6 +281,7 @@ def train(job: Job, training: Training) -> dict[str, Any]:
             resume=(job.run_folder / "checkpoint.pt").is_file(),
             holdout_units=study.holdout_units,
             show=end_if_asked,
+            shared=shared,
         )
         trainer.run()
     if trainer.interrupted:

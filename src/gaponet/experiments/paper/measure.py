@@ -162,7 +162,7 @@ def measure_commands(
     for way, config in ways.items():
         compensator = None
         if config is not None:
-            compensator = make_compensator(simulator or unit.robot, model, config, len(targets))
+            compensator = make_compensator(simulator or unit.robot, model, config, payloads)
         played = play(unit.robot, unit.physics, targets, payloads, unit.dt, compensator)
         q_dis = []
         for i, target in enumerate(targets):
@@ -206,7 +206,7 @@ def measure_delivery(
     for way, config in ways.items():
         compensator = None
         if config is not None:
-            compensator = make_compensator(unit.robot, model, config, len(runs))
+            compensator = make_compensator(unit.robot, model, config, payloads)
         played = play(unit.robot, unit.physics, targets, payloads, unit.dt, compensator)
         offsets: dict[float, list[list[float]]] = {payload: [] for payload in unit.payloads}
         near: dict[float, list[bool]] = {payload: [] for payload in unit.payloads}

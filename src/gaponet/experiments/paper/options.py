@@ -43,4 +43,4 @@ class PaperOptions:
 
     def for_quick_run(self) -> PaperOptions:
         """Return the options of a quick run."""
-        return replace(self, seeds=1, steps=1_500, motions=2, goals=4)
+        return replace(self, seeds=1, steps=1_500, motions=1, goals=4)

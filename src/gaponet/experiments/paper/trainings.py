@@ -55,7 +55,7 @@ QUICK_PRETRAINING = PretrainingConfig(
 QUICK_PPO = PPOConfig(
     num_envs=16, num_steps=16, epochs=1, mini_batches=1, critic_warmup=1, explained=-1e9
 )
-QUICK_STEPS = 1_500
+QUICK_NO_VALIDATION = 1_000  # updates between validations: only the last one counts
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,9 @@ def _recipe(config: TrainConfig, block: Block, budget: Budget) -> TrainConfig:
     """Return the settings with the training of a block."""
     config = replace(config, threads=1, pretraining=PRETRAINING)
     if budget.quick:
-        config = replace(config, pretraining=QUICK_PRETRAINING, ppo=QUICK_PPO, validate_every=2)
+        config = replace(
+            config, pretraining=QUICK_PRETRAINING, ppo=QUICK_PPO, validate_every=QUICK_NO_VALIDATION
+        )
     return config.paper_recipe() if block == "ppo" else config
 
 
