@@ -49,5 +49,3 @@ def wild_model(folder: Path, robot: RobotSpec, answer: float) -> GapModel:
     (folder / "model" / "card.json").write_text(json.dumps(card))
     save_robot(robot, folder / "robot")
     return GapModel.load(folder)
-
-

@@ -172,8 +172,8 @@ class GapModel:
             threads: Threads of onnxruntime; 0 for all cores, which is faster for hundreds of robots at once.
 
         Raises:
-            ModelError: A file is missing, damaged, or from a newer version; or the card contradicts the network: shapes,
-                joints, gains, ranges, rate, payload, largest correction.
+            ModelError: A file is missing, damaged, or from a newer version; or the card contradicts the network in
+                shapes, joints, gains, ranges, rate, payload or largest correction.
         """
         folder = Path(path)
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder

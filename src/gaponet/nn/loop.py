@@ -154,8 +154,8 @@ class DeltaLoop:
             payload_mass: kg, one number or (num_envs,).
 
         Returns:
-            Δa, shape of ctrl, rad. It is within ±delta_max of the model, and ctrl + Δa is within the joint limits. Where
-            the network's answer is not finite, it is zero.
+            Δa, shape of ctrl, rad. It is within ±delta_max of the model, and ctrl + Δa is within the joint limits.
+            Where the network's answer is not finite, it is zero.
 
         Raises:
             UsageError: Arrays have another shape.
