@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import warnings
 from pathlib import Path
 
 import torch
@@ -38,11 +39,13 @@ def wild_model(folder: Path, robot: RobotSpec, answer: float) -> GapModel:
     config = ModelConfig(history=2, num_probes=2)
     joints = len(robot.operated)
     content = io.BytesIO()
-    torch.onnx.export(
-        WildNetwork(joints, answer), (torch.zeros(2, config.input_dim(joints)),), content,
-        input_names=["x"], output_names=["delta"], dynamo=False,
-        dynamic_axes={"x": {0: "batch"}, "delta": {0: "batch"}},
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            WildNetwork(joints, answer), (torch.zeros(2, config.input_dim(joints)),), content,
+            input_names=["x"], output_names=["delta"], dynamo=False,
+            dynamic_axes={"x": {0: "batch"}, "delta": {0: "batch"}},
+        )  # fmt: skip
     (folder / "model").mkdir(parents=True)
     (folder / "model" / "model.onnx").write_bytes(content.getvalue())
     card = make_card(config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2])

@@ -15,12 +15,14 @@ from wild_model import wild_model
 
 import gaponet as gp
 from gaponet.api.run_report import SilentReporter, describe_plan
+from gaponet.api.run_robot import Compensation
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.hardware import hardware_robot, reference_robot
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.plan import Planner
+from gaponet.hw.control.recording import Recording
 from gaponet.hw.drivers.open import open_driver
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
@@ -146,6 +148,28 @@ def test_a_network_that_fails_on_the_planned_motion_moves_nothing(arm, tmp_path)
         gp.run_robot(
             motion=Motion("far", "joint", 0.02, far), options=options, report=SilentReporter()
         )
+
+
+class Notes(SilentReporter):
+    """Keeps the sentences of a run."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+
+@pytest.mark.filterwarnings("ignore:the network's answer:RuntimeWarning")
+def test_a_network_that_fails_while_the_robot_moves_is_noted_and_recorded(arm, tmp_path):
+    compensator = gp.Compensator(arm, wild_model(tmp_path / "run", arm, np.nan))
+    compensator.reset(np.array([1.2, 0.0]), 0.0)
+    compensator.step(np.array([1.2, 0.0]), None)
+    recording = Recording(arm.name, True, arm.joint_names, arm.joint_names, 0.02)
+    reporter = Notes()
+    Compensation(compensator).note_failures(recording, reporter)
+    assert recording.summary()["refused_answers"] > 0
+    assert "not finite" in reporter.notes[0]
 
 
 # ---- consent
