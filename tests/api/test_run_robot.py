@@ -23,6 +23,7 @@ from gaponet.hw.control.hardware import hardware_robot, reference_robot
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.plan import Planner
 from gaponet.hw.control.recording import Recording
+from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.drivers.open import open_driver
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
@@ -199,6 +200,21 @@ def test_a_consent_other_than_true_writes_to_no_servo(answer, bus, nobody, tmp_p
         )  # fmt: skip
     assert "will move as planned" in statements[0]
     assert not any(request[4] in WRITES for request in servos.heard)
+
+
+def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
+    port, servos = bus
+    (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
+    options = gp.RunOptions(
+        connection=gp.Connection(port=port),
+        control=ControlConfig(rate=4.0, damp=0.3),
+        safety=SafetyConfig(acceleration=2.0),
+    )
+    result = gp.run_robot(
+        motion=tmp_path / "first.csv", driver="so101", options=options, consent=lambda text: True
+    )
+    assert any(request[4] in WRITES for request in servos.heard)
+    assert not result.recording.virtual
 
 
 def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):

@@ -70,5 +70,5 @@ def first_message(error: gp.GAPONetError) -> str:
 absent = gp.no_such_name  # type: ignore[attr-defined]
 gp.gap(data, robot)  # type: ignore[call-arg]
 gp.gap(data, motion="wave")  # type: ignore[call-arg]
-gp.run_robot(robot, "sweep-elbow_flex")  # type: ignore[misc]
+gp.run_robot(robot, "sweep-elbow_flex")  # type: ignore[call-arg]
 gp.run_robot(robot, consent=True)  # type: ignore[arg-type]

@@ -178,8 +178,9 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
         compensation.require_gains(connected)
         if motion is not None:
             plan = planner.plan(motion, connected.read().qpos)
-            controller.plan = compensation.judge(planner, plan, options.payload_mass)
-            report.plan(describe_plan(controller.plan, robot, connected, limits.max_payload))
+            plan = compensation.judge(planner, plan, options.payload_mass)
+            report.plan(describe_plan(plan, robot, connected, limits.max_payload))
+            controller.plan = plan
         how = "as planned" if motion is not None else f"as {options.targets} says"
         permission.require_motion(connected, how)
 

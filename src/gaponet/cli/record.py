@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +13,7 @@ from gaponet.api.run_robot import RunRequest, execute, resolve_robot
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
-from gaponet.cli.run import ControlArgs, ScreenReporter, options_of, show_result
+from gaponet.cli.run import ControlArgs, ScreenReporter, show_result
 
 
 @writes("dataset")
@@ -58,9 +58,8 @@ def record(
                 f"--unit-id {unit_id}: a virtual robot is chosen by --unit {args.connection.unit}"
             )
         unit_id = args.connection.unit_name
-    options = RunOptions(
-        **options_of(args, ControlOptions), payload_mass=payload_mass, out=out / "recordings"
-    )
+    shared = {field.name: getattr(args, field.name) for field in fields(ControlOptions)}
+    options = RunOptions(**shared, payload_mass=payload_mass, out=out / "recordings")
     first = RunRequest(args.robot, motion[0], args.driver, options=options)
     spec = resolve_robot(first)
     known = Dataset.open_existing(out, spec)

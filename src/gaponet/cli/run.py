@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -75,7 +75,7 @@ def run(
             motion=motion,
             driver=args.driver,
             compensate=args.compensate,
-            options=RunOptions(**options_of(args, RunOptions)),
+            options=args,
             report=ScreenReporter(screen),
         )
     show_result(screen, result)
@@ -84,11 +84,6 @@ def run(
     screen.result(result.to_dict())
     if result.fault or (args.out and result.recording.rows.error):
         sys.exit(3)
-
-
-def options_of(args: ControlOptions, kind: type[ControlOptions]) -> dict[str, object]:
-    """Return the values of arguments that a class of options has, by field."""
-    return {field.name: getattr(args, field.name) for field in fields(kind)}
 
 
 class ScreenReporter:
