@@ -20,6 +20,9 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gaponet.api import *  # noqa: F403
     from gaponet.api.results import *  # noqa: F403
+    from gaponet.api.run_options import Connection as Connection
+    from gaponet.api.run_options import RunOptions as RunOptions
+    from gaponet.api.run_robot import run_robot as run_robot
     from gaponet.base.progress import progress_bar as progress_bar
     from gaponet.data.doctor import DoctorResult as DoctorResult
     from gaponet.data.importer import ImportResult as ImportResult
@@ -46,9 +49,12 @@ else:
         ),
         **dict.fromkeys(
             ("AdaptResult", "CheckResult", "EvalResult", "ExciteResult", "ExportResult", "GapResult",
-             "IdentifyResult", "PairResult", "ReplayResult", "TorqueResult", "TrainResult"),
+             "IdentifyResult", "PairResult", "ReplayResult", "RunResult", "TorqueResult", "TrainResult"),
             "gaponet.api.results",
         ),
+        "run_robot": "gaponet.api.run_robot",
+        "RunOptions": "gaponet.api.run_options",
+        "Connection": "gaponet.api.run_options",
         "progress_bar": "gaponet.base.progress",
         "CollectResult": "gaponet.testing.collect",
         "DoctorResult": "gaponet.data.doctor",

@@ -11,9 +11,9 @@ from arm import TOML, commands, write_arm
 from motion_files import write_motion
 from runs import untrained
 
+from gaponet.api.run_options import Connection, LiveOptions, RunOptions
+from gaponet.api.run_robot import RunRequest, listen
 from gaponet.cli.main import main
-from gaponet.cli.out import Out
-from gaponet.cli.run import Connection, Live, RunArgs, listen
 from gaponet.data.store import Dataset
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.driver import State
@@ -238,14 +238,13 @@ def test_options_that_would_do_nothing_are_refused(arm, motion, tmp_path, capsys
 @pytest.mark.parametrize(("kind", "needs"), [("zmq", "zmq"), ("dds", "cyclonedds")])
 def test_live_targets_are_listened_for_where_it_says(arm, kind, needs, tmp_path):
     pytest.importorskip(needs)
-    asked = RunArgs(
+    options = RunOptions(
         targets=kind,
-        live=Live(address=f"ipc://{tmp_path}/targets"),
+        live=LiveOptions(address=f"ipc://{tmp_path}/targets"),
         connection=Connection(domain=29),
     )
-    targets = listen(
-        Out(False), asked, arm, SimpleNamespace(commanded=arm.joint_names), SimulatedClock()
-    )
+    driver = SimpleNamespace(commanded=arm.joint_names)
+    targets = listen(RunRequest(options=options), arm, driver, SimulatedClock())
     said = targets(0, State(0.0, *np.zeros((4, 2))))
     assert isinstance(said, NotYet)
     assert targets.transport.address in said.text

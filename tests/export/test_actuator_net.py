@@ -61,6 +61,14 @@ def test_the_torque_of_a_late_servo_follows_from_the_past_of_error_and_speed():
     assert net(torch.full((1, 8), 9.0)).item() == 3.0
 
 
+def test_a_network_adds_no_more_torque_than_the_runs_largest_correction():
+    joint = {"kp": 20.0, "kd": 0.0, "delay": 0.0, "offset": 0.0, "effort_limit": 100.0}
+    net = ActuatorNet(joint, 0.005, 4, delta_max=0.3)
+    torch.nn.init.constant_(net.net[-1].bias, 1e6)
+    at_rest = torch.zeros(1, 8)
+    assert net(at_rest).item() == pytest.approx(20.0 * 0.3)
+
+
 def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(run, tmp_path, monkeypatch):
     monkeypatch.setattr(actuator_net, "STEPS", 300)
     assert main(["export", str(run), "--to", "actuator-net", "--out", str(tmp_path)]) == 0

@@ -59,6 +59,28 @@ def test_files_of_two_exports_are_refused_as_one_model(artifact, robot, tmp_path
         GapModel.load(tmp_path / "out")
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"joint_names": ["elbow", "shoulder"]},
+        {"dt": [0.01]},
+        {"payload_seen": [0.0, 50.0]},
+        {"qpos_range": [[-9.0, 9.0], [-9.0, 9.0]]},
+        {"kp": [1.0, 1.0]},
+        {"recorded": {"kp": [1.0, 1.0], "kd": None}},
+        {"model": {"delta_max": 3.0}},
+        {"model": {"payload_max": 50.0}},
+    ],
+)
+def test_a_card_that_contradicts_its_network_is_refused_by_field(copied, changed):
+    card = json.loads((copied / "card.json").read_text())
+    model = card["model"] | changed.get("model", {})
+    (copied / "card.json").write_text(json.dumps(card | changed | {"model": model}))
+    field = next(iter(changed))
+    with pytest.raises(ModelError, match=rf"card\.json: {field} is .* was exported with"):
+        GapModel.load(copied)
+
+
 def test_another_rate_is_refused(artifact, robot):
     model = GapModel.load(artifact[0])
     model.require(robot, 0.02006)  # the clock of a real 50 Hz loop

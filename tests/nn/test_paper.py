@@ -116,14 +116,15 @@ def loop(infer, **how):
 
 def test_a_correction_is_held_for_its_duration_and_restarts_after_a_reset():
     count = iter(range(100))
-    held = loop(lambda x: np.full((2, 2), next(count), np.float32), delta_hold=3)
+    held = loop(lambda x: np.full((2, 2), next(count) / 100, np.float32), delta_hold=3)
     zero = np.zeros((2, 2))
     seen = []
     for t in range(8):
         if t == 4:
             held.reset(np.array([1]))
         seen.append(held.delta(zero, zero, zero, 0.0)[:, 0])
-    assert np.array(seen).T.tolist() == [[0, 0, 0, 3, 3, 3, 6, 6], [0, 0, 0, 3, 4, 4, 4, 7]]
+    answers = np.round(100 * np.array(seen).T)
+    assert answers.tolist() == [[0, 0, 0, 3, 3, 3, 6, 6], [0, 0, 0, 3, 4, 4, 4, 7]]
 
 
 def test_held_sensors_see_the_observation_of_the_last_refresh_and_the_trunk_the_present_action():

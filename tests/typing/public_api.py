@@ -54,6 +54,12 @@ compensator = gp.Compensator(robot)
 assert_type(sim, gp.AlignedSim)
 assert_type(compensator, gp.Compensator)
 delta = trained.model.loop().delta(np.zeros(5), np.zeros(5), np.zeros(5), payload_mass=0.0)
+options = gp.RunOptions(connection=gp.Connection(port="/dev/ttyACM0"), payload_mass=0.1)
+played = gp.run_robot(robot, motion="sweep-elbow_flex", driver="so101", options=options)
+assert_type(played, gp.RunResult)
+assert_type(played.tracking_error, dict[str, float])
+assert_type(played.fault, str)
+gp.run_robot("./my_so101", motion=Path("m.csv"), compensate=True, consent=lambda text: True)
 classes = (gp.Controller, gp.RemoteRobot, gp.MujocoAligner)
 
 
@@ -64,3 +70,5 @@ def first_message(error: gp.GAPONetError) -> str:
 absent = gp.no_such_name  # type: ignore[attr-defined]
 gp.gap(data, robot)  # type: ignore[call-arg]
 gp.gap(data, motion="wave")  # type: ignore[call-arg]
+gp.run_robot(robot, "sweep-elbow_flex")  # type: ignore[call-arg]
+gp.run_robot(robot, consent=True)  # type: ignore[arg-type]

@@ -18,18 +18,22 @@ from gaponet.base.arrays import Array
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
     from gaponet.export.rollout import RolloutPrediction
+    from gaponet.hw.control.plan import Plan
+    from gaponet.hw.control.recording import Recording
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.config import ModelKind
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.spec import RobotSpec
     from gaponet.sysid.acceptance import Identified
     from gaponet.sysid.evidence.drift import Drift, ParameterChange
+    from gaponet.sysid.motion.motion import Motion
     from gaponet.sysid.torque_motors import TorqueDrivenFit
 
 __all__ = [
     "AdaptResult", "CheckResult", "EvalResult", "ExciteResult", "ExportResult", "GapResult", "IdentifyResult",
-    "PairResult", "ReplayResult", "TorqueResult", "TrainResult",
+    "PairResult", "ReplayResult", "RunResult", "TorqueResult", "TrainResult",
 ]  # fmt: skip
+MIN_MOVEMENT_RAD = 1e-6  # of a target, so that a joint counts as moved
 Metrics = dict[
     str, Any
 ]  # mpjae rad, q_dis rad·s, …, and by_joint, by_payload, by_unit, by_motion, by_horizon
@@ -422,3 +426,69 @@ class Prediction:
             "errors": self.before, "errors_then": self.after, "worth_seconds": self.useful_seconds,
             "open": dict(self.undetermined), "played": [list(pair) for pair in self.played],
         }  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """One run on a robot.
+
+    Attributes:
+        recording: Readings, commands, events and timing of every control period.
+        robot: The robot with its identified values.
+        plan: Plan that was shown; None if live targets never had one.
+        would_send: Commands of a dry run by joint: range (rad), speed (rad/s) and torque (N·m). Empty otherwise.
+        file: MOTION.parquet that was written, or None.
+    """
+
+    recording: Recording
+    robot: RobotSpec
+    plan: Plan | None = None
+    would_send: dict[str, dict[str, float]] = field(default_factory=dict)
+    file: Path | None = None
+
+    @property
+    def motion(self) -> Motion | None:
+        """The motion as it was played, within limits; None for live targets."""
+        return self.plan.motion if self.plan is not None else None
+
+    @property
+    def fault(self) -> str:
+        """Kind and reason of the fault that ended the run; empty if there was none."""
+        fault = self.recording.fault
+        return f"{fault.kind}: {fault.text}" if fault is not None else ""
+
+    @property
+    def tracking_error(self) -> dict[str, float]:
+        """Joint that moved → mean |measured − target| over the run, rad; measured one period after the command."""
+        recording = self.recording
+        rows = recording.phase_rows("run")
+        if len(rows) < 2:
+            return {}
+        columns = [recording.joint_names.index(name) for name in recording.commanded]
+        target = rows["target"][:, columns]
+        measured = rows["qpos"][:, columns]
+        errors = np.abs(measured[1:] - target[:-1]).mean(axis=0)
+        spans = np.ptp(target, axis=0)
+        found = {}
+        for joint, error, span in zip(recording.commanded, errors, spans, strict=True):
+            if span > MIN_MOVEMENT_RAD:
+                found[joint] = float(error)
+        return found
+
+    @property
+    def mean_tracking_error(self) -> float | None:
+        """Mean of `tracking_error` over the joints that moved, rad; None if none did."""
+        errors = list(self.tracking_error.values())
+        return float(np.mean(errors)) if errors else None
+
+    def to_dict(self) -> dict[str, Any]:
+        found = self.recording.summary() | self.tracking()
+        if self.file is not None:
+            found["file"] = str(self.file)
+        return found
+
+    def tracking(self) -> dict[str, Any]:
+        """Return the tracking errors as JSON has them: empty if the run had fewer than two periods."""
+        if len(self.recording.phase_rows("run")) < 2:
+            return {}
+        return {"tracking_error_rad": {"mean": self.mean_tracking_error} | self.tracking_error}

@@ -7,7 +7,8 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from rich.console import Console
@@ -120,16 +121,20 @@ def _least_width(head: str, cells: list[str]) -> int:
     )
 
 
+def holds_folder(out: Path | None, kind: str) -> AbstractContextManager[object]:
+    """Hold the folder that a command writes, if it writes one, so that a wrong folder costs no work and no motion."""
+    return nullcontext() if out is None else lock_folder(out, kind)
+
+
 def writes(kind: str) -> Callable[[Command], Command]:
-    """Decorator of a command: it holds its --out from the start, so that a wrong folder costs no work and no motion."""
+    """Decorator of a command: it holds its --out from the start (holds_folder)."""
 
     def decorate(command: Command) -> Command:
         @functools.wraps(command)
         def held(*args: Any, **kwargs: Any) -> Any:
             given = inspect.signature(command).bind(*args, **kwargs)
             given.apply_defaults()
-            out = given.arguments["out"]
-            with nullcontext() if out is None else lock_folder(out, kind):
+            with holds_folder(given.arguments["out"], kind):
                 return command(*args, **kwargs)
 
         return cast("Command", held)

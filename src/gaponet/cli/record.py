@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from gaponet.api.run_options import ControlOptions, RunOptions
+from gaponet.api.run_robot import RunRequest, execute, resolve_robot
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
-from gaponet.cli.run import ControlArgs, RunArgs, perform, resolve_robot, tracking
+from gaponet.cli.run import ControlArgs, ScreenReporter, show_result
 
 
 @writes("dataset")
@@ -21,7 +24,9 @@ def record(
     unit_id: str = "",
     repetitions: int = 1,
     seed: int = 0,
-    args: Annotated[ControlArgs, tyro.conf.arg(name="")] = ControlArgs(),  # noqa: B008
+    args: Annotated[
+        ControlArgs, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff
+    ] = ControlArgs(),  # noqa: B008
     json: Json = False,
 ) -> None:
     """Play a motion without correction and record it into a dataset.
@@ -53,15 +58,22 @@ def record(
                 f"--unit-id {unit_id}: a virtual robot is chosen by --unit {args.connection.unit}"
             )
         unit_id = args.connection.unit_name
-    request = RunArgs(**vars(args), payload_mass=payload_mass)
-    spec = resolve_robot(request)
+    shared = {field.name: getattr(args, field.name) for field in fields(ControlOptions)}
+    options = RunOptions(**shared, payload_mass=payload_mass, out=out / "recordings")
+    first = RunRequest(args.robot, motion[0], args.driver, options=options)
+    spec = resolve_robot(first)
     known = Dataset.open_existing(out, spec)
     if known is not None:  # before anything moves
         require_stored_robot(out, spec, DatasetError, MOVE_STORED_ROBOT)
     written: list[str] = []
     errors: list[dict[str, Any]] = []
     for count, name in enumerate([name for name in motion for _ in range(repetitions)], seed):
-        recording, played, spec = perform(screen, name, request, count, out / "recordings")
+        request = replace(first, motion=name, options=replace(options, seed=count))
+        result = execute(request, ScreenReporter(screen))
+        show_result(screen, result)
+        recording = result.recording
+        played = result.motion
+        spec = result.robot
         assert played
         slot = (played.name, unit_id, payload_mass, side)
         same = [e for e in known.entries if e.meta.repetition_key == slot] if known else []
@@ -79,6 +91,6 @@ def record(
         sequence = to_sequence(recording.log(stem), spec, meta)
         known = known or Dataset.create(out, spec)  # not before there is something to keep
         written.append(known.append(sequence, measure_delays(sequence)).id)
-        errors.append(tracking(recording))
+        errors.append(result.tracking())
         screen.say(f"added to {out}: {written[-1]}, {len(sequence)} rows at {sequence.rate:.2f} Hz")
     screen.result({"dataset": str(out), "written": written, "tracking": errors})

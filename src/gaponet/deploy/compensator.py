@@ -12,6 +12,9 @@ G is evaluated at the state and history of the shadow, not of the robot. If the 
 same. The command does not depend on measurements, so there is no loop that can become unstable, and measurement noise
 does not reach the servos. (With the measured state, the error was not smaller and commands were four times rougher.)
 
+Where the network's answer is not finite, G counts as zero (nn/bound.py). The iteration then forgets the correction: it
+falls to (1 − γ)² of itself in each control period, and what remains is the feed-forward.
+
 The remaining error is integrated, slowly and with a low-pass. A loaded arm swings on its servo with little damping
 (3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1). There, an integrator alone is unstable above 2ζω, 2 1/s.
 """
@@ -285,10 +288,20 @@ class Compensator:
 
     @property
     def doubt(self) -> str:
-        """Message if the servo torques of one robot are those of another payload than stated; else ""."""
-        if not (self.payload_stated and self.single):
-            return ""
-        return self.payload_estimate.contradiction(float(self.payload_mass[0]))
+        """Message if the network fails, or if one robot's servo torques contradict the stated payload; else ""."""
+        sentences = []
+        if self.refused_answers:
+            sentences.append(
+                f"{self.refused_answers} answers of the network were not finite; it corrected nothing there"
+            )
+        if self.payload_stated and self.single:
+            sentences.append(self.payload_estimate.contradiction(float(self.payload_mass[0])))
+        return "; ".join(sentence for sentence in sentences if sentence)
+
+    @property
+    def refused_answers(self) -> int:
+        """Number of the network's answers that were not finite; one answer per robot and iteration."""
+        return 0 if self.loop is None else self.loop.refused_answers
 
     # ---- internals
 

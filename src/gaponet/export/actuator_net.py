@@ -3,7 +3,8 @@
 mjlab, Newton and Isaac Lab load this form (Hwangbo et al. 2019, Science Robotics 4, eaau5872). It contains the
 identified servo exactly: a delayed target minus the present position is the error at that time minus the motion since.
 A small network is fitted to the torque that the run's network adds, kp · Δa, on rollouts that the run's network
-corrects. Engines give a joint's network neither posture nor payload, so effects of these are lost.
+corrects. Its inputs are clipped and its torque is at most kp times the run's delta_max, so it is finite wherever the
+engine's state is. Engines give a joint's network neither posture nor payload, so effects of these are lost.
 """
 
 from __future__ import annotations
@@ -59,12 +60,15 @@ class ActuatorNet(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, joint: dict[str, Any], step: float, length: int) -> None:
+    def __init__(
+        self, joint: dict[str, Any], step: float, length: int, delta_max: float = np.inf
+    ) -> None:
         """
         Args:
             joint: The servo, as in facts.json.
             step: Physics step, s.
             length: Physics steps of the past, L.
+            delta_max: Largest correction of the run's network, rad; kp times it bounds the torque that is added.
         """
         super().__init__()
         kp, delayed = joint["kp"], np.zeros(length)
@@ -84,6 +88,7 @@ class ActuatorNet(nn.Module):
             kp,
             1.0,
         )
+        self.most_added = kp * delta_max  # N·m
         widths = (2 * length, *HIDDEN)
         layers = [layer for a, b in pairwise(widths) for layer in (nn.Linear(a, b), nn.ELU())]
         self.net = nn.Sequential(*layers, head := nn.Linear(HIDDEN[-1], 1))
@@ -95,9 +100,8 @@ class ActuatorNet(nn.Module):
         return ((x - self.mean) / self.std).clamp(-MAX_INPUT_STD, MAX_INPUT_STD)
 
     def forward(self, x: Tensor) -> Tensor:
-        torque = (
-            x @ self.servo + self.rest + (self.gain * self.scale) * self.net(self.standardised(x))
-        )
+        added = (self.gain * self.scale) * self.net(self.standardised(x))
+        torque = x @ self.servo + self.rest + added.clamp(-self.most_added, self.most_added)
         return torque.clamp(-self.limit, self.limit)
 
 
@@ -173,7 +177,10 @@ def _fit_networks(
 ) -> dict[str, ActuatorNet]:
     """Return a network for each joint; joints that are not operated have the servo alone."""
     step, length = facts["options"]["timestep"], _length(facts)
-    nets = {name: ActuatorNet(joint, step, length) for name, joint in facts["joints"].items()}
+    delta_max = facts["delta_max"]
+    nets = {
+        name: ActuatorNet(joint, step, length, delta_max) for name, joint in facts["joints"].items()
+    }
     rng = np.random.default_rng(0)
     torch.manual_seed(0)
     for name in robot.joint_names:
@@ -241,6 +248,7 @@ def _stacked(nets: ListOf[ActuatorNet]) -> Callable[[np.ndarray], np.ndarray]:
     stack = lambda get: np.stack([get(net).detach().numpy() for net in nets])  # noqa: E731
     servo, mean, std = (stack(lambda net, f=f: getattr(net, f)) for f in ("servo", "mean", "std"))
     rest, limit, scale = np.array([(net.rest, net.limit, net.gain * net.scale) for net in nets]).T
+    most_added = np.array([net.most_added for net in nets])
     layers = [
         (stack(lambda net, k=k: net.net[k].weight), stack(lambda net, k=k: net.net[k].bias))
         for k in (0, 2, 4)
@@ -251,7 +259,8 @@ def _stacked(nets: ListOf[ActuatorNet]) -> Callable[[np.ndarray], np.ndarray]:
         for k, (weight, bias) in enumerate(layers):
             z = np.einsum("noi,ni->no", weight, z) + bias
             z = np.where(z > 0, z, np.expm1(np.minimum(z, 0))) if k < len(layers) - 1 else z
-        return np.clip((past * servo[:, :, 0]).sum(1) + rest + scale * z[:, 0], -limit, limit)
+        added = np.clip(scale * z[:, 0], -most_added, most_added)
+        return np.clip((past * servo[:, :, 0]).sum(1) + rest + added, -limit, limit)
 
     return torque
 

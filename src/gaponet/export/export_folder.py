@@ -270,6 +270,7 @@ def export_networks(
     facts = simulator_facts(robot, dt, payload_mass) | {
         "file": ROBOT,
         "virtual": train[0].meta.virtual,
+        "delta_max": model.config.delta_max,
     }
     with lock_folder(folder, FOLDER_KIND):
         _write_scene(robot, folder / ROBOT, payload_mass, servos=False, dt=dt)

@@ -30,10 +30,12 @@ class DeltaStep(nn.Module):
 
     Attributes:
         depth: Frames in the past; a frame is [q | q̇ | applied target], 3n numbers.
+        refused: Number of answers of the network that were not finite, () int64; there Δa is zero, as in nn/bound.py.
     """
 
     low: Tensor
     high: Tensor
+    refused: Tensor
 
     def __init__(self, net: nn.Module, model: GapModel) -> None:
         super().__init__()
@@ -44,9 +46,11 @@ class DeltaStep(nn.Module):
         self.stride: int = config.stride
         self.payload_input: bool = config.payload_input
         self.payload_max: float = config.payload_max
+        self.delta_max: float = config.delta_max
         low, high = torch.from_numpy(model.qpos_range.T.copy()).float()
         self.register_buffer("low", low)
         self.register_buffer("high", high)
+        self.register_buffer("refused", torch.zeros((), dtype=torch.int64))
 
     def forward(
         self,
@@ -57,7 +61,9 @@ class DeltaStep(nn.Module):
         frames: Tensor,
         fresh: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Return Δa, (B, n) rad, within the joint limits, and the new past. Gradients do not reach earlier periods.
+        """Return Δa, (B, n) rad, within ±delta_max and the joint limits, and the new past.
+
+        Gradients do not reach earlier periods.
 
         Args:
             qpos, qvel, ctrl: (B, n) rad, rad/s, rad; a target that is not finite counts as the last applied one.
@@ -74,10 +80,17 @@ class DeltaStep(nn.Module):
         if self.payload_input:
             inputs.append((payload_mass / self.payload_max)[:, None])
         inputs.append(ctrl)
-        delta = self.net(torch.cat(inputs, dim=1))
+        delta = self._bounded(self.net(torch.cat(inputs, dim=1)))
         applied = torch.minimum(torch.maximum(ctrl + delta, self.low), self.high)
         newest = torch.cat([state, applied], dim=1).detach()
         return applied - ctrl, torch.cat([newest[:, None], frames[:, :-1]], dim=1)
+
+    def _bounded(self, delta: Tensor) -> Tensor:
+        """Return answers (B, n) rad within ±delta_max, and zero where one is not finite; count these."""
+        finite = torch.isfinite(delta).all(dim=1)
+        self.refused += (~finite).sum()
+        limited = delta.clamp(-self.delta_max, self.delta_max)
+        return torch.where(finite[:, None], limited, torch.zeros_like(limited))
 
 
 def delta_step(model: GapModel, run: Path) -> DeltaStep:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired
+from typing import Annotated, Any, Literal, NotRequired, cast
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -21,8 +22,14 @@ from gaponet.robot.folder import has_stored_robot, load_stored_robot, stored_rob
 from gaponet.robot.spec import RobotSpec
 
 WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
+# Fields of the card that export also writes into the ONNX file: what the network's inputs and outputs mean, and for
+# which robots they hold.
+FACTS_IN_NETWORK = (
+    "robot", "joint_names", "kp", "kd", "qpos_range", "dt", "payload_seen", "recorded", "model",
+)  # fmt: skip
 GAIN_TOLERANCE = 0.02  # relative, between recorded and real gains
 RATE_TOLERANCE = 0.02  # relative: a clock of 49.85 Hz counts as 50 Hz
+MAX_SHOWN = 80  # characters of a value in an error message
 
 
 def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, Any]:
@@ -115,6 +122,34 @@ def _require_output(
         raise ModelError(f"{file}: does not fit its card ({reason}); copy or train the model again")
 
 
+def facts_in_network(card: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a card that are stored in the ONNX file, as JSON reads them."""
+    facts = {name: card[name] for name in FACTS_IN_NETWORK if name in card}
+    return cast(dict[str, Any], json.loads(json.dumps(facts)))
+
+
+def _require_stored_facts(network: OnnxNetwork, card: dict[str, Any], folder: Path) -> None:
+    """Refuse a card that says something else about the network than the network's own file does."""
+    try:
+        stored = network.stored_facts
+    except ValueError as error:
+        raise ModelError(f"{folder / WEIGHTS}: {error}; copy or train the model again") from None
+    if not stored:
+        return
+    given = facts_in_network(card)
+    for name in FACTS_IN_NETWORK:
+        if stored.get(name) != given.get(name):
+            raise ModelError(
+                f"{folder / CARD}: {name} is {_short(given.get(name))}, but {WEIGHTS} was exported with "
+                f"{_short(stored.get(name))}; restore the card, or run gaponet export RUN again"
+            )
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 1] + "…"
+
+
 @dataclass(frozen=True)
 class GapModel:
     """Delta-action model and its card. It has no state and can be shared.
@@ -137,7 +172,8 @@ class GapModel:
             threads: Threads of onnxruntime; 0 for all cores, which is faster for hundreds of robots at once.
 
         Raises:
-            ModelError: A file is missing, damaged, or from a newer version.
+            ModelError: A file is missing, damaged, or from a newer version; or the card contradicts the network in
+                shapes, joints, gains, ranges, rate, payload or largest correction.
         """
         folder = Path(path)
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
@@ -151,6 +187,7 @@ class GapModel:
         network = OnnxNetwork.read(file, threads)
         n = len(card["joint_names"])
         _require_output(network, config.input_dim(n), n, config.delta_max, file)
+        _require_stored_facts(network, card, folder)
         if card.get("sha256", {}).get(WEIGHTS, digest := sha256(file)) != digest:
             raise ModelError(
                 f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN again"

@@ -16,6 +16,7 @@ import numpy as np
 from gaponet.base.arrays import Array, array_module, copy_array, zeros_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
+from gaponet.nn.bound import AnswerBound
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.observation import History, Layout
 from gaponet.nn.onnx_network import Network, OnnxNetwork
@@ -64,6 +65,7 @@ class DeltaLoop:
             rows[..., part] for part in (layout.q, layout.v, layout.action)
         )
         self._payload = x[:, layout.payload.start] if config.payload_input else None
+        self._bound = AnswerBound(config.delta_max)
         self.answer = self._bind(network, shape)
         self.low, self.high = (
             np.array(side, float) if self._numpy else x.new_tensor(side)
@@ -80,6 +82,11 @@ class DeltaLoop:
     def applied(self) -> Any:
         """Targets of the last period: ctrl + Δa within the joint limits, (num_envs, n) rad. Send these."""
         return self._applied.reshape(self.num_envs, self.n)
+
+    @property
+    def refused_answers(self) -> int:
+        """Number of the network's answers that were not finite, for which no correction was used (nn/bound.py)."""
+        return self._bound.refused
 
     # ---- history
 
@@ -147,7 +154,8 @@ class DeltaLoop:
             payload_mass: kg, one number or (num_envs,).
 
         Returns:
-            Δa, shape of ctrl, rad. ctrl + Δa is within the joint limits.
+            Δa, shape of ctrl, rad. It is within ±delta_max of the model, and ctrl + Δa is within the joint limits.
+            Where the network's answer is not finite, it is zero.
 
         Raises:
             UsageError: Arrays have another shape.
@@ -210,12 +218,14 @@ class DeltaLoop:
     # ---- internals
 
     def _bind(self, network: Network | None, shape: tuple[int, ...]) -> Callable[[], Any]:
-        """Return a function without arguments: present x → Δa of this shape, rad."""
-        if isinstance(network, OnnxNetwork):
-            return network.bind(self.x, shape)
+        """Return a function without arguments: present x → Δa of this shape, rad, finite and within ±delta_max."""
         if network is None:
             return partial(zeros_like, self.x, *shape)
-        return lambda: network(self.x).reshape(shape)
+        bound = self._bound
+        if isinstance(network, OnnxNetwork):
+            evaluate = network.bind(self.x, shape)
+            return lambda: bound(evaluate())
+        return lambda: bound(network(self.x).reshape(shape))
 
     def _finite(self, qpos: Any, ctrl: Any) -> Any:
         """Replace targets that are not finite by the last applied ones, or by the positions of robots without history.

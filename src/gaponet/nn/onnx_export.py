@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.base.files import atomic_write, lock_folder, write_text
-from gaponet.nn.artifact import CARD, WEIGHTS
+from gaponet.nn.artifact import CARD, WEIGHTS, facts_in_network
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import MAX_FEATURE, DeltaNet
 from gaponet.nn.networks import build_network
-from gaponet.nn.onnx_network import TRUSTED, OnnxNetwork
+from gaponet.nn.onnx_network import CARD_FACTS, TRUSTED, OnnxNetwork
 
 MAX_DIFFERENCE_RAD = 1e-5  # between ONNX and torch
 
@@ -41,7 +41,7 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
     """
     with lock_folder(folder, "model"):
         frozen = copy.deepcopy(net).eval()
-        content = onnx_content(frozen)
+        content = _with_facts(onnx_content(frozen), card)
         with torch.inference_mode():
             expected = frozen(torch.from_numpy(samples)).numpy()
         difference = float(np.abs(expected - OnnxNetwork(content)(samples)).max())
@@ -94,6 +94,16 @@ def onnx_content(net: DeltaNet) -> bytes:
             dynamic_axes={name: {0: "batch"} for name in ("x", "delta")},
         )  # fmt: skip
     return content.getvalue()
+
+
+def _with_facts(content: bytes, card: dict[str, Any]) -> bytes:
+    """Return an ONNX file with the fields of its card that GapModel.load compares."""
+    import onnx
+
+    graph = onnx.load_model_from_string(content)
+    facts = json.dumps(facts_in_network(card), ensure_ascii=False)
+    onnx.helper.set_model_props(graph, {CARD_FACTS: facts})
+    return graph.SerializeToString()
 
 
 def trained_network(run: Path, config: ModelConfig, n: int) -> DeltaNet:

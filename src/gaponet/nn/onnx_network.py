@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from gaponet.base.errors import ModelError
 from gaponet.base.sandbox import sandboxed
 
 Network = Callable[[Any], Any]  # x (B, dim) float32 → Δa (B, n) rad; numpy arrays or torch tensors
+CARD_FACTS = "gaponet_card"  # key of the file's metadata with fields of the card, as JSON
 TRUSTED: set[str] = set()  # hashes of ONNX files that this process wrote or tested in the sandbox
 
 
@@ -33,6 +35,22 @@ class OnnxNetwork:
 
     def __call__(self, x: Array) -> Array:
         return self.session.run(None, {"x": x})[0]
+
+    @property
+    def stored_facts(self) -> dict[str, Any]:
+        """Fields of the card that export wrote into the file; empty for a file of an older version or another program.
+
+        Raises:
+            ValueError: What is stored there is not a JSON object.
+        """
+        text = self.session.get_modelmeta().custom_metadata_map.get(CARD_FACTS, "{}")
+        try:
+            facts = json.loads(text)
+        except RecursionError:
+            facts = None
+        if not isinstance(facts, dict):
+            raise ValueError("its metadata is not a JSON object")
+        return facts
 
     def bind(self, x: Array, shape: tuple[int, ...]) -> Callable[[], Array]:
         """Return a function without arguments: present content of x → Δa, rad. This is faster than a plain call.

@@ -94,6 +94,8 @@ class RobotSpec:
         contacts: True if links collide as the MJCF states. It is off by default, because links welded to the world
             collide permanently with their neighbours, which looks like a gap.
         nominal: The robot before identification; None if no parameter was identified (sysid/identify.py).
+        limits_accepted: True if the user stated that this folder's gains and ranges hold on hardware
+            (hw/control/hardware.py); no file states it.
     """
 
     name: str
@@ -139,6 +141,7 @@ class RobotSpec:
     carries_payload: bool = True
     gain_scale: float = 1.0
     nominal: RobotSpec | None = None
+    limits_accepted: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.joint_names)

@@ -17,7 +17,7 @@ from gaponet.testing.virtual_robot import VirtualRobot
 
 STATE_PERIOD_S = 0.002  # 500 Hz, as the H1-2
 DAMPING_FACTOR = 4.0  # of the robot's kd while damping; see drivers.unitree
-MAX_LAG_S = 0.5  # behind real time
+MAX_LAG_S = 0.5  # simulated time behind the clock, once the robot was commanded
 
 
 class LiveUnit:
@@ -72,7 +72,11 @@ class LiveUnit:
 
 
 class VirtualDriver:
-    """A `Driver` of a virtual robot in this process; its time is the controller's clock."""
+    """A `Driver` of a virtual robot in this process; its time is the controller's clock.
+
+    Until the first command the robot stands still, so time that passes without a reading (planning, the question for
+    consent, compiling) is not simulated. From the first command on all time is.
+    """
 
     virtual = True
     noisy = True
@@ -103,11 +107,12 @@ class VirtualDriver:
         self.facts: dict[str, Any] = {}
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
-        self.clock, self.period, self._given = (
-            clock,
-            period,
-            (robot, physics, payload, seed, period),
-        )
+        self.clock = clock
+        self.period = period
+        self._given = (robot, physics, payload, seed, period)
+        self._begun = 0.0  # clock's time at the connection, s
+        self._skipped = 0  # state periods that were not simulated, before the first command
+        self._commanded = False
         locked = idle_joints(robot, robot.operated)
         self.commanded = tuple(joint for joint in robot.joint_names if joint not in locked)
         self._at = robot.index(self.commanded)
@@ -115,26 +120,43 @@ class VirtualDriver:
     def connect(self) -> None:
         self.live = LiveUnit(*self._given)
         self._begun = self.clock.now()
+        self._skipped = 0
+        self._commanded = False
         self._state = self._measure()
 
     def read(self) -> State:
-        """Simulate until now and return the state."""
-        due = int((self.clock.now() - self._begun) / self.period + 1e-6)
-        if (due - self.live.steps) * self.period > MAX_LAG_S:
+        """Simulate until now and return the state.
+
+        Raises:
+            DriverError: The simulation of a commanded robot is more than MAX_LAG_S behind the clock.
+        """
+        due = self._periods_due()
+        if due <= 0:
+            return self._state
+        if not self._commanded:
+            self._skipped += due - 1
+            due = 1
+        if due * self.period > MAX_LAG_S:
             raise DriverError(
-                f"{self.address}: this machine cannot simulate it in real time; run without real time"
+                f"{self.address}: this machine cannot simulate it in real time; run without real time (--fast)"
             )
-        if due > self.live.steps:
-            while self.live.steps < due:
-                self.live.step()
-            self._state = self._measure()
+        for _ in range(due):
+            self.live.step()
+        self._state = self._measure()
         return self._state
 
+    def _periods_due(self) -> int:
+        """Return how many state periods the simulation is behind the clock."""
+        elapsed = int((self.clock.now() - self._begun) / self.period + 1e-6)
+        return elapsed - self._skipped - self.live.steps
+
     def _measure(self) -> State:
-        return State(self._begun + self.live.steps * self.period, *self.live.read())
+        time = self._begun + (self._skipped + self.live.steps) * self.period
+        return State(time, *self.live.read())
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Send a command; it takes effect after the unit's own delay."""
+        self._commanded = True
         self.live.set_gains(self.kp, self.kd)
         self.live.ctrl[self._at] = ctrl[self._at]
 
@@ -143,8 +165,11 @@ class VirtualDriver:
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
         """Stiffness zero, damping four times the robot's, on the commanded joints."""
-        kp, kd = self.kp.copy(), self.kd.copy()
-        kp[self._at], kd[self._at] = 0.0, DAMPING_FACTOR * kd[self._at]
+        self._commanded = True
+        kp = self.kp.copy()
+        kd = self.kd.copy()
+        kp[self._at] = 0.0
+        kd[self._at] = DAMPING_FACTOR * kd[self._at]
         self.live.set_gains(kp, kd)
 
     def confirm(self) -> str:

@@ -115,6 +115,11 @@ class Aligner:
         self.payload_mass = torch.full((num_envs,), float(mass), device=device)
         self.sent = torch.zeros(num_envs, len(joint_names), device=device)
 
+    @property
+    def refused_answers(self) -> int:
+        """Number of the network's answers that were not finite, one per world and period; there it corrects nothing."""
+        return 0 if self.past.program is None else int(self.past.program.refused)
+
     @torch.no_grad()
     def __call__(self, qpos: Tensor, qvel: Tensor, target: Tensor) -> Tensor:
         """Return the targets to send for this control period, (num_envs, joints) rad.

@@ -30,6 +30,7 @@ MAX_WEIGHT_SHARE, POSTURES = (
     64,
 )  # of the effort limit, for identified masses; postures in which they are compared
 RELATIVE_TOLERANCE = 1e-6  # between values of two files
+RANGE_TOLERANCE_RAD = 1e-6  # between joint ranges of two files
 MAX_KP = 300.0  # N·m/rad of any joint; the H1-2's legs have 200
 MAX_KD = 10.0  # N·m·s/rad
 MAX_BEYOND_RANGE_RAD = (
@@ -48,7 +49,9 @@ def reference_robot(driver: str, limits_from: str | None) -> RobotSpec:
             f"driver '{driver}' is an extension, whose robot this package does not have; give --limits-from FOLDER, a "
             "robot folder whose gains, joint ranges, effort limits and collision shapes you have read"
         )
-    return load_robot(limits_from or PACKAGE_FOLDER / ROBOT_OF_DRIVER[driver]).before_identification
+    if limits_from is None:
+        return load_robot(PACKAGE_FOLDER / ROBOT_OF_DRIVER[driver]).before_identification
+    return replace(load_robot(limits_from).before_identification, limits_accepted=True)
 
 
 def hardware_robot(robot: RobotSpec, reference: RobotSpec) -> RobotSpec:
@@ -61,8 +64,7 @@ def hardware_robot(robot: RobotSpec, reference: RobotSpec) -> RobotSpec:
     Raises:
         RobotError: A nominal value of `robot` differs from the reference, or an identified value is implausible.
     """
-    if robot.folder.resolve() != reference.folder.resolve():
-        _require_equal(robot.before_identification, reference)
+    _require_equal(robot.before_identification, reference)
     require_plausible(robot)
     if robot.nominal is None:
         return reference
@@ -78,7 +80,7 @@ def robot_hash(robot: RobotSpec) -> str:
 
 
 def _require_equal(robot: RobotSpec, reference: RobotSpec) -> None:
-    use = f"Use a folder made from {reference.folder}, or --limits-from FOLDER with a folder whose values you have read"
+    use = _advice(reference)
     if robot.joint_names != reference.joint_names:
         raise RobotError(f"{robot.folder}: its joints are not those of {reference.folder}. {use}")
     for name, unit in (
@@ -97,6 +99,8 @@ def _require_equal(robot: RobotSpec, reference: RobotSpec) -> None:
                 f"{robot.folder}: {name} of {reference.joint_names[i]} is {_text(theirs[i])} {unit}, the known robot "
                 f"has {_text(ours[i])} ({reference.folder}). {use}"
             )
+    if robot.folder.resolve() == reference.folder.resolve():
+        return  # the same files; only numbers in memory may differ
     if read_shapes(robot.folder) != read_shapes(reference.folder):
         raise RobotError(
             f"{robot.folder}: collision.toml differs from that of {reference.folder}. {use}"
@@ -160,8 +164,11 @@ def _require_light(robot: RobotSpec, nominal: RobotSpec) -> None:
         )
 
 
-def require_motor_limits(robot: RobotSpec, packaged: str) -> None:
-    """Refuse gains and effort limits beyond those of a packaged robot's motors.
+def require_known_limits(robot: RobotSpec, packaged: str) -> None:
+    """Refuse the robot of a driver whose gains, ranges or effort limits are beyond those of the known robot.
+
+    The drivers of this package call it, so it holds for whoever makes one. The known robot is the package's. A robot of
+    `reference_robot` whose folder the user named may have other gains and ranges, but nothing beyond its motors.
 
     Args:
         robot: The robot of a driver.
@@ -170,6 +177,54 @@ def require_motor_limits(robot: RobotSpec, packaged: str) -> None:
     Raises:
         RobotError: With the folder, the joint and the bound.
     """
+    _require_motor_limits(robot, packaged)
+    nominal = robot.before_identification
+    if nominal.limits_accepted:
+        return
+    known = load_robot(PACKAGE_FOLDER / packaged)
+    columns = known.index(nominal.joint_names)
+    _require_within(nominal, "kp", "N·m/rad", known.kp[columns], known)
+    _require_within(nominal, "kd", "N·m·s/rad", known.kd[columns], known)
+    low, high = known.qpos_range[columns].T
+    lowest, highest = nominal.qpos_range.T
+    wider = ~((lowest >= low - RANGE_TOLERANCE_RAD) & (highest <= high + RANGE_TOLERANCE_RAD))
+    if wider.any():
+        joint = int(wider.argmax())
+        raise RobotError(
+            f"{robot.folder}: the range of {nominal.joint_names[joint]} is {_text(nominal.qpos_range[joint])} rad, the "
+            f"known robot has {low[joint]:g} to {high[joint]:g} ({known.folder}). {_advice(known)}"
+        )
+
+
+def accepted_folder(robot: RobotSpec) -> str | None:
+    """Return the folder whose limits the user accepted for this robot, as another process finds it; or None."""
+    nominal = robot.before_identification
+    return str(nominal.folder.resolve()) if nominal.limits_accepted else None
+
+
+def _require_within(
+    robot: RobotSpec, name: str, unit: str, bounds: Array, known: RobotSpec
+) -> None:
+    """Refuse gains above the known robot's, (n,); NaN too."""
+    values = getattr(robot, name)
+    beyond = ~(values <= bounds * (1 + RELATIVE_TOLERANCE))
+    if beyond.any():
+        joint = int(beyond.argmax())
+        raise RobotError(
+            f"{robot.folder}: {name} of {robot.joint_names[joint]} is {values[joint]:g} {unit}, the known robot has "
+            f"{bounds[joint]:g} ({known.folder}). {_advice(known)}"
+        )
+
+
+def _advice(reference: RobotSpec) -> str:
+    return (
+        f"Use a folder made from {reference.folder}, or --limits-from FOLDER (Python: limits_from) with a folder whose "
+        "values you have read"
+    )
+
+
+def _require_motor_limits(robot: RobotSpec, packaged: str) -> None:
+    """Refuse gains and effort limits beyond those of a packaged robot's motors."""
     nominal, motors = robot.before_identification, load_robot(PACKAGE_FOLDER / packaged)
     effort = motors.effort_limit[motors.index(robot.joint_names)] * (1 + RELATIVE_TOLERANCE)
     for name, most in (("kp", MAX_KP), ("kd", MAX_KD), ("effort_limit", effort)):

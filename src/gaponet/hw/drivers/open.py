@@ -10,6 +10,7 @@ from typing import Any
 from gaponet import plugins
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Driver
+from gaponet.hw.control.hardware import hardware_robot, reference_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 
 DRIVERS = {
@@ -35,18 +36,25 @@ def supported_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return {option: value for option, value in options.items() if option in parameters}
 
 
-def open_driver(kind: str, robot: RobotSpec | str | Path, **options: Any) -> Driver:
+def open_driver(
+    kind: str, robot: RobotSpec | str | Path, *, limits_from: str | None = None, **options: Any
+) -> Driver:
     """Return a driver that is not yet connected.
 
     Args:
         kind: One of driver_names(). Virtual robots live in the caller's process (testing.virtual_driver).
         robot: The robot, its name or its folder.
+        limits_from: Robot folder whose gains and ranges hold instead of the package's; read it first. The robot must
+            equal it, but for identified values.
         options: Parameters of the driver's class or function.
 
     Raises:
         UsageError: There is no such driver, its package is broken, or it lacks a member of Driver.
+        RobotError: The robot's gains, ranges or effort limits are beyond those that hold.
     """
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
+    if limits_from is not None:
+        spec = hardware_robot(spec, reference_robot(kind, limits_from))
     driver: Driver = plugins.require(plugins.DRIVERS, kind, DRIVERS, "driver")(spec, **options)
     members = [
         *Driver.__annotations__,

@@ -25,7 +25,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError, EndAction, Fault, State
-from gaponet.hw.control.hardware import require_motor_limits
+from gaponet.hw.control.hardware import accepted_folder, require_known_limits
 from gaponet.hw.drivers import feetech as reg
 from gaponet.hw.drivers.so101_calibration import (
     JOINTS,
@@ -112,13 +112,13 @@ class SO101Driver:
 
         Raises:
             UsageError: The robot is no SO-101, or the file is no calibration.
-            RobotError: Gains or effort limits exceed those of the motors.
+            RobotError: Gains or ranges exceed those of the known robot, or effort limits those of the motors.
         """
         if set(robot.joint_names) != set(JOINTS):
             raise UsageError(
                 f"the so101 driver is for the joints {', '.join(JOINTS)}; {robot.name} has others"
             )
-        require_motor_limits(robot, "so101")
+        require_known_limits(robot, "so101")
         self.robot, self.port, self.calibration = robot, port, calibration
         self.timeout, self.silent = timeout, silent
         self.address = port
@@ -458,6 +458,7 @@ class SO101Driver:
         return {
             "kind": "so101", "robot": str(self.robot.folder.resolve()), "port": self.port,
             "calibration": calibration, "silent": True, "torque_limit": self._torque_limit,
+            "limits_from": accepted_folder(self.robot),
         }  # fmt: skip
 
 

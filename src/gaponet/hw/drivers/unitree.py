@@ -26,7 +26,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError, EndAction, Fault, State
-from gaponet.hw.control.hardware import range_violation, require_motor_limits
+from gaponet.hw.control.hardware import accepted_folder, range_violation, require_known_limits
 from gaponet.hw.control.safety import damping_gains
 from gaponet.hw.drivers import hg
 from gaponet.robot.spec import RobotSpec
@@ -114,7 +114,7 @@ class UnitreeDriver:
 
         Raises:
             UsageError: The robot is no H1-2, or the topic does not take the legs.
-            RobotError: Gains or effort limits exceed those of the motors.
+            RobotError: Gains or ranges exceed those of the known robot, or effort limits those of the motors.
         """
         if set(robot.joint_names) != set(MOTOR_NAMES):
             raise UsageError(
@@ -124,7 +124,7 @@ class UnitreeDriver:
             raise UsageError(
                 "rt/arm_sdk does not take the legs; use joints arms or upper_body, or topic lowcmd"
             )
-        require_motor_limits(robot, "h1_2")
+        require_known_limits(robot, "h1_2")
         nominal = robot.before_identification
         self.robot, self.topic, self.joints = robot, topic, joints
         self.kp, self.kd, self._effort_limit = nominal.kp, nominal.kd, nominal.effort_limit
@@ -365,6 +365,7 @@ class UnitreeDriver:
         return {
             "kind": "unitree", "robot": str(self.robot.folder.resolve()), "topic": self.topic,
             "joints": self.joints, "domain": self.domain, "interface": self.interface, "sole": False,
+            "limits_from": accepted_folder(self.robot),
         }  # fmt: skip
 
 

@@ -1,0 +1,290 @@
+"""gp.run_robot does what gaponet run does: known limits, a plan, consent; the result says what happened."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import commands
+from servos import Servos, on_port
+from wild_model import wild_model
+
+import gaponet as gp
+from gaponet.api.run_report import SilentReporter, describe_plan
+from gaponet.api.run_robot import Compensation
+from gaponet.base.errors import RobotError, UsageError
+from gaponet.cli.main import main
+from gaponet.hw.control.clock import SimulatedClock
+from gaponet.hw.control.hardware import hardware_robot, reference_robot
+from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.plan import Planner
+from gaponet.hw.control.recording import Recording
+from gaponet.hw.control.safety import SafetyConfig
+from gaponet.hw.drivers.open import open_driver
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.motion.motion import Motion
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.virtual_driver import VirtualDriver
+
+QUICK = ControlConfig(blend=0.2, blend_speed=4.0, settle=0.1, damp=0.1)
+FAST = gp.RunOptions(connection=gp.Connection(fast=True), control=QUICK)
+SWAY = Motion("sway", "whole_body", 0.02, commands(30, seed=1))
+WRITES = (0x03, 0x83)  # of the servo bus: write, sync write
+DRIVER_OF = {"h1_2": "unitree", "so101": "so101"}
+
+
+def changed(name: str, old: str, new: str, folder: Path) -> Path:
+    """Write a copy of a packaged robot's folder in which a line of robot.toml is another one, everywhere."""
+    save_robot(load_robot(name), folder)
+    file = folder / "robot.toml"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+    return folder
+
+
+@pytest.fixture
+def nobody(monkeypatch):
+    """Nobody sits at a terminal."""
+    monkeypatch.setattr("sys.stdin", io.StringIO("yes\n"))
+
+
+@pytest.fixture
+def bus():
+    pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
+    servos = Servos()
+    with on_port(servos) as port:
+        yield port, servos
+
+
+# ---- what it does
+
+
+def test_a_virtual_robot_plays_a_motion_and_the_result_has_its_errors(arm):
+    result = gp.run_robot(arm, motion=SWAY, options=FAST, report=SilentReporter())
+    assert result.fault == ""
+    assert result.recording.virtual
+    assert result.motion is not None
+    assert result.motion.name == "sway"
+    assert set(result.tracking_error) == set(arm.joint_names)
+    assert 0 < result.mean_tracking_error < 0.3
+
+
+def test_compensation_by_an_identified_folder_reduces_the_error(arm, tmp_path):
+    soft = arm.with_servos({joint: {"kp": 10.0} for joint in arm.joint_names})
+    save_robot(soft, tmp_path / "soft")
+    errors = {}
+    for compensate in (False, True):
+        result = gp.run_robot(
+            tmp_path / "soft",
+            motion=SWAY,
+            compensate=compensate,
+            options=FAST,
+            report=SilentReporter(),
+        )
+        errors[compensate] = result.mean_tracking_error
+    assert errors[True] < 0.7 * errors[False]
+
+
+def test_the_plan_is_shown_on_standard_error_unless_a_reporter_is_given(arm, capsys):
+    gp.run_robot(arm, motion=SWAY, options=FAST)
+    shown = capsys.readouterr()
+    assert "Plan: sway" in shown.err
+    assert "at the end it goes back" in shown.err
+    assert shown.out == ""
+
+
+def test_a_recording_is_written_where_out_says(arm, tmp_path):
+    options = gp.RunOptions(
+        connection=gp.Connection(fast=True), control=QUICK, out=tmp_path / "out"
+    )
+    result = gp.run_robot(arm, motion=SWAY, options=options, report=SilentReporter())
+    assert result.file == tmp_path / "out" / "sway.parquet"
+    assert result.file.is_file()
+
+
+def test_the_plan_names_the_source_of_the_states_where_the_driver_knows_it(so101):
+    driver = VirtualDriver(so101, load_fleet("easy", so101).unit("virtual-1"), SimulatedClock())
+    driver.facts["source"] = "participant 01.02 on 192.168.123.161"
+    motion = Motion("still", "joint", 0.02, np.repeat(so101.qpos_home[None], 20, axis=0))
+    plan = Planner(so101, driver.commanded).plan(motion, so101.qpos_home)
+    text = str(describe_plan(plan, so101, driver, heaviest=0.0))
+    assert "states come from participant 01.02 on 192.168.123.161" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "motion", "word"),
+    [
+        ({}, None, "give either"),
+        ({"targets": "zmq"}, "sway", "give either"),
+        ({"dry_run": True, "out": Path("out")}, "sway", "dry run"),
+        ({"connection": gp.Connection(fast=True), "targets": "zmq"}, None, "real time"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(arm, options, motion, word):
+    with pytest.raises(UsageError, match=word):
+        gp.run_robot(arm, motion=motion, options=gp.RunOptions(**options))
+
+
+def test_an_unknown_driver_is_refused_with_those_that_exist(arm):
+    with pytest.raises(UsageError, match=r"no driver 'toaster'; there are virtual, .*so101"):
+        gp.run_robot(arm, motion=SWAY, driver="toaster")
+
+
+def test_a_network_that_fails_on_the_planned_motion_moves_nothing(arm, tmp_path):
+    wild_model(tmp_path / "run", arm, np.nan)
+    far = np.zeros((30, 2))
+    far[:, 0] = 1.2
+    options = gp.RunOptions(
+        connection=gp.Connection(fast=True), control=QUICK, model=tmp_path / "run", unchecked=True
+    )
+    with (
+        pytest.warns(RuntimeWarning, match="not finite"),
+        pytest.raises(UsageError, match="answers of the network are not finite"),
+    ):
+        gp.run_robot(
+            motion=Motion("far", "joint", 0.02, far), options=options, report=SilentReporter()
+        )
+
+
+class Notes(SilentReporter):
+    """Keeps the sentences of a run."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+
+@pytest.mark.filterwarnings("ignore:the network's answer:RuntimeWarning")
+def test_a_network_that_fails_while_the_robot_moves_is_noted_and_recorded(arm, tmp_path):
+    compensator = gp.Compensator(arm, wild_model(tmp_path / "run", arm, np.nan))
+    compensator.reset(np.array([1.2, 0.0]), 0.0)
+    compensator.step(np.array([1.2, 0.0]), None)
+    recording = Recording(arm.name, True, arm.joint_names, arm.joint_names, 0.02)
+    reporter = Notes()
+    Compensation(compensator).note_failures(recording, reporter)
+    assert recording.summary()["refused_answers"] > 0
+    assert "not finite" in reporter.notes[0]
+
+
+# ---- consent
+
+
+@pytest.mark.parametrize("driver", ["unitree", "so101"])
+def test_without_a_terminal_and_without_consent_no_driver_is_opened(driver, nobody):
+    options = gp.RunOptions(connection=gp.Connection(port="/dev/nothing"))
+    with pytest.raises(UsageError, match="no terminal to ask on"):
+        gp.run_robot(motion="sweep-elbow", driver=driver, options=options)
+
+
+@pytest.mark.parametrize("answer", [False, None, "yes", 1], ids=repr)
+def test_a_consent_other_than_true_writes_to_no_servo(answer, bus, nobody, tmp_path):
+    port, servos = bus
+    statements = []
+
+    def consent(statement: str) -> object:
+        statements.append(statement)
+        return answer
+
+    (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
+    options = gp.RunOptions(connection=gp.Connection(port=port), control=ControlConfig(rate=4.0))
+    with pytest.raises(UsageError, match="nothing was commanded"):
+        gp.run_robot(
+            motion=tmp_path / "first.csv", driver="so101", options=options, consent=consent, report=SilentReporter()
+        )  # fmt: skip
+    assert "will move as planned" in statements[0]
+    assert not any(request[4] in WRITES for request in servos.heard)
+
+
+def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
+    port, servos = bus
+    (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
+    options = gp.RunOptions(
+        connection=gp.Connection(port=port),
+        control=ControlConfig(rate=4.0, damp=0.3),
+        safety=SafetyConfig(acceleration=2.0),
+    )
+    result = gp.run_robot(
+        motion=tmp_path / "first.csv", driver="so101", options=options, consent=lambda text: True
+    )
+    assert any(request[4] in WRITES for request in servos.heard)
+    assert not result.recording.virtual
+
+
+def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):
+    options = gp.RunOptions(connection=gp.Connection(topic="lowcmd"), yes=True)
+    with pytest.raises(UsageError, match="a robot that stands falls"):
+        gp.run_robot(motion="sweep-left_elbow", driver="unitree", options=options)
+
+
+# ---- limits
+
+
+@pytest.mark.parametrize(
+    ("name", "gain", "strong"),
+    [
+        ("h1_2", "kp = 100.0", "kp = 150.0"),
+        ("h1_2", "kd = 2.0", "kd = 3.0"),
+        ("so101", "kp = 17.8", "kp = 26.7"),
+    ],
+)
+@pytest.mark.parametrize("way", ["class", "open_driver", "run_robot", "command"])
+def test_a_folder_with_gains_beyond_the_known_robots_is_refused_in_every_way(
+    way, name, gain, strong, tmp_path, capsys
+):
+    folder = changed(name, gain, strong, tmp_path / "strong")
+    kind = DRIVER_OF[name]
+    message = r"k[pd] of \w+ is .*the known robot has"
+    if way == "command":
+        words = ["run", "--driver", kind, "--robot", str(folder), "--motion", "x", "--yes"]
+        assert main(words) == 2
+        assert re.search(message, " ".join(capsys.readouterr().err.split()))
+        return
+    with pytest.raises(RobotError, match=message):
+        open_in(way, kind, folder)
+
+
+def open_in(way: str, kind: str, folder: Path) -> None:
+    """Give a robot folder to a driver in one of the public ways."""
+    if way == "class":
+        from gaponet.hw.drivers.so101 import SO101Driver
+        from gaponet.hw.drivers.unitree import UnitreeDriver
+
+        {"unitree": UnitreeDriver, "so101": SO101Driver}[kind](load_robot(folder))
+    elif way == "open_driver":
+        open_driver(kind, folder)
+    else:
+        gp.run_robot(folder, motion="x", driver=kind, options=gp.RunOptions(yes=True))
+
+
+def test_a_robot_changed_in_memory_is_refused_though_its_folder_is_the_packages(so101):
+    strong = replace(so101, kp=1.5 * so101.kp)
+    with pytest.raises(RobotError, match=r"kp of .* the known robot has"):
+        hardware_robot(strong, reference_robot("so101", None))
+
+
+def test_a_driver_refuses_a_wider_joint_range(tmp_path):
+    save_robot(load_robot("so101"), tmp_path / "wide")
+    file = tmp_path / "wide" / "robot.xml"
+    file.write_text(re.sub(r'range="[^"]*"', 'range="-3 3"', file.read_text()))
+    with pytest.raises(RobotError, match=r"the range of .* the known robot has"):
+        open_driver("so101", tmp_path / "wide")
+
+
+def test_a_folder_that_the_user_names_may_have_other_gains_also_in_the_watchdog(tmp_path):
+    folder = changed("so101", "kp = 17.8", "kp = 26.7", tmp_path / "strong")
+    driver = open_driver("so101", folder, limits_from=str(folder))
+    watchdog = open_driver(**driver.watchdog())
+    np.testing.assert_allclose(watchdog.kp, 1.5 * load_robot("so101").kp)
+
+
+def test_no_folder_lifts_the_limits_of_the_motors(tmp_path):
+    folder = changed("h1_2", "kp = 100.0", "kp = 301.0", tmp_path / "strong")
+    with pytest.raises(RobotError, match="the driver of h1_2 takes at most 300"):
+        open_driver("unitree", folder, limits_from=str(folder))
