@@ -1,16 +1,12 @@
-"""gaponet experiment as a user types it."""
+"""gaponet experiment paper, as a user types it."""
 
 import json
-from types import SimpleNamespace
 
 import pytest
 from arm import recordings, write_arm
 
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-
-TRAIN = """--seeds 1 --budget 640 --pretraining.rounds 1 --pretraining.num-envs 16 --pretraining.steps 40
---pretraining.gradient-steps 20""".split()  # noqa: SIM905
 
 
 @pytest.fixture(scope="module")
@@ -23,46 +19,48 @@ def place(tmp_path_factory):
     return folder
 
 
-def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(
-    place, capsys, monkeypatch
-):
-    def identify(train, robot, val, progress):
-        return SimpleNamespace(
-            robot=robot.with_servos({joint: {"kp": 10.0} for joint in robot.operated})
-        )
-
-    monkeypatch.setattr("gaponet.experiments.compare.identify", identify)
-    words = ["experiment", "compare", str(place / "data"), "--out", str(place / "out"), "--robot", str(place / "arm"),
-             "--models", "mlp", *TRAIN, "--identify", "--json"]  # fmt: skip
-    assert main([*words, "--seeds", "0"]) == 2
-    assert "--seeds is at least 1" in capsys.readouterr().err
-    assert main(words) == 0
-    captured = capsys.readouterr()
-    found = json.loads(captured.out)
-    assert "1 trainings (1 settings), 0 there already" in captured.err
-    totals = {row[0]: row[2] for row in found["tables"]["totals"]["rows"]}
-    assert list(totals) == [
-        "nominal simulator",
-        "delay + offset",
-        "identification",
-        "MLP, full coupling",
+@pytest.fixture(scope="module")
+def words(place):
+    return [
+        *("experiment", "paper", str(place / "data"), "--out", str(place / "out"), "--quick"),
+        *("--methods", "GAPONet", "--blocks", "labels", "--json"),
     ]
-    assert totals["identification"]["mean"] < totals["nominal simulator"]["mean"]
-    assert found["facts"]["unseen"] is True
-    assert found["virtual"].startswith("VIRTUAL arm")
-    assert str(place) not in found["facts"]["command"]
-    for name in (
-        "compare.md",
-        "compare.csv",
-        "compare.svg",
-        "compare.png",
-        "report.html",
-        "cells/mlp-0/cell.json",
-    ):
-        assert (place / "out" / name).is_file(), name
+
+
+@pytest.fixture(scope="module")
+def first_run(words, place):
+    """Exit code of the first run, and when its result was written."""
+    code = main(words)
+    return code, (place / "out/trainings/labels-GAPONet-0/result.json").stat().st_mtime_ns
+
+
+def test_the_experiment_ends_in_a_page_with_the_paper_s_figures_and_tables(place, first_run):
+    assert first_run[0] == 0
+    page = (place / "out" / "paper.html").read_text(encoding="utf-8")
+    for number in ("Figure 1", "Figure 2", "Figure 3", "Table 1"):
+        assert f"<h2>{number}. " in page
+    assert "QUICK RUN" in page
+    assert (place / "out" / "figures" / "figure3_labels.svg").is_file()
+    assert (place / "out" / "tables" / "table1_labels.csv").is_file()
+
+
+def test_the_network_of_a_quick_run_takes_steps(place, first_run):
+    result = json.loads((place / "out/trainings/labels-GAPONet-0/result.json").read_text())
+    progress = place / "out/trainings/labels-GAPONet-0/progress.jsonl"
+    last = json.loads(progress.read_text(encoding="utf-8").splitlines()[-1])
+    assert last["stage"] == "ppo"
+    assert last["kl"] > 0
+    assert result["steps"] >= 1500
+
+
+def test_the_same_command_goes_on_where_it_was_and_prints_the_same(words, place, first_run, capsys):
     assert main(words) == 0
-    captured = capsys.readouterr()
-    assert "1 there already" in captured.err
-    assert json.loads(captured.out)["tables"] == found["tables"]
-    assert main([*words, "--budget", "641"]) == 2
-    assert "another budget" in capsys.readouterr().err
+    again = json.loads(capsys.readouterr().out)
+    written = (place / "out/trainings/labels-GAPONet-0/result.json").stat().st_mtime_ns
+    assert written == first_run[1]
+    assert again["tables"] == json.loads((place / "out" / "paper.json").read_text())["tables"]
+
+
+def test_results_of_another_experiment_are_not_mixed(words, first_run, capsys):
+    assert main([*words, "--fleet", "easy", "--unit", "virtual-2"]) == 2
+    assert "another unit" in capsys.readouterr().err

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -15,6 +15,26 @@ from gaponet.cli.options import Json, Source, actions
 from gaponet.cli.out import Out, writes
 from gaponet.experiments.paper.options import PaperOptions
 from gaponet.share.reading import open_dataset
+
+if TYPE_CHECKING:
+    from gaponet.experiments.paper.experiment import PaperResult
+
+TITLES = {  # of tables on the terminal; the page numbers them too
+    "claims_labels": "The paper's claims (labels, then PPO)",
+    "claims_ppo": "The paper's claims (PPO alone)",
+    "beside_paper": "Figure 2: the recordings",
+    "figure3_labels": "Figure 3 (labels, then PPO)",
+    "figure3_ppo": "Figure 3 (PPO alone)",
+    "table1_labels": "Table 1 (labels, then PPO)",
+    "table1_ppo": "Table 1 (PPO alone)",
+    "commands_labels": "Commands on the robot (labels, then PPO)",
+    "commands_ppo": "Commands on the robot (PPO alone)",
+    "table2": "Table 2",
+    "sensors": "What the Sensor Predictor saves",
+    "methods": "Methods",
+    "large_gaps_labels": "Large gaps (labels, then PPO)",
+    "large_gaps_ppo": "Large gaps (PPO alone)",
+}
 
 
 @writes("experiments")
@@ -39,13 +59,8 @@ def paper(
 
     screen = Out(json)
     data, robot = open_dataset(dataset, options.robot)
-    result = run_paper_experiment(data, robot, out, options, _share_bar, progress_bars)
-    for name, table in result.tables.items():
-        screen.show(name, table)
-        if table.caption:
-            screen.say(table.caption)
-    for sentence in result.sentences:
-        screen.say(f"- {sentence}")
+    result = run_paper_experiment(data, robot, out, options, share_bar, progress_bars)
+    show_paper_result(screen, result, tuple(result.tables))
     screen.say(f"written: {result.page}")
     screen.result(
         {
@@ -58,8 +73,20 @@ def paper(
         raise ModelError(f"{len(result.failures)} trainings failed; run it again to retry")
 
 
+def show_paper_result(screen: Out, result: PaperResult, shown: tuple[str, ...]) -> None:
+    """Print the tables of these names, and the conclusions."""
+    for name, table in result.tables.items():
+        if name not in shown:
+            continue
+        screen.show(TITLES.get(name, name), table)
+        if table.caption:
+            screen.say(table.caption)
+    for sentence in result.sentences:
+        screen.say(f"- {sentence}")
+
+
 @contextmanager
-def _share_bar(title: str) -> Iterator[Callable[[float], None]]:
+def share_bar(title: str) -> Iterator[Callable[[float], None]]:
     """Open a progress bar that is told the share done."""
     with progress_bar(title) as update:
         yield lambda share: update(share, 1.0, "")

@@ -35,3 +35,8 @@ def test_a_claim_of_40_percent_is_judged_by_two_standard_errors(mean, verdict):
 def test_no_correction_is_no_reduction():
     baseline = np.array([1.0, 3.0, 2.0])
     assert reduction([baseline], baseline, MOTIONS).mean == 0.0
+
+
+def test_where_there_is_no_error_nothing_is_reduced():
+    nothing = np.zeros(3)
+    assert reduction([nothing], nothing, MOTIONS).mean == 0.0

@@ -4,22 +4,18 @@ from dataclasses import replace
 
 import pytest
 
+from gaponet.experiments.paper.options import PaperOptions
 from gaponet.experiments.paper.printed import TABLE_2
 from gaponet.experiments.paper.tables import PRINTED_ROW
-from gaponet.experiments.paper.trainings import (
-    NETWORKS,
-    TABLE_2_CHANGES,
-    Budget,
-    all_trainings,
-)
+from gaponet.experiments.paper.trainings import NETWORKS, TABLE_2_CHANGES, all_trainings
 
-BUDGET = Budget(steps=100_000, seeds=3)
+OPTIONS = PaperOptions(steps=100_000, seeds=3)
 PAYLOADS = (0.0, 3.0)
 
 
 @pytest.fixture
 def trainings():
-    return all_trainings(BUDGET, (50.0, 100.0), PAYLOADS, table_2=True)
+    return all_trainings(OPTIONS, (50.0, 100.0), PAYLOADS)
 
 
 @pytest.mark.parametrize("block", ["labels", "ppo"])
@@ -59,9 +55,15 @@ def test_each_row_of_table_2_observes_as_many_values_as_the_paper_prints(trainin
 
 
 def test_a_dataset_of_one_rate_and_one_payload_has_no_rows_about_them():
-    rows = {t.name for t in all_trainings(BUDGET, (50.0,), (0.0,), table_2=True)}
+    rows = {t.name for t in all_trainings(OPTIONS, (50.0,), (0.0,))}
     assert not {"100 Hz", "payload in"} & rows
 
 
 def test_the_first_trainings_are_every_method_with_one_seed(trainings):
     assert [t.name for t in trainings[:4]] == list(NETWORKS)
+
+
+def test_only_the_methods_and_blocks_that_are_asked_for_are_trained():
+    options = replace(OPTIONS, methods=("GAPONet",), blocks=("ppo",))
+    trainings = all_trainings(options, (50.0,), PAYLOADS)
+    assert {(t.block, t.name) for t in trainings} == {("ppo", "GAPONet")}

@@ -13,6 +13,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.result_table import ResultTable
 from gaponet.experiments.paper.commands import REFERENCE_WAY, WAY_TITLES
+from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.printed import (
     AXES,
     CLAIM_ALL_PAYLOADS,
@@ -21,7 +22,7 @@ from gaponet.experiments.paper.printed import (
 )
 from gaponet.experiments.paper.results import Results
 from gaponet.experiments.paper.statistics import Reduction, reduction
-from gaponet.experiments.paper.trainings import BLOCK_TITLES, Block
+from gaponet.experiments.paper.trainings import BLOCK_TITLES
 
 BLOCKS: tuple[Block, ...] = ("labels", "ppo")
 JUDGED = "GAPONet"

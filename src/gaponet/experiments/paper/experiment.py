@@ -24,7 +24,7 @@ from gaponet.experiments.paper.claims import Claim, claim_table, claims
 from gaponet.experiments.paper.figure3 import draw_figure_3, figure_3_table
 from gaponet.experiments.paper.jobs import Job, SharedInputs, run_jobs
 from gaponet.experiments.paper.measure import ShareDone, record_unit
-from gaponet.experiments.paper.options import PaperOptions
+from gaponet.experiments.paper.options import Block, PaperOptions
 from gaponet.experiments.paper.page import Section, write_page
 from gaponet.experiments.paper.results import Results
 from gaponet.experiments.paper.study import Study, quick_dataset
@@ -36,7 +36,7 @@ from gaponet.experiments.paper.tables import (
     table_1,
     table_2,
 )
-from gaponet.experiments.paper.trainings import BLOCK_TITLES, Block, Budget, all_trainings
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, all_trainings
 from gaponet.experiments.paper.unseen_motions import require_unseen
 from gaponet.robot.spec import RobotSpec
 
@@ -142,14 +142,8 @@ def record_unseen(study: Study, rate: float, progress: ShareDone) -> None:
 
 def all_jobs(study: Study) -> list[Job]:
     """Return all jobs, identification and baselines first."""
-    options = study.options
-    budget = Budget(options.steps, options.seeds, options.quick)
-    trainings = all_trainings(budget, study.rates, study.payloads, table_2=not options.only)
-    jobs = [Job(study)]
-    for training in trainings:
-        if not options.only or training.name in options.only:
-            jobs.append(Job(study, training))
-    return jobs
+    trainings = all_trainings(study.options, study.rates, study.payloads)
+    return [Job(study), *(Job(study, training) for training in trainings)]
 
 
 def summarise(study: Study, jobs: list[Job], failures: list[str]) -> PaperResult:

@@ -8,8 +8,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd, ResultTable
+from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.results import Results
-from gaponet.experiments.paper.trainings import Block
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 
 if TYPE_CHECKING:

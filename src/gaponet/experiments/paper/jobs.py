@@ -44,7 +44,7 @@ STOP_FILE = (
     "stop"  # exists while the experiment is to end: running trainings store a checkpoint and end
 )
 LOCK_TIMEOUT_S = 60.0  # trainings of an experiment that was killed end within this time
-QUICK_IDENTIFY_WINDOWS = 2
+QUICK_IDENTIFY_S = 1.0  # time of its searches in a quick run
 
 Show = Callable[[Running, int], None]
 
@@ -203,14 +203,18 @@ def measure_baselines(job: Job) -> None:
 
 def identified_robot(study: Study) -> RobotSpec:
     """Return the robot identified on the training recordings; it is stored in OUT/identified."""
-    from gaponet.sysid.identify import identify
+    from gaponet.sysid.identify import WINDOWS, identify
 
     folder = study.out / "identified"
     if not (folder / "robot.toml").is_file():
         splits = study.splits()
-        options: dict[str, Any] = {"nthread": 1}
+        options: dict[str, Any] = {"nthread": 1, "windows": study.options.identify_windows}
+        if (
+            study.options.identify_windows < WINDOWS
+        ):  # in a hurry: gains, friction, delay and offset alone
+            options |= {"terms": (), "table": False}
         if study.options.quick:
-            options |= {"windows": QUICK_IDENTIFY_WINDOWS, "terms": (), "table": False, "budget": 1}
+            options |= {"budget": QUICK_IDENTIFY_S}
         fitted = identify(
             study.data.sequences(splits["train"]),
             study.robot,

@@ -11,8 +11,9 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.experiments.paper.jobs import Job
+from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.study import Study
-from gaponet.experiments.paper.trainings import NETWORKS, Block
+from gaponet.experiments.paper.trainings import NETWORKS
 
 WRIST = "wrist"  # the paper's Figure 3 and MPJAE are without wrists
 

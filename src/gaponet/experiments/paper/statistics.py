@@ -57,13 +57,13 @@ def reduction(errors: ListOf[Array], baseline: Array, motions: ListOf[str]) -> R
         baseline: Error of each recording by the baseline, (recordings,).
         motions: Motion of each recording: recordings of one motion are not independent.
     """
-    by_seed = np.array([100 * (1 - error.sum() / baseline.sum()) for error in errors])
+    by_seed = np.array([_percent_less(error, baseline) for error in errors])
     mean_error = np.mean(errors, axis=0)  # (recordings,)
     names = list(dict.fromkeys(motions))
     left_out = []
     for name in names:
         kept = np.array([motion != name for motion in motions])
-        left_out.append(100 * (1 - mean_error[kept].sum() / baseline[kept].sum()))
+        left_out.append(_percent_less(mean_error[kept], baseline[kept]))
     count = len(names)
     motion_error = 0.0
     if count > 1:
@@ -72,3 +72,11 @@ def reduction(errors: ListOf[Array], baseline: Array, motions: ListOf[str]) -> R
     if len(by_seed) > 1:
         seed_error = float(by_seed.std(ddof=1) / np.sqrt(len(by_seed)))
     return Reduction(float(by_seed.mean()), seed_error, motion_error, len(by_seed), count)
+
+
+def _percent_less(error: Array, baseline: Array) -> float:
+    """Return the reduction of the sum, %; 0 where there is no error to reduce."""
+    total = float(baseline.sum())
+    if total == 0.0:
+        return 0.0
+    return 100 * (1 - float(error.sum()) / total)

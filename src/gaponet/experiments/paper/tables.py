@@ -15,9 +15,10 @@ from gaponet.experiments.paper.commands import (
     WAY_TITLES,
 )
 from gaponet.experiments.paper.measure import LARGE_GAPS_RAD
+from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.printed import AXES, TABLE_1, TABLE_2, PrintedRow
 from gaponet.experiments.paper.results import Results
-from gaponet.experiments.paper.trainings import BLOCK_TITLES, TABLE_2_CHANGES, Block
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, TABLE_2_CHANGES
 
 CONVERGED_SHARE = 0.5  # of the nominal error; above it a row of Table 2 is not converged
 # Row of Table 2 here → row of the paper. The paper does not say what is held for an action duration.

@@ -7,12 +7,11 @@ recipe. Block "table2": the paper's network in its own form, one setting changed
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
+from gaponet.experiments.paper.options import Block, Method, PaperOptions
 from gaponet.nn.config import ModelConfig, ModelKind
 from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 
-Block = Literal["labels", "ppo", "table2"]
 BLOCK_TITLES: dict[Block, str] = {
     "labels": "labels, then PPO",
     "ppo": "PPO alone",
@@ -20,7 +19,7 @@ BLOCK_TITLES: dict[Block, str] = {
 }
 
 # Method → kind of network. The order is that of all tables.
-NETWORKS: dict[str, ModelKind] = {
+NETWORKS: dict[Method, ModelKind] = {
     "MLP": "mlp",  # ASAP's form, the paper's baseline
     "shared MLP": "shared_mlp",  # the inputs and the number of weights of GAPONet
     "literal": "paper",  # equations 1 to 4 of the paper, with its widths
@@ -53,7 +52,7 @@ QUICK_PRETRAINING = PretrainingConfig(
     rounds=1, num_envs=16, steps=40, gradient_steps=30, batch_size=128, sensor_states=128
 )
 QUICK_PPO = PPOConfig(
-    num_envs=16, num_steps=16, epochs=1, mini_batches=1, critic_warmup=1, explained=-1e9
+    num_envs=16, num_steps=16, epochs=2, mini_batches=1, critic_warmup=1, explained=-1e9
 )
 QUICK_NO_VALIDATION = 1_000  # updates between validations: only the last one counts
 
@@ -83,23 +82,8 @@ class Training:
         return "".join(letter if letter.isalnum() or letter in "-+" else "_" for letter in words)
 
 
-@dataclass(frozen=True)
-class Budget:
-    """Lengths of the trainings.
-
-    Attributes:
-        steps: Control steps of one training.
-        seeds: Trainings of each setting.
-        quick: Tiny networks' worth of work, to see that everything runs.
-    """
-
-    steps: int
-    seeds: int
-    quick: bool = False
-
-
 def all_trainings(
-    budget: Budget, rates: tuple[float, ...], payloads: tuple[float, ...], *, table_2: bool
+    options: PaperOptions, rates: tuple[float, ...], payloads: tuple[float, ...]
 ) -> list[Training]:
     """Return all trainings, the most important first, so that an interrupted night has every method.
 
@@ -107,20 +91,34 @@ def all_trainings(
         rates: Control rates of the dataset, Hz, ascending. The first one is used wherever the rate is not the question.
         payloads: Payloads of the dataset, kg.
     """
-    base = TrainConfig(rates=rates[:1])
+    trainings: list[Training] = []
+    for block in ("labels", "ppo"):
+        if block not in options.blocks:
+            continue
+        for seed in range(options.seeds):
+            trainings += method_trainings(options, block, seed, rates[:1])
+    if "table2" in options.blocks:
+        for seed in range(options.seeds):
+            trainings += table_2_trainings(options, seed, rates, payloads)
+    return trainings
+
+
+def method_trainings(
+    options: PaperOptions, block: Block, seed: int, rates: tuple[float, ...]
+) -> list[Training]:
+    """Return one training of each network with the same settings."""
+    config = _recipe(TrainConfig(rates=rates, seed=seed), block, options)
     trainings = []
-    for seed in range(budget.seeds):
-        trainings += _methods("labels", _recipe(base, "labels", budget), seed, budget.steps)
-    for seed in range(budget.seeds):
-        trainings += _methods("ppo", _recipe(base, "ppo", budget), seed, budget.steps)
-    if table_2:
-        for seed in range(budget.seeds):
-            trainings += table_2_trainings(budget, seed, rates, payloads)
+    for name, kind in NETWORKS.items():
+        if name in options.methods:
+            model = replace(config.model, kind=kind)
+            own = replace(config, model=model)
+            trainings.append(Training(block, name, seed, own, options.steps))
     return trainings
 
 
 def table_2_trainings(
-    budget: Budget, seed: int, rates: tuple[float, ...], payloads: tuple[float, ...]
+    options: PaperOptions, seed: int, rates: tuple[float, ...], payloads: tuple[float, ...]
 ) -> list[Training]:
     """Return the rows of Table 2 that the dataset allows."""
     trainings = []
@@ -131,32 +129,19 @@ def table_2_trainings(
             continue
         row_rates = rates[-1:] if row == "100 Hz" else rates[:1]
         model = replace(TABLE_2_MODEL, **changes)  # type: ignore[arg-type]
-        config = TrainConfig(model=model, rates=row_rates)
-        config = _recipe(config, "labels", budget)
-        trainings.append(Training("table2", row, seed, _seeded(config, seed), budget.steps))
+        config = _recipe(TrainConfig(model=model, rates=row_rates, seed=seed), "labels", options)
+        trainings.append(Training("table2", row, seed, config, options.steps))
     return trainings
 
 
-def _methods(block: Block, config: TrainConfig, seed: int, steps: int) -> list[Training]:
-    """Return one training of each network with the same settings."""
-    trainings = []
-    for name, kind in NETWORKS.items():
-        model = replace(config.model, kind=kind)
-        trainings.append(
-            Training(block, name, seed, _seeded(replace(config, model=model), seed), steps)
-        )
-    return trainings
-
-
-def _recipe(config: TrainConfig, block: Block, budget: Budget) -> TrainConfig:
+def _recipe(config: TrainConfig, block: Block, options: PaperOptions) -> TrainConfig:
     """Return the settings with the training of a block."""
     config = replace(config, threads=1, pretraining=PRETRAINING)
-    if budget.quick:
+    if options.quick:
         config = replace(
-            config, pretraining=QUICK_PRETRAINING, ppo=QUICK_PPO, validate_every=QUICK_NO_VALIDATION
+            config,
+            pretraining=QUICK_PRETRAINING,
+            ppo=QUICK_PPO,
+            validate_every=QUICK_NO_VALIDATION,
         )
     return config.paper_recipe() if block == "ppo" else config
-
-
-def _seeded(config: TrainConfig, seed: int) -> TrainConfig:
-    return replace(config, seed=seed)
