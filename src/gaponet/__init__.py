@@ -19,6 +19,7 @@ from gaponet.base.errors import GAPONetError as GAPONetError
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gaponet.api import *  # noqa: F403
+    from gaponet.api.paper import paper_experiment as paper_experiment
     from gaponet.api.results import *  # noqa: F403
     from gaponet.api.run_options import Connection as Connection
     from gaponet.api.run_options import RunOptions as RunOptions
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from gaponet.deploy.aligned_sim import AlignedSim as AlignedSim
     from gaponet.deploy.compensator import Compensator as Compensator
     from gaponet.deploy.mujoco_loop import MujocoAligner as MujocoAligner
+    from gaponet.experiments.paper.experiment import PaperResult as PaperResult
+    from gaponet.experiments.paper.options import PaperOptions as PaperOptions
     from gaponet.hw.control.controller import Controller as Controller
     from gaponet.hw.targets.client import RemoteRobot as RemoteRobot
     from gaponet.nn.artifact import GapModel as GapModel
@@ -52,6 +55,9 @@ else:
              "IdentifyResult", "PairResult", "ReplayResult", "RunResult", "TorqueResult", "TrainResult"),
             "gaponet.api.results",
         ),
+        "paper_experiment": "gaponet.api.paper",
+        "PaperOptions": "gaponet.experiments.paper.options",
+        "PaperResult": "gaponet.experiments.paper.experiment",
         "run_robot": "gaponet.api.run_robot",
         "RunOptions": "gaponet.api.run_options",
         "Connection": "gaponet.api.run_options",

@@ -72,3 +72,6 @@ gp.gap(data, robot)  # type: ignore[call-arg]
 gp.gap(data, motion="wave")  # type: ignore[call-arg]
 gp.run_robot(robot, "sweep-elbow_flex")  # type: ignore[call-arg]
 gp.run_robot(robot, consent=True)  # type: ignore[arg-type]
+paper = gp.paper_experiment(data, out="paper_run", options=gp.PaperOptions(seeds=1))
+assert_type(paper, gp.PaperResult)
+assert_type(paper.page, Path)

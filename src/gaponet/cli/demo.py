@@ -32,9 +32,8 @@ def demo(out: Path = Path("demo_run"), json: Json = False) -> None:
     """
     if any(find_spec(module) is None for module in NEEDED_MODULES):
         raise UsageError("the demo trains and draws: pip install 'gaponet[train,report]'")
-    from gaponet.experiments.paper.experiment import run_paper_experiment
+    from gaponet.api.paper import paper_experiment
     from gaponet.experiments.paper.options import DEMO
-    from gaponet.share.reading import open_dataset
 
     began = time.monotonic()
     screen = Out(json)
@@ -53,8 +52,9 @@ def demo(out: Path = Path("demo_run"), json: Json = False) -> None:
             f"--out {experiment})",
             "3 The paper's experiment, in small",
         )
-        data, robot = open_dataset(str(dataset))
-        result = run_paper_experiment(data, robot, experiment, DEMO, share_bar, progress_bars)
+        result = paper_experiment(
+            dataset, out=experiment, options=DEMO, open_bar=share_bar, open_bars=progress_bars
+        )
         shown = ("figure3_labels", "table1_labels", "claims_labels")
         show_paper_result(screen, result, shown)
         screen.say(f"the page: {result.page}  ({time.monotonic() - began:.0f} s in all)")

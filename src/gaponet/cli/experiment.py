@@ -14,7 +14,6 @@ from gaponet.base.progress import progress_bar, progress_bars
 from gaponet.cli.options import Json, Source, actions
 from gaponet.cli.out import Out, writes
 from gaponet.experiments.paper.options import PaperOptions
-from gaponet.share.reading import open_dataset
 
 if TYPE_CHECKING:
     from gaponet.experiments.paper.experiment import PaperResult
@@ -55,11 +54,12 @@ def paper(
         options: Size of the experiment, and where it runs.
     """
     import gaponet.report.page  # noqa: F401  # needs an extra; without it nothing is trained
-    from gaponet.experiments.paper.experiment import run_paper_experiment
+    from gaponet.api.paper import paper_experiment
 
     screen = Out(json)
-    data, robot = open_dataset(dataset, options.robot)
-    result = run_paper_experiment(data, robot, out, options, share_bar, progress_bars)
+    result = paper_experiment(
+        dataset, out=out, options=options, open_bar=share_bar, open_bars=progress_bars
+    )
     show_paper_result(screen, result, tuple(result.tables))
     screen.say(f"written: {result.page}")
     screen.result(
