@@ -103,7 +103,10 @@ class Job:
         words = self.words
         if "--out" in words[:-1]:
             written = words[words.index("--out") + 1]
-            path_inside(self._root, written)
+            try:
+                path_inside(self._root, written)
+            except UsageError as error:
+                raise UsageError(f"{self._name}: --out: {error}") from None
             return f"./{written}"
         if words[:2] not in (["robot", "check"], ["data", "card"]) or len(words) < 3:
             return ""
