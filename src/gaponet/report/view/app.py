@@ -365,19 +365,18 @@ class App:
         """Show how far the running command is."""
         self.bar.visible = running is not None
         self.cancel.visible = running is not None
-        self.running.content = ""
+        text = ""
         if running is not None:
             self.bar.value, note = running.progress()
             command = escape_markdown(running.words[0])
-            self.running.content = (
-                f"**gaponet {command}**, {self.bar.value:.0f} %. {escape_markdown(note)}"
-            )
-        if elsewhere is not None:
+            text = f"**gaponet {command}**, {self.bar.value:.0f} %. {escape_markdown(note)}"
+        elif elsewhere is not None:
             command = escape_markdown(elsewhere.words[0])
-            self.running.content = (
+            text = (
                 f"**gaponet {command}** of an earlier page is still running. "
                 "It ends soon, because the server of that page has ended."
             )
+        self.running.content = text
 
     def _show_results(self) -> None:
         """Show the result of each step, and what may be done next."""
@@ -392,9 +391,10 @@ class App:
             pictures.content = self._pictures(step, job)
         reasons = [f"Left out: {escape_markdown(text)}" for text in self.jobs.unreadable()]
         self.unreadable.content = "\n\n".join(reasons)
-        self.target.options = TARGETS
+        targets = TARGETS
         if self._network() is not None:
-            self.target.options = TARGETS + NETWORK_TARGETS
+            targets = TARGETS + NETWORK_TARGETS
+        self.target.options = targets
         self.fit.disabled = bool(self._locked())
         self.proposal.visible = self.jobs.result("doctor") is not None
 

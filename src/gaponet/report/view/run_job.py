@@ -15,9 +15,10 @@ import os
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
-from gaponet.base.files import WINDOWS, lock_file, write_json
+from gaponet.base.files import LOCK_RETRY_S, WINDOWS, lock_file, write_json
 
 LOCK = "lock"  # file of a job, locked while its process lives
 ENDED = "ended.json"  # file of a job, written when it ends
@@ -34,7 +35,7 @@ def main() -> None:
     from gaponet.__main__ import entry
 
     folder = Path(sys.argv.pop(1))
-    _lock = lock_file(folder / LOCK)  # the system releases it at the end
+    _lock = _lock_job(folder / LOCK)  # the system releases it at the end
     server = _take_standard_input()
     threading.Thread(target=_end_with_server, args=(server, folder), daemon=True).start()
     code = 1  # of an exception that nobody expected
@@ -45,6 +46,15 @@ def main() -> None:
         raise
     finally:
         write_ending(folder, BY_ITSELF, code)
+
+
+def _lock_job(path: Path) -> int:
+    """Lock a job's file; a page that looks whether the job lives may hold it for a moment."""
+    while True:
+        descriptor = lock_file(path)
+        if descriptor is not None:
+            return descriptor
+        time.sleep(LOCK_RETRY_S)
 
 
 def _take_standard_input() -> int:

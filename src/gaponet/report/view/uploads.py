@@ -184,7 +184,7 @@ def connect_upload_button(button: Any, receive: Callable[[str, bytes], None]) ->
     Raises:
         UsageError: This version of viser keeps its callbacks elsewhere.
     """
-    state = getattr(button, "_impl", None)
+    state: Any = getattr(button, "_impl", None)
     if not isinstance(getattr(state, "update_cb", None), list):
         raise UsageError(
             "this version of viser mixes up uploads; run: pip install 'viser>=1.1,<1.2'"
@@ -289,7 +289,7 @@ def _require_free(file: Path, target: Path) -> None:
 
 def _missing_folders(files: list[Path], target: Path) -> set[Path]:
     """Return the folders below `target` that relative paths need and that do not exist."""
-    missing = set()
+    missing = set[Path]()
     for file in files:
         missing.update(target / parent for parent in file.parents if not (target / parent).exists())
     return missing
