@@ -180,16 +180,15 @@ from gaponet.report.view import app, jobs
 
 COMMAND = '''
 import subprocess, sys, time
-import gaponet.__main__ as command
-from gaponet.report.view.run_job import main
+from pathlib import Path
+from gaponet.report.view.run_job import run
 
 def wait():
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     print(child.pid, flush=True)
     time.sleep(600)
 
-command.entry = wait
-main()
+run(Path(sys.argv[1]), wait)
 '''
 jobs.module_command = lambda module, folder, *words: [sys.executable, "-c", COMMAND, folder]
 running = jobs.Jobs(Path(sys.argv[1]))

@@ -12,10 +12,12 @@ The server holds the writing end of a pipe, and never writes. The system closes 
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from gaponet.base.files import LOCK_RETRY_S, WINDOWS, lock_file, write_json
@@ -32,20 +34,28 @@ def write_ending(folder: Path, how: str, code: int = 0) -> None:
 
 def main() -> None:
     """Run the command line of this process as a job of the page."""
-    from gaponet.__main__ import entry
+    run(Path(sys.argv.pop(1)), _gaponet)
 
-    folder = Path(sys.argv.pop(1))
+
+def run(folder: Path, command: Callable[[], object]) -> None:
+    """Run a command as the job of a folder, and store how it ended."""
     _lock = _lock_job(folder / LOCK)  # the system releases it at the end
     server = _take_standard_input()
     threading.Thread(target=_end_with_server, args=(server, folder), daemon=True).start()
     code = 1  # of an exception that nobody expected
     try:
-        entry()
+        command()
+        code = 0
     except SystemExit as leaving:
-        code = leaving.code if isinstance(leaving.code, int) else 1
+        code = leaving.code if isinstance(leaving.code, int) else code
         raise
     finally:
         write_ending(folder, BY_ITSELF, code)
+
+
+def _gaponet() -> None:
+    """Do what `python -m gaponet` does."""
+    runpy.run_module("gaponet", run_name="__main__", alter_sys=True)
 
 
 def _lock_job(path: Path) -> int:
