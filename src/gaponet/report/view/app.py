@@ -391,7 +391,7 @@ class App:
             pictures.content = self._pictures(step, job)
         reasons = [f"Left out: {escape_markdown(text)}" for text in self.jobs.unreadable()]
         self.unreadable.content = "\n\n".join(reasons)
-        targets = TARGETS
+        targets: tuple[str, ...] = TARGETS
         if self._network() is not None:
             targets = TARGETS + NETWORK_TARGETS
         self.target.options = targets
