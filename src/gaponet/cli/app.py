@@ -12,7 +12,11 @@ from gaponet.base.files import lock_folder
 from gaponet.cli.out import Out
 
 
-def app(folder: tyro.conf.Positional[Path] = Path("gaponet_app"), port: int = 8080) -> None:
+def app(
+    folder: tyro.conf.Positional[Path] = Path("gaponet_app"),
+    port: int = 8080,
+    outside: tuple[Path, ...] = (),
+) -> None:
     """All steps in a browser: from logs to an identified simulator.
 
     The page is served to this machine only. Its address holds a secret. Ctrl-C ends it.
@@ -21,10 +25,12 @@ def app(folder: tyro.conf.Positional[Path] = Path("gaponet_app"), port: int = 80
     Args:
         folder: Folder for logs, models and results.
         port: Port of the page, on this machine; the next free one is taken.
+        outside: Other folders that the results in `folder` may use, as gaponet view prints them.
     """
     if find_spec("viser") is None:
         raise UsageError("gaponet app needs viser; run: pip install 'gaponet[view,report]'")
     from gaponet.report.view.app import App, serve
 
     with lock_folder(folder, "app"):
-        serve(App(folder.resolve(), port), Out().say)
+        allowed = tuple(path.resolve() for path in outside)
+        serve(App(folder.resolve(), port, allowed), Out().say)

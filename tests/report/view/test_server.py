@@ -53,6 +53,29 @@ def test_only_the_address_with_the_token_shows_the_page(address):
     assert answer(address, address.path + "../../../../etc/passwd")[0].status == 404
 
 
+def test_only_scripts_of_the_page_itself_run_and_they_reach_only_its_server(address):
+    response, text = answer(address)
+    policy = dict(
+        directive.split(" ", 1)
+        for directive in response.headers["Content-Security-Policy"].split("; ")
+    )
+    nonce = policy["script-src"].split("'")[1].removeprefix("nonce-")
+    assert policy["script-src"] == f"'nonce-{nonce}' 'wasm-unsafe-eval'"
+    assert policy["connect-src"] == f"'self' ws://127.0.0.1:{address.port} data: blob:"
+    assert policy["default-src"] == "'none'"
+    assert text.count(b"<script nonce=") == 2
+    assert text.count(b"<script") == text.count(b"<script nonce=")
+    assert answer(address)[0].headers["Content-Security-Policy"].count(nonce) == 0
+
+
+def test_a_page_of_viser_without_a_script_is_refused():
+    from gaponet.base.errors import UsageError
+    from gaponet.report.view.server import with_nonce
+
+    with pytest.raises(UsageError, match="page that is not known"):
+        with_nonce("<html><head></head></html>", "", "x")
+
+
 def test_a_page_of_another_name_or_of_another_site_is_refused(address):
     assert answer(address, Host=f"localhost:{address.port}")[0].status == 200
     assert answer(address, Host="evil.example:80")[0].status == 403

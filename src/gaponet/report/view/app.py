@@ -1,17 +1,19 @@
-"""The page of `gaponet app`: six steps from logs to an identified simulator, each by commands in one folder."""
+"""The page of `gaponet app`: six steps from logs to an identified simulator, each by commands in one folder.
+
+The folder may come from somebody else. Markdown and HTML of the page hold its texts only escaped; jobs.py validates
+what commands left there, inside.py keeps to files of the folder, and server.py lets no other script run.
+"""
 
 from __future__ import annotations
 
 import base64
-import io
-import os
+import html
 import re
+import shlex
 import shutil
 import signal
 import sys
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Callable, Iterable
 from importlib.resources import files
 from pathlib import Path
@@ -20,47 +22,67 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import GAPONetError, UsageError
-from gaponet.base.files import FOLDER_MARKER, write_text
+from gaponet.base.files import write_text
 from gaponet.base.text import escape_markdown
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import look
 from gaponet.data.store import Dataset
 from gaponet.report.methods import colour
 from gaponet.report.verdict import NetworkGain
+from gaponet.report.view.inside import read_inside
 from gaponet.report.view.jobs import OUT, PROGRESS_LINE, Job, Jobs
 from gaponet.report.view.player import Player, draw_curves
+from gaponet.report.view.run_job import BY_ITSELF, CANCELLED, WITH_SERVER
 from gaponet.report.view.scene import Scene
 from gaponet.report.view.server import open_server, run_until_interrupt
 from gaponet.report.view.side_by_side import Clip, SideBySide, side_by_side, standing
+from gaponet.report.view.uploads import PLACES, Uploads, connect_upload_button
 from gaponet.robot.finding import Finding
-from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
+from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_robots
 from gaponet.sim.dataset_robot import dataset_robot
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "signed_percent")
 TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
-POLL_S, MAX_UNPACKED_BYTES = 0.5, 2 << 30
+POLL_S = 0.5
 PANEL_WIDTH = 560  # pixels
-STYLE = files("gaponet.report").joinpath("templates", "app.html")
+TEMPLATES = files("gaponet.report").joinpath("templates")
 
 
 class App:
     """Controls, texts and pictures of the page. All pages of a server show the same."""
 
-    def __init__(self, folder: Path, port: int) -> None:
-        """Serve the page of a folder, an absolute path, which holds logs, models, commands and their results."""
-        self.folder, self.jobs, self.polled, self.seen = folder, Jobs(folder), 0.0, (-1, True)
-        self.server, self.address = open_server("gaponet app", port)
+    def __init__(self, folder: Path, port: int, outside: tuple[Path, ...] = ()) -> None:
+        """Serve the page of a folder, an absolute path, which holds logs, models, commands and their results.
+
+        Args:
+            outside: Other folders, absolute paths, that stored commands may use: a robot, a dataset.
+
+        Raises:
+            UsageError: A folder in it is a link.
+        """
+        _make_places(folder)
+        self.folder = folder
+        self.jobs = Jobs(folder, outside)
+        self.polled = 0.0
+        self.seen: tuple[int, str] | None = None  # number of jobs and name of the living one
+        script = TEMPLATES.joinpath("app.js").read_text(encoding="utf-8")
+        self.server, self.address = open_server("gaponet app", port, script)
         self.gui = self.server.gui
         self.texts: dict[str, tuple[Any, str, Any]] = {}  # step → text, hint, pictures
         self.player: Player | None = None
-        for name in ("logs", "model", "new_logs"):
-            (folder / name).mkdir(exist_ok=True)
         self.gui.main_panel.set_width(PANEL_WIDTH)
-        self.gui.add_html(STYLE.read_text(encoding="utf-8"))
-        self.status, self.bar = self.gui.add_markdown(""), self.gui.add_progress_bar(0.0)
+        self.gui.add_html(TEMPLATES.joinpath("app.html").read_text(encoding="utf-8"))
+        self.status = self.gui.add_markdown("")
+        self.running = self.gui.add_markdown("")
+        self.bar = self.gui.add_progress_bar(0.0)
         self.cancel = self._button("Cancel", lambda _: self.jobs.cancel())
+        self.notices = self.gui.add_markdown("")
+        self.uploads = Uploads(folder, self.jobs, self._show_notices)
+        self.dismiss = self._button("Dismiss", lambda _: self.uploads.notices.dismiss())
+        self.dismiss.visible = False
+        self.unreadable = self.gui.add_markdown("")
         tabs = self.gui.add_tab_group()
         for number, step in enumerate(
             (self._robot, self._logs, self._check, self._gap, self._identify, self._use), 1
@@ -76,6 +98,7 @@ class App:
         self.polled += elapsed
         if self.polled >= POLL_S:
             self.polled = 0.0
+            self._attempt(self.uploads.place_waiting)
             self._attempt(self.refresh)
 
     # Steps: controls, and the command of each button.
@@ -145,19 +168,18 @@ class App:
             choice.on_update(lambda _: self._draw_recording())
 
     def _set_aside(self, _: Any, place: str = "logs") -> None:
-        self.jobs.require_idle()
-        aside = next(
-            name
-            for n in range(1, 1 << 20)
-            if not (self.folder / (name := f"{place}_aside{n}")).exists()
-        )
-        (self.folder / place).rename(self.folder / aside)
-        (self.folder / place).mkdir()
+        number = 1
+        while (self.folder / f"{place}_aside{number}").exists():
+            number += 1
+        aside = f"{place}_aside{number}"
+        with self.jobs.idle():
+            (self.folder / place).rename(self.folder / aside)
+            (self.folder / place).mkdir()
         self.status.content = f"The logs are in {aside} now; {place} is empty."
 
     def _guess(self, _: Any) -> None:
         file = self.folder / "logs" / "logs.toml"
-        if file.is_file() and file.read_text(encoding="utf-8") != self.described.value:
+        if file.is_file() and self._stored_description() != self.described.value:
             raise UsageError(f"{file} is there, and a guess would replace it; move it away first")
         kind, facts, recordings = look(self.folder / "logs")
         self.described.value = guess_logs(recordings, self._chosen_robot(), kind, dict(facts))
@@ -189,10 +211,15 @@ class App:
         self._text("doctor", "Read the logs first. Then check them.")
 
     def _propose(self, _: Any) -> None:
-        findings = [Finding(**f) for f in (self._need("doctor").result or {})["findings"]]
-        file = self.folder / "logs" / "logs.toml"
-        own = self.described.value or (file.read_text(encoding="utf-8") if file.is_file() else "")
+        findings = _findings(self._need("doctor"))
+        own = self.described.value or self._stored_description()
         self.described.value = f"{own}\n{Finding.proposal(findings)}".lstrip()
+
+    def _stored_description(self) -> str:
+        """Return the logs.toml of the folder; "" if there is none."""
+        if not (self.folder / "logs" / "logs.toml").is_file():
+            return ""
+        return read_inside(self.folder, "logs/logs.toml").decode()
 
     def _gap(self) -> None:
         self._run("Measure the error", "gap", lambda: ("gap", self._need("import").out))
@@ -234,12 +261,11 @@ class App:
         job = self.jobs.result("doctor")
         if job is None:
             return self.texts["identify"][1]
-        errors = ", ".join(
-            f["check"] for f in (job.result or {})["findings"] if f["level"] == "error"
-        )
-        return (
-            errors and f"Locked: the check finds an error ({errors}). Step Check says what to do."
-        )
+        errors = [finding.check for finding in _findings(job) if finding.level == "error"]
+        if not errors:
+            return ""
+        names = escape_markdown(", ".join(errors))
+        return f"Locked: the check finds an error ({names}). Step Check says what to do."
 
     def _use(self) -> None:
         out, self.target = lambda step: self._need(step).out, self.gui.add_dropdown("for", TARGETS)
@@ -294,9 +320,11 @@ class App:
     def _network(self) -> Job | None:
         """Return the training if its network helps on validation motions."""
         job = self.jobs.result("train")
-        error = (job.result or {})["val_mpjae"] if job is not None else {}
+        if job is None or job.result is None:
+            return None
+        error = job.result.get("val_mpjae", {})
         gain = NetworkGain(
-            "", error.get("added", 0.0), error.get("error") or np.nan, error.get("start", 0.0)
+            "", error.get("added") or 0.0, error.get("error") or np.nan, error.get("start") or 0.0
         )
         return job if gain.helps else None
 
@@ -306,12 +334,8 @@ class App:
         """Show the running command; when one starts or ends, also the results and what may be done next."""
         with self.jobs.lock:  # a job that is being started is neither running nor ended
             running, every = self.jobs.running, self.jobs.all
-        self.bar.visible = self.cancel.visible = running is not None
-        if running is not None:
-            self.bar.value, note = running.progress()
-            self.status.content = (
-                f"**gaponet {running.words[0]}**, {self.bar.value:.0f} %. {escape_markdown(note)}"
-            )
+            elsewhere = self.jobs.running_elsewhere
+        self._show_progress(running, elsewhere)
         models = [
             f
             for f in sorted((self.folder / "model").rglob("*"))
@@ -321,38 +345,73 @@ class App:
             *packaged_robots(),
             *(f.relative_to(self.folder).as_posix() for f in models),
         ]
-        if self.seen == (state := (len(every), running is None)):
+        living = running or elsewhere
+        state = (len(every), living.folder.name if living else "")
+        if self.seen == state:
             return
-        if running is None:
-            self.status.content = _ending(every[-1]) if every else "Six steps, from left to right."
+        if living is not None:
+            self.status.content = ""
+        elif every:
+            self.status.content = _ending(every[-1])
+        else:
+            self.status.content = "Six steps, from left to right."
+        self._show_results()
+        if self.jobs.result("import"):
+            self._show_recordings()
+        self._go_on(living, every)
+        self.seen = state  # last: after an error all is shown again
+
+    def _show_progress(self, running: Job | None, elsewhere: Job | None) -> None:
+        """Show how far the running command is."""
+        self.bar.visible = running is not None
+        self.cancel.visible = running is not None
+        text = ""
+        if running is not None:
+            self.bar.value, note = running.progress()
+            command = escape_markdown(running.words[0])
+            text = f"**gaponet {command}**, {self.bar.value:.0f} %. {escape_markdown(note)}"
+        elif elsewhere is not None:
+            command = escape_markdown(elsewhere.words[0])
+            text = (
+                f"**gaponet {command}** of an earlier page is still running. "
+                "It ends soon, because the server of that page has ended."
+            )
+        self.running.content = text
+
+    def _show_results(self) -> None:
+        """Show the result of each step, and what may be done next."""
         for step, (text, hint, pictures) in self.texts.items():
             job = self.jobs.result(step)
-            hint = (step == "identify" and self._locked()) or hint
-            text.content, pictures.content = (
-                _report(job) if job else hint,
-                self._pictures(step, job),
-            )
-        self.target.options = TARGETS + NETWORK_TARGETS * (self._network() is not None)
-        self.fit.disabled, self.proposal.visible = (
-            bool(self._locked()),
-            self.jobs.result("doctor") is not None,
-        )
-        if self.jobs.result("import"):
-            data = self._dataset()
-            self.recording.options, self.joint.options = (
-                [e.id for e in data.entries],
-                data.joint_names,
-            )
-            self._draw_recording()
-        if (
-            running is None
-            and (last := self.jobs.result("identify"))
-            and last.number == every[-1].number
-        ):
+            if job is not None:
+                text.content = _report(job)
+            elif step == "identify":
+                text.content = self._locked() or hint
+            else:
+                text.content = hint
+            pictures.content = self._pictures(step, job)
+        reasons = [f"Left out: {escape_markdown(text)}" for text in self.jobs.unreadable()]
+        self.unreadable.content = "\n\n".join(reasons)
+        targets: tuple[str, ...] = TARGETS
+        if self._network() is not None:
+            targets = TARGETS + NETWORK_TARGETS
+        self.target.options = targets
+        self.fit.disabled = bool(self._locked())
+        self.proposal.visible = self.jobs.result("doctor") is not None
+
+    def _show_recordings(self) -> None:
+        data = self._dataset()
+        self.recording.options = [entry.id for entry in data.entries]
+        self.joint.options = data.joint_names
+        self._draw_recording()
+
+    def _go_on(self, living: Job | None, every: list[Job]) -> None:
+        """After an identification compare it with the nominal robot; before the first recording show the robot."""
+        last = self.jobs.result("identify")
+        fitted = last is not None and last.number == every[-1].number and living is None
+        if last is not None and fitted and self.jobs.started_here(last):
             self.jobs.start("causes", "gap", self._need("import").out, "--robot", last.out)
         elif self.player is None and self.jobs.result("robot"):
             self.play(standing(self._chosen_robot()))
-        self.seen = state  # last: after an error all is shown again
 
     def play(
         self, shown: Scene | SideBySide, clip: Clip | None = None, magnify: float = 1.0
@@ -380,22 +439,14 @@ class App:
 
     def _pictures(self, step: str, job: Job | None) -> str:
         """Return the figures of a result as HTML, with links that save them."""
-        files = [] if job is None else (job.result or {}).get("figures", [])
-        if job is not None and step == "causes":
-            files = [f"{self._need('identify').out}/gap.{kind}" for kind in ("svg", "png")]
-        sources = {
-            p: base64.b64encode(p.read_bytes()).decode()
-            for f in files
-            if (p := self.folder / f).is_file()
-        }
-        html, saved = "", '<a download="{}" href="data:image/{};base64,{}">save {}</a> '
-        for file, data in sources.items():
-            if file.suffix == ".svg":
-                html += f'<img alt="{step}" style="width:100%;background:white" src="data:image/svg+xml;base64,{data}">'
-            html += saved.format(
-                file.name, file.suffix[1:].replace("svg", "svg+xml"), data, file.suffix[1:].upper()
-            )
-        return html
+        if job is None or job.result is None:
+            return ""
+        names = job.result.get("figures", [])
+        if step == "causes":
+            folder = self._need("identify").out
+            names = [f"{folder}/gap.svg", f"{folder}/gap.png"]
+        shown = [_picture(self.folder, name) for name in names]
+        return "".join(shown)
 
     def _text(self, step: str, hint: str) -> None:
         """Add the place of a step's result; `hint` stands there before."""
@@ -411,16 +462,16 @@ class App:
         return self._button(label, lambda _: self.jobs.start(step, *words()))
 
     def _upload(self, label: str, place: str) -> None:
-        """Add a button that stores a file in a folder of the page."""
+        """Add a button that stores files in a folder of the page."""
 
-        def store(event: Any) -> None:
-            self.jobs.require_idle()
-            store_upload(event.target.value.name, event.target.value.content, self.folder / place)
-            self.status.content = (
-                f"{escape_markdown(event.target.value.name)} is stored in {place}."
-            )
+        def receive(name: str, content: bytes) -> None:
+            self._attempt(self.uploads.receive, name, content, place)
 
-        self.gui.add_upload_button(label).on_upload(lambda event: self._attempt(store, event))
+        connect_upload_button(self.gui.add_upload_button(label), receive)
+
+    def _show_notices(self, text: str, dismissible: bool) -> None:
+        self.notices.content = text
+        self.dismiss.visible = dismissible
 
     def _attempt(self, act: Callable[..., None], *arguments: Any) -> None:
         """Call a function; an error is shown above the steps."""
@@ -442,82 +493,119 @@ class App:
 
     def _chosen_robot(self) -> RobotSpec:
         name = self._need("robot").out
-        return load_robot(name if name in packaged_robots() else self.folder / name)
+        if name in packaged_robots():
+            return load_robot(name)
+        return load_robot(self.folder / name)
 
     def _dataset(self) -> Dataset:
         return Dataset(self.folder / self._need("import").out)
 
 
-def store_upload(name: str, content: bytes, folder: Path) -> None:
-    """Write an uploaded file, or what a .zip holds, below a folder: all or nothing, inside it, and over no file."""
-    with tempfile.TemporaryDirectory(
-        prefix=f"{FOLDER_MARKER}-{os.getpid()}-", dir=folder.parent
-    ) as temporary:
-        if name.lower().endswith(".zip"):
-            try:
-                with zipfile.ZipFile(io.BytesIO(content)) as archive:
-                    if sum(item.file_size for item in archive.infolist()) > MAX_UNPACKED_BYTES:
-                        raise UsageError(
-                            f"{name}: holds more than {MAX_UNPACKED_BYTES >> 30} GiB; give it in parts"
-                        )
-                    archive.extractall(temporary)  # which drops .. and a leading / from names
-            except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
-                raise UsageError(
-                    f"{name}: is not readable ({error}); pack it again, without a password"
-                ) from None
-        else:
-            Path(temporary, re.split(r"[/\\:]", name)[-1].lstrip(".") or "file").write_bytes(
-                content
+def _make_places(folder: Path) -> None:
+    """Make the folders that the page writes into; a link, which could lead elsewhere, is refused."""
+    for name in (*PLACES, "jobs", "incoming"):
+        if (folder / name).is_symlink():
+            raise UsageError(
+                f"{folder / name}: is a link, and gaponet app writes only inside its folder; "
+                "put a folder in its place"
             )
-        places = {
-            f: folder / f.relative_to(temporary) for f in Path(temporary).rglob("*") if f.is_file()
-        }
-        for place in places.values():
-            if place.exists() or not place.resolve().is_relative_to(folder.resolve()):
-                raise UsageError(
-                    f"{place}: exists, or a link leads out of here; nothing is stored; move it away"
-                )
-        for file, place in places.items():
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.move(file, place)
+    for name in PLACES:
+        (folder / name).mkdir(exist_ok=True)
+
+
+def _findings(job: Job) -> list[Finding]:
+    """Return the findings of a check."""
+    return [] if job.result is None else job.result.get("findings", [])
+
+
+def _picture(folder: Path, name: str) -> str:
+    """Return a picture of the page's folder as HTML with a link that saves it, or why it is not shown."""
+    try:
+        data = base64.b64encode(read_inside(folder, name)).decode()
+    except UsageError as error:
+        return f"<p>Not shown: {html.escape(str(error))}</p>"
+    kind = Path(name).suffix[1:]
+    address = f"data:image/{kind.replace('svg', 'svg+xml')};base64,{data}"
+    saved = html.escape(Path(name).name)
+    text = f'<a download="{saved}" href="{address}">save {kind.upper()}</a> '
+    if kind == "svg":
+        text = f'<img alt="{saved}" style="width:100%;background:white" src="{address}">{text}'
+    return text
 
 
 def _ending(job: Job) -> str:
     """Return how a command ended, in Markdown."""
+    command = f"**gaponet {escape_markdown(job.words[0])}**"
     if job.result is not None:
-        return f"**gaponet {job.words[0]}** has ended."
-    last = [line for line in job.lines if line.strip() and not PROGRESS_LINE.match(line)][-1:]
-    why = last[0] if last else "it was cancelled; what was there before is unchanged."
-    return f"**gaponet {job.words[0]}** gave no result: {escape_markdown(why)}"
+        return f"{command} has ended."
+    return f"{command} gave no result: {escape_markdown(_reason(job))}"
+
+
+def _reason(job: Job) -> str:
+    """Return why a command gave no result."""
+    unchanged = "what was there before is unchanged."
+    ending = job.ending
+    how = "" if ending is None else ending["how"]
+    if how == CANCELLED:
+        return f"it was cancelled; {unchanged}"
+    if how == WITH_SERVER:
+        return f"it ended with the server of the page; {unchanged}"
+    said = [line for line in job.lines if line.strip() and not PROGRESS_LINE.match(line)]
+    if said:
+        return said[-1]
+    if ending is not None and how == BY_ITSELF:
+        return f"it ended with exit code {ending['code']} and said nothing."
+    return f"it was killed, or the computer went off; {unchanged}"
 
 
 def _report(job: Job) -> str:
     """Return what a command printed, in Markdown, and the command."""
     lines = list[str]()
     for line in job.lines:
-        text = re.sub("[┃│]", "|", escape_markdown(line.strip()))
-        if line.startswith("┡"):
-            lines.append(f"| --- |{' ---: |' * line.count('╇')}")
-        elif line.startswith(("┃", "│")):
-            lines.append(text)
-        elif text and not line.startswith(("┏", "└", "     ok ")) and not PROGRESS_LINE.match(line):
-            bold = "**" * text.startswith(("error ", "warning "))
-            lines += ["", f"{bold}{text}{bold}"]
-    return "\n".join(
-        [*lines, "", f"To repeat it in the folder of this page: {escape_markdown(job.command)}"]
-    )
+        lines += _report_line(line)
+    repeat = f"To repeat it in the folder of this page: {escape_markdown(job.command)}"
+    return "\n".join([*lines, "", repeat])
+
+
+def _report_line(line: str) -> list[str]:
+    """Return a line that a command printed as lines of Markdown; a table of rich becomes one of Markdown."""
+    text = re.sub("[┃│]", "|", escape_markdown(line.strip()))
+    if line.startswith("┡"):
+        return [f"| --- |{' ---: |' * line.count('╇')}"]
+    if line.startswith(("┃", "│")):
+        return [text]
+    if not text or line.startswith(("┏", "└", "     ok ")) or PROGRESS_LINE.match(line):
+        return []
+    if text.startswith(("error ", "warning ")):
+        return ["", f"**{text}**"]
+    return ["", text]
 
 
 def serve(page: App, say: Callable[[str], None], step: str = "") -> None:
-    """Serve a page until Ctrl-C; `step` is the number of the step that is shown first."""
-    signal.signal(
-        signal.SIGTERM, lambda *_: sys.exit(143)
-    )  # otherwise the running command would stay
-    say(f"open {page.address}{step and '?step=' + step} in a browser; Ctrl-C ends")
+    """Serve a page until Ctrl-C; `step` is the number of the step that is shown first.
+
+    SIGTERM and SIGHUP (the terminal was closed) end it in the same way. The running command ends with it, also after
+    `kill -9` (run_job.py).
+    """
+    _end_on_signals()
+    query = f"?step={step}" if step else ""
+    say(f"open {page.address}{query} in a browser; Ctrl-C ends")
     try:
         run_until_interrupt(page.server, page.tick)
     finally:
-        page.jobs.cancel()
+        page.jobs.close()
+
+
+def _end_on_signals() -> None:
+    """Let SIGTERM and SIGHUP leave through `finally`; one that is ignored (nohup) stays so."""
+
+    def leave(number: int, _frame: object) -> None:
+        sys.exit(128 + number)
+
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, leave)
 
 
 def serve_dataset(
@@ -525,15 +613,20 @@ def serve_dataset(
 ) -> None:
     """Serve a dataset and a scene of it at step Gap. The page's folder stays if a command has written into it."""
     folder = Path(tempfile.mkdtemp(prefix="gaponet_view_"))
-    jobs = Jobs(folder)
-    jobs.add("robot", "robot", "check", str(scene.shown.robot.folder.resolve()), result="{}")
-    jobs.add("import", "data", "card", str(data.path.resolve()), result="{}")
-    page = App(folder, port)
+    robot = scene.shown.robot.folder.resolve()
+    dataset = data.path.resolve()
+    packaged = robot.parent == PACKAGE_FOLDER.resolve()
+    outside = (dataset,) if packaged else (robot, dataset)
+    jobs = Jobs(folder, outside)
+    jobs.add("robot", "robot", "check", robot.name if packaged else str(robot), result="{}")
+    jobs.add("import", "data", "card", str(dataset), result="{}")
+    page = App(folder, port, outside)
     page.play(scene, clip, magnify)
     try:
         serve(page, say, "4")
     finally:
         if len(jobs.all) > 2:
-            say(f"results are in {folder}; to go on: gaponet app {folder}")
+            words = ["gaponet", "app", str(folder), "--outside", *map(str, outside)]
+            say(f"results are in {folder}; to go on: {shlex.join(words)}")
         else:
             shutil.rmtree(folder)

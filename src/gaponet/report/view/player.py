@@ -78,8 +78,8 @@ class Player:
                 frame.position, frame.wxyz = scene.data.xpos[body], scene.data.xquat[body]
         row = scene.row(now)
         rows = "\n".join(
-            f"| {n} | {1e3 * m.error[row]:.1f} | {1e3 * m.mpjae:.1f} |"
-            for n, m in self.copies.items()
+            f"| {escape_markdown(name)} | {1e3 * copy.error[row]:.1f} | {1e3 * copy.mpjae:.1f} |"
+            for name, copy in self.copies.items()
         )
         self.table.content = (
             f"| mean error, mrad | now | whole motion |\n| --- | ---: | ---: |\n{rows}"
