@@ -17,6 +17,9 @@ from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_r
 STORED_ROBOT = "robot"  # subfolder of a run or a dataset
 MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"
 PROVENANCE_FILE = "identified.json"  # what a robot was identified from (report/candidate.py)
+ADAPTATION_FILE = (
+    "adapted.json"  # to which unit it was adapted, and what the doctor found in its recordings
+)
 UNCERTAINTY_FILE = "uncertainty.json"  # of its values (sysid/uncertainty.py)
 OLD_UNCERTAINTY_FILE = "known.json"  # the same in folders that older versions wrote
 COPIED_FILES = (

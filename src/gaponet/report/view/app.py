@@ -32,7 +32,7 @@ from gaponet.report.view.player import Player, draw_curves
 from gaponet.report.view.scene import Scene
 from gaponet.report.view.server import open_server, run_until_interrupt
 from gaponet.report.view.side_by_side import Clip, SideBySide, side_by_side, standing
-from gaponet.robot.finding import Finding
+from gaponet.robot.finding import Finding, errors_of
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
 from gaponet.sim.dataset_robot import dataset_robot
 
@@ -234,9 +234,8 @@ class App:
         job = self.jobs.result("doctor")
         if job is None:
             return self.texts["identify"][1]
-        errors = ", ".join(
-            f["check"] for f in (job.result or {})["findings"] if f["level"] == "error"
-        )
+        findings = [Finding(**f) for f in (job.result or {})["findings"]]
+        errors = ", ".join(f.check for f in errors_of(findings))
         return (
             errors and f"Locked: the check finds an error ({errors}). Step Check says what to do."
         )
