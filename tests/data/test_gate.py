@@ -76,7 +76,7 @@ def test_what_the_doctor_calls_an_error_is_refused_with_the_finding_and_the_way_
     with pytest.raises(DatasetError) as refusal:
         pass_gate(data, data.entries, arm)
     text = str(refusal.value)
-    assert text.startswith(f"{tmp_path / 'data'}: stopped at what gaponet doctor calls an error")
+    assert text.startswith(f"{tmp_path / 'data'}: stopped at what the doctor calls an error")
     assert f" {WRONG[fault]}: " in text
     assert "gaponet doctor DATASET --fix" in text
     assert text.endswith("--despite-errors (Python: despite_errors=True)")

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from gaponet.sysid.acceptance import Covariance, HeldOut
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
+# Files of an earlier robot in the same folder, which do not describe the new one.
+OUTDATED_FILES = (PROVENANCE_FILE, ADAPTATION_FILE, UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE)
 MIN_MOTIONS_TO_SPLIT = 3  # with fewer motions, halves of the recordings fit and validate in turn
 
 
@@ -99,11 +101,11 @@ def identify(
         DatasetError, UsageError: A unit is not there, or `like` has no joint that corresponds.
         NoGainError: Nothing that was fitted does better; it names the joints and what to record.
     """
-    from gaponet.base.files import lock_folder
+    from gaponet.base.files import lock_folder, whole_folder
     from gaponet.data.checks.gate import pass_gate, used_recordings
     from gaponet.data.split import split_entries
     from gaponet.nn.training.config import Budget
-    from gaponet.robot.folder import save_robot
+    from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sysid.acceptance import HeldOut, held_out_errors
     from gaponet.sysid.identify import identify as fit
@@ -111,6 +113,7 @@ def identify(
 
     data, spec = as_dataset(dataset, robot)
     data.require_robot(spec)
+    data.require_sequences()
     require_commands(data)
     all_units = {e.meta.unit_id for e in data.entries}
     if set(units) - all_units:
@@ -124,6 +127,7 @@ def identify(
     seconds = None if budget is None else Budget.parse(budget).seconds
     if budget is not None and seconds is None:
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
+    require_other_folder(folder, spec)
     with lock_folder(folder, "robot"):
         gate = pass_gate(
             data,
@@ -142,26 +146,16 @@ def identify(
         )
         if not (fitted.improved or taken) or after.mean() > (1 - MIN_RELATIVE_GAIN) * given.mean():
             raise NoGainError(fitted.no_gain_message(spec, given, after))
-        save_robot(fitted.robot, folder)
         errors = {"nominal": nominal, "identified": after}
-        _save_origin(
-            folder,
-            data,
-            split,
-            {name: float(e.mean()) for name, e in errors.items()},
-            gate,
-            fitted.findings,
-        )
+        means = {name: float(e.mean()) for name, e in errors.items()}
         judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
-        _save_uncertainty(
-            folder,
-            data.sequences(split["train"]),
-            val,
-            fitted.covariance,
-            None,
-            judges,
-            fitted.links,
-        )
+        train_set = data.sequences(split["train"])
+        with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
+            save_robot(fitted.robot, place)
+            write_json(
+                place / PROVENANCE_FILE, _origin(folder, data, split, means, gate, fitted.findings)
+            )
+            _save_uncertainty(place, train_set, val, fitted.covariance, None, judges, fitted.links)
     return IdentifyResult(
         robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began,
         taken_from=taken, doctor=gate,
@@ -194,10 +188,10 @@ def identify_torque(
         UsageError: A recording lacks torque.
         NoGainError: The fit is no better than the robot as given.
     """
-    from gaponet.base.files import lock_folder
+    from gaponet.base.files import lock_folder, whole_folder
     from gaponet.data.checks.gate import TORQUE_DRIVEN_CHECKS, pass_gate
     from gaponet.data.split import split_entries
-    from gaponet.robot.folder import save_robot
+    from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sysid.torque_motors import fit_torque_driven
 
     data, spec = as_dataset(dataset, robot)
@@ -207,6 +201,7 @@ def identify_torque(
         {"train": data.entries, "val": data.entries, "test": []} if few else split_entries(data, ())
     )
     folder, train_set = Path(out), data.sequences(split["train"])
+    require_other_folder(folder, spec)
     with lock_folder(folder, "robot"):
         gate = pass_gate(
             data, data.entries, spec, despite_errors=despite_errors, checks=TORQUE_DRIVEN_CHECKS
@@ -220,27 +215,28 @@ def identify_torque(
                 f"nothing is written: half a second on, the error is {1e3 * after:.2f} mrad with the fit and "
                 f"{1e3 * before:.2f} mrad with {spec.name} as given"
             )
-        save_robot(fitted.robot, folder)
-        _save_origin(folder, data, split, {"nominal": before, "identified": after}, gate)
+        means = {"nominal": before, "identified": after}
+        with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
+            save_robot(fitted.robot, place)
+            write_json(place / PROVENANCE_FILE, _origin(folder, data, split, means, gate))
     return TorqueResult(
         robot=fitted.robot, folder=folder, before=before, after=after, fit=fitted,
         virtual=any(e.meta.virtual for e in data.entries), doctor=gate,
     )  # fmt: skip
 
 
-def _save_origin(
+def _origin(
     folder: Path, data: Dataset, split: Mapping[str, ListOf[Entry]], val_mpjae: Mapping[str, float],
     gate: GateReport, findings: ListOf[str] = (),
-) -> None:  # fmt: skip
-    """Write what a robot folder was identified from: dataset, recordings and motions by split, validation errors, what
+) -> dict[str, Any]:  # fmt: skip
+    """Return what a robot folder was identified from: dataset, recordings and motions by split, validation errors, what
     the doctor found, and what the fit found."""
-    (folder / ADAPTATION_FILE).unlink(missing_ok=True)  # of a robot that this one replaces
-    write_json(folder / PROVENANCE_FILE, {
+    return {
         "dataset": data.address or os.path.relpath(data.path, folder),
         "parts": {name: {e.id: e.hash for e in entries} for name, entries in split.items()},
         "motions": {name: sorted({e.meta.motion for e in entries}) for name, entries in split.items()},
         "val_mpjae": dict(val_mpjae), "findings": list(findings), "doctor": gate.to_dict(),
-    })  # fmt: skip
+    }  # fmt: skip
 
 
 def _copy_origin(source: Path, folder: Path) -> None:
@@ -259,7 +255,7 @@ def _save_uncertainty(
     from gaponet.sysid.uncertainty import LinkUncertainty
 
     for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
-        (folder / name).unlink(missing_ok=True)
+        (folder / name).unlink(missing_ok=True)  # of the robot as it was before this fit
     robot = load_robot(folder)
     made = estimate_uncertainty(robot, sequences, validation, covariance, before, held_out)
     replace(
@@ -434,9 +430,9 @@ def adapt_robot(
         NoGainError: The fit does not follow the recordings, or motions that it was not given, better than the given
             robot; nothing is written.
     """
-    from gaponet.base.files import lock_folder
+    from gaponet.base.files import lock_folder, whole_folder
     from gaponet.data.checks.gate import pass_gate
-    from gaponet.robot.folder import save_robot
+    from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sim.replay import rollout_errors
     from gaponet.sysid.adapt import FIELDS, adapt
@@ -446,6 +442,7 @@ def adapt_robot(
         Path(out),
         as_robot(Path(robot) if isinstance(robot, str) and "/" in robot else robot),
     )
+    require_other_folder(folder, spec)
     uncertainty = ParameterUncertainty.load(spec)
     with (
         lock_folder(folder, "robot"),
@@ -476,12 +473,12 @@ def adapt_robot(
                 f"nothing is written: over all {len(sequences)} recording(s) the error is {1e3 * after:.2f} mrad with "
                 f"the fit and {1e3 * before:.2f} mrad with {spec.name}; give longer logs (--seconds), or keep the robot"
             )
-        save_robot(fitted.robot, folder)
-        _copy_origin(spec.folder, folder)
-        write_json(
-            folder / ADAPTATION_FILE, {"unit_id": recorded.unit_id, "doctor": gate.to_dict()}
-        )
-        _save_uncertainty(folder, sequences, [], {}, uncertainty)
+        adapted = {"unit_id": recorded.unit_id, "doctor": gate.to_dict()}
+        with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
+            save_robot(fitted.robot, place)
+            _copy_origin(spec.folder, place)
+            write_json(place / ADAPTATION_FILE, adapted)
+            _save_uncertainty(place, sequences, [], {}, uncertainty)
     robot, joints = (
         fitted.robot,
         zip(fitted.robot.operated, fitted.robot.operated_index, strict=True),

@@ -117,7 +117,7 @@ def refuse_errors(findings: Iterable[Finding], place: str, way_out: str = WAY_OU
     others = [f.check for f in errors[1:]]
     more = f" Other errors: {', '.join(dict.fromkeys(others))}." if others else ""
     raise DatasetError(
-        f"{place}: stopped at what gaponet doctor calls an error, {_sentence(errors[0])}.{more} "
+        f"{place}: stopped at what the doctor calls an error, {_sentence(errors[0])}.{more} "
         f"{way_out}. To go on all the same: --despite-errors (Python: despite_errors=True)"
     )
 
