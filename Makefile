@@ -85,7 +85,8 @@ fuzz: setup
 hostile: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow tests/base
 
-# Every command that writes, killed, on full and read-only disks, twice at once: half an hour; disks need root. Then ranks
+# Every command that writes, killed and repeated; those that store data also on full and read-only disks and twice at once:
+# an hour; disks need root. Then ranks
 # of torchrun killed and frozen: five minutes.
 kills: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kills.py kills_work

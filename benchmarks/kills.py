@@ -1,6 +1,6 @@
 """Writing commands under adversity: killed at random moments, on full or read-only disks, and started twice.
 
-    python benchmarks/kills.py WORK [--kills 20] [--only import,train] [--seed 0]
+    python benchmarks/kills.py WORK [--kills 20] [--only import,train] [--trials kills] [--seed 0]
 
 Records a small VIRTUAL SO-101 set in WORK/input. Each command of `cases` runs once undisturbed, and then
 
@@ -13,6 +13,10 @@ Records a small VIRTUAL SO-101 set in WORK/input. Each command of `cases` runs o
 
 At the end, the content of the folder must equal that of the undisturbed command. Prints one JSON object; exits with 1
 if a content differs, a file remains, an exit code is wrong, or a traceback was printed.
+
+Not among the cases: run and record, which play a motion again and store it under a new name; demo and the experiments
+beside compare, which consist of commands and cells that are; view --render and replay --out, which write one file as
+`robot show --out` does; data labels, which writes two such files.
 """
 
 from __future__ import annotations
@@ -30,6 +34,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +49,26 @@ from gaponet.data.store import Dataset
 TRAIN = ["--model.history", "2", "--pretraining.num-envs", "16", "--pretraining.steps", "40",
          "--pretraining.rounds", "3", "--pretraining.gradient-steps", "40", "--pretraining.batch-size", "128",
          "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
+QUICK_FIT = ["--windows", "2", "--no-table", "--threads", "1", "--terms"]
+ARM = """<mujoco model="arm">
+  <compiler angle="radian" autolimits="true"/>
+  <default><joint damping="0.5" armature="0.02" frictionloss="0.05"/></default>
+  <worldbody>
+    <body name="upper">
+      <joint name="shoulder" axis="0 1 0" range="-1.5 1.5"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3"/>
+      <body name="fore" pos="0.2 0 0">
+        <joint name="elbow" axis="0 1 0" range="-1.5 1.5"/>
+        <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.2"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""  # two joints, so that a fit takes seconds
+GAINS = ["--kp", "20", "--effort-limit", "5"]
 LIMIT_S = 600.0
+TRIALS = ("kills", "races", "foreign", "full", "read_only")
+AS_ROOT = ("full", "read_only")  # trials that mount a disk
 REFUSALS = ("Folder", "File", "Usage", "Dataset", "Model")  # first words of one-line errors
 
 
@@ -55,8 +79,9 @@ class Case:
     argv: Callable[[Path], list[str]]
     content: Callable[[Path], Any]
     begin: Path | None = None  # initial content of OUT
-    done: int = 0  # exit code of a repeated command
+    done: tuple[int, ...] = (0,)  # exit codes of a repeated command that had already ended
     unwritable: int = 2  # exit code on a disk that is mounted read-only
+    trials: tuple[str, ...] = TRIALS
 
 
 def entries(out: Path) -> Any:
@@ -85,9 +110,32 @@ def trained(out: Path) -> Any:
     return [curve, digests(out / "model")["model.onnx"], names(out)]
 
 
+def without(*patterns: str) -> Callable[[Path], Any]:
+    """Return a content: the hash of each file, and only the name of files that hold a time or a place."""
+
+    def content(out: Path) -> Any:
+        made = digests(out)
+        return {
+            name: "" if any(fnmatch(name, pattern) for pattern in patterns) else digest
+            for name, digest in made.items()
+        }
+
+    return content
+
+
 def page(out: Path) -> Any:
     """Require a complete report; return the evaluation and the files."""
     assert (out / "report.html").read_text().rstrip().endswith("</html>")
+    return [json.loads((out / "metrics.json").read_text())["methods"], names(out)]
+
+
+def file_count(out: Path) -> int:
+    """Return the number of files: the name of a pushed file is its hash, and some files hold the time of the push."""
+    return len(names(out))
+
+
+def measured(out: Path) -> Any:
+    """Return the errors of an evaluation, and the files."""
     return [json.loads((out / "metrics.json").read_text())["methods"], names(out)]
 
 
@@ -103,7 +151,10 @@ def result(out: Path) -> Any:
 
 
 def cases(given: Path) -> dict[str, Case]:
-    """Return every command that writes; `given` holds data, bare (data without replays), logs (LeRobot) and a run."""
+    """Return every command that writes a folder in several steps.
+
+    `given` holds data, bare (data without replays), logs (LeRobot), a run, and what `further_cases` needs.
+    """
     robot = ["--robot", "so101"]
     data, log, run = (str(given / name) for name in ("data", "logs", "run"))
     recipe = ["--recipe", str(given / "more.toml")]
@@ -123,10 +174,103 @@ def cases(given: Path) -> dict[str, Case]:
             lambda out: ["gap", str(out)], entries, given / "bare", unwritable=0
         ),  # replays go elsewhere
         "train": Case(train, trained),
-        "export": Case(lambda out: ["data", "export", data, "--out", str(out)], digests, done=2),
+        "export": Case(
+            lambda out: ["data", "export", data, "--out", str(out)], digests, done=(0, 2)
+        ),
         "artifact": Case(lambda out: ["export", run, "--out", str(out)], names),
         "report": Case(lambda out: ["report", str(out), "--dataset", data], page, given / "run"),
         "experiment": Case(experiment, result),
+    } | further_cases(given)
+
+
+def further_cases(given: Path) -> dict[str, Case]:
+    """Return commands that are only killed and repeated.
+
+    `given` holds, of an arm with two joints, a model file, a nominal and an identified robot, a fleet of one, data and
+    logs; an empty folder; and a bucket.
+    """
+    data, logs, nominal, identified, fleet, trained_on = (
+        str(given / name)
+        for name in ("arm_data", "arm_logs", "nominal", "identified", "fleet", "data")
+    )
+
+    def killed(
+        words: Callable[[Path], list[str]],
+        content: Callable[[Path], Any] = digests,
+        begin: str | None = None,
+        done: tuple[int, ...] = (0,),
+    ) -> Case:
+        return Case(words, content, given / begin if begin else None, done, trials=("kills",))
+
+    def identify(out: Path) -> list[str]:
+        return ["identify", data, "--out", str(out), *QUICK_FIT]
+
+    def adapt(out: Path) -> list[str]:
+        return ["adapt", nominal, data, "--out", str(out), "--unit", "virtual-1", "--seconds", "8"]
+
+    def new_robot(out: Path) -> list[str]:
+        return ["robot", "new", str(given / "arm.xml"), "--out", str(out), *GAINS]
+
+    def check_fleet(out: Path) -> list[str]:
+        return [
+            "check",
+            fleet,
+            data,
+            "--fleet",
+            "--out",
+            str(out),
+            "--night",
+            "n",
+            "--workers",
+            "1",
+        ]
+
+    def start(out: Path) -> list[str]:
+        return ["start", nominal, logs, "--out", str(out), "--unit-id", "virtual-1"]
+
+    timed = without("fleet.html", "virtual-1.json")
+    return {
+        "robot new": killed(new_robot),
+        "identify": killed(identify, without("identified.json")),  # the path of the dataset
+        "adapt": killed(adapt),
+        "adapt a run": killed(
+            lambda out: ["adapt", str(out), trained_on, "--seconds", "8"], begin="run"
+        ),
+        "eval": killed(lambda out: ["eval", str(out), trained_on], measured, "run"),
+        "gap by cause": killed(lambda out: ["gap", data, "--robot", f"{out}/"], begin="identified"),
+        "export to mjcf": killed(
+            lambda out: ["export", identified, "--to", "mjcf", "--out", str(out)], without("*.npz")
+        ),
+        "export randomization": killed(
+            lambda out: ["export", identified, "--to", "randomization", "--out", str(out)]
+        ),
+        "excite": killed(
+            lambda out: ["excite", "--robot", nominal, "--out", str(out), "--minutes", "2"]
+        ),
+        "doctor": killed(lambda out: ["doctor", data, "--figures", str(out)]),
+        "data card": killed(
+            lambda out: ["data", "card", str(out), "--licence", "CC0-1.0"],
+            without("card.json", "CARD.md", "dataset.json"),  # dates, order of keys
+            "arm_data",
+        ),
+        "data split": killed(
+            lambda out: ["data", "split", str(out), "--by", "motion"], begin="arm_data"
+        ),
+        "data remove": killed(
+            lambda out: ["data", "remove", str(out), "tour-all-0*"],
+            entries,
+            "arm_data",
+            done=(0, 2),
+        ),
+        "data figures": killed(lambda out: ["data", "figures", data, "--out", str(out)]),
+        "robot show": killed(
+            lambda out: ["robot", "show", identified, "--out", str(out / "known.png")],
+            begin="empty",
+        ),
+        "push": killed(lambda out: ["push", data, f"file://{out}/data"], file_count, "empty"),
+        "pull": killed(lambda out: ["pull", f"file://{given}/bucket/data", str(out)], entries),
+        "check a fleet": killed(check_fleet, timed, done=(0, 1)),
+        "start": killed(start, without("*.html", "*.json", "*.npz")),
     }
 
 
@@ -136,6 +280,10 @@ def prepare(given: Path) -> None:
     given.mkdir(parents=True)
     for name, payloads, variants in (("few", "0.0", 3), ("more", "0.0, 0.2", 6)):
         (given / f"{name}.toml").write_text(recipe.format(payloads, variants))
+    (given / "arm.xml").write_text(ARM)
+    nominal = str(given / "nominal")
+    arm_data = str(given / "arm_data")
+    few = ["--recipe", str(given / "few.toml")]
     for argv in (
         [
             "collect",
@@ -148,10 +296,17 @@ def prepare(given: Path) -> None:
         ],
         ["data", "export", str(given / "data"), "--out", str(given / "logs")],
         ["train", str(given / "data"), "--out", str(given / "run"), "--budget", "2000", *TRAIN],
+        ["robot", "new", str(given / "arm.xml"), "--out", nominal, *GAINS],
+        ["collect", "--robot", nominal, *few, "--fleet", "easy", "--out", arm_data],
+        ["data", "export", arm_data, "--to", "lerobot", "--out", str(given / "arm_logs")],
+        ["identify", arm_data, "--out", str(given / "identified"), *QUICK_FIT],
+        ["push", arm_data, f"file://{given}/bucket/data"],
     ):
         if wait(start(argv, given / "prepare.txt")):
             raise SystemExit(f"{argv[0]} failed; see {given / 'prepare.txt'}")
     shutil.copytree(given / "data", given / "bare", ignore=shutil.ignore_patterns("replays"))
+    shutil.copytree(given / "identified", given / "fleet" / "virtual-1")
+    (given / "empty").mkdir()
 
 
 def start(argv: list[str], log: Path) -> int:
@@ -231,6 +386,13 @@ class Trial:
         if not equal:
             self.wrong.append(f"{what}: {out} is not what the undisturbed command leaves")
 
+    def run(self, kind: str, kills: int) -> None:
+        """Run a trial of TRIALS."""
+        if kind == "kills":
+            self.kills(kills)
+        else:
+            getattr(self, kind)()
+
     def kills(self, wanted: int) -> None:
         """Kill and restart the command; compare when it ends."""
         turn = 0
@@ -249,7 +411,7 @@ class Trial:
                 self.log.unlink(missing_ok=True)
                 if self.case.content is entries and (out / "dataset.json").is_file():
                     Dataset(out).sequences()  # whatever is listed is there
-            self.expect("resumed", code, 0, self.case.done)
+            self.expect("resumed", code, *self.case.done)
             self.same("killed", out)
 
     def full(self) -> None:
@@ -356,25 +518,26 @@ def main() -> int:
     parser.add_argument("work", type=Path)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--only", default="", help="some of the commands, separated by commas")
+    parser.add_argument(
+        "--trials", default=",".join(TRIALS), help="some of the trials, separated by commas"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     args = parser.parse_args()
     work, found, wrong = args.work.resolve(), {}, 0
+    wanted = args.trials.split(",")
     if not (work / "input").is_dir():
         prepare(work / "input")
     for name, case in cases(work / "input").items():
         if args.only and name not in args.only.split(","):
             continue
         trial = Trial(name, case, work, np.random.default_rng(args.seed))
-        trial.kills(args.kills)
-        trial.races()
-        trial.foreign()
-        if os.geteuid() == 0:
-            trial.full()
-            trial.read_only()
+        for kind in case.trials:
+            if kind in wanted and (kind not in AS_ROOT or os.geteuid() == 0):
+                trial.run(kind, args.kills)
         found[name] = {"whole_s": round(trial.duration, 1), **trial.count, "wrong": trial.wrong}
         wrong += len(trial.wrong)
         print(f"{name}: {found[name]}", file=sys.stderr, flush=True)
-    if not args.only or "mixed" in args.only.split(","):
+    if "mixed" in args.only.split(",") or (not args.only and "races" in wanted):
         found["mixed"] = mixed(work / "input", work / "mixed")
         wrong += len(found["mixed"]["wrong"])
     print(json.dumps(found))

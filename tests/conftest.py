@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -15,11 +16,26 @@ from arm import write_arm
 
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
+from gaponet.hw.control.clock import SimulatedClock
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 
+CLOCK_SEED = "GAPONET_CLOCK_SEED"  # environment variable: repeats the starts of simulated clocks
+SimulatedClock.seed = int(os.environ.get(CLOCK_SEED, SimulatedClock.seed))
 SHARED = Path(os.environ.get("GAPONET_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Say with a failure at which time the simulated clocks of this process began."""
+    report = yield
+    if report.failed:
+        repeat = f"{CLOCK_SEED}={SimulatedClock.seed} repeats the starts of simulated clocks"
+        report.sections.append(("clocks", repeat))
+    return report
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ from gaponet.base.files import (
     atomic_write,
     lock_folder,
     require_own_folder,
+    whole_folder,
     write_text,
 )
 
@@ -126,3 +127,54 @@ def test_a_folder_of_an_older_version_is_recognised_by_its_files(tmp_path, kind,
     (tmp_path / FOLDER_MARKER).unlink()
     with pytest.raises(FolderError, match="so it is no run of gaponet"):
         require_own_folder(tmp_path, "run")
+
+
+def test_a_whole_folder_appears_when_its_block_ends(tmp_path):
+    with whole_folder(tmp_path / "robot", "robot", last="robot.toml") as place:
+        (place / "robot.toml").write_text("new")
+        (place / "meshes").mkdir()
+        (place / "meshes" / "arm.obj").write_text("v")
+        assert not (tmp_path / "robot" / "robot.toml").exists()
+    assert names(tmp_path / "robot") == [FOLDER_MARKER, "meshes", "robot.toml"]
+    assert (tmp_path / "robot" / "meshes" / "arm.obj").read_text() == "v"
+
+
+def test_a_whole_folder_whose_block_fails_stays_as_it_was(tmp_path):
+    with whole_folder(tmp_path, "robot", last="robot.toml") as place:
+        (place / "robot.toml").write_text("old")
+
+    def fail():
+        with whole_folder(tmp_path, "robot", last="robot.toml", obsolete=("x.json",)) as place:
+            (place / "robot.toml").write_text("new")
+            (place / "picture.png").write_text("new")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert names(tmp_path) == [FOLDER_MARKER, "robot.toml"]
+    assert (tmp_path / "robot.toml").read_text() == "old"
+
+
+def test_what_describes_the_replaced_files_is_removed_with_them(tmp_path):
+    for name in ("uncertainty.json", "report.html"):
+        (tmp_path / name).write_text("of the old robot")
+    (tmp_path / FOLDER_MARKER).write_text("robot\n")
+    with whole_folder(
+        tmp_path, "robot", last="robot.toml", obsolete=("uncertainty.json",)
+    ) as place:
+        (place / "robot.toml").write_text("new")
+    assert names(tmp_path) == [FOLDER_MARKER, "report.html", "robot.toml"]
+
+
+def test_a_whole_folder_of_a_killed_process_is_left_as_it_was_and_tidied_by_the_next(tmp_path):
+    killed = (
+        "import os; from pathlib import Path; from gaponet.base.files import whole_folder\n"
+        f"with whole_folder(Path({str(tmp_path)!r}), 'robot', last='robot.toml') as place:\n"
+        "    (place / 'robot.toml').write_text('half')\n"
+        "    os._exit(9)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", killed], check=False).returncode == 9
+    assert not (tmp_path / "robot.toml").exists()
+    with whole_folder(tmp_path, "robot", last="robot.toml") as place:
+        (place / "robot.toml").write_text("whole")
+    assert names(tmp_path) == [FOLDER_MARKER, "robot.toml"]

@@ -97,5 +97,30 @@ def test_new_makes_checks_and_shows_a_robot_from_a_vendor_s_model(tmp_path, caps
         assert (tmp_path / "mine" / "picture.png").read_bytes().startswith(b"\x89PNG")
     assert main(["robot", "check", str(tmp_path / "mine"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["simulator_hash"] == result["simulator_hash"]
+
+
+def test_new_may_be_given_again_but_replaces_no_robot_that_a_person_changed(tmp_path, capsys):
+    model, mine = write_mjcf(tmp_path / "repo"), tmp_path / "mine"
+    told = ["robot", "new", str(model), "--out", str(mine), "--joints", "shoulder", "elbow"]
+    assert main(told) == 0
+    (mine / "picture.png").unlink(missing_ok=True)  # as a command leaves it that was killed early
+    files = sorted(p.name for p in mine.iterdir())
+    assert main(told) == 0
+    assert {p.name for p in mine.iterdir()} >= set(files)
+    toml = mine / "robot.toml"
+    toml.write_text(toml.read_text() + "# mine\n")
     assert main(told) == 2
     assert "holds a robot; choose another --out" in capsys.readouterr().err
+
+
+def test_new_that_ends_before_its_picture_leaves_no_robot(tmp_path, monkeypatch):
+    def stop(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gaponet.cli.robot._picture", stop)
+    model, mine = write_mjcf(tmp_path / "repo"), tmp_path / "mine"
+    told = ["robot", "new", str(model), "--out", str(mine), "--joints", "shoulder", "elbow"]
+    assert main(told) == 130
+    assert not mine.exists()
+    monkeypatch.undo()
+    assert main(told) == 0

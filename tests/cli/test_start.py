@@ -228,5 +228,7 @@ def test_logs_with_an_error_are_not_fitted(place, monkeypatch, capsys):
             "\n".join([head, *(",".join(f"{x:.6f}" for x in row) for row in values)]) + "\n"
         )
     assert main(["start", "arm.xml", "logs"]) == 2
-    assert "no fit repairs it" in capsys.readouterr().err
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "sign: shoulder moves against its command" in said
+    assert "delete started/data, and give the same command again" in said
     assert not Path("started/identified").exists()

@@ -43,6 +43,11 @@ class NotedArm(VirtualDriver):
         self.closed: list[bool] = []
 
     @property
+    def elapsed(self) -> float:
+        """Time since the clock began, s."""
+        return self.clock.now() - self.clock.start
+
+    @property
     def damped(self) -> float:
         """Time of the first damping message, s."""
         return next(time for time, ctrl in self.sent if ctrl is None)

@@ -26,11 +26,17 @@ from gaponet.base.errors import NoGainError, UsageError
 from gaponet.base.files import write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
-from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, PROVENANCE_FILE, UNCERTAINTY_FILE
+from gaponet.robot.folder import (
+    ADAPTATION_FILE,
+    OLD_UNCERTAINTY_FILE,
+    PROVENANCE_FILE,
+    UNCERTAINTY_FILE,
+)
 from gaponet.robot.servo_fields import Term
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
+    from gaponet.data.checks.gate import GateReport
     from gaponet.data.sequence import Sequence
     from gaponet.data.store import Entry
     from gaponet.nn.artifact import GapModel
@@ -40,6 +46,8 @@ if TYPE_CHECKING:
     from gaponet.sysid.acceptance import Covariance, HeldOut
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
+# Files of an earlier robot in the same folder, which do not describe the new one.
+OUTDATED_FILES = (PROVENANCE_FILE, ADAPTATION_FILE, UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE)
 MIN_MOTIONS_TO_SPLIT = 3  # with fewer motions, halves of the recordings fit and validate in turn
 
 
@@ -58,6 +66,7 @@ def identify(
     budget: str | None = None,
     stops: bool = False,
     masses: bool = False,
+    despite_errors: bool = False,
     progress: Progress = no_progress,
 ) -> IdentifyResult:
     """Fit the servos of the simulator, and the table under the robot, to the training motions.
@@ -85,15 +94,18 @@ def identify(
         budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.
         stops: Add an end stop to joints that stayed behind several commands; otherwise they are reported.
         masses: Fit masses, centres of mass and inertias of the links too; accepted as a term is.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
 
     Raises:
+        DatasetError: The doctor finds an error in the recordings of the units that are fitted.
         DatasetError, UsageError: A unit is not there, or `like` has no joint that corresponds.
         NoGainError: Nothing that was fitted does better; it names the joints and what to record.
     """
-    from gaponet.base.files import lock_folder
+    from gaponet.base.files import lock_folder, whole_folder
+    from gaponet.data.checks.gate import pass_gate, used_recordings
     from gaponet.data.split import split_entries
     from gaponet.nn.training.config import Budget
-    from gaponet.robot.folder import save_robot
+    from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sysid.acceptance import HeldOut, held_out_errors
     from gaponet.sysid.identify import identify as fit
@@ -101,6 +113,7 @@ def identify(
 
     data, spec = as_dataset(dataset, robot)
     data.require_robot(spec)
+    data.require_sequences()
     require_commands(data)
     all_units = {e.meta.unit_id for e in data.entries}
     if set(units) - all_units:
@@ -114,7 +127,15 @@ def identify(
     seconds = None if budget is None else Budget.parse(budget).seconds
     if budget is not None and seconds is None:
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
+    require_other_folder(folder, spec)
     with lock_folder(folder, "robot"):
+        gate = pass_gate(
+            data,
+            used_recordings(data, split),
+            spec,
+            despite_errors=despite_errors,
+            progress=progress,
+        )
         fitted = fit(
             data.sequences(split["train"]), start, val, windows, terms, table, threads, progress, seconds, stops,
             masses=masses,
@@ -125,28 +146,19 @@ def identify(
         )
         if not (fitted.improved or taken) or after.mean() > (1 - MIN_RELATIVE_GAIN) * given.mean():
             raise NoGainError(fitted.no_gain_message(spec, given, after))
-        save_robot(fitted.robot, folder)
         errors = {"nominal": nominal, "identified": after}
-        _save_origin(
-            folder,
-            data,
-            split,
-            {name: float(e.mean()) for name, e in errors.items()},
-            fitted.findings,
-        )
+        means = {name: float(e.mean()) for name, e in errors.items()}
         judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
-        _save_uncertainty(
-            folder,
-            data.sequences(split["train"]),
-            val,
-            fitted.covariance,
-            None,
-            judges,
-            fitted.links,
-        )
+        train_set = data.sequences(split["train"])
+        with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
+            save_robot(fitted.robot, place)
+            write_json(
+                place / PROVENANCE_FILE, _origin(folder, data, split, means, gate, fitted.findings)
+            )
+            _save_uncertainty(place, train_set, val, fitted.covariance, None, judges, fitted.links)
     return IdentifyResult(
         robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began,
-        taken_from=taken,
+        taken_from=taken, doctor=gate,
     )  # fmt: skip
 
 
@@ -156,6 +168,7 @@ def identify_torque(
     out: Place,
     current: bool = False,
     robot: RobotSpec | Place | None = None,
+    despite_errors: bool = False,
 ) -> TorqueResult:
     """Fit friction, inertia and delay of a robot that is driven by torque.
 
@@ -168,14 +181,17 @@ def identify_torque(
         out: Robot folder to write.
         current: The recorded torque is a current, or its constant is unknown: fit N·m per unit too.
         robot: Start of the fit, if not the robot that the dataset keeps.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
 
     Raises:
+        DatasetError: The doctor finds an error in the recordings.
         UsageError: A recording lacks torque.
         NoGainError: The fit is no better than the robot as given.
     """
-    from gaponet.base.files import lock_folder
+    from gaponet.base.files import lock_folder, whole_folder
+    from gaponet.data.checks.gate import TORQUE_DRIVEN_CHECKS, pass_gate
     from gaponet.data.split import split_entries
-    from gaponet.robot.folder import save_robot
+    from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sysid.torque_motors import fit_torque_driven
 
     data, spec = as_dataset(dataset, robot)
@@ -185,7 +201,11 @@ def identify_torque(
         {"train": data.entries, "val": data.entries, "test": []} if few else split_entries(data, ())
     )
     folder, train_set = Path(out), data.sequences(split["train"])
+    require_other_folder(folder, spec)
     with lock_folder(folder, "robot"):
+        gate = pass_gate(
+            data, data.entries, spec, despite_errors=despite_errors, checks=TORQUE_DRIVEN_CHECKS
+        )
         fitted = fit_torque_driven(
             train_set, train_set if few else data.sequences(split["val"]), spec, current
         )
@@ -195,25 +215,35 @@ def identify_torque(
                 f"nothing is written: half a second on, the error is {1e3 * after:.2f} mrad with the fit and "
                 f"{1e3 * before:.2f} mrad with {spec.name} as given"
             )
-        save_robot(fitted.robot, folder)
-        _save_origin(folder, data, split, {"nominal": before, "identified": after})
+        means = {"nominal": before, "identified": after}
+        with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
+            save_robot(fitted.robot, place)
+            write_json(place / PROVENANCE_FILE, _origin(folder, data, split, means, gate))
     return TorqueResult(
         robot=fitted.robot, folder=folder, before=before, after=after, fit=fitted,
-        virtual=any(e.meta.virtual for e in data.entries),
+        virtual=any(e.meta.virtual for e in data.entries), doctor=gate,
     )  # fmt: skip
 
 
-def _save_origin(
+def _origin(
     folder: Path, data: Dataset, split: Mapping[str, ListOf[Entry]], val_mpjae: Mapping[str, float],
-    findings: ListOf[str] = (),
-) -> None:  # fmt: skip
-    """Write what a robot folder was identified from: dataset, recordings and motions by split, validation errors."""
-    write_json(folder / PROVENANCE_FILE, {
+    gate: GateReport, findings: ListOf[str] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Return what a robot folder was identified from: dataset, recordings and motions by split, validation errors, what
+    the doctor found, and what the fit found."""
+    return {
         "dataset": data.address or os.path.relpath(data.path, folder),
         "parts": {name: {e.id: e.hash for e in entries} for name, entries in split.items()},
         "motions": {name: sorted({e.meta.motion for e in entries}) for name, entries in split.items()},
-        "val_mpjae": dict(val_mpjae), "findings": list(findings),
-    })  # fmt: skip
+        "val_mpjae": dict(val_mpjae), "findings": list(findings), "doctor": gate.to_dict(),
+    }  # fmt: skip
+
+
+def _copy_origin(source: Path, folder: Path) -> None:
+    """Keep on record from which motions the robot of `source` was identified, if that is stated."""
+    if (source / PROVENANCE_FILE).is_file():
+        text = (source / PROVENANCE_FILE).read_text(encoding="utf-8")
+        write_text(folder / PROVENANCE_FILE, text)
 
 
 def _save_uncertainty(
@@ -225,7 +255,7 @@ def _save_uncertainty(
     from gaponet.sysid.uncertainty import LinkUncertainty
 
     for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
-        (folder / name).unlink(missing_ok=True)
+        (folder / name).unlink(missing_ok=True)  # of the robot as it was before this fit
     robot = load_robot(folder)
     made = estimate_uncertainty(robot, sequences, validation, covariance, before, held_out)
     replace(
@@ -244,6 +274,7 @@ def train(
     holdout_units: tuple[str, ...] = (),
     resume: bool = False,
     log: tuple[str, ...] = (),
+    despite_errors: bool = False,
     progress: Progress = no_progress,
 ) -> TrainResult:
     """Train a delta-action model; the run keeps the model with the least error in rollouts of validation motions.
@@ -263,17 +294,21 @@ def train(
         holdout_units: Units never trained on; their test motions stay in the test split.
         resume: Continue the run in `out`.
         log: tensorboard, wandb.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
 
     Returns:
         The exported model; RUN/model holds it.
 
     Raises:
         ModelError: The budget bought no training step.
+        DatasetError: The doctor finds an error in the recordings of the units that train or validate.
         DatasetError, UsageError: The recordings, the config or the folder do not fit; the message says what.
     """
     from gaponet.base.files import lock_folder
+    from gaponet.data.checks.gate import pass_gate, used_recordings
     from gaponet.nn.training import ranks
     from gaponet.nn.training.config import Budget, TrainConfig
+    from gaponet.nn.training.run_folder import training_splits
     from gaponet.nn.training.selection import candidate_errors, train_best
     from gaponet.nn.training.trainer import Trainer
 
@@ -282,6 +317,8 @@ def train(
     with ranks.joined(config.device), ranks.on_first(lock_folder(folder, "run")):
         data, spec = as_dataset(dataset, robot)
         require_commands(data)
+        entries = used_recordings(data, training_splits(data, config, holdout_units))
+        gate = pass_gate(data, entries, spec, despite_errors=despite_errors)
 
         def one(kind: ModelKind, run: Path, share: float, spent: float, resume: bool) -> GapModel:
             def show(status: Status) -> None:
@@ -289,14 +326,16 @@ def train(
 
             return Trainer(
                 data, spec, run, replace(config, model=replace(config.model, kind=kind)), whole.part(share),
-                resume=resume, holdout_units=holdout_units, show=show, log=log, shared=shared,
+                resume=resume, holdout_units=holdout_units, show=show, log=log, shared=shared, gate=gate,
             ).run()  # fmt: skip
 
         if model == "auto":
             trained = train_best(folder, resume, one)
         else:
             trained = one(model or config.model.kind, folder, 1.0, 0.0, resume)
-    return TrainResult(model=trained, card=trained.card, candidates=candidate_errors(folder))
+    return TrainResult(
+        model=trained, card=trained.card, doctor=gate, candidates=candidate_errors(folder)
+    )
 
 
 def adapt_model(
@@ -308,6 +347,7 @@ def adapt_model(
     seconds: float = 30.0,
     robot: RobotSpec | Place | None = None,
     mixed_gains: bool = False,
+    despite_errors: bool = False,
     progress: Progress = no_progress,
 ) -> AdaptResult:
     """Fit the servo parameters of one unit under a trained model, to a short log.
@@ -324,10 +364,13 @@ def adapt_model(
         seconds: Duration of the recordings to use, in windows of 8 s.
         robot: Another robot than the one that the dataset keeps.
         mixed_gains: Accept recordings made with different kp or kd together.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
 
     Raises:
+        DatasetError: The doctor finds an error in the recordings of the unit.
         UsageError, ModelError: The unit is not named, or the model fits another robot.
     """
+    from gaponet.data.checks.gate import pass_gate
     from gaponet.data.sequence import require_same_gains
     from gaponet.nn.adaptation import Adaptation
     from gaponet.nn.artifact import GapModel
@@ -338,6 +381,7 @@ def adapt_model(
     data.require_robot(spec)
     model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
     _, entries = entries_of_unit(data, unit, motions)
+    gate = pass_gate(data, entries, spec, despite_errors=despite_errors)
     if not motions:
         entries = [e for e in entries if e.meta.motion in model.card["motions"]["train"]] or entries
     if not mixed_gains:
@@ -345,10 +389,12 @@ def adapt_model(
     fitted = Adaptation.fit(
         model, simulator, data.sequences(entries), seconds, _window_rms(progress)
     )
+    fitted = replace(fitted, doctor=gate.to_dict())
     fitted.save(folder)
     return AdaptResult(
         unit_id=fitted.unit_id, servos={j: {str(f): v for f, v in s.items()} for j, s in fitted.servos.items()},
         before=fitted.before, after=fitted.after, robot=None, folder=folder, recordings=len(entries),
+        doctor=gate,
     )  # fmt: skip
 
 
@@ -361,6 +407,7 @@ def adapt_robot(
     motions: tuple[str, ...] = (),
     seconds: float = 30.0,
     payload_mass: float | None = None,
+    despite_errors: bool = False,
     progress: Progress = no_progress,
 ) -> AdaptResult:
     """Fit the servo parameters of one unit on one day to a short log: a robot folder in, a robot folder out.
@@ -375,14 +422,17 @@ def adapt_robot(
         motions: Only these.
         seconds: Duration of the recordings to fit, in windows of 8 s; all of them are used for validation.
         payload_mass: kg in each hand, of logs whose format does not state it.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
 
     Raises:
+        DatasetError: The doctor finds an error in the recordings.
         UsageError: The unit is not named.
         NoGainError: The fit does not follow the recordings, or motions that it was not given, better than the given
             robot; nothing is written.
     """
-    from gaponet.base.files import lock_folder
-    from gaponet.robot.folder import save_robot
+    from gaponet.base.files import lock_folder, whole_folder
+    from gaponet.data.checks.gate import pass_gate
+    from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sim.replay import rollout_errors
     from gaponet.sysid.adapt import FIELDS, adapt
@@ -392,11 +442,20 @@ def adapt_robot(
         Path(out),
         as_robot(Path(robot) if isinstance(robot, str) and "/" in robot else robot),
     )
+    require_other_folder(folder, spec)
     uncertainty = ParameterUncertainty.load(spec)
     with (
         lock_folder(folder, "robot"),
-        unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
+        unit_recordings(source, spec, unit, motions, payload_mass) as recorded,
     ):
+        gate = pass_gate(
+            recorded.dataset,
+            recorded.entries,
+            spec,
+            despite_errors=despite_errors,
+            place=recorded.source,
+        )
+        sequences = recorded.sequences()
         fitted = adapt(sequences, spec, seconds, None, _window_rms(progress), judge=True)
         if not fitted.accepted:
             before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
@@ -414,22 +473,19 @@ def adapt_robot(
                 f"nothing is written: over all {len(sequences)} recording(s) the error is {1e3 * after:.2f} mrad with "
                 f"the fit and {1e3 * before:.2f} mrad with {spec.name}; give longer logs (--seconds), or keep the robot"
             )
-        save_robot(fitted.robot, folder)
-        if (
-            spec.folder / PROVENANCE_FILE
-        ).is_file():  # identification's training motions stay on record
-            write_text(
-                folder / PROVENANCE_FILE,
-                (spec.folder / PROVENANCE_FILE).read_text(encoding="utf-8"),
-            )
-        _save_uncertainty(folder, sequences, [], {}, uncertainty)
+        adapted = {"unit_id": recorded.unit_id, "doctor": gate.to_dict()}
+        with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
+            save_robot(fitted.robot, place)
+            _copy_origin(spec.folder, place)
+            write_json(place / ADAPTATION_FILE, adapted)
+            _save_uncertainty(place, sequences, [], {}, uncertainty)
     robot, joints = (
         fitted.robot,
         zip(fitted.robot.operated, fitted.robot.operated_index, strict=True),
     )
     return AdaptResult(
-        unit_id=unit, servos={j: {f: float(getattr(robot, f)[i]) for f in FIELDS} for j, i in joints},
-        before=before, after=after, robot=robot, folder=folder, recordings=len(sequences),
+        unit_id=recorded.unit_id, servos={j: {f: float(getattr(robot, f)[i]) for f in FIELDS} for j, i in joints},
+        before=before, after=after, robot=robot, folder=folder, recordings=len(sequences), doctor=gate,
     )  # fmt: skip
 
 

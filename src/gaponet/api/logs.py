@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,7 +16,7 @@ from gaponet.api.opening import Place, as_dataset, as_robot, entries_of_unit
 from gaponet.api.results import ExciteResult, PairResult, Prediction
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.progress import Progress, no_progress, with_note
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, Entry
 from gaponet.robot.folder import MOVE_STORED_ROBOT
 from gaponet.robot.spec import RobotSpec
 
@@ -307,6 +308,24 @@ def _standard_errors(
     }
 
 
+@dataclass(frozen=True)
+class UnitRecordings:
+    """Recordings of one unit.
+
+    Attributes:
+        source: What a person calls them: the dataset, or the logs that were imported.
+    """
+
+    source: str
+    unit_id: str
+    dataset: Dataset
+    entries: list[Entry]
+
+    def sequences(self) -> list[Sequence]:
+        """Read the recordings."""
+        return self.dataset.sequences(self.entries)
+
+
 @contextmanager
 def unit_recordings(
     source: Dataset | Place,
@@ -314,8 +333,8 @@ def unit_recordings(
     unit: str = "",
     motions: tuple[str, ...] = (),
     payload_mass: float | None = None,
-) -> Iterator[tuple[str, list[Sequence]]]:
-    """Yield one unit's id and its recordings, from a dataset or from logs; arguments as of `check`.
+) -> Iterator[UnitRecordings]:
+    """Yield the recordings of one unit, from a dataset or from logs; arguments as of `check`.
 
     Logs are imported into a temporary folder.
 
@@ -344,4 +363,5 @@ def unit_recordings(
             raise UsageError(
                 f"--payload-mass {payload_mass:g}: {source} states {stated:g} kg; leave it out"
             )
-        yield unit, data.sequences(entries)
+        name = str(source) if isinstance(source, (str, Path)) else str(data.path)
+        yield UnitRecordings(name, unit, data, entries)

@@ -163,7 +163,8 @@ def check(
 
     spec = as_robot(Path(robot) if isinstance(robot, str) else robot)
     uncertainty = ParameterUncertainty.require(spec)
-    with unit_recordings(logs, spec, unit, motions, payload_mass) as (_, sequences):
+    with unit_recordings(logs, spec, unit, motions, payload_mass) as recorded:
+        sequences = recorded.sequences()
         drifted = drift(spec, uncertainty, sequences, threads)
     return CheckResult(
         verdict=drifted.verdict, advice=drifted.advice, recordings=len(sequences), drift=drifted

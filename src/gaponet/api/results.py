@@ -16,6 +16,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 if TYPE_CHECKING:
+    from gaponet.data.checks.gate import GateReport
     from gaponet.data.store import Dataset
     from gaponet.export.rollout import RolloutPrediction
     from gaponet.hw.control.plan import Plan
@@ -122,6 +123,7 @@ class IdentifyResult:
         fit: Standard errors, terms that were tried, warnings.
         seconds: Duration of the fit.
         taken_from: Joint → joint of `like` whose servo was its start.
+        doctor: What the doctor found in the recordings.
     """
 
     robot: RobotSpec
@@ -129,6 +131,7 @@ class IdentifyResult:
     errors: Mapping[str, Array]
     fit: Identified = field(repr=False)
     seconds: float
+    doctor: GateReport
     taken_from: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -166,7 +169,7 @@ class IdentifyResult:
             "links": {body: vars(link) for body, link in self.robot.links.items()},
             "touching": list(fit.table_fit.motions) if fit.table_fit else [],
             "warnings": list(fit.warnings), "findings": list(fit.findings), "undetermined": fit.undetermined,
-            "seconds": self.seconds, "robot": str(self.folder),
+            "seconds": self.seconds, "robot": str(self.folder), "doctor": self.doctor.to_dict(),
         }  # fmt: skip
 
 
@@ -178,6 +181,7 @@ class TorqueResult:
         robot: The robot with identified armature, damping, friction and delay, as written to `folder`.
         before, after: Mean |error| half a second after a recorded state, driven by the recorded torque, rad.
         fit: Values, standard errors and errors by joint.
+        doctor: What the doctor found in the recordings.
     """
 
     robot: RobotSpec
@@ -186,6 +190,7 @@ class TorqueResult:
     after: float
     virtual: bool
     fit: TorqueDrivenFit = field(repr=False)
+    doctor: GateReport
 
     def to_dict(self) -> dict[str, Any]:
         from gaponet.robot.servo_fields import PASSIVE_FIELDS
@@ -199,6 +204,7 @@ class TorqueResult:
         return {
             "joints": joints, "std": fit.std, "torque": fit.torque, "windows": fit.windows,
             "angle": {str(h): x for h, x in fit.angle.items()}, "robot": str(self.folder),
+            "doctor": self.doctor.to_dict(),
         }  # fmt: skip
 
 
@@ -210,10 +216,12 @@ class TrainResult:
         model: The exported model that was best on validation motions.
         card: What its card.json says: training, data, errors.
         candidates: Kind of network → validation error after its part of the budget, rad; empty if one kind was given.
+        doctor: What the doctor found in the recordings.
     """
 
     model: GapModel
     card: dict[str, Any] = field(repr=False)
+    doctor: GateReport
     candidates: Mapping[ModelKind, float] = field(default_factory=dict)
 
     @property
@@ -236,6 +244,7 @@ class TrainResult:
         return {key: self.card[key] for key in keys} | {
             "kind": kind,
             "candidates": dict(self.candidates),
+            "doctor": self.doctor.to_dict(),
         }
 
 
@@ -249,6 +258,7 @@ class AdaptResult:
         robot: The adapted robot; None for a model.
         folder: Robot folder or run folder that holds the result.
         recordings: Number of recordings behind `before` and `after`.
+        doctor: What the doctor found in the recordings.
     """
 
     unit_id: str
@@ -258,11 +268,13 @@ class AdaptResult:
     robot: RobotSpec | None
     folder: Path
     recordings: int
+    doctor: GateReport
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "unit_id": self.unit_id, "before": self.before, "after": self.after,
             "servos": {joint: dict(servo) for joint, servo in self.servos.items()}, "robot": str(self.folder),
+            "doctor": self.doctor.to_dict(),
         }  # fmt: skip
 
 

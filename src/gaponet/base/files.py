@@ -182,6 +182,50 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
         os.close(descriptor)
 
 
+@contextmanager
+def whole_folder(
+    folder: Path, kind: str, last: str, obsolete: tuple[str, ...] = ()
+) -> Iterator[Path]:
+    """Lock a folder and yield an empty one; when the block succeeds, its files replace those of `folder`.
+
+    The folder is complete if `last` is there: this file is taken away first and put back last. If the process is killed
+    before, or the block fails, `folder` stays as it was.
+
+    Args:
+        kind: As of `lock_folder`.
+        last: Name of the file without which the folder is incomplete.
+        obsolete: Names of files in `folder` that are removed, since the new files make them wrong.
+
+    Raises:
+        FolderError: The folder is somebody else's, or another process writes into it.
+        OSError: A file could not be written.
+    """
+    with lock_folder(folder, kind):
+        temporary = folder / f"{FOLDER_MARKER}-{os.getpid()}-new"
+        temporary.mkdir()
+        try:
+            yield temporary
+            _replace_files(temporary, folder, last, obsolete)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _replace_files(source: Path, target: Path, last: str, obsolete: tuple[str, ...]) -> None:
+    """Move the files of a folder, markers aside, into another one, `last` as the last one."""
+    names = []
+    for path in sorted(source.rglob("*")):
+        if path.is_file() and path.name != FOLDER_MARKER:
+            flush_to_disk(path)
+            names.append(path.relative_to(source))
+    names.remove(Path(last))
+    for name in (last, *obsolete):
+        (target / name).unlink(missing_ok=True)
+    for path in (*names, Path(last)):
+        (target / path).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(source / path, target / path)
+    flush_to_disk(target)
+
+
 def _write_at(descriptor: int, offset: int, line: bytes) -> None:
     os.lseek(descriptor, offset, os.SEEK_SET)
     os.write(descriptor, line)

@@ -34,7 +34,7 @@ Logs = Annotated[
 def adapt(
     run: Known, dataset: Logs, out: Path | None = None, unit: Unit = "", motions: tuple[str, ...] = (),
     seconds: float = 30.0, payload_mass: float | None = None, robot: Robot = None, mixed_gains: Flag = False,
-    json: Json = False,
+    despite_errors: Flag = False, json: Json = False,
 ) -> None:  # fmt: skip
     """Adapt an identified robot to another unit or day with short logs.
 
@@ -54,7 +54,7 @@ def adapt(
         with progress_bar("adapting") as update:
             made = api.adapt_robot(
                 run, dataset, out=out, unit=unit, motions=motions, seconds=seconds, payload_mass=payload_mass,
-                progress=update,
+                despite_errors=despite_errors, progress=update,
             )  # fmt: skip
         screen.say(
             f"error {mrad(made.before)} → {mrad(made.after)} mrad ({made.after / made.before:.2f} of it) on "
@@ -75,7 +75,7 @@ def adapt(
     with progress_bar("adapting") as update:
         made = api.adapt_model(
             run, dataset, unit=unit, motions=motions, seconds=seconds, robot=robot, mixed_gains=mixed_gains,
-            progress=update,
+            despite_errors=despite_errors, progress=update,
         )  # fmt: skip
     _show(screen, made)
     screen.say(
@@ -93,3 +93,4 @@ def _show(screen: Out, made: AdaptResult) -> None:
     screen.table(f"Servos of unit {made.unit_id}", ["joint", *(SERVO_FIELDS[f].heading for f in FIELDS)], [
         [j, *(f"{v[f] * SERVO_FIELDS[f].factor:.3g}" for f in FIELDS)] for j, v in made.servos.items()
     ])  # fmt: skip
+    screen.findings(made.doctor.findings)

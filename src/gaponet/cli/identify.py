@@ -31,7 +31,7 @@ def identify(
     dataset: Source, out: Path, windows: int = 40, terms: tuple[Term, ...] | None = None, table: bool = True,
     threads: int = 0, budget: str | None = None, stops: Flag = False, masses: Flag = False, current: Flag = False,
     details: Flag = False, robot: Robot = None, like: str | None = None, units: tuple[str, ...] = (),
-    holdout_units: tuple[str, ...] = (), json: Json = False,
+    holdout_units: tuple[str, ...] = (), despite_errors: Flag = False, json: Json = False,
 ) -> None:  # fmt: skip
     """Fit the simulator's servos to logs and write a robot folder.
 
@@ -54,14 +54,17 @@ def identify(
             what = "--like, --units, --holdout-units, --terms, --stops and --masses"
             raise UsageError(f"{dataset} holds a robot that is driven by torque; leave out {what}")
         with progress_bar("identifying"):
-            driven = api.identify_torque(data, out=out, current=current, robot=spec)
+            driven = api.identify_torque(
+                data, out=out, current=current, robot=spec, despite_errors=despite_errors
+            )
         _show_torque(screen, driven, current)
         screen.result(driven.to_dict())
         return
     with progress_bar("identifying") as update:
         made = api.identify(
             data, out=out, windows=windows, robot=spec, like=like, units=units, holdout_units=holdout_units,
-            terms=terms, table=table, threads=threads, budget=budget, stops=stops, masses=masses, progress=update,
+            terms=terms, table=table, threads=threads, budget=budget, stops=stops, masses=masses,
+            despite_errors=despite_errors, progress=update,
         )  # fmt: skip
     _show(screen, made, details)
     if "backlash" in (terms or ()) and "backlash" not in [c.name for c in made.fit.comparisons]:
@@ -133,6 +136,7 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
             f"table: {what}; error with a low tip {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "
             f"{', '.join(touch.motions)}"
         )
+    screen.findings(made.doctor.findings)
     unknown = [w for w in fit.warnings if UNDETERMINED in w]
     for warning in fit.warnings:
         if details or warning not in unknown:
@@ -187,6 +191,7 @@ def _show_torque(screen: Out, made: TorqueResult, current: bool) -> None:
         [name, *(f"{mrad(a[j])} → {mrad(b[j])}" for a, b in fit.angle.values())]
         for j, name in enumerate(spec.operated)
     ])  # fmt: skip
+    screen.findings(made.doctor.findings)
     screen.say(
         f"robot folder {made.folder}: armature, damping, friction and delay; a servo's kp and kd are the file's still"
     )

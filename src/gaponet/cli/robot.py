@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -131,13 +130,22 @@ def new(
     from gaponet.report.view.gl import prepare
 
     prepare()
-    from gaponet.robot.new import RobotOptions, new_robot
+    from gaponet.robot.new import PICTURE, RobotOptions, new_robot
 
     screen = Out(json)
     options = RobotOptions(
         joints, kp, kd, effort_limit, servo, packages, rate, keyframe, contacts, name
     )
-    made = new_robot(model, out, options)
+    no_picture = list[str]()
+
+    def draw(made: NewRobot) -> bytes | None:
+        try:
+            return _picture(made, model.name)
+        except (UsageError, ModuleNotFoundError) as error:
+            no_picture.append(str(error))
+            return None
+
+    made = new_robot(model, out, options, draw)
     for note in made.notes:
         screen.say(f"  {note}", "   note", "cyan")
     passive = ("damping, friction, armature", "passive_source")
@@ -152,13 +160,9 @@ def new(
             "   from",
             "cyan",
         )
-    picture = None
-    try:
-        from gaponet.report.view.picture import still
-
-        picture = _picture(made, model.name, still)
-    except (UsageError, ModuleNotFoundError) as error:
-        screen.say(f"  no picture: {error}", "   note", "cyan")
+    for reason in no_picture:
+        screen.say(f"  no picture: {reason}", "   note", "cyan")
+    picture = None if no_picture else out / PICTURE
     result = check_robot(screen, made.robot, None, ())
     screen.say(f"written: {out}/robot.toml, robot.xml{', picture.png' if picture else ''}")
     screen.next(
@@ -169,20 +173,17 @@ def new(
     )
 
 
-def _picture(made: NewRobot, label: str, still: Callable[..., bytes]) -> Path:
-    """picture.png in the folder: the vendor's model beside ours, both at home."""
+def _picture(made: NewRobot, label: str) -> bytes:
+    """Return a PNG: the vendor's model beside ours, both at home."""
+    from gaponet.report.view.picture import still
     from gaponet.sim.model import build_model
 
-    path = made.robot.folder / "picture.png"
-    png = still(
+    return still(
         [
             (label, made.vendor, made.pose),
             ("robot.xml", build_model(made.robot), made.robot.qpos_home),
         ]
     )
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(png)
-    return path
 
 
 def check_robot(
@@ -266,6 +267,9 @@ def show(
     screen.table(f"Parameters of {spec.name}, ± standard error", columns, table_rows(known, fields))
     origin = read_origin(spec.folder)
     findings = list(origin.get("findings", ())) if origin else []
+    doctor = origin.get("doctor", {}) if origin else {}
+    for error in doctor.get("despite_errors", ()):
+        screen.say(f"  identified despite an error of the recordings, {error}", "warning", "yellow")
     for line in (*findings, *sentences(known)):
         screen.say(line)
     if out is not None:

@@ -25,6 +25,7 @@ from gaponet.cli.logs import joint_map, show_diagnosis
 from gaponet.cli.main import main
 from gaponet.cli.options import Flag, Json, Logs, Model
 from gaponet.cli.out import Out
+from gaponet.data.checks.gate import refuse_errors
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
@@ -79,7 +80,7 @@ def start(
     time_unit: Literal["s", "ms", "us", "ns"] | None = None, rate: float | None = None, cut: float | None = None,
     skip_bad: Flag = False, allow_pickle: Flag = False,
     to: Literal["mjcf", "mjlab", "isaaclab", "newton", "drake", "json"] = "mjcf", budget: str | None = None,
-    dry_run: Flag = False, anyway: Flag = False, json: Json = False,
+    dry_run: Flag = False, despite_errors: Flag = False, json: Json = False,
 ) -> None:  # fmt: skip
     """All steps in one command: from model file and logs to a report.
 
@@ -107,7 +108,7 @@ def start(
         to: Engine to export to.
         budget: Time that identification may take, such as 4m; default no limit.
         dry_run: Print the inspection and the commands, and write nothing.
-        anyway: Continue although the doctor found errors in the logs.
+        despite_errors: Continue although the doctor finds errors in the logs; the identified robot keeps them.
     """
     from gaponet.report.view.gl import prepare
 
@@ -162,6 +163,7 @@ def start(
         for words in commands:
             words += ["--to", to] if words[0] == "export" else []
             words += ["--budget", budget] if words[0] == "identify" and budget else []
+            words += ["--despite-errors"] if words[0] == "identify" and despite_errors else []
         lines = [shlex.join(["gaponet", *words]) for words in commands]
         if dry_run:
             for line in lines:
@@ -173,7 +175,7 @@ def start(
                 record.begin(
                     shlex.join(next(words for words in commands if words[0] == "import")[2:])
                 )
-                _run(screen, commands, lines, record, anyway)
+                _run(screen, commands, lines, record, despite_errors)
             screen.say(f"commands that ran: {out / COMMANDS_FILE}")
             screen.next(f"look at {out / 'identified' / 'report.html'}")
     screen.result({
@@ -389,7 +391,11 @@ def hash_logs(logs: Path, out: Path) -> dict[str, str]:
 
 
 def _run(
-    screen: Out, commands: list[list[str]], lines: list[str], record: StartRecord, anyway: bool
+    screen: Out,
+    commands: list[list[str]],
+    lines: list[str],
+    record: StartRecord,
+    despite_errors: bool,
 ) -> None:
     """Run the commands that have not finished on the present inputs; none of them names the next one."""
     Out.names_next = False
@@ -404,12 +410,12 @@ def _run(
                 with progress_bar("examining") as update:
                     diagnosis = api.doctor(words[1], progress=update)
                 show_diagnosis(screen, diagnosis)
-                if diagnosis.count("error") and not anyway:
-                    raise UsageError(
-                        "stopped: an error that the doctor finds is in the logs, and no fit repairs it. "
-                        f"Repair the logs or {record.out / 'logs.toml'} (see gaponet doctor {words[1]} --fix), "
-                        f"delete {words[1]}, and start again; or --anyway"
+                if not despite_errors:
+                    way_out = (
+                        f"Correct the logs or {record.out / 'logs.toml'} (gaponet doctor {words[1]} --fix proposes "
+                        f"lines), delete {words[1]}, and give the same command again"
                     )
+                    refuse_errors(diagnosis.findings, words[1], way_out)
             elif code := main(words):
                 if code == 128 + signal.SIGINT:
                     raise KeyboardInterrupt("the same command again goes on")

@@ -34,6 +34,7 @@ def train(
     robot: Robot = None,
     holdout_units: tuple[str, ...] = (),
     log: tuple[Literal["tensorboard", "wandb"], ...] = (),
+    despite_errors: Flag = False,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),  # noqa: B008
     json: Json = False,
 ) -> None:
@@ -55,7 +56,7 @@ def train(
     with nullcontext(no_progress) if started() else progress_bar(f"training {model}") as update:
         trained = api.train(
             dataset, out=out, budget=budget, config=config, model=model, robot=robot, holdout_units=holdout_units,
-            resume=resume, log=log, progress=update,
+            resume=resume, log=log, despite_errors=despite_errors, progress=update,
         )  # fmt: skip
     if started():  # the first rank prints for all
         return
@@ -86,6 +87,7 @@ def train(
         screen.say(
             "that is within what motions scatter, or less than 2 %: the identified robot is as good without it"
         )
+    screen.findings(trained.doctor.findings)
     screen.say(f"{kind} in {trained.model.path}")
     screen.next(step)
     screen.result(trained.to_dict())

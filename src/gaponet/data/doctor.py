@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.base.executor import LOCAL
 from gaponet.base.progress import Progress, no_progress
-from gaponet.data.checks import CHECKS
+from gaponet.data.checks import CHECKS, run_checks
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
 from gaponet.data.checks.static_checks import feedforward, static_checks
@@ -20,12 +20,6 @@ from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import LEVELS, Finding
 from gaponet.robot.spec import RobotSpec
-
-CONSEQUENCES = (
-    "blocked",
-    "stuck",
-    "sag",
-)  # findings that an exchanged, mirrored or mis-scaled joint causes
 
 
 @dataclass(frozen=True)
@@ -79,18 +73,7 @@ class DoctorResult:
         dataset.require_robot(robot)
         dataset.require_sequences()
         surveys = survey_all(dataset, robot, progress, executor)
-        findings = [f for check in CHECKS for f in check.run(surveys, robot)]
-        wrong = {
-            j
-            for f in findings
-            if f.level == "error" and f.check in ("order", "sign", "unit")
-            for j in f.joints
-        }
-        findings = [
-            f
-            for f in findings
-            if f.check not in CONSEQUENCES or not f.joints or not wrong >= set(f.joints)
-        ]
+        findings = run_checks(CHECKS, surveys, robot)
         if gravity_model is not None:
             findings += _examine_loads(findings, surveys, robot, gravity_model)
         findings.sort(key=lambda f: -LEVELS.index(f.level))

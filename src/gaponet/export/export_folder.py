@@ -16,7 +16,7 @@ import numpy as np
 
 from gaponet.base.arrays import array_module
 from gaponet.base.errors import UsageError
-from gaponet.base.files import lock_folder, write_text
+from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
 from gaponet.export.engine_configs import TEMPLATES, engine_config
@@ -309,7 +309,7 @@ def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
             f"qvel_{i}": s.qvel,
             f"dt_{i}": np.array(s.dt),
         }
-    with file.open("wb") as opened:
+    with atomic_write(file) as temporary, temporary.open("wb") as opened:
         np.savez_compressed(opened, **arrays)
 
 

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError
-from gaponet.base.files import lock_folder, write_text
+from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.export.simulator_facts import Joints
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
@@ -370,13 +370,16 @@ def _write(source: Source, out: Path) -> Path:
         Path(os.path.abspath(f)) for f in mujoco.mju_getXMLDependencies(str(source.main))
     } | set(source.text)
     root = Path(os.path.commonpath([f.parent for f in needed]))
+    edited = source.edited()
     with lock_folder(out, "engine"):
         for file in sorted(needed):
             copy = out / file.relative_to(root)
             copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copy)
-        for file, text in source.edited().items():
-            (out / file.relative_to(root)).write_bytes(text)
+            with atomic_write(copy) as temporary:
+                if file in edited:
+                    temporary.write_bytes(edited[file])
+                else:
+                    shutil.copyfile(file, temporary)
     return out / source.main.relative_to(root)
 
 

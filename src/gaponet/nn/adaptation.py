@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +36,7 @@ class Adaptation:
         logs: Content hashes of the recordings.
         seconds: Duration of the fitted windows.
         before, after: RMS error of the fitted windows, rad.
+        doctor: What the doctor found in the recordings: despite_errors and warnings, a sentence each.
     """
 
     unit_id: str
@@ -45,6 +46,7 @@ class Adaptation:
     seconds: float
     before: float
     after: float
+    doctor: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def robot(self, simulator: RobotSpec) -> RobotSpec:
         """Return the simulator with the parameters of this unit."""

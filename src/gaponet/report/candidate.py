@@ -26,13 +26,15 @@ DATA_HINT = "data of the robot that the run was trained for"
 
 class _Origin(TypedDict):
     """Data that a robot was identified from: dataset (address, or path from the folder), recordings and motions by
-    split, the error on validation motions, rad, and what was learned about backlash and links."""
+    split, the error on validation motions, rad, what was learned about backlash and links, and what the doctor found in
+    the recordings (checks/gate.py)."""
 
     dataset: str
     parts: SplitHashes
     motions: dict[str, tuple[str, ...]]
     val_mpjae: dict[str, float]
     findings: NotRequired[tuple[str, ...]]
+    doctor: NotRequired[dict[str, tuple[str, ...]]]
 
 
 @dataclass(frozen=True)

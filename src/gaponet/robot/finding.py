@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -55,6 +56,11 @@ class Finding:
                 f"# No line is known that mends: {other}. Do what the findings say."
             ]
         return "\n".join(lines) + "\n"
+
+
+def errors_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return the findings that must be corrected before anything is learned from the recordings."""
+    return tuple(f for f in findings if f.level == "error")
 
 
 def abbreviate(names: list[str]) -> str:

@@ -17,6 +17,9 @@ from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_r
 STORED_ROBOT = "robot"  # subfolder of a run or a dataset
 MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"
 PROVENANCE_FILE = "identified.json"  # what a robot was identified from (report/candidate.py)
+ADAPTATION_FILE = (
+    "adapted.json"  # to which unit it was adapted, and what the doctor found in its recordings
+)
 UNCERTAINTY_FILE = "uncertainty.json"  # of its values (sysid/uncertainty.py)
 OLD_UNCERTAINTY_FILE = "known.json"  # the same in folders that older versions wrote
 COPIED_FILES = (
@@ -49,8 +52,7 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     """
     from gaponet.robot.self_contained import self_contained_mjcf
 
-    if folder.resolve() == robot.folder.resolve():
-        raise UsageError(f"{folder}: is the robot's own folder; choose another")
+    require_other_folder(folder, robot)
     text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_HEADING)[0]
     text = IDENTIFIED_TABLES.sub("", re.sub(r"(?m)^mjcf\s*=.*\n", "", text)).rstrip() + "\n"
     text = _with_gains(text, robot.nominal or robot)
@@ -90,6 +92,12 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         raise RobotError(
             f"{robot.folder}/robot.toml: write each joint as a [[joint]] table of its own"
         )
+
+
+def require_other_folder(folder: Path, robot: RobotSpec) -> None:
+    """Refuse to write a robot over the folder that it was loaded from."""
+    if folder.resolve() == robot.folder.resolve():
+        raise UsageError(f"{folder}: is the robot's own folder; choose another")
 
 
 def require_self_contained(folder: Path) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError, UsageError
-from gaponet.base.files import lock_folder, write_text
+from gaponet.base.files import whole_folder, write_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
 from gaponet.robot.freeze import freeze
 from gaponet.robot.mjcf import compile_spec
@@ -21,6 +22,7 @@ from gaponet.robot.self_contained import self_contained_text
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.robot.vendor import read_vendor
 
+PICTURE = "picture.png"  # of a robot folder
 HAND_PREFIXES = ("attachment", "tcp", "tool", "flange", "palm", "grip", "hand", "wrist")
 IMPLICIT_INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_IMPLICIT,
@@ -65,8 +67,16 @@ class NewRobot:
     notes: list[str] = field(default_factory=list)  # what was omitted, fixed or corrected
 
 
-def new_robot(path: Path, out: Path, options: RobotOptions) -> NewRobot:
-    """Write the robot folder `out` from the MJCF or URDF at `path`.
+def new_robot(
+    path: Path,
+    out: Path,
+    options: RobotOptions,
+    draw: Callable[[NewRobot], bytes | None] = lambda made: None,
+) -> NewRobot:
+    """Write the robot folder `out` from the MJCF or URDF at `path`; the folder is complete or absent.
+
+    Args:
+        draw: Returns the PNG of picture.png, or None for no picture.
 
     Raises:
         RobotError: The model is damaged, or has no joint to log.
@@ -92,12 +102,27 @@ def new_robot(path: Path, out: Path, options: RobotOptions) -> NewRobot:
             text, robot_toml = (
                 t.replace(f'"{name}"', f'"{name.replace("/", "_")}"') for t in (text, robot_toml)
             )
-    if (out / "robot.toml").exists():
+    if _holds_another_robot(out, text, robot_toml):
         raise UsageError(f"{out}: holds a robot; choose another --out, or move it away")
-    with lock_folder(out, "robot"):
-        write_text(out / "robot.xml", text)
-        write_text(out / "robot.toml", robot_toml)
-    return NewRobot(load_robot(out), joint_drives, model, pose, notes)
+    with whole_folder(out, "robot", last="robot.toml") as place:
+        write_text(place / "robot.xml", text)
+        write_text(place / "robot.toml", robot_toml)
+        made = NewRobot(load_robot(place), joint_drives, model, pose, notes)
+        picture = draw(made)
+        if picture is not None:
+            (place / PICTURE).write_bytes(picture)
+    return replace(made, robot=load_robot(out))
+
+
+def _holds_another_robot(folder: Path, xml: str, toml: str) -> bool:
+    """True if a folder holds a robot that is not the one to be written: the same command may be given again."""
+    if not (folder / "robot.toml").exists():
+        return False
+    for name, text in (("robot.toml", toml), ("robot.xml", xml)):
+        file = folder / name
+        if not file.is_file() or file.read_text(encoding="utf-8", errors="replace") != text:
+            return True
+    return False
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -95,15 +95,15 @@ class RobotClock(SimulatedClock):
     def __init__(
         self, robot: RobotSpec, bus: Loopback, unit: str, payload: float, fleet: str
     ) -> None:
-        super().__init__(100.0)
+        super().__init__()
         physics = load_fleet(fleet, robot).unit(unit)
         self.robot = Disobedient(robot, physics, (payload, "both"), rate=RATE)
         self.robot.clock = self  # type: ignore[assignment]
         self.steps = 0
 
     def wait_until(self, deadline: float) -> float:
-        while 100.0 + self.steps / RATE <= deadline:
-            self._now = max(self._now, 100.0 + self.steps / RATE)
+        while self.start + self.steps / RATE <= deadline:
+            self._now = max(self._now, self.start + self.steps / RATE)
             self.robot._receive(self._now)
             self.robot.live.step()
             self.robot._send_state(self.steps, self._now)

@@ -128,7 +128,7 @@ ERRORS: dict[str, Callable[[Bus], object]] = {
 
 @pytest.fixture
 def clock() -> SimulatedClock:
-    return SimulatedClock(100.0)
+    return SimulatedClock()
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from gaponet.base.errors import UsageError
+from gaponet.base.files import lock_folder
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.training import selection
 from gaponet.nn.training.selection import candidate_errors, train_best
@@ -16,6 +17,13 @@ ERRORS = {"gaponet": 3.0, "shared_mlp": 1.0, "mlp": 2.0}
 @pytest.fixture(autouse=True)
 def without_trees(monkeypatch):
     monkeypatch.setattr(selection, "trees_available", lambda: False)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run folder, locked as gaponet train locks it."""
+    with lock_folder(tmp_path / "run", "run"):
+        yield tmp_path / "run"
 
 
 class Trainings:
@@ -40,24 +48,22 @@ class Trainings:
         return SimpleNamespace(card=card)
 
 
-def test_the_best_kind_gets_the_rest_of_the_budget(tmp_path):
+def test_the_best_kind_gets_the_rest_of_the_budget(run):
     train = Trainings()
-    train_best(tmp_path / "run", False, train)
+    train_best(run, False, train)
     assert train.calls == [
         ("gaponet", "gaponet", 0.2, 0.0, False),
         ("shared_mlp", "shared_mlp", 0.2, 0.2, False),
         ("mlp", "mlp", 0.2, 0.4, False),
         ("shared_mlp", "run", 0.6, 0.4, True),
     ]
-    assert candidate_errors(tmp_path / "run") == ERRORS
-    assert (tmp_path / "run/checkpoint.pt").read_text() == "shared_mlp"
+    assert candidate_errors(run) == ERRORS
+    assert (run / "checkpoint.pt").read_text() == "shared_mlp"
 
 
-def test_an_interrupted_choice_leaves_the_best_so_far_and_goes_on_where_it_was(
-    tmp_path, monkeypatch
-):
+def test_an_interrupted_choice_leaves_the_best_so_far_and_goes_on_where_it_was(run, monkeypatch):
     monkeypatch.setattr(GapModel, "load", classmethod(lambda cls, run: run))
-    run, train = tmp_path / "run", Trainings(interrupted="shared_mlp")
+    train = Trainings(interrupted="shared_mlp")
     train_best(run, False, train)
     assert [kind for kind, *_ in train.calls] == ["gaponet", "shared_mlp"]
     assert (run / "checkpoint.pt").read_text() == "gaponet"
@@ -84,14 +90,34 @@ def test_a_run_of_one_kind_is_resumed_with_its_kind(tmp_path):
 
 @pytest.mark.parametrize(("later", "chosen"), [(0.6, "trees"), (0.4, "shared_mlp")])
 def test_trees_win_if_the_best_network_does_not_pass_them_with_the_rest_of_the_budget(
-    tmp_path, monkeypatch, later, chosen
+    run, monkeypatch, later, chosen
 ):
     monkeypatch.setattr(selection, "trees_available", lambda: True)
     monkeypatch.setattr(GapModel, "load", classmethod(lambda cls, run: run))
     train = Trainings(trees=0.5, later=later)
-    train_best(tmp_path / "run", False, train)
+    train_best(run, False, train)
     assert train.calls[3:] == [
         ("trees", "trees", 0.2, 0.6, False),
         ("shared_mlp", "shared_mlp", 0.4, 0.6, True),
     ]
-    assert (tmp_path / "run/checkpoint.pt").read_text() == chosen
+    assert (run / "checkpoint.pt").read_text() == chosen
+
+
+def test_a_copy_of_the_best_run_that_is_interrupted_is_made_again(run, monkeypatch):
+    def fail(*paths):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr("gaponet.base.files.os.replace", fail)
+        full.setattr(selection, "write_json", write_errors)
+        with pytest.raises(OSError, match="No space left"):
+            train_best(run, False, Trainings())
+    assert not (run / "checkpoint.pt").exists()
+    again = Trainings()
+    train_best(run, True, again)
+    assert again.calls == [("shared_mlp", "run", 0.6, 0.4, True)]
+    assert (run / "checkpoint.pt").read_text() == "shared_mlp"
+
+
+def write_errors(path, errors):
+    path.write_text(json.dumps(errors))

@@ -6,7 +6,37 @@ run on every dataset. The gravity and static checks need a gravity model too (da
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from gaponet.data.checks import completeness, motor, timing, wiring
 from gaponet.data.checks.check import Check
+from gaponet.data.checks.survey import Survey
+from gaponet.robot.finding import Finding
+from gaponet.robot.spec import RobotSpec
 
 CHECKS: tuple[Check, ...] = (*wiring.CHECKS, *timing.CHECKS, *completeness.CHECKS, *motor.CHECKS)
+WRONG_JOINT_CHECKS = (
+    "order",
+    "sign",
+    "unit",
+)  # their errors name exchanged, mirrored or mis-scaled joints
+CONSEQUENCES = ("blocked", "stuck", "sag")  # checks that such a joint fails too
+
+
+def run_checks(checks: Iterable[Check], surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
+    """Return the findings of checks, without those that an exchanged, mirrored or mis-scaled joint explains."""
+    findings = list[Finding]()
+    for check in checks:
+        findings += check.run(surveys, robot)
+    wrong_joints = set[str]()
+    for finding in findings:
+        if finding.level == "error" and finding.check in WRONG_JOINT_CHECKS:
+            wrong_joints |= set(finding.joints)
+    return [f for f in findings if not _is_consequence(f, wrong_joints)]
+
+
+def _is_consequence(finding: Finding, wrong_joints: set[str]) -> bool:
+    """True if all joints of a finding are known to be wrong, and that explains it."""
+    if finding.check not in CONSEQUENCES or not finding.joints:
+        return False
+    return set(finding.joints) <= wrong_joints

@@ -16,6 +16,7 @@ class Check(NamedTuple):
     function: Callable[[list[Survey], RobotSpec], Iterator[Finding]]
     name: str
     ok_message: str
+    may_be_error: bool = False  # only such a check may yield errors; the gate runs no others
 
     def run(self, surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
         """Return the findings, at least one."""

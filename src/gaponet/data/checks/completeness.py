@@ -273,5 +273,5 @@ CHECKS = (
     Check(_blocked, "blocked", "no joint ran into a stop"),
     Check(_saturation, "saturation", ""),
     Check(_resolution, "resolution", ""),
-    Check(_stuck, "stuck", "every channel changes while its joint moves"),
+    Check(_stuck, "stuck", "every channel changes while its joint moves", may_be_error=True),
 )

@@ -193,4 +193,4 @@ def _averaging(levels: Array, widths: Array = AVERAGING_WIDTHS_S) -> tuple[float
     return best
 
 
-CHECKS = (Check(_timing, "timing", ""),)
+CHECKS = (Check(_timing, "timing", "", may_be_error=True),)

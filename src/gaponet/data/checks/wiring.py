@@ -293,11 +293,13 @@ def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 
 CHECKS = (
-    Check(_command, "command", "commands are positions that the joints come near"),
-    Check(_order, "order", ""),
-    Check(_sign, "sign", "no joint moves against its command"),
-    Check(_copied, "copied", "no state comes before its command"),
-    Check(_unit, "unit", ""),
+    Check(
+        _command, "command", "commands are positions that the joints come near", may_be_error=True
+    ),
+    Check(_order, "order", "", may_be_error=True),
+    Check(_sign, "sign", "no joint moves against its command", may_be_error=True),
+    Check(_copied, "copied", "no state comes before its command", may_be_error=True),
+    Check(_unit, "unit", "", may_be_error=True),
     Check(_limits, "range", "commands and positions stay inside the joint ranges"),
-    Check(_labels, "labels", "no recording is stored twice"),
+    Check(_labels, "labels", "no recording is stored twice", may_be_error=True),
 )

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import gc
+import random
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 SPIN_S = 0.0003  # last part of a wait, spent in a busy loop: on a quiet Linux a sleep ends up to this much late
+
+START_RANGE_S = (1e3, 1e6)  # of a simulated clock: computers are on for an hour or some days
 
 
 class Clock(Protocol):
@@ -51,11 +54,21 @@ class MonotonicClock:
 class SimulatedClock:
     """Time that passes only in `wait_until`: a loop with a virtual robot runs as fast as it can.
 
+    As on a real computer the time has no known start, so that code which mistakes a time for a duration fails.
+
     Attributes:
+        seed: Of the start; drawn once in a process. Set it before clocks are made to repeat their starts.
+        start: Time at which the clock began, s.
         suspended_s: What `suspended` returns.
     """
 
-    def __init__(self, start: float = 0.0) -> None:
+    seed: ClassVar[int] = random.SystemRandom().randrange(2**32)
+
+    def __init__(self, start: float | None = None) -> None:
+        """Start at a given time, s, or at one that follows from the seed."""
+        if start is None:
+            start = random.Random(self.seed).uniform(*START_RANGE_S)
+        self.start = start
         self._now = start
         self.suspended_s = 0.0
 

@@ -54,8 +54,7 @@ class TrainingData:
         """
         dataset.require_robot(robot)
         self.dataset, self.robot, self.holdout_units = dataset, robot, holdout_units
-        rule = (holdout_units, config.holdout_payloads, config.rates, config.train_share)
-        self.splits: Splits = resolve_splits(dataset, config.split, *rule)
+        self.splits = training_splits(dataset, config, holdout_units)
         if not config.mixed_gains:
             metas = (e.meta for entries in self.splits.values() for e in entries)
             require_same_gains(metas, dataset.joint_names, robot.operated)
@@ -82,6 +81,18 @@ class TrainingData:
         return self.dataset.sequences(stratified_subset(entries, count), optional=False)
 
 
+def training_splits(
+    dataset: Dataset, config: TrainConfig, holdout_units: tuple[str, ...]
+) -> Splits:
+    """Return the splits that training with these options uses.
+
+    Raises:
+        DatasetError, UsageError: A split would be empty, or the split file does not fit.
+    """
+    rule = (holdout_units, config.holdout_payloads, config.rates, config.train_share)
+    return resolve_splits(dataset, config.split, *rule)
+
+
 def require_suitable(run: Path, robot: RobotSpec, resume: bool) -> None:
     """Refuse a folder that holds a run and is not to be resumed, or that holds no run of this simulator and is.
 
@@ -105,7 +116,12 @@ def require_suitable(run: Path, robot: RobotSpec, resume: bool) -> None:
 
 
 def write_setup(
-    run: Path, data: TrainingData, config: TrainConfig, budget: Budget, resume: bool
+    run: Path,
+    data: TrainingData,
+    config: TrainConfig,
+    budget: Budget,
+    resume: bool,
+    despite_errors: bool = False,
 ) -> None:
     """Write config.json, split.json and the robot."""
     dataset, robot = data.dataset, data.robot
@@ -118,6 +134,8 @@ def write_setup(
         data.holdout_units,
         ranks.world(),
     )
+    if despite_errors:
+        words += " --despite-errors"
     write_json(run / "config.json", asdict(config) | {
         "budget": asdict(budget), "holdout_units": data.holdout_units, "robot": robot.name, "command": words,
         "dataset": dataset.address or os.path.relpath(dataset.path, run), "dataset_hash": dataset_hash(dataset.entries),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.base.files import write_json
+from gaponet.base.files import FOLDER_MARKER, whole_folder, write_json
 from gaponet.base.structure import read_json
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelKind
@@ -93,5 +93,12 @@ def _kind(run: Path) -> ModelKind | None:
 
 
 def _copy(out: Path, kind: ModelKind) -> None:
-    ignore = shutil.ignore_patterns(".*")
-    ranks.once(lambda: shutil.copytree(out / FOLDER / kind, out, dirs_exist_ok=True, ignore=ignore))
+    """Put the run of a candidate in the place of OUT's own, all of it or nothing."""
+    ranks.once(lambda: _copy_run(out / FOLDER / kind, out))
+
+
+def _copy_run(source: Path, out: Path) -> None:
+    with whole_folder(out, "run", last=CHECKPOINT) as place:
+        shutil.copytree(
+            source, place, dirs_exist_ok=True, ignore=shutil.ignore_patterns(FOLDER_MARKER + "*")
+        )

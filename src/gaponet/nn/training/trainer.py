@@ -20,6 +20,7 @@ import torch
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.files import lock_folder, write_json
 from gaponet.base.structure import validated
+from gaponet.data.checks.gate import GateReport
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.nn.artifact import GapModel, make_card
@@ -61,6 +62,7 @@ class Trainer:
         show: Callable[[Status], None] = lambda status: None,
         log: tuple[str, ...] = (),
         shared: dict[str, Any] | None = None,
+        gate: GateReport | None = None,
     ) -> None:
         """Read the recordings and write the run's setup. All inputs are checked before training takes time.
 
@@ -69,6 +71,7 @@ class Trainer:
             show: Called with the state of the run.
             shared: Name → result that does not depend on the kind of network, and the seconds that it took. Trainings
                 of several kinds on the same recordings fill and use it; each has the same time left for its network.
+            gate: What the doctor found in the recordings, for the card.
 
         Raises:
             DatasetError, UsageError: The recordings, the options or the folder do not fit.
@@ -77,6 +80,7 @@ class Trainer:
         config = validated(TrainConfig, asdict(config), "training options", UsageError).sized()
         require_suitable(out, robot, resume)
         self.robot, self.out, self.config, self.budget, self.show = robot, out, config, budget, show
+        self.gate = gate or GateReport()
         self.data, self.rank_config = (
             TrainingData(dataset, robot, config, holdout_units),
             ranks.share(config),
@@ -92,7 +96,8 @@ class Trainer:
             if resume:
                 self.state = Checkpoint.read(out, net, self.state.dataset_hash)
             if not ranks.rank():
-                write_setup(out, self.data, config, budget, resume)
+                despite_errors = bool(self.gate.errors)
+                write_setup(out, self.data, config, budget, resume, despite_errors)
                 self.state.write_progress(out)
         net.to(config.network_device())
         self.loggers = Loggers(() if ranks.rank() else log, out, asdict(config))
@@ -376,6 +381,7 @@ class Trainer:
                 "start": state.untrained_error,
             }
             | improvement,
+            doctor=self.gate.to_dict(),
             sensor_r2=state.sensor_r2,
             seed=self.config.seed,
             gain=state.best_state["bounded.gain"].item(),

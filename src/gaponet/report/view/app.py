@@ -37,7 +37,7 @@ from gaponet.report.view.scene import Scene
 from gaponet.report.view.server import open_server, run_until_interrupt
 from gaponet.report.view.side_by_side import Clip, SideBySide, side_by_side, standing
 from gaponet.report.view.uploads import PLACES, Uploads, connect_upload_button
-from gaponet.robot.finding import Finding
+from gaponet.robot.finding import Finding, errors_of
 from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_robots
 from gaponet.sim.dataset_robot import dataset_robot
 
@@ -261,10 +261,10 @@ class App:
         job = self.jobs.result("doctor")
         if job is None:
             return self.texts["identify"][1]
-        errors = [finding.check for finding in _findings(job) if finding.level == "error"]
+        errors = errors_of(_findings(job))
         if not errors:
             return ""
-        names = escape_markdown(", ".join(errors))
+        names = escape_markdown(", ".join(finding.check for finding in errors))
         return f"Locked: the check finds an error ({names}). Step Check says what to do."
 
     def _use(self) -> None:
