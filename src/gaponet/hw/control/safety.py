@@ -43,6 +43,7 @@ MAX_OPTIONS |= {
     "torque_share": (1, "to 1"),
 }
 MIN_SPEED_RAD_S = 1e-6  # below it a joint counts as standing still for damping
+MAX_BELIEVED_SPEED_RAD_S = 12.0  # for damping; a joint that moves faster than this has jumped
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class SafetyConfig:
     tilt: float = 0.7
     """Largest lean of the trunk, rad."""
     tracking: float = 0.6
-    """Largest |command − measured|, rad, …"""
+    """Largest |requested − measured| before the torque limit, rad, …"""
     tracking_time: float = 0.25
     """… for longer than this, s."""
     following: float = 0.25
@@ -223,30 +224,13 @@ def limit_command(
 
 
 def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
-    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown."""
+    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown.
+
+    A speed above MAX_BELIEVED_SPEED_RAD_S is a wrong reading, and counts as that speed: a joint always brakes.
+    """
     speed = np.abs(np.nan_to_num(qvel, nan=0.0, posinf=0.0, neginf=0.0))
-    return np.minimum(kd, effort / np.maximum(speed, MIN_SPEED_RAD_S))
-
-
-# docs/deploy-safety.md explains the kinds of faults. EXTERNAL_FAULTS are not the robot's own: a robot that cannot brake
-# is then lowered; after any other its torque is switched off at once. After DISOBEDIENCE_FAULTS, where a joint did not
-# go where it was sent, the recording is no data.
-EXTERNAL_FAULTS = (
-    "stale", "overrun", "suspend", "checksum", "target", "silence", "driver", "obedience", "error", "stop",
-)  # fmt: skip
-FAULT_KINDS = (
-    *EXTERNAL_FAULTS,
-    "frozen",
-    "nan",
-    "jump",
-    "temperature",
-    "tracking",
-    "torque",
-    "plan",
-    "robot",
-    "tilt",
-)
-DISOBEDIENCE_FAULTS = ("obedience", "frozen", "jump", "tracking")
+    believed = np.clip(speed, MIN_SPEED_RAD_S, MAX_BELIEVED_SPEED_RAD_S)
+    return np.minimum(kd, effort / believed)
 
 
 class StateMonitor:
@@ -286,7 +270,12 @@ class StateMonitor:
         self._refused: list[tuple[float, int]] = []  # time, s, and messages refused until then
 
     def check(
-        self, now: float, state: State, ctrl: Array | None, late: float = 0.0
+        self,
+        now: float,
+        state: State,
+        ctrl: Array | None,
+        late: float = 0.0,
+        requested: Array | None = None,
     ) -> Fault | None:
         """Return the first fault at the start of a control period.
 
@@ -295,6 +284,8 @@ class StateMonitor:
             state: The newest one.
             ctrl: The command in force since the last period, (len(commanded),) rad; None where there is none.
             late: How late this period starts, s.
+            requested: Where the joints are asked to be, as `ctrl`, but without the torque limit. That limit keeps the
+                command near the measured position, wherever a wrong reading goes; default the command.
         """
         fault = (
             self.overrun(late)
@@ -306,7 +297,7 @@ class StateMonitor:
             or self._hot(state)
             or self._frozen(state, ctrl)
             or self._frozen_joint(state, ctrl)
-            or self._tracking(state, ctrl)
+            or self._tracking(state, ctrl if requested is None else requested)
             or self._checksum(now, state)
         )
         self._last, self._last_ctrl = state, ctrl
@@ -406,12 +397,16 @@ class StateMonitor:
             f"the position of {joint} stands still while its command or velocity goes {far}",
         )
 
-    def _tracking(self, state: State, ctrl: Array | None) -> Fault | None:
-        error = np.zeros(1) if ctrl is None else np.abs(ctrl - state.qpos[self.commanded])
+    def _tracking(self, state: State, requested: Array | None) -> Fault | None:
+        if requested is None:
+            self._tracking_s = 0.0
+            return None
+        error = np.abs(requested - state.qpos[self.commanded])
         worst = int(error.argmax())
-        self._tracking_s = (
-            self._tracking_s + self.dt if error[worst] > self.config.tracking else 0.0
-        )
+        if error[worst] > self.config.tracking:
+            self._tracking_s += self.dt
+        else:
+            self._tracking_s = 0.0
         if self._tracking_s > self.config.tracking_time:
             joint = self.names[int(self.commanded[worst])]
             return Fault(

@@ -154,7 +154,8 @@ class TargetGenerator:
         self.weight = self._handed = self._progress = (
             0.0  # weights; s on the path to the first target
         )
-        self._obstacle, self._release_text, self._checked_payload = "", "handed over", False
+        self._obstacle = ""
+        self._checked_payload = False
         self.remarks: list[str] = []
 
     def step(
@@ -184,13 +185,6 @@ class TargetGenerator:
             self._guard.allow_start_clearance()
             ends = state.qpos_with(joints, self._last), state.qpos_with(joints, self.start)
             self._search = planner.back(*ends) if self.context.dt >= MIN_SEARCH_PERIOD_S else None
-
-    def hold(self, state: State) -> None:
-        """Hold a robot that does not obey where it is: nothing moves, whatever listens again."""
-        self._last, self._release_text = (
-            state.qpos[self.context.joints],
-            "let go; the robot did not obey",
-        )
 
     def _blend_in(self, state: State, policy: Policy) -> Array | PhaseChange | Fault:
         config, dt, following = self.context.config, self.context.dt, self.following
@@ -253,7 +247,7 @@ class TargetGenerator:
 
     def _release(self, n: int) -> Array | PhaseChange:
         if self.weight == 0.0:
-            return PhaseChange(Trigger.RELEASED, self._release_text)
+            return PhaseChange(Trigger.RELEASED, "handed over")
         self.weight = max(1.0 - n * self.context.dt / self.context.config.damp, 0.0) * self._handed
         return self._last
 
