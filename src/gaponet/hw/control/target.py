@@ -192,6 +192,7 @@ class TargetGenerator:
         if arrived and self._handed > FULL_WEIGHT:
             return PhaseChange(Trigger.ARRIVED, "motion")
         first = policy(0, state)
+        self._take_remarks(policy)
         if isinstance(first, Fault):
             return first
         goal = self.start if first is None else first[self.context.joints]
@@ -209,8 +210,16 @@ class TargetGenerator:
         self.weight = self._handed
         return self._last
 
+    def _take_remarks(self, policy: Policy) -> None:
+        """Take over what a policy has to remark; only that of live targets has remarks."""
+        remarks = getattr(policy, "remarks", [])
+        self.remarks.extend(remarks)
+        remarks.clear()
+
     def _run(self, n: int, state: State, policy: Policy) -> Array | PhaseChange | Fault:
-        target, self.weight = policy(n, state), 1.0
+        target = policy(n, state)
+        self.weight = 1.0
+        self._take_remarks(policy)
         if isinstance(target, Fault):
             return target
         if not self._checked_payload and n * self.context.dt >= PAYLOAD_CHECK_S:
