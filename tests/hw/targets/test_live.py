@@ -165,9 +165,7 @@ def test_two_senders_before_the_start_are_refused_and_nothing_is_commanded(arm):
     assert driver.sent == []
 
 
-def test_a_second_sender_that_is_connected_and_silent_is_refused_before_the_start(
-    arm, monkeypatch
-):
+def test_a_second_sender_that_is_connected_and_silent_is_refused_before_the_start(arm, monkeypatch):
     monkeypatch.setattr(Scripted, "senders", lambda self: {"a", "b"})
 
     recording, driver, _, _ = live(arm, lambda t: [good(t)])

@@ -147,9 +147,9 @@ class LiveTargets:
     """Policy of a controller whose targets arrive over a transport.
 
     The sender of the first well-formed message is the only sender of the run. If another one speaks before a first
-    target is accepted, nobody knows which of the two was meant, and the run is refused. Later its messages are rejected,
-    with a remark, and the robot follows the first one. They cannot move the robot, and a stop would let every program
-    that reaches the address drop an arm in the middle of a motion.
+    target is accepted, nobody knows which of the two was meant, and the run is refused. Later its messages are
+    rejected, with a remark, and the robot follows the first one. They cannot move the robot, and a stop would let every
+    program that reaches the address drop an arm in the middle of a motion.
 
     Attributes:
         counts: accepted (`taken`) and rejected (`refused`, by kind) messages; periods in which a target was `held`;
