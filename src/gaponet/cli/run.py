@@ -502,6 +502,7 @@ def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: f
         else f"nearest to each other: {plan.nearest}, {100 * plan.clearance:.1f} cm",
         f"commands lead their targets by at most {plan.correction:.2f} rad ({plan.corrected_joint}); nearest to each "
         f"other: {100 * plan.command_clearance:.1f} cm" if plan.corrected_joint else "",
+        f"the robot: {driver.facts['source']}" if "source" in driver.facts else "",
         f"limits and collision shapes: {robot.folder}",
         f"most torque, {load}: {plan.joint}, {plan.torque:.2f} of what may be used",
         f"at the end it {back}{how[driver.at_end]}; a stop {driver.at_stop} it",
