@@ -156,7 +156,9 @@ class Reader:
             publication = None
         if publication is None:
             return "a publisher that has left"
-        names = _programs(self._reader.participant)
+        participant = self._reader.participant
+        assert participant is not None
+        names = _programs(participant)
         program = names.get(publication.participant_key, NAMELESS)
         return f"{program}, DDS writer {publication.key}"
 
