@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import gaponet.hw
-from gaponet.hw.control.faults import FAULTS, Ending, lowers, spoils_data
+from gaponet.hw.control.safety import FAULTS, Ending, lowers, spoils_data
 
 PAGE = Path(__file__).parents[3] / "docs" / "deploy-safety.md"
 SOURCES = Path(gaponet.hw.__file__).parent

@@ -7,8 +7,8 @@ import pytest
 
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import State
-from gaponet.hw.control.faults import FAULT_KINDS
 from gaponet.hw.control.safety import (
+    FAULT_KINDS,
     Limits,
     SafetyConfig,
     StateMonitor,

@@ -15,7 +15,6 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.clock import Clock, MonotonicClock, no_garbage_collection
 from gaponet.hw.control.driver import Driver, DriverError, Fault, State
-from gaponet.hw.control.faults import lowers, spoils_data
 from gaponet.hw.control.following import FollowingMonitor
 from gaponet.hw.control.output import Context, Output
 from gaponet.hw.control.phases import (
@@ -32,7 +31,7 @@ from gaponet.hw.control.plan import Plan, Planner, TargetCompensator
 from gaponet.hw.control.publisher import sole_publisher
 from gaponet.hw.control.recording import Event, Recording
 from gaponet.hw.control.rows import Row
-from gaponet.hw.control.safety import Limits, SafetyConfig, StateMonitor
+from gaponet.hw.control.safety import Limits, SafetyConfig, StateMonitor, lowers, spoils_data
 from gaponet.hw.control.stop import StopKeys, StopRequest, stop_on_signals
 from gaponet.hw.control.target import PhaseChange, Readiness, TargetGenerator
 from gaponet.hw.control.watchdog import Watchdog

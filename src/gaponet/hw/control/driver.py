@@ -19,7 +19,7 @@ class DriverError(GAPONetError):
 
 @dataclass(frozen=True)
 class Fault:
-    """Reason why a robot is stopped: a kind of faults.FAULTS, and a sentence."""
+    """Reason why a robot is stopped: a kind of safety.FAULTS, and a sentence."""
 
     kind: str
     text: str

@@ -16,8 +16,8 @@ from gaponet.base.errors import LogError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.data.formats.table import NOT_OBEYED
 from gaponet.data.log import Channel, Log
-from gaponet.hw.control.faults import FAULT_KINDS
 from gaponet.hw.control.rows import READINGS, ROWS_SUFFIX, Rows
+from gaponet.hw.control.safety import FAULT_KINDS
 
 FOLDER_KIND = "recordings"
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
