@@ -43,6 +43,9 @@ MAX_OPTIONS |= {
     "temperature": (150, "up to 150 °C"),
     "torque_share": (1, "to 1"),
 }
+MIN_APPROACH_RAD_S = (
+    0.2  # with which a joint comes nearer to where it is asked to be; less is standing
+)
 MIN_SPEED_RAD_S = 1e-6  # below it a joint counts as standing still for damping
 MAX_BELIEVED_SPEED_RAD_S = 12.0  # for damping; a joint that moves faster than this has jumped
 
@@ -399,7 +402,7 @@ class StateMonitor:
             or self._hot(state)
             or self._frozen(state, ctrl)
             or self._frozen_joint(state, ctrl)
-            or self._tracking(state, ctrl if requested is None else requested)
+            or self._tracking(state, ctrl, requested)
             or self._checksum(now, state)
         )
         self._last, self._last_ctrl = state, ctrl
@@ -499,11 +502,21 @@ class StateMonitor:
             f"the position of {joint} stands still while its command or velocity goes {far}",
         )
 
-    def _tracking(self, state: State, requested: Array | None) -> Fault | None:
-        if requested is None:
+    def _tracking(self, state: State, ctrl: Array | None, requested: Array | None) -> Fault | None:
+        """Return a fault if a joint is far from its command, or from where it is asked to be without coming nearer.
+
+        A fast joint may lag far behind the latter while it comes nearer at its full torque.
+        """
+        if ctrl is None:
             self._tracking_s = 0.0
             return None
-        error = np.abs(requested - state.qpos[self.commanded])
+        qpos = state.qpos[self.commanded]
+        error = np.abs(ctrl - qpos)
+        if requested is not None:
+            distance = requested - qpos
+            approach = np.sign(distance) * state.qvel[self.commanded]  # rad/s
+            stays = approach < MIN_APPROACH_RAD_S
+            error = np.where(stays, np.maximum(error, np.abs(distance)), error)
         worst = int(error.argmax())
         if error[worst] > self.config.tracking:
             self._tracking_s += self.dt
