@@ -111,6 +111,11 @@ class Wire:
         if self.lost:
             raise OSError(5, "Input/output error")
 
+    @property
+    def in_waiting(self) -> int:
+        self._there()
+        return len(self.buffer)
+
     def read(self, size: int = 1) -> bytes:
         self._there()
         out, self.buffer = self.buffer[:size], self.buffer[size:]

@@ -60,7 +60,7 @@ def link(
 
     out, name = Out(json), robot or ("h1_2" if driver == "unitree" else "so101")
     options = (
-        {"domain": domain, "interface": interface, "silent": True}
+        {"domain": domain, "interface": interface, "silent": True, "sole": False}
         if driver == "unitree"
         else {"port": port}
     )
@@ -77,8 +77,14 @@ def link(
         ["age when it comes, ms: p50, p99, max", three("age_ms")],
         ["between two, ms: p50, p99, max", three("interval_ms")],
         ["lost, refused", f"{measured['lost']}, {measured['refused']}"],
+        ["these states are of", bus.facts.get("source", "a driver that does not say")],
         *([f"publish {topic}", "; ".join(programs) or "nobody"] for topic, programs in publishers.items()),
     ])  # fmt: skip
+    robots = publishers.get("rt/lowstate", [])
+    if len(robots) > 1:
+        out.say(
+            f"{len(robots)} robots publish rt/lowstate: both would move, so run refuses this bus"
+        )
     out.result(measured | {"publishers": publishers, "virtual": bus.virtual} | bus.facts)
 
 

@@ -19,7 +19,7 @@ from gaponet.hw.control.phases import (
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "controller.md"
 WAITING = (Phase.CONNECT, Phase.IDLE)
-SENDING = {Action.BLEND_IN, Action.PLAY, Action.GO_BACK, Action.RELEASE, Action.RELEASE_HERE}
+SENDING = {Action.BLEND_IN, Action.PLAY, Action.GO_BACK, Action.RELEASE}
 
 
 def test_every_event_is_defined_once_in_every_phase_and_leads_forward():
@@ -52,10 +52,8 @@ def test_nothing_moves_without_consent_and_a_robot_that_is_ready(missing):
 
 
 @pytest.mark.parametrize("phase", Phase)
-@pytest.mark.parametrize(
-    "fault", [t for t in Trigger if "FAULT" in t.name or t is Trigger.NOT_FOLLOWING]
-)
-def test_a_stop_in_any_phase_ends_held_or_damped(phase, fault):
+@pytest.mark.parametrize("fault", [t for t in Trigger if "FAULT" in t.name])
+def test_a_fault_in_any_phase_ends_damped_or_in_silence_and_sends_no_position(phase, fault):
     following, action = TRANSITION_TABLE[phase, fault]
     if phase in ENDED:
         assert action is Action.IGNORE, "it goes on damping, or has ended"
@@ -63,8 +61,8 @@ def test_a_stop_in_any_phase_ends_held_or_damped(phase, fault):
         assert (following, action) == (Phase.STOPPED, Action.SEND_NOTHING), (
             "never commanded, or damped already"
         )
-    elif following is not Phase.DAMP:
-        assert (fault, action) == (Trigger.NOT_FOLLOWING, Action.RELEASE_HERE)
+    else:
+        assert (following, action) == (Phase.DAMP, Action.DAMP)
 
 
 def test_the_page_has_the_same_table():

@@ -8,8 +8,6 @@ import pytest
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import State
 from gaponet.hw.control.safety import (
-    DISOBEDIENCE_FAULTS,
-    EXTERNAL_FAULTS,
     FAULT_KINDS,
     Limits,
     SafetyConfig,
@@ -54,12 +52,6 @@ def test_limits_have_the_values_that_are_promised():
     for module, constants in CONSTANTS.items():
         found = vars(import_module(f"gaponet.hw.{module}"))
         assert {name: found[name] for name in constants} == constants
-
-
-def test_faults_of_the_robot_itself_let_go_at_once_and_disobedience_spoils_a_recording():
-    own = {"frozen", "nan", "jump", "temperature", "tracking", "torque", "plan", "robot", "tilt"}
-    assert set(FAULT_KINDS) - set(EXTERNAL_FAULTS) == own
-    assert set(DISOBEDIENCE_FAULTS) == {"obedience", "frozen", "jump", "tracking"}
 
 
 @pytest.fixture
@@ -158,9 +150,9 @@ def test_a_correction_is_bounded_in_size_and_rate(limits):
     np.testing.assert_allclose(delta, [0.5, -0.04])
 
 
-def test_damping_never_asks_for_more_than_the_effort_limit():
+def test_damping_stays_within_the_effort_limit_at_every_speed_that_is_believed():
     kd = damping_gains(np.full(3, 8.0), np.array([1.0, 100.0, np.nan]), np.full(3, 20.0))
-    np.testing.assert_allclose(kd, [8.0, 0.2, 8.0])
+    np.testing.assert_allclose(kd, [8.0, 20.0 / 12.0, 8.0])  # 100 rad/s is a wrong reading
 
 
 def test_limits_that_leave_nothing_or_more_than_there_is_are_refused(arm):

@@ -42,6 +42,9 @@ class Scripted:
         self.began = self.looked if self.began is None else self.began
         return [] if looked == self.looked else self.say(self.looked - self.began)
 
+    def senders(self):
+        return set()
+
     def publish(self, to, state):
         self.states.append((to, state))
 
@@ -148,6 +151,41 @@ WRONG = {  # from FAULT on, every message is of this kind
         "malformed",
     ),
 }
+
+
+def two_senders(t):
+    return [good(t), good(t, "b")]
+
+
+def test_two_senders_before_the_start_are_refused_and_nothing_is_commanded(arm):
+    recording, driver, _, _ = live(arm, two_senders)
+
+    assert recording.fault.kind == "source"
+    assert "nothing was commanded" in recording.fault.text
+    assert driver.sent == []
+
+
+def test_a_second_sender_that_is_connected_and_silent_is_refused_before_the_start(arm, monkeypatch):
+    monkeypatch.setattr(Scripted, "senders", lambda self: {"a", "b"})
+
+    recording, driver, _, _ = live(arm, lambda t: [good(t)])
+
+    assert recording.fault.kind == "source"
+    assert driver.sent == []
+
+
+def test_a_second_sender_during_the_run_is_remarked_once_and_moves_nothing(arm):
+    alone, _, _, _ = live(arm, lambda t: [good(t)])
+
+    recording, _, _, targets = live(arm, lambda t: [good(t)] if t < FAULT else two_senders(t))
+
+    remarks = [event.text for event in recording.events if "second sender" in event.text]
+    assert remarks == ["targets of a second sender, b, are rejected"]
+    assert recording.fault is None
+    assert targets.counts["sender"] == "a"
+    np.testing.assert_array_equal(
+        alone.phase_rows("run")["ctrl"], recording.phase_rows("run")["ctrl"]
+    )
 
 
 @pytest.mark.parametrize("what", WRONG)
@@ -316,6 +354,9 @@ def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
         def receive(self):
             said, self.said = self.said, []
             return said
+
+        def senders(self):
+            return set()
 
         def publish(self, to, state):
             self.said = [Message("a", self.clock.now(), dict.fromkeys(so101.joint_names, 0.0))]

@@ -231,6 +231,21 @@ def test_a_trajectory_on_the_bus_arrives_and_states_are_published(ros2):
     assert (state.name, state.position, state.effort) == (["a", "b"], [0.1, 0.2], [1.0, 2.0])
 
 
+def test_a_second_publisher_of_targets_on_the_bus_is_seen_before_it_says_anything(ros2):
+    from gaponet.hw.drivers import dds
+
+    domain = 30 + os.getpid() % 150
+    transport = ros2.ROS2Transport(domain)
+    buses = [dds.Bus(domain, "lo") for _ in range(2)]
+    writers = [bus.writer(ros2.TOPIC, ros2.JointTrajectory) for bus in buses]
+    deadline = time.monotonic() + 60
+    while len(transport.senders()) < len(writers) and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+    assert len(transport.senders()) == 2
+    transport.close("over")
+
+
 @pytest.mark.peers
 @pytest.mark.parametrize("version", ["jazzy", "kilted"])
 def test_ros_2_itself_is_heard_and_hears_us(ros2, version):

@@ -31,13 +31,7 @@ from gaponet.hw.control.plan import Plan, Planner, TargetCompensator
 from gaponet.hw.control.publisher import sole_publisher
 from gaponet.hw.control.recording import Event, Recording
 from gaponet.hw.control.rows import Row
-from gaponet.hw.control.safety import (
-    DISOBEDIENCE_FAULTS,
-    EXTERNAL_FAULTS,
-    Limits,
-    SafetyConfig,
-    StateMonitor,
-)
+from gaponet.hw.control.safety import Limits, SafetyConfig, StateMonitor, lowers, spoils_data
 from gaponet.hw.control.stop import StopKeys, StopRequest, stop_on_signals
 from gaponet.hw.control.target import PhaseChange, Readiness, TargetGenerator
 from gaponet.hw.control.watchdog import Watchdog
@@ -256,10 +250,11 @@ class Controller:
         except (DriverError, OSError) as error:
             fault = Fault("driver", str(error))
         if state:
-            ctrl = (
-                None if self.recording.disobedience else self.output.ctrl
-            )  # while it is let go no joint must follow
-            fault = self.monitor.check(self._now, state, ctrl, self._now - self.output.due)
+            # While the robot is let go no joint must follow.
+            ctrl = None if self.recording.disobedience else self.output.ctrl
+            requested = None if ctrl is None else self.output.expected()
+            late = self._now - self.output.due
+            fault = self.monitor.check(self._now, state, ctrl, late, requested)
             if self.phase in MOVING:
                 fault = fault or self.following.check(state, self.output)
             elif self.phase is Phase.IDLE and (fault is None or fault.kind != "stop"):
@@ -308,7 +303,12 @@ class Controller:
             if not any(e.text == str(error) for e in self.recording.events):
                 self._note(str(error), "driver", self.clock.now())
         if not left:
-            self._fire(Trigger.DAMPED, *self.output.confirm())
+            text, kind = self.output.confirm()
+            fault = self.recording.fault
+            obeys = fault is None or fault.kind != "obedience" or self.driver.reads_back
+            if not kind and not obeys:
+                text = "let go; the robot did not obey, and cannot say whether it damped"
+            self._fire(Trigger.DAMPED, text, kind)
 
     def _verify(self) -> None:
         """Read back all that the robot holds, at the end of a run without fault."""
@@ -336,8 +336,6 @@ class Controller:
                 Trigger.FAULT_AFTER_WATCHDOG,
                 f"{text}; the watchdog has damped the robot",
             )
-        elif fault.kind == "obedience" and self.driver.at_end == "hand_over":
-            trigger = Trigger.NOT_FOLLOWING
         self._fire(trigger, text, fault.kind)
 
     def _fire(self, trigger: Trigger, text: str, kind: str = "") -> None:
@@ -349,17 +347,14 @@ class Controller:
             raise AssertionError(f"{trigger.name} in phase {self.phase}: {text}")
         self.phase, self._phase_start = phase, self._k
         if action is Action.DAMP:
-            self.output.begin_damping(self._now, kind in EXTERNAL_FAULTS)
-        elif self._targets and self._state:
-            if action is Action.GO_BACK:
-                self._targets.go_back(self._state)
-            elif action is Action.RELEASE_HERE:
-                self._targets.hold(self._state)
+            self.output.begin_damping(self._now, lowers(kind))
+        elif action is Action.GO_BACK and self._targets and self._state:
+            self._targets.go_back(self._state)
         self._note(text, kind)
 
     def _note(self, text: str, kind: str = "", now: float | None = None) -> None:
         event = Event(self._now if now is None else now, self.phase.value, kind, text)
-        if kind in DISOBEDIENCE_FAULTS:
+        if spoils_data(kind):
             self.recording.disobedience = self.recording.disobedience or text
         self.recording.events.append(event)
         try:

@@ -19,7 +19,7 @@ class DriverError(GAPONetError):
 
 @dataclass(frozen=True)
 class Fault:
-    """Reason why a robot is stopped: a kind of safety.FAULT_KINDS, and a sentence."""
+    """Reason why a robot is stopped: a kind of safety.FAULTS, and a sentence."""
 
     kind: str
     text: str
@@ -66,8 +66,8 @@ class Driver(Protocol):
             robots the controller checks that the joints follow.
         kp, kd: Gains of the real servos under `write`, (n), N·m/rad and N·m·s/rad; final once connected.
         qpos_range: Joint ranges that the robot itself reports, (n, 2) rad, or None; final once connected.
-        facts: Stored with a recording (registers, kind of machine); `remarks`: sentences for the user; final once
-            connected.
+        facts: Stored with a recording (registers, kind of machine); `remarks`: sentences for the user; `source`: the
+            one robot that the states are from, in words. Final once connected.
         at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the robot's own controller
             takes over), hold (servos keep the last target after `close`), damp (nothing holds it afterwards).
         at_stop: Effect of `damp`, as a verb: damps, lowers.

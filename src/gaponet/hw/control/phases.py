@@ -35,8 +35,7 @@ class Trigger(Enum):
     DAMP = "the run is over without fault, on rt/lowcmd"
     RELEASED = "weight 0 was sent"
     DAMPED = "the time for damping (`--damp`) is over"
-    NOT_FOLLOWING = "a joint does not follow its commands, on rt/arm_sdk"
-    FAULT = "any other fault, key, signal or call, after the first command"
+    FAULT = "any fault, key, signal or call, after the first command"
     FAULT_BEFORE_COMMAND = "any fault, key, signal or call, before the first command"
     FAULT_AFTER_WATCHDOG = (
         "any fault, key, signal or call, after the watchdog began to damp the robot"
@@ -53,7 +52,6 @@ class Action(Enum):
     PLAY = "send the positions of the motion, corrected where a model is given"
     GO_BACK = "send positions, back to where the robot was at the start"
     RELEASE = "send the last position; weight 1 → 0"
-    RELEASE_HERE = "send the measured position; weight → 0"
     DAMP = "send no position: stiffness 0, damping gains (H1-2); torque limits to 0, then torque off (SO-101)"
     HOLD = "send nothing; servos hold the last position"
     SEND_NOTHING = "send nothing"
@@ -70,7 +68,6 @@ _FAULTS = (
     Trigger.FAULT,
     Trigger.FAULT_BEFORE_COMMAND,
     Trigger.FAULT_AFTER_WATCHDOG,
-    Trigger.NOT_FOLLOWING,
 )
 
 # Phases, triggers, next phase (None: the same one), action. Earlier rows take precedence.
@@ -83,8 +80,6 @@ TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, A
     ((Phase.RUN, Phase.BLEND_OUT), (Trigger.HOLD,), Phase.STOPPED, Action.HOLD),
     ((Phase.RUN, Phase.BLEND_OUT), (Trigger.DAMP,), Phase.DAMP, Action.DAMP),
     ((Phase.RELEASE,), (Trigger.RELEASED,), Phase.STOPPED, Action.SEND_NOTHING),
-    (MOVING, (Trigger.NOT_FOLLOWING,), Phase.RELEASE, Action.RELEASE_HERE),
-    ((Phase.RELEASE,), (Trigger.NOT_FOLLOWING,), Phase.DAMP, Action.DAMP),
     (COMMANDING, (Trigger.FAULT,), Phase.DAMP, Action.DAMP),
     (
         COMMANDING,

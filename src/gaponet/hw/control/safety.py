@@ -17,6 +17,7 @@ Size and rate of a model's correction are bounded before that; the three limits 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +43,11 @@ MAX_OPTIONS |= {
     "temperature": (150, "up to 150 °C"),
     "torque_share": (1, "to 1"),
 }
+MIN_APPROACH_RAD_S = (
+    0.2  # with which a joint comes nearer to where it is asked to be; less is standing
+)
 MIN_SPEED_RAD_S = 1e-6  # below it a joint counts as standing still for damping
+MAX_BELIEVED_SPEED_RAD_S = 12.0  # for damping; a joint that moves faster than this has jumped
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class SafetyConfig:
     tilt: float = 0.7
     """Largest lean of the trunk, rad."""
     tracking: float = 0.6
-    """Largest |command − measured|, rad, …"""
+    """Largest |requested − measured| before the torque limit, rad, …"""
     tracking_time: float = 0.25
     """… for longer than this, s."""
     following: float = 0.25
@@ -223,30 +228,114 @@ def limit_command(
 
 
 def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
-    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown."""
+    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown.
+
+    A speed above MAX_BELIEVED_SPEED_RAD_S is a wrong reading, and counts as that speed: a joint always brakes.
+    """
     speed = np.abs(np.nan_to_num(qvel, nan=0.0, posinf=0.0, neginf=0.0))
-    return np.minimum(kd, effort / np.maximum(speed, MIN_SPEED_RAD_S))
+    believed = np.clip(speed, MIN_SPEED_RAD_S, MAX_BELIEVED_SPEED_RAD_S)
+    return np.minimum(kd, effort / believed)
 
 
-# docs/deploy-safety.md explains the kinds of faults. EXTERNAL_FAULTS are not the robot's own: a robot that cannot brake
-# is then lowered; after any other its torque is switched off at once. After DISOBEDIENCE_FAULTS, where a joint did not
-# go where it was sent, the recording is no data.
-EXTERNAL_FAULTS = (
-    "stale", "overrun", "suspend", "checksum", "target", "silence", "driver", "obedience", "error", "stop",
-)  # fmt: skip
-FAULT_KINDS = (
-    *EXTERNAL_FAULTS,
-    "frozen",
-    "nan",
-    "jump",
-    "temperature",
-    "tracking",
-    "torque",
-    "plan",
-    "robot",
-    "tilt",
-)
-DISOBEDIENCE_FAULTS = ("obedience", "frozen", "jump", "tracking")
+# Faults: what each one puts in doubt, what may still be used afterwards, and how the robot ends.
+#
+# After a fault no joint is sent to a position, neither to a target nor to a measured one: a wrong reading would move
+# the joint. The robot damps. Damping needs no position. A measured speed may only lower a damping gain, and only as
+# far as damping_gains allows. docs/deploy-safety.md has the same table.
+
+
+class Ending(StrEnum):
+    """What stops the robot after a fault. An SO-101 has no brake: it is lowered, or let go at once."""
+
+    DAMP_OR_LOWER = "damp; lower an SO-101"
+    DAMP_OR_LET_GO = "damp; let an SO-101 go at once"
+    NOTHING = "none: nothing was commanded"
+
+
+@dataclass(frozen=True)
+class FaultRule:
+    """What follows from one kind of fault."""
+
+    doubted: str
+    """What may be wrong."""
+    usable: str
+    """What may still be used to stop the robot."""
+    ending: Ending
+    """What is done."""
+    is_data: bool = True
+    """The recording until the fault can be trusted; False where a joint did not go where it was sent."""
+
+
+LAST_COMMAND = "the last command, without stiffness; damping; torque limits"
+NO_GOAL = "the last command, without stiffness; damping; torque off"
+
+FAULTS: dict[str, FaultRule] = {
+    "stale": FaultRule("all readings: they are old", LAST_COMMAND, Ending.DAMP_OR_LOWER),
+    "checksum": FaultRule(
+        "all readings: the bus damages messages", LAST_COMMAND, Ending.DAMP_OR_LOWER
+    ),
+    "overrun": FaultRule(
+        "the age of readings: this computer was late", LAST_COMMAND, Ending.DAMP_OR_LOWER
+    ),
+    "suspend": FaultRule(
+        "all readings from before the suspend", LAST_COMMAND, Ending.DAMP_OR_LOWER
+    ),
+    "driver": FaultRule(
+        "the bus, in both directions",
+        "what needs no answer, sent until the bus takes it",
+        Ending.DAMP_OR_LOWER,
+    ),
+    "target": FaultRule("the motion or the model", LAST_COMMAND, Ending.DAMP_OR_LOWER),
+    "silence": FaultRule("the sender of targets", LAST_COMMAND, Ending.DAMP_OR_LOWER),
+    "error": FaultRule("the policy, the model or this program", LAST_COMMAND, Ending.DAMP_OR_LOWER),
+    "stop": FaultRule("nothing: somebody asked for it", LAST_COMMAND, Ending.DAMP_OR_LOWER),
+    "obedience": FaultRule(
+        "positions, and whether the robot holds its commands and settings",
+        LAST_COMMAND,
+        Ending.DAMP_OR_LOWER,
+        is_data=False,
+    ),
+    "source": FaultRule(
+        "which robot the states are from, or whose goals the servos hold",
+        NO_GOAL,
+        Ending.DAMP_OR_LET_GO,
+        is_data=False,
+    ),
+    "frozen": FaultRule(
+        "position and speed of a joint, or of all", NO_GOAL, Ending.DAMP_OR_LET_GO, is_data=False
+    ),
+    "nan": FaultRule("all readings of a joint", NO_GOAL, Ending.DAMP_OR_LET_GO),
+    "jump": FaultRule(
+        "position and speed of a joint", NO_GOAL, Ending.DAMP_OR_LET_GO, is_data=False
+    ),
+    "temperature": FaultRule("a motor or its sensor", NO_GOAL, Ending.DAMP_OR_LET_GO),
+    "tracking": FaultRule(
+        "the position of a joint, or that its way is free",
+        NO_GOAL,
+        Ending.DAMP_OR_LET_GO,
+        is_data=False,
+    ),
+    "torque": FaultRule(
+        "position and speed of a joint, or that its way is free", NO_GOAL, Ending.DAMP_OR_LET_GO
+    ),
+    "robot": FaultRule("a motor, its readings and its goal", NO_GOAL, Ending.DAMP_OR_LET_GO),
+    "tilt": FaultRule("the stand of the robot, or its IMU", NO_GOAL, Ending.DAMP_OR_LET_GO),
+    "plan": FaultRule("the way to the first target", "all readings", Ending.NOTHING),
+}
+FAULT_KINDS = tuple(FAULTS)
+
+
+def lowers(kind: str) -> bool:
+    """Return True if a robot without brakes is lowered; False if its torque goes off at once.
+
+    The end of a run without fault has no rule, and lowers nothing.
+    """
+    return kind in FAULTS and FAULTS[kind].ending is Ending.DAMP_OR_LOWER
+
+
+def spoils_data(kind: str) -> bool:
+    """Return True if a recording with this fault is no data."""
+    return kind in FAULTS and not FAULTS[kind].is_data
 
 
 class StateMonitor:
@@ -286,7 +375,12 @@ class StateMonitor:
         self._refused: list[tuple[float, int]] = []  # time, s, and messages refused until then
 
     def check(
-        self, now: float, state: State, ctrl: Array | None, late: float = 0.0
+        self,
+        now: float,
+        state: State,
+        ctrl: Array | None,
+        late: float = 0.0,
+        requested: Array | None = None,
     ) -> Fault | None:
         """Return the first fault at the start of a control period.
 
@@ -295,6 +389,8 @@ class StateMonitor:
             state: The newest one.
             ctrl: The command in force since the last period, (len(commanded),) rad; None where there is none.
             late: How late this period starts, s.
+            requested: Where the joints are asked to be, as `ctrl`, but without the torque limit. That limit keeps the
+                command near the measured position, wherever a wrong reading goes; default the command.
         """
         fault = (
             self.overrun(late)
@@ -306,7 +402,7 @@ class StateMonitor:
             or self._hot(state)
             or self._frozen(state, ctrl)
             or self._frozen_joint(state, ctrl)
-            or self._tracking(state, ctrl)
+            or self._tracking(state, ctrl, requested)
             or self._checksum(now, state)
         )
         self._last, self._last_ctrl = state, ctrl
@@ -406,12 +502,26 @@ class StateMonitor:
             f"the position of {joint} stands still while its command or velocity goes {far}",
         )
 
-    def _tracking(self, state: State, ctrl: Array | None) -> Fault | None:
-        error = np.zeros(1) if ctrl is None else np.abs(ctrl - state.qpos[self.commanded])
+    def _tracking(self, state: State, ctrl: Array | None, requested: Array | None) -> Fault | None:
+        """Return a fault if a joint is far from its command, or from where it is asked to be without coming nearer.
+
+        A fast joint may lag far behind the latter while it comes nearer at its full torque.
+        """
+        if ctrl is None:
+            self._tracking_s = 0.0
+            return None
+        qpos = state.qpos[self.commanded]
+        error = np.abs(ctrl - qpos)
+        if requested is not None:
+            distance = requested - qpos
+            approach = np.sign(distance) * state.qvel[self.commanded]  # rad/s
+            stays = approach < MIN_APPROACH_RAD_S
+            error = np.where(stays, np.maximum(error, np.abs(distance)), error)
         worst = int(error.argmax())
-        self._tracking_s = (
-            self._tracking_s + self.dt if error[worst] > self.config.tracking else 0.0
-        )
+        if error[worst] > self.config.tracking:
+            self._tracking_s += self.dt
+        else:
+            self._tracking_s = 0.0
         if self._tracking_s > self.config.tracking_time:
             joint = self.names[int(self.commanded[worst])]
             return Fault(

@@ -154,7 +154,8 @@ class TargetGenerator:
         self.weight = self._handed = self._progress = (
             0.0  # weights; s on the path to the first target
         )
-        self._obstacle, self._release_text, self._checked_payload = "", "handed over", False
+        self._obstacle = ""
+        self._checked_payload = False
         self.remarks: list[str] = []
 
     def step(
@@ -185,19 +186,13 @@ class TargetGenerator:
             ends = state.qpos_with(joints, self._last), state.qpos_with(joints, self.start)
             self._search = planner.back(*ends) if self.context.dt >= MIN_SEARCH_PERIOD_S else None
 
-    def hold(self, state: State) -> None:
-        """Hold a robot that does not obey where it is: nothing moves, whatever listens again."""
-        self._last, self._release_text = (
-            state.qpos[self.context.joints],
-            "let go; the robot did not obey",
-        )
-
     def _blend_in(self, state: State, policy: Policy) -> Array | PhaseChange | Fault:
         config, dt, following = self.context.config, self.context.dt, self.following
         arrived = self._progress >= self.path.duration + config.settle
         if arrived and self._handed > FULL_WEIGHT:
             return PhaseChange(Trigger.ARRIVED, "motion")
         first = policy(0, state)
+        self._take_remarks(policy)
         if isinstance(first, Fault):
             return first
         goal = self.start if first is None else first[self.context.joints]
@@ -215,8 +210,16 @@ class TargetGenerator:
         self.weight = self._handed
         return self._last
 
+    def _take_remarks(self, policy: Policy) -> None:
+        """Take over what a policy has to remark; only that of live targets has remarks."""
+        remarks = getattr(policy, "remarks", [])
+        self.remarks.extend(remarks)
+        remarks.clear()
+
     def _run(self, n: int, state: State, policy: Policy) -> Array | PhaseChange | Fault:
-        target, self.weight = policy(n, state), 1.0
+        target = policy(n, state)
+        self.weight = 1.0
+        self._take_remarks(policy)
         if isinstance(target, Fault):
             return target
         if not self._checked_payload and n * self.context.dt >= PAYLOAD_CHECK_S:
@@ -253,7 +256,7 @@ class TargetGenerator:
 
     def _release(self, n: int) -> Array | PhaseChange:
         if self.weight == 0.0:
-            return PhaseChange(Trigger.RELEASED, self._release_text)
+            return PhaseChange(Trigger.RELEASED, "handed over")
         self.weight = max(1.0 - n * self.context.dt / self.context.config.damp, 0.0) * self._handed
         return self._last
 

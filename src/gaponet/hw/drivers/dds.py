@@ -40,7 +40,9 @@ QUEUE_LENGTH = 64  # messages buffered between two reads: 128 ms at 500 Hz
 MAX_SAMPLE_KIB = 64  # of a message that is put together from fragments
 DISCOVERY_S = 0.5  # in which other participants are heard
 MAX_ENTRIES = 500  # of discovery that are read
+NAMELESS = "a program that does not tell its name"
 SHUTDOWN_S = 3.0  # longest wait for the deletion of the domains at the end of a process
+HANDLE_MASK = (1 << 64) - 1  # cyclonedds gives a handle now with a sign, now without
 SCALARS = {"<f4": float32, "<i2": int16, "<u4": uint32, "u1": byte}
 
 
@@ -129,6 +131,37 @@ class Reader:
         """Return the messages since the last call, oldest first, as arrays of bytes."""
         return [np.frombuffer(sample.data, np.uint8) for sample in self.samples()]
 
+    def receive_with_publisher(self) -> list[tuple[int, Array]]:
+        """Return the messages since the last call, oldest first: publisher's handle and array of bytes."""
+        messages = []
+        for sample in self.samples():
+            handle = sample.sample_info.publication_handle & HANDLE_MASK
+            messages.append((handle, np.frombuffer(sample.data, np.uint8)))
+        return messages
+
+    def publishers(self) -> set[int]:
+        """Return the handles of the publishers of the topic that are connected now; takes some µs."""
+        try:
+            handles = self._reader.get_matched_publications()
+        except DDSException as error:
+            raise DriverError(f"DDS does not say who publishes: {error}") from None
+        return {handle & HANDLE_MASK for handle in handles}
+
+    def describe(self, handle: int) -> str:
+        """Return a publisher in words: its program, and the GUID of its DDS writer."""
+        signed = handle - (1 << 64) if handle >> 63 else handle
+        try:
+            publication = self._reader.get_matched_publication_data(signed)
+        except DDSException:
+            publication = None
+        if publication is None:
+            return "a publisher that has left"
+        participant = self._reader.participant
+        assert participant is not None
+        names = _programs(participant)
+        program = names.get(publication.participant_key, NAMELESS)
+        return f"{program}, DDS writer {publication.key}"
+
 
 class Bus:
     """One participant in a DDS domain, on one network interface."""
@@ -172,20 +205,15 @@ class Bus:
 
     def publishers(self) -> defaultdict[str, list[str]]:
         """Return the other publishers, which takes DISCOVERY_S: topic → programs, as they call themselves."""
-        from cyclonedds.builtin import (
-            BuiltinDataReader,
-            BuiltinTopicDcpsParticipant,
-            BuiltinTopicDcpsPublication,
-        )
+        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 
-        programs = BuiltinDataReader(self._participant, BuiltinTopicDcpsParticipant)
         publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         time.sleep(DISCOVERY_S)
-        names = {e.key: _program(e.qos) for e in programs.read(N=MAX_ENTRIES) if hasattr(e, "key")}
+        names = _programs(self._participant)
         publishers: defaultdict[str, list[str]] = defaultdict(list)
         for entry in publications.read(N=MAX_ENTRIES):
             if hasattr(entry, "topic_name") and entry.participant_key != self._participant.guid:
-                name = names.get(entry.participant_key, "a program that does not tell its name")
+                name = names.get(entry.participant_key, NAMELESS)
                 publishers[entry.topic_name].append(name)
         return publishers
 
@@ -209,6 +237,14 @@ def _configuration(interface: str) -> str:
         "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
         f"<Internal><MaxSampleSize>{MAX_SAMPLE_KIB} KiB</MaxSampleSize></Internal></Domain></CycloneDDS>"
     )
+
+
+def _programs(participant: DomainParticipant) -> dict[Any, str]:
+    """Return the names of all participants, as they call themselves, by their keys."""
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
+
+    entries = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant).read(N=MAX_ENTRIES)
+    return {entry.key: _program(entry.qos) for entry in entries if hasattr(entry, "key")}
 
 
 def _program(qos: Qos) -> str:

@@ -8,6 +8,7 @@ protocol manual. Tested against buses that answer by the same documents, well an
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -29,6 +30,7 @@ FAULTY = sum(1 << bit for bit, word in enumerate(ERRORS) if word)
 RETRIES = 2  # of a read, as LeRobot's num_read_retries
 REQUEST_TAGS = 8  # lengths of replies, by which the requests that they answer are told apart
 MAX_REPLY_BYTES = 64  # behind the length byte of a reply
+REMEMBERED_REQUESTS = 16  # by which echoes of what was sent here are known
 MAX_BYTES_RATIO = 4  # of received to requested bytes, after which a request is given up
 
 
@@ -103,6 +105,8 @@ class ServoBus:
     Attributes:
         refused: Number of replies with a wrong checksum.
         errors: Servo → error bits of all its replies so far.
+        foreign: Number of intact packets that another program must have caused: requests that were not sent here, and
+            replies of a length that nobody here has asked for.
     """
 
     def __init__(self, stream: Serial, timeout: float = 0.01) -> None:
@@ -110,7 +114,10 @@ class ServoBus:
         self.stream, self.timeout = stream, timeout
         self.refused = 0
         self.errors: dict[int, int] = {}
+        self.foreign = 0
         self._tag = 0
+        self._sizes: set[int] = set()  # bytes of all replies that were asked for
+        self._sent: deque[bytes] = deque(maxlen=REMEMBERED_REQUESTS)  # requests
 
     def sync_read(
         self, servos: Iterable[int], block: Register, retries: int = RETRIES
@@ -126,9 +133,10 @@ class ServoBus:
             self._tag = (self._tag + 1) % REQUEST_TAGS
             size = block.size + self._tag
             sizes.add(size)
+            self._sizes.add(size)
             request = packet(BROADCAST, SYNC_READ, bytes([block.address, size, *missing]))
-            self.stream.reset_input_buffer()
-            self.stream.write(request)
+            self._discard_input()
+            self._send(request)
             replies |= self._replies(missing, size, sizes, request)
             missing = [servo for servo in missing if servo not in replies]
             if not missing:
@@ -140,15 +148,37 @@ class ServoBus:
         parameters = b"".join(
             bytes([servo]) + register.encode(value) for servo, value in values.items()
         )
-        self.stream.write(
+        self._send(
             packet(BROADCAST, SYNC_WRITE, bytes([register.address, register.size]) + parameters)
         )
 
     def broadcast(self, register: Register, value: int) -> None:
         """Write one register of all servos on the bus; they do not acknowledge it."""
-        self.stream.write(
-            packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value))
-        )
+        self._send(packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value)))
+
+    def _send(self, request: bytes) -> None:
+        self._sent.append(request)
+        self.stream.write(request)
+
+    def _discard_input(self) -> None:
+        """Empty the input buffer; count what another program has caused in it."""
+        waiting = self.stream.in_waiting
+        data = self.stream.read(waiting) if waiting else b""
+        while (start := data.find(b"\xff\xff")) >= 0 and len(data) >= start + 6:
+            end = start + 4 + data[start + 3]
+            body = data[start + 2 : end]
+            intact = len(data) >= end and len(body) > 3 and checksum(body[:-1]) == body[-1]
+            if intact:
+                self._count_foreign(body)
+            data = data[end if intact else start + 1 :]
+        self.stream.reset_input_buffer()
+
+    def _count_foreign(self, body: bytes) -> None:
+        """Count an intact packet, without FF FF, that no request of ours explains."""
+        if b"\xff\xff" + body in self._sent:
+            return
+        if body[0] == BROADCAST or body[1] - 2 not in self._sizes:
+            self.foreign += 1
 
     def _replies(
         self, servos: list[int], expected: int, sizes: set[int], request: bytes
@@ -182,6 +212,7 @@ class ServoBus:
                     data = data[start + len(request) :]
                 else:
                     data = data[start + 2 + len(body) :]
+                    self._count_foreign(body)
                     self.errors[body[0]] = self.errors.get(body[0], 0) | body[2]
                     if body[0] in servos and body[1] - 2 in sizes:
                         replies[body[0]] = body[3:-1]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError, EndAction, Fault, State
 from gaponet.hw.control.hardware import accepted_folder, require_known_limits
 from gaponet.hw.drivers import feetech as reg
+from gaponet.hw.drivers.serial_port import other_programs
 from gaponet.hw.drivers.so101_calibration import (
     JOINTS,
     STEP_RAD,
@@ -62,6 +63,11 @@ CONNECT_TIMEOUT_S = 1.0  # for a first whole state
 FULL_TORQUE = 1000  # of TORQUE_LIMIT, 0.1 %
 SETTINGS_INTERVAL_S = 1.0  # in which the settings of all servos are read again, one after the other
 MAX_MISMATCHES = 3  # readings in a row that differ from what was sent: packets get lost
+REMEMBERED_GOALS = (
+    64  # sent last; a servo that misses packets holds one of them, or that before the run
+)
+FOREIGN_WINDOW_S = 1.0  # in which signs of another program are counted
+MAX_FOREIGN_SIGNS = 2  # one may be noise on the cable
 RELATIVE_KP_TOLERANCE = 0.01
 GAINS = {
     "p": reg.P, "i": reg.I, "d": reg.D, "max_torque": reg.MAX_TORQUE, "protection_current": reg.PROTECTION_CURRENT,
@@ -144,6 +150,11 @@ class SO101Driver:
             0.0,
         )  # servo whose settings were read last, and when, s
         self._disobedience: Fault | None = None
+        self._goals_before: set[int] = set()  # that the servos held when they were found
+        self._goals_sent: deque[set[int]] = deque(maxlen=REMEMBERED_GOALS)
+        self._foreign_signs: list[float] = []  # times of signs of another program, s
+        self._foreign_packets = 0  # of the bus, when they were looked at last
+        self._awaits_watchdog = False  # the port is open for others until the next `read`
 
     def connect(self) -> None:
         """Open the port, and read model, settings and state of every servo; nothing is written."""
@@ -151,6 +162,7 @@ class SO101Driver:
             bus = self._open()
             if self.silent:
                 return
+            self._claim_port()
             with self._port_errors():
                 bus.timeout = max(self.timeout, CONNECT_SILENCE_S)
                 self._identify(bus)
@@ -201,6 +213,20 @@ class SO101Driver:
             if mode:
                 fcntl.ioctl(self._serial.fileno(), mode)  # type: ignore[union-attr]
 
+    def _claim_port(self) -> None:
+        """Keep other programs from opening the port, and refuse if one has it open already.
+
+        Raises:
+            DriverError: With the programs.
+        """
+        self._set_sharing(EXCLUSIVE)
+        self._awaits_watchdog = False
+        others = other_programs(self.port)
+        if others:
+            raise DriverError(
+                f"{self.port}: {', '.join(others)} has the port open and can command the arm; end it first"
+            )
+
     def _identify(self, bus: reg.ServoBus) -> None:
         """Read and check model and mode of each servo; then read its gains, limits and calibration."""
         servos = self.arm.servos
@@ -238,7 +264,11 @@ class SO101Driver:
             STIFFNESS_PER_P * np.array(servo_facts["p"], float),
             servo_facts["torque_limit"],
         )
+        self._goals_before = {
+            reg.GOAL_POSITION.value_in(reg.RUNNING, running[servo]) for servo in servos
+        }
         self.facts = {
+            "source": f"servos {', '.join(map(str, servos))} on {Path(self.port).resolve()}",
             "servos": servo_facts,
             "calibration": {joint: asdict(row) for joint, row in stored.items()},
             "remarks": self._remarks(servo_facts),
@@ -268,7 +298,12 @@ class SO101Driver:
         return notes
 
     def read(self) -> State:
-        """Return the state of all servos; the last state again if one did not answer."""
+        """Return the state of all servos; the last state again if one did not answer.
+
+        The first call after `watchdog` closes the port for other programs again.
+        """
+        if self._awaits_watchdog:
+            self._claim_port()
         with self._port_errors():
             self._poll(self._require_bus())
         assert self._state is not None
@@ -287,7 +322,10 @@ class SO101Driver:
             for name, field in READINGS.items()
         }
         self._disobedience = (
-            self._disobedience or self._check_running(blocks) or self._check_next_settings(bus, now)
+            self._disobedience
+            or self._check_source(bus, blocks, now)
+            or self._check_running(blocks)
+            or self._check_next_settings(bus, now)
         )
         sign = self.arm.sign
         share = np.abs(raw["current"]) / STALL_CURRENT_STEPS * np.sign(raw["load"])
@@ -295,6 +333,33 @@ class SO101Driver:
             now, self.arm.qpos(raw["qpos"]), raw["qvel"] * STEP_RAD * sign, share * self._nominal.effort_limit * sign,
             raw["temperature"], bus.refused, fault=self._fault(bus),
         )  # fmt: skip
+
+    def _check_source(
+        self, bus: reg.ServoBus, blocks: dict[int, bytes], now: float
+    ) -> Fault | None:
+        """Return a fault if another program commands the servos, or speaks on the bus.
+
+        Its goals are seen if they are in force when the servos are read: they were never sent here. Its requests, and
+        the replies to them, are seen if they reach this port.
+        """
+        signs = bus.foreign - self._foreign_packets
+        self._foreign_packets = bus.foreign
+        what = "packets came that nobody here has asked for"
+        for servo, block in blocks.items():
+            goal = reg.GOAL_POSITION.value_in(reg.RUNNING, block)
+            is_on = reg.TORQUE_ENABLE.value_in(reg.RUNNING, block)
+            if self._goal is not None and is_on and not self._was_sent(goal):
+                signs += 1
+                what = f"servo {servo} holds the goal {goal}, which was never sent here"
+        recent = [time_s for time_s in self._foreign_signs if now - time_s <= FOREIGN_WINDOW_S]
+        self._foreign_signs = recent + [now] * signs
+        if not signs or len(self._foreign_signs) < MAX_FOREIGN_SIGNS:
+            return None
+        return Fault("source", f"another program is on {self.port}: {what}; end it")
+
+    def _was_sent(self, goal: int) -> bool:
+        """Return True if a goal was in a servo before the run, or was sent to any servo lately."""
+        return goal in self._goals_before or any(goal in goals for goals in self._goals_sent)
 
     def _check_running(self, blocks: dict[int, bytes]) -> Fault | None:
         """Return a fault if a servo's torque is off, or its goal or limits are not those that were sent or found."""
@@ -391,6 +456,7 @@ class SO101Driver:
                     reg.TORQUE_ENABLE, {servo: 1 for servo in goal if servo not in self._torque_on}
                 )
         self._goal = goal
+        self._goals_sent.append(set(goal.values()))
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
         """Lower the arm: torque limits decrease with `share`; at 0 the torque of all servos on the bus is switched off.
@@ -453,8 +519,10 @@ class SO101Driver:
         self._serial = None
 
     def watchdog(self) -> dict[str, object] | None:
-        """Return the options of a driver that opens the port before it is exclusive, and is silent until it damps."""
+        """Return the options of a driver that is silent until it damps; let it open the port until the next `read`."""
         calibration = str(self.calibration) if self.calibration else None
+        self._set_sharing(SHARED)
+        self._awaits_watchdog = True
         return {
             "kind": "so101", "robot": str(self.robot.folder.resolve()), "port": self.port,
             "calibration": calibration, "silent": True, "torque_limit": self._torque_limit,

@@ -19,7 +19,7 @@ from __future__ import annotations
 import contextlib
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import numpy as np
 
@@ -29,10 +29,11 @@ from gaponet.hw.control.driver import DriverError, EndAction, Fault, State
 from gaponet.hw.control.hardware import accepted_folder, range_violation, require_known_limits
 from gaponet.hw.control.safety import damping_gains
 from gaponet.hw.drivers import hg
+from gaponet.hw.drivers.sole_source import SoleSource
 from gaponet.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
-    from gaponet.hw.drivers.dds import Bus, Reader, Writer
+    from gaponet.hw.drivers.dds import Bus, Writer
 
 Topic = Literal["arm_sdk", "lowcmd"]
 Joints = Literal["arms", "upper_body", "all"]
@@ -62,6 +63,7 @@ MOTOR_FIELDS = (
     "vol",
     "motorstate",
 )  # not all 0 in a slot with a motor
+STATES_TOPIC = "rt/lowstate"
 WEIGHT_MOTOR = 27
 KD_FACTOR = (
     4.0  # of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
@@ -109,8 +111,8 @@ class UnitreeDriver:
             joints: arms, upper_body (with torso), or all.
             domain: DDS domain; 0 on a robot.
             interface: Network interface to the robot; lo for a virtual one on this machine.
-            sole: Refuse to connect if another participant publishes the topic.
-            silent: Only listen: publish nothing, and accept other publishers.
+            sole: Refuse to connect if another participant publishes the topic, or if two robots publish their states.
+            silent: Only listen: publish nothing, and accept other publishers of the topic.
 
         Raises:
             UsageError: The robot is no H1-2, or the topic does not take the legs.
@@ -157,7 +159,8 @@ class UnitreeDriver:
         self._state: State | None = None
         self._clock: TickClock | None = None
         self._bus: Bus | None = None
-        self._reader: Reader | None = None
+        self._states: SoleSource | None = None
+        self._last_ctrl: Array | None = None  # last position command, all joints, rad
         self._writer: Writer | None = None
 
     def connect(self) -> None:
@@ -166,32 +169,50 @@ class UnitreeDriver:
 
         self._bus = dds.Bus(self.domain, self.interface)
         topic = f"rt/{self.topic}"
-        self._reader = self._bus.reader("rt/lowstate", dds.LowState)
+        self._states = SoleSource(self._bus.reader(STATES_TOPIC, dds.LowState), STATES_TOPIC)
         if not self.silent:
             self._writer = self._bus.writer(topic, dds.LowCmd)
-        others = self._bus.publishers()[topic] if self.sole and not self.silent else []
+        publishers = self._bus.publishers() if self.sole else {}
+        others = [] if self.silent else publishers.get(topic, [])
         if others:
             raise DriverError(
                 f"others publish {topic} on {self.interface}: {'; '.join(others)}; stop them first (on the "
                 "robot: leave debug programs, and for lowcmd release the motion mode)"
             )
-        arrivals, messages = self._listen(self._reader)
+        robots = publishers.get(STATES_TOPIC, [])
+        if len(robots) > 1:
+            self._refuse_second(robots)
+        arrivals, messages = self._listen(self._states)
+        if self._states.second and self.sole:
+            self._refuse_second([self._states.identity, self._states.second])
         self._require_h1_2(messages)
         self._clock = TickClock(
             arrivals, [int(hg.LowState.view(data, "tick")[0]) for data in messages]
         )
         self._state = self._decode(messages[-1], self._clock, arrivals[-1])
         hg.LowCmd.view(self._command, "mode_machine")[:] = self._machine
-        self.facts = {"mode_machine": self._machine, "topic": self.topic}
+        self.facts = {
+            "mode_machine": self._machine,
+            "topic": self.topic,
+            "source": f"{STATES_TOPIC} of {self._states.identity}",
+        }
 
-    def _listen(self, reader: Reader) -> tuple[list[float], list[Array]]:
+    def _refuse_second(self, robots: list[str]) -> NoReturn:
+        """Refuse a bus on which more than one robot publishes its states: all of them would take each command."""
+        raise DriverError(
+            f"{len(robots)} robots publish {STATES_TOPIC} on domain {self.domain}, {self.interface}: "
+            f"{'; '.join(robots)}. Each of them would move. Leave one on this domain or network; a program that was "
+            "killed is remembered for about 10 s"
+        )
+
+    def _listen(self, states: SoleSource) -> tuple[list[float], list[Array]]:
         """Return the arrival times, s, of the intact messages of LISTEN_S, and these."""
         arrivals: list[float] = []
         messages: list[Array] = []
         start = time.monotonic()
         while not arrivals or time.monotonic() < arrivals[0] + LISTEN_S:
             now = time.monotonic()
-            for data in reader.receive()[-1:]:
+            for data in states.receive()[-1:]:
                 if self._intact(data):
                     arrivals.append(now)
                     messages.append(data)
@@ -240,10 +261,18 @@ class UnitreeDriver:
     def read(self) -> State:
         """Return the newest state with a right checksum; its time is the robot's, mapped to ours (TickClock)."""
         assert self._state is not None
-        assert self._reader is not None
+        assert self._states is not None
         assert self._clock is not None
-        now, newest = time.monotonic(), None
-        for data in self._reader.receive():
+        now = time.monotonic()
+        newest = None
+        messages = self._states.receive()
+        if self._states.second and self._fault is None:
+            self._fault = Fault(
+                "source",
+                f"a second robot publishes {STATES_TOPIC} and takes the same commands: {self._states.second}",
+            )
+            self._state = replace(self._state, fault=self._fault)
+        for data in messages:
             if self._intact(data):
                 newest = data
                 self.received += 1
@@ -298,6 +327,7 @@ class UnitreeDriver:
         """
         if problem := range_violation(self.robot, ctrl, self._at):
             raise DriverError(f"{problem}; it was not sent")
+        self._last_ctrl = np.array(ctrl, float)
         self._send(ctrl, self.kp, self.kd, weight)
 
     def verify(self) -> None:
@@ -306,10 +336,14 @@ class UnitreeDriver:
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
         """Send stiffness 0 and damping gains, at most those that the effort limits allow at the present speed.
 
-        A torso that is only held stays held until the weight is 0: a trunk must not swing while the arms brake.
+        The position in the message has no stiffness, but a robot may blend it with its own by the weight. So it is the
+        last command, not a reading, which may be what is wrong. A torso that is only held stays held until the weight
+        is 0: a trunk must not swing while the arms brake.
         """
         state = self._state
-        qpos = np.nan_to_num(state.qpos) if state else np.zeros(len(self._motor))
+        qpos = self._last_ctrl
+        if qpos is None:
+            qpos = np.nan_to_num(state.qpos) if state else np.zeros(len(self._motor))
         qvel = state.qvel if state else np.zeros(len(self._motor))
         kd = damping_gains(KD_FACTOR * self.kd, qvel, self._effort_limit)
         self._send(qpos, np.zeros_like(kd), kd, weight)
@@ -349,7 +383,7 @@ class UnitreeDriver:
         with contextlib.suppress(DriverError):
             if not hold:
                 self.damp(0.0)
-        self._bus = self._reader = self._writer = None
+        self._bus = self._states = self._writer = None
 
     def publishers(self) -> dict[str, list[str]]:
         """Return the other publishers on the bus: topic → programs; the robot's topics are always included."""
@@ -357,7 +391,7 @@ class UnitreeDriver:
         publishers = self._bus.publishers()
         return {
             topic: publishers[topic]
-            for topic in ("rt/lowstate", "rt/arm_sdk", "rt/lowcmd", *sorted(publishers))
+            for topic in (STATES_TOPIC, "rt/arm_sdk", "rt/lowcmd", *sorted(publishers))
         }
 
     def watchdog(self) -> dict[str, object] | None:

@@ -85,6 +85,15 @@ class Message(NamedTuple):
     error: str = ""
 
 
+def sender_name(sender: Hashable) -> str:
+    """Return a sender in words: a DDS handle or the bytes of a ZeroMQ connection as hexadecimal digits."""
+    if isinstance(sender, bytes):
+        return sender.hex()
+    if isinstance(sender, int):
+        return f"{sender:x}"
+    return str(sender)
+
+
 def decode(sender: Hashable, data: bytes) -> Message:
     """Return a message from JSON; it carries its error if the bytes are not one."""
     if len(data) > MAX_MESSAGE_BYTES:
@@ -103,6 +112,9 @@ class Transport(Protocol):
 
     def receive(self) -> list[Message]:
         """Return the messages since the last call, oldest first, at most some dozens."""
+
+    def senders(self) -> set[Hashable]:
+        """Return the senders that are connected now; empty where a transport knows them by their messages alone."""
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
         """Send joint_names, commanded, and qpos, qvel, tau in SI units to the sender, or to all listeners."""
@@ -134,10 +146,15 @@ def next_step(step: Array, distance: Array, max_step: float, max_change: float) 
 class LiveTargets:
     """Policy of a controller whose targets arrive over a transport.
 
-    The sender of the first well-formed message is the only sender of the run.
+    The sender of the first well-formed message is the only sender of the run. If another one speaks before a first
+    target is accepted, nobody knows which of the two was meant, and the run is refused. Later its messages are
+    rejected, with a remark, and the robot follows the first one. They cannot move the robot, and a stop would let every
+    program that reaches the address drop an arm in the middle of a motion.
 
     Attributes:
-        counts: accepted (`taken`) and rejected (`refused`, by kind) messages; periods in which a target was `held`.
+        counts: accepted (`taken`) and rejected (`refused`, by kind) messages; periods in which a target was `held`;
+            the `sender`.
+        remarks: Sentences for the recording; the controller takes them out.
     """
 
     def __init__(
@@ -162,7 +179,8 @@ class LiveTargets:
         decode("", b"no message")
         self.transport, self.robot, self.commanded, self.clock = transport, robot, commanded, clock
         self.dt, self.speed, self.config = dt, speed, config
-        self.counts: dict[str, Any] = {"taken": 0, "held": 0, "refused": Counter()}
+        self.counts: dict[str, Any] = {"taken": 0, "held": 0, "refused": Counter(), "sender": ""}
+        self.remarks: list[str] = []
         self._sender: Hashable | None = None
         self._joints: tuple[str, ...] = ()
         self._target: Array | None = None  # the last accepted one, all joints, rad
@@ -190,7 +208,13 @@ class LiveTargets:
         readings = {name: getattr(state, name).tolist() for name in ("qpos", "qvel", "tau")}
         self.transport.publish(self._sender, {"time": state.time, **names, **readings})
         if not (self._ended and k > 0):
+            unproven = self._target is None
             self._receive(now, state)
+            if unproven and self._has_second_sender():
+                return Fault(
+                    "source",
+                    f"more than one program sends targets to {self.transport.address}; end all but one",
+                )
         ending = self._ended and (
             k > 0 or self._target is None
         )  # row 0 is also the goal of the blend
@@ -218,6 +242,12 @@ class LiveTargets:
         """Send the sender the reason why the run is over, and close the transport."""
         self.transport.close(reason)
 
+    def _has_second_sender(self) -> bool:
+        """Return True if another sender than that of the run has spoken, or is connected."""
+        if self.counts["refused"]["stranger"]:
+            return True
+        return len(self.transport.senders()) > 1
+
     def _advance(self, target: Array) -> None:
         """Move on towards a target (n) rad by one control period."""
         if not self._position.size:
@@ -237,6 +267,10 @@ class LiveTargets:
                 (None, kind, why) if kind else self._full_target(message, before, since, state)
             )
             if kind:
+                if kind == "stranger" and not self.counts["refused"][kind]:
+                    self.remarks.append(
+                        f"targets of a second sender, {sender_name(message.sender)}, are rejected"
+                    )
                 self.counts["refused"][kind] += 1
                 self._rejection = f"; the last one was rejected: {why}"
             elif target is not None:
@@ -252,6 +286,7 @@ class LiveTargets:
             return "malformed", message.error
         if self._sender is None:
             self._sender = message.sender
+            self.counts["sender"] = sender_name(message.sender)
         if message.sender != self._sender:
             return (
                 "stranger",

@@ -49,6 +49,10 @@ class PipeTransport:
             messages.append(decode("stdin", bytes(MAX_MESSAGE_BYTES + 1)))
         return messages
 
+    def senders(self) -> set[Hashable]:
+        """Return the one sender that a pipe has."""
+        return {"stdin"}
+
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
         """Do nothing: a pipe has no way back."""
 

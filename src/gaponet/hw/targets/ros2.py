@@ -85,11 +85,12 @@ class ROS2Transport:
 
     def receive(self) -> list[Message]:
         """Return the messages since the last call."""
-        samples = self._reader.samples()
-        return [
-            to_message(sample.sample_info.publication_handle, bytes(sample.data))
-            for sample in samples
-        ]
+        messages = self._reader.receive_with_publisher()
+        return [to_message(publisher, bytes(data)) for publisher, data in messages]
+
+    def senders(self) -> set[Hashable]:
+        """Return the publishers of the topic, also those that have not sent a message."""
+        return set(self._reader.publishers())
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
         """Publish a JointState of all joints, stamped with the wall clock, as ROS does."""

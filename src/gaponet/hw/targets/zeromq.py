@@ -55,6 +55,10 @@ class ZeroMQTransport:
                 messages.append(decode(sender, parts[-1] if parts else b""))
         return messages
 
+    def senders(self) -> set[Hashable]:
+        """Return nothing: ZeroMQ tells senders by their messages alone."""
+        return set()
+
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
         """Send a JSON object to the sender; it is dropped if the sender does not read."""
         self._sender = to

@@ -1,0 +1,129 @@
+"""Two H1-2 on one bus: refused before the start, damped during a run. In simulated time, and on a real DDS bus."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hw.control.loopback import RobotClock, living
+from hw.noted_arm import phases
+
+from gaponet.hw.control.controller import Controller
+from gaponet.hw.control.driver import DriverError
+from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.recording import Recording
+from gaponet.hw.drivers.unitree import MOTOR_NAMES, UnitreeDriver
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.testing.unitree_virtual import VirtualH12
+
+PERIOD_S = 0.02
+ELBOW = MOTOR_NAMES.index("left_elbow_joint")
+DOMAIN = 200 + os.getpid() % 30
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotSpec:
+    return load_robot("h1_2")
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch, robot: RobotSpec) -> RobotClock:
+    return living(monkeypatch, robot)
+
+
+def stiff_commands(robot: VirtualH12) -> list[dict]:
+    """Commands that a robot received and that held or moved its elbow."""
+    return [row for row in robot.heard if row["kp"][ELBOW] > 0]
+
+
+def sway(robot: RobotSpec, clock: RobotClock, during: Callable[[int], None]) -> Recording:
+    """Both elbows sway for 2 s; `during` is called with the period of the run."""
+    elbow = robot.index(["left_elbow_joint"])[0]
+
+    def policy(k: int, state: object) -> np.ndarray | None:
+        during(k)
+        target = robot.qpos_home.copy()
+        target[elbow] += 0.3 * (1 + np.sin(0.06 * k))
+        return target if k < 100 else None
+
+    config = ControlConfig(blend=0.5, blend_speed=2.0, settle=0.1, damp=0.5)
+    driver = UnitreeDriver(robot, domain=DOMAIN)
+    return Controller(driver, robot, config=config, clock=clock, watchdog=False).run(policy)
+
+
+def test_two_robots_on_one_bus_are_refused_and_neither_is_commanded(robot, clock):
+    second = clock.add_robot()
+
+    with pytest.raises(DriverError, match="2 robots publish rt/lowstate"):
+        sway(robot, clock, during=lambda k: None)
+
+    assert clock.robot.heard == []
+    assert second.heard == []
+
+
+def test_a_second_robot_that_appears_while_a_person_reads_the_plan_is_refused(robot, clock):
+    driver = UnitreeDriver(robot, domain=DOMAIN)
+    controller = Controller(
+        driver, robot, clock=clock, watchdog=False, on_connect=lambda _: clock.add_robot()
+    )
+
+    recording = controller.run(lambda k, state: robot.qpos_home)
+
+    assert recording.fault.kind == "source"
+    assert "nothing was commanded" in recording.fault.text
+    assert clock.robot.heard == []
+
+
+def test_a_second_robot_that_appears_during_a_run_is_damped_within_three_periods(robot, clock):
+    def during(k: int) -> None:
+        if k == 30:
+            clock.add_robot()
+
+    recording = sway(robot, clock, during)
+
+    (second,) = clock.seconds
+    assert recording.fault.kind == "source"
+    assert phases(recording)[-2:] == ["damp", "stopped"]
+    for each in (clock.robot, second):
+        stiff = [row["time"] for row in stiff_commands(each)]
+        damped = next(row["time"] for row in each.heard if row["kp"][ELBOW] == 0)
+        assert len([time for time in stiff if time > recording.fault.time]) == 0
+        assert damped - second.heard[0]["time"] <= 3 * PERIOD_S
+
+
+def test_states_of_a_second_robot_are_never_taken_for_those_of_the_first(robot, clock):
+    def during(k: int) -> None:
+        if k == 30:
+            clock.add_robot().live.unit.reset(robot.qpos_home[None] + 0.3, [1])
+
+    recording = sway(robot, clock, during)
+
+    read = np.array([row.state.qpos for row in recording.rows])
+    assert np.abs(np.diff(read, axis=0)).max() < 0.1
+
+
+def test_a_run_with_a_second_robot_is_no_data(robot, clock):
+    recording = sway(robot, clock, lambda k: clock.add_robot() if k == 80 else None)
+
+    assert "second robot" in recording.disobedience
+
+
+def test_the_recording_names_the_robot_that_the_states_are_from(robot, clock):
+    recording = sway(robot, clock, during=lambda k: None)
+
+    assert recording.fault is None
+    assert recording.meta["source"] == "rt/lowstate of robot 1"
+
+
+def test_a_watchdog_also_damps_when_there_are_two_robots(robot, clock):
+    clock.add_robot()
+    watchdog = UnitreeDriver(robot, domain=DOMAIN, sole=False)
+
+    watchdog.connect()
+    watchdog.damp(1.0)
+    clock.wait_until(clock.now() + PERIOD_S)
+
+    for each in (clock.robot, *clock.seconds):
+        assert each.heard[-1]["kp"][ELBOW] == 0
