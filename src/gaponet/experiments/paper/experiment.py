@@ -18,6 +18,7 @@ from gaponet.base.errors import ModelError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Running
 from gaponet.base.result_table import ResultTable
+from gaponet.data.checks.gate import pass_gate, used_recordings
 from gaponet.data.paper_counts import count_as_paper, table_beside_paper
 from gaponet.data.store import Dataset
 from gaponet.experiments.paper.claims import Claim, claim_table, claims
@@ -119,7 +120,16 @@ def prepare(
         unseen_unit = study.unit_name if study.virtual else ""
         small = quick_dataset(dataset, nominal, out / "data", unseen_unit)
         study = replace(study, dataset=str(small.path.resolve()))
-    study.splits()  # refuses what cannot be split
+    splits = study.splits()  # refuses what cannot be split
+    if not study.has_results:
+        with open_bar("checking the recordings") as update:
+            pass_gate(
+                study.data,
+                used_recordings(study.data, splits),
+                nominal,
+                despite_errors=options.despite_errors,
+                progress=lambda done, total, note: update(done / total),
+            )
     study.require_same_setup()
     if study.virtual:
         for rate in {study.rates[0], study.rates[-1]}:

@@ -46,6 +46,8 @@ class PaperOptions:
     """Where they run: local, ray or ray:ADDRESS (docs/install.md)."""
     identify_windows: Count = 40
     """Rollouts of 8 s that identification fits; fewer are faster and less exact."""
+    despite_errors: Flag = False
+    """Train on recordings in which gaponet doctor finds an error; the page says so."""
     quick: Flag = False
     """See every part work in three minutes. The numbers mean nothing."""
 

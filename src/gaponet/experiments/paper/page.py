@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 VERSIONS = ("gaponet", "mujoco", "numpy", "torch")
 QUICK_LABEL = "QUICK RUN: it shows that every part works, and its numbers mean nothing."
 
+DESPITE_ERRORS = "Trained on recordings in which the doctor finds an error (--despite-errors)."
+
 
 @dataclass(frozen=True)
 class Section:
@@ -66,6 +68,8 @@ def write_page(study: Study, sections: list[Section], sentences: list[str]) -> P
     provenance = describe_provenance(study.data)
     if study.options.quick:
         provenance = f"{QUICK_LABEL} {provenance}"
+    if study.options.despite_errors:
+        provenance = f"{DESPITE_ERRORS} {provenance}"
     facts = _facts(study)
     record: dict[str, Any] = {
         "provenance": provenance,

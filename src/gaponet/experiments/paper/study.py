@@ -139,6 +139,11 @@ class Study:
         entries = [entry for entry in unseen.entries if round(1 / entry.dt) == rate]
         return Recorded(unseen.sequences(entries))
 
+    @property
+    def has_results(self) -> bool:
+        """True if the experiment has begun in this folder."""
+        return (self.out / SETUP_FILE).is_file()
+
     def require_same_setup(self) -> None:
         """Write what the results belong to, or refuse a folder with results of something else.
 
@@ -153,9 +158,10 @@ class Study:
             "goals": self.options.goals,
             "unit": self.unit_name if self.virtual else "",
             "quick": self.options.quick,
+            "despite_errors": self.options.despite_errors,
         }
         file = self.out / SETUP_FILE
-        if not file.is_file():
+        if not self.has_results:
             write_json(file, setup)
             return
         stored = read_json(dict[str, Any], file, DatasetError, SETUP_HINT)
