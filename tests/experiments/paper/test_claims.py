@@ -55,7 +55,7 @@ def training(name, share, block="labels", seed=0):
 
 def make_results(*trainings):
     robot = SimpleNamespace(operated=("shoulder", "elbow"))
-    study = SimpleNamespace(virtual=True, robot=robot)
+    study = SimpleNamespace(virtual=True, delivers=True, robot=robot)
     baselines = {
         "motions": ["a", "a", "b", "b"],
         "payloads": PAYLOADS,

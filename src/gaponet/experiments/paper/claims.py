@@ -60,6 +60,7 @@ def claims(results: Results) -> list[Claim]:
         found += _alignment_claims(results, block)
         if results.study.virtual:
             found += _command_claims(results, block)
+        if results.study.delivers:
             found += _delivery_claims(results, block)
     return found
 

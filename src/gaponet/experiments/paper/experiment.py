@@ -214,8 +214,9 @@ def _table_1(results: Results) -> list[Section]:
     for block in BLOCKS:
         if not results.networks(block):
             continue
-        title = f"Delivery: offsets of the hands ({BLOCK_TITLES[block]})"
-        sections.append(Section("Table 1", title, tables=[table_1(results, block)]))
+        if results.study.delivers:
+            title = f"Delivery: offsets of the hands ({BLOCK_TITLES[block]})"
+            sections.append(Section("Table 1", title, tables=[table_1(results, block)]))
         title = f"Commands on the robot ({BLOCK_TITLES[block]})"
         sections.append(Section("", title, tables=[commands_table(results, block)]))
     return sections

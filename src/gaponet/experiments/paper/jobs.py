@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from gaponet.base.structure import read_json
 from gaponet.experiments.paper.commands import ShareDone
 from gaponet.experiments.paper.measure import (
     Delivery,
-    Measurement,
     measure_alignment,
     measure_commands,
     measure_delivery,
@@ -196,7 +195,8 @@ def measure_baselines(job: Job) -> None:
     if study.virtual:
         unit = study.virtual_unit()
         result["nominal"]["commands"] = measure_commands(unit, None)
-        result["nominal"]["delivery"] = measure_delivery(unit, Delivery.plan(unit), None)
+        if study.delivers:
+            result["nominal"]["delivery"] = measure_delivery(unit, Delivery.plan(unit), None)
         result["identified"]["commands"] = measure_commands(unit, None, identified)
     write_json(job.result_file, result)
 
@@ -231,19 +231,17 @@ def train_and_measure(job: Job, training: Training) -> None:
     study = job.study
     model = GapModel.load(job.run_folder)
     rate = training.config.rates[0]
-    alignment = measure_alignment(study.recorded(rate), study.robot, model)
-    measurement = Measurement(alignment=alignment)
+    measured: dict[str, Any] = {
+        "alignment": measure_alignment(study.recorded(rate), study.robot, model)
+    }
     if training.block != "table2":
-        measurement = Measurement(alignment=alignment, latency=measure_latency(model))
+        measured["latency"] = measure_latency(model)
         if study.virtual:
             unit = study.virtual_unit()
-            measurement = Measurement(
-                alignment=alignment,
-                commands=measure_commands(unit, model),
-                delivery=measure_delivery(unit, Delivery.plan(unit), model),
-                latency=measurement.latency,
-            )
-    write_json(job.result_file, facts | asdict(measurement))
+            measured["commands"] = measure_commands(unit, model)
+            if study.delivers:
+                measured["delivery"] = measure_delivery(unit, Delivery.plan(unit), model)
+    write_json(job.result_file, facts | measured)
 
 
 def train(job: Job, training: Training) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -253,13 +253,3 @@ def measure_latency(model: GapModel) -> dict[str, float]:
         seconds.append(time.perf_counter() - began)
     median, slow = np.quantile(seconds, [0.5, 0.99])
     return {"p50_us": 1e6 * float(median), "p99_us": 1e6 * float(slow)}
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """All that is measured of one method; parts that do not apply are empty."""
-
-    alignment: dict[str, Any]
-    commands: dict[str, Any] = field(default_factory=dict)
-    delivery: dict[str, Any] = field(default_factory=dict)
-    latency: dict[str, float] = field(default_factory=dict)

@@ -59,6 +59,11 @@ class Study:
         """True for recordings of a VIRTUAL fleet, of which another unit can be played."""
         return all(entry.meta.virtual for entry in self.data.entries)
 
+    @property
+    def delivers(self) -> bool:
+        """True if the unseen unit has hands that can bring a payload to a goal."""
+        return self.virtual and bool(self.robot.payload_mounts)
+
     @cached_property
     def payloads(self) -> tuple[float, ...]:
         """Payloads of the recordings, kg in each hand, ascending."""

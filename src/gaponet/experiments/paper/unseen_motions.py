@@ -9,15 +9,15 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.data.split import hash_order
 from gaponet.data.store import Dataset
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
-from gaponet.sysid.motion.coordinated import BUILDERS
+from gaponet.sysid.motion.coordinated import BUILDERS, available
 from gaponet.sysid.motion.library import Library
 from gaponet.sysid.motion.motion import Motion
 
 VARIANT = 90  # recipes count variants from 0 and never get this far
+MAX_VARIANTS = 10  # of each kind, for a robot without hands
 LIBRARY_SEED = 2026  # recipes have others
 MIN_RMS_DIFFERENCE_RAD = 0.01  # between the targets of two motions that count as different
 
@@ -37,7 +37,7 @@ class UnseenMotion:
 def make_unseen_motions(
     robot: RobotSpec, count: int, max_payload: float, dt: float
 ) -> list[UnseenMotion]:
-    """Make coordinated motions of all kinds, both hands first; single-joint motions for a robot without arms.
+    """Make coordinated motions of all kinds, both hands first; of all joints for a robot without hands.
 
     Args:
         count: Number of motions.
@@ -48,12 +48,7 @@ def make_unseen_motions(
         UsageError: The robot has fewer motions.
     """
     library = Library(robot, LIBRARY_SEED, max_payload)
-    sides = list(library.kit.arms)
-    if len(sides) == 2:
-        sides = ["both", *sides]
-    names = [f"{kind}-{side}-{VARIANT}" for side in sides for kind in BUILDERS]
-    if not names:
-        names = hash_order(library.names())
+    names = unseen_names(library)
     if count > len(names):
         raise UsageError(f"--motions {count}: {robot.name} has {len(names)} for this experiment")
     # With a fixed base, limbs without an operated joint share no dynamics with the others.
@@ -64,6 +59,17 @@ def make_unseen_motions(
         ctrl[:, idle] = robot.qpos_home[idle]
         motions.append(UnseenMotion(name, ctrl))
     return motions
+
+
+def unseen_names(library: Library) -> list[str]:
+    """Return names of motions that no recipe has: of the hands, both first; else of all joints together."""
+    sides = list(library.kit.arms)
+    if len(sides) == 2:
+        sides = ["both", *sides]
+    if sides:
+        return [f"{kind}-{side}-{VARIANT}" for side in sides for kind in BUILDERS]
+    variants = range(VARIANT, VARIANT + MAX_VARIANTS)
+    return [f"{kind}-all-{variant}" for variant in variants for kind in available(library.kit)]
 
 
 def require_unseen(
