@@ -33,7 +33,7 @@ def test_the_notebook_goes_from_recordings_to_figure_3(tmp_path, tmp_path_factor
     smaller = {
         'robot="h1_2"': 'robot="so101"',
         'recipe="demo"': f'recipe="{recipe}"',
-        "seeds=1": "quick=True, methods=(\"GAPONet\",)",
+        "seeds=1": 'quick=True, methods=("GAPONet",)',
     }
     notebook = nbformat.read(FILE, 4)
     for cell in notebook.cells:
