@@ -14,8 +14,8 @@ Records a small VIRTUAL SO-101 set in WORK/input. Each command of `cases` runs o
 At the end, the content of the folder must equal that of the undisturbed command. Prints one JSON object; exits with 1
 if a content differs, a file remains, an exit code is wrong, or a traceback was printed.
 
-Not among the cases: run and record, which play a motion again and store it under a new name; demo and the experiments
-beside compare, which consist of commands and cells that are; view --render and replay --out, which write one file as
+Not among the cases: run and record, which play a motion again and store it under a new name; demo, which consists of
+commands that are; view --render and replay --out, which write one file as
 `robot show --out` does; data labels, which writes two such files.
 """
 
@@ -140,14 +140,9 @@ def measured(out: Path) -> Any:
 
 
 def result(out: Path) -> Any:
-    """Return the rows of an experiment, without times, and its files."""
-    record = json.loads((out / "compare.json").read_text())
-    table = record["tables"][0]
-    rows = [
-        [cell for cell, name in zip(row, table["columns"], strict=True) if name != "min"]
-        for row in table["rows"]
-    ]
-    return [rows, sorted(p.name for p in (out / "cells").iterdir()), names(out)]
+    """Return the claims and Figure 3 of an experiment, and its files."""
+    tables = json.loads((out / "paper.json").read_text())["tables"]
+    return [tables["claims_labels"]["rows"], tables["figure3_labels"]["rows"], names(out)]
 
 
 def cases(given: Path) -> dict[str, Case]:
@@ -164,8 +159,18 @@ def cases(given: Path) -> dict[str, Case]:
         return ["train", data, "--out", str(out), "--budget", "4000", *resume, *TRAIN]
 
     def experiment(out: Path) -> list[str]:
-        return ["experiment", "compare", data, "--out", str(out), "--models", "mlp", "--seeds", "1", "--budget", "2000",
-                *TRAIN]  # fmt: skip
+        return [
+            "experiment",
+            "paper",
+            data,
+            "--out",
+            str(out),
+            "--quick",
+            "--methods",
+            "GAPONet",
+            "--blocks",
+            "labels",
+        ]
 
     return {
         "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),

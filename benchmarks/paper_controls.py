@@ -1,0 +1,100 @@
+"""Controls of the paper's experiment: what a network is credited with that cannot know.
+
+    python benchmarks/paper_controls.py EXPERIMENT [--steps 200000] [--seed 0]
+
+EXPERIMENT is the folder of `gaponet experiment paper`. Each control is trained and measured as its networks are:
+
+    untrained          the correction is zero
+    literal            as the experiment trains it
+    sensors are noise  the literal network; in training its sensor values are drawn at random, afterwards they are zero
+    payload permuted   GAPONet and literal; the payload that the network is told is that of another simulation
+
+It prints the reduction of Q_dis over the nominal simulator, %, on the motions and the unit of Figure 3.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaponet.experiments.paper.jobs import Job, train
+from gaponet.experiments.paper.measure import measure_alignment
+from gaponet.experiments.paper.options import PaperOptions
+from gaponet.experiments.paper.statistics import reduction
+from gaponet.experiments.paper.study import Study
+from gaponet.experiments.paper.trainings import method_trainings
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.paper import PaperNet
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.share.reading import open_dataset
+
+TRAINER_ENV = "gaponet.nn.training.trainer.DeltaEnv"
+
+
+class PermutedPayloadEnv(DeltaEnv):
+    """The simulations carry their payload; the network is told that of another one."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        rng = np.random.default_rng(0)
+        self.payload = rng.permutation(self.payload)
+
+
+def noise_instead_of_sensors(net: PaperNet, x: Tensor, z: Tensor) -> Tensor:
+    """Return noise in training, and its mean afterwards, (B, 2nm)."""
+    shape = (len(x), net.config.sensor_dim(net.n))
+    if net.training:
+        return torch.randn(shape, device=x.device)
+    return 0.0 * x[:, :1].expand(shape)
+
+
+def main() -> None:
+    """Train and measure all controls."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("experiment", type=Path)
+    parser.add_argument("dataset")
+    parser.add_argument("--steps", type=int, default=200_000)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    _, robot = open_dataset(arguments.dataset)
+    options = PaperOptions(steps=arguments.steps)
+    dataset = str(Path(arguments.dataset).resolve())
+    study = Study(dataset, robot.before_identification, arguments.experiment, options)
+    recorded = study.recorded()
+    nominal = np.array(measure_alignment(recorded, study.robot, None)["q_dis"]).mean(axis=1)
+    trainings = {
+        training.name: training
+        for training in method_trainings(options, "labels", arguments.seed, study.rates[:1])
+    }
+    controls: dict[str, tuple[str, Any]] = {
+        "literal": ("literal", None),
+        "sensors are noise": (
+            "literal",
+            patch.object(PaperNet, "sensors", noise_instead_of_sensors),
+        ),
+        "payload permuted, literal": ("literal", patch(TRAINER_ENV, PermutedPayloadEnv)),
+        "payload permuted, GAPONet": ("GAPONet", patch(TRAINER_ENV, PermutedPayloadEnv)),
+    }
+    print("untrained: 0 % (its correction is zero)")
+    for name, (network, change) in controls.items():
+        training = replace(trainings[network], name=f"control {name}")
+        job = Job(study, training)
+        if change is None:
+            train(job, training)
+        else:
+            with change:
+                train(job, training)
+        measured = measure_alignment(recorded, study.robot, GapModel.load(job.run_folder))
+        error = np.array(measured["q_dis"]).mean(axis=1)
+        print(f"{name}: {reduction([error], nominal, recorded.motions)} %", flush=True)
+
+
+if __name__ == "__main__":
+    main()
