@@ -20,6 +20,7 @@ from gaponet.base.executor import open_pool
 from gaponet.base.files import atomic_write, lock_folder, write_json
 from gaponet.base.progress import Running
 from gaponet.base.structure import read_json
+from gaponet.data.split import stratified_subset
 from gaponet.experiments.paper.commands import ShareDone
 from gaponet.experiments.paper.measure import (
     Delivery,
@@ -203,6 +204,7 @@ def measure_baselines(job: Job) -> None:
 
 def identified_robot(study: Study) -> RobotSpec:
     """Return the robot identified on the training recordings; it is stored in OUT/identified."""
+    from gaponet.nn.training.run_folder import MAX_VALIDATION_ROLLOUTS
     from gaponet.sysid.identify import WINDOWS, identify
 
     folder = study.out / "identified"
@@ -215,10 +217,11 @@ def identified_robot(study: Study) -> RobotSpec:
             options |= {"terms": (), "table": False}
         if study.options.quick:
             options |= {"budget": QUICK_IDENTIFY_S}
+        judged = stratified_subset(splits["val"], MAX_VALIDATION_ROLLOUTS)  # as the networks are
         fitted = identify(
             study.data.sequences(splits["train"]),
             study.robot,
-            study.data.sequences(splits["val"]),
+            study.data.sequences(judged),
             **options,
         )
         save_robot(fitted.robot, folder)
