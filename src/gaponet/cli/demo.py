@@ -23,9 +23,10 @@ NEEDED_MODULES = ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")
 def demo(out: Path = Path("demo_run"), json: Json = False) -> None:
     """Run the paper's experiment in small, on VIRTUAL robots, in minutes.
 
-    It takes four minutes on two cores. It records three units and an unseen fourth with 0 and 3 kg, shows how far the simulator is from them, identifies
-    the robot, trains GAPONet and an MLP on three units, and measures both on the fourth. Lengths are counted in control
-    steps, so that every machine gets the same result. An interrupted demo continues.
+    It records three units of an H1-2 and an unseen fourth with 0 and 3 kg, shows how far the simulator is from them,
+    identifies the robot, trains GAPONet and an MLP on three units, and measures both on the fourth. Lengths are counted
+    in control steps, so that every machine gets the same result. It takes four minutes on two cores; an interrupted
+    demo continues.
 
     Args:
         out: Folder for the dataset and the experiment.
