@@ -373,4 +373,4 @@ def networks(name: tyro.conf.Positional[str] = "", json: Json = False) -> None:
     new=new, check=check, list=list_robots, link=link, show=show, servos=servos, networks=networks
 )
 def robot(action: None) -> None:
-    """Make, check or show a robot folder; list servo types and trained networks."""
+    """Make, check or show a robot folder; list servos and networks."""

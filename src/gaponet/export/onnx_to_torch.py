@@ -17,7 +17,7 @@ from torch.nn import functional
 from gaponet.base.errors import ModelError
 
 Attributes = dict[str, Any]
-Operator = Callable[[list[Any], Attributes], Tensor]
+Operator = Callable[[list[Any], Attributes], Any]
 
 
 def _gemm(inputs: list[Any], attributes: Attributes) -> Tensor:
@@ -44,9 +44,9 @@ def _clip(inputs: list[Any], attributes: Attributes) -> Tensor:
 
 
 def _slice(inputs: list[Any], attributes: Attributes) -> Tensor:
-    """inputs: Data, starts, ends, axes, and steps of 1."""
+    """inputs: Data, starts, ends, axes, and perhaps steps, which are 1."""
     part = inputs[0]
-    starts, ends, axes = (values.tolist() for values in inputs[1:4])
+    starts, ends, axes = inputs[1:4]
     for start, end, axis in zip(starts, ends, axes, strict=True):
         size = part.shape[axis]
         low = start + size if start < 0 else start
@@ -62,17 +62,17 @@ def _flatten(inputs: list[Any], attributes: Attributes) -> Tensor:
 
 
 def _reduce_sum(inputs: list[Any], attributes: Attributes) -> Tensor:
-    axes = attributes["axes"] if len(inputs) < 2 else inputs[1].tolist()
+    axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
     return inputs[0].sum(axes, keepdim=bool(attributes.get("keepdims", 1)))
 
 
 def _squeeze(inputs: list[Any], attributes: Attributes) -> Tensor:
-    axes = attributes["axes"] if len(inputs) < 2 else inputs[1].tolist()
+    axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
     return inputs[0].squeeze(tuple(axes))
 
 
 def _unsqueeze(inputs: list[Any], attributes: Attributes) -> Tensor:
-    axes = attributes["axes"] if len(inputs) < 2 else inputs[1].tolist()
+    axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
     result = inputs[0]
     for axis in sorted(axes):
         result = result.unsqueeze(axis)
@@ -93,7 +93,7 @@ OPERATORS: dict[str, Operator] = {
     "MatMul": lambda inputs, attributes: inputs[0] @ inputs[1],
     "Mul": lambda inputs, attributes: inputs[0] * inputs[1],
     "ReduceSum": _reduce_sum,
-    "Reshape": lambda inputs, attributes: inputs[0].reshape(inputs[1].tolist()),
+    "Reshape": lambda inputs, attributes: inputs[0].reshape(inputs[1]),
     "Slice": _slice,
     "Squeeze": _squeeze,
     "Sub": lambda inputs, attributes: inputs[0] - inputs[1],
@@ -137,29 +137,37 @@ class OnnxModule(nn.Module):
             else:
                 self.steps.append((operator, names, attributes, node.output[0]))
         used = {name for _, names, _, _ in self.steps for name in names}
-        self.constants: dict[str, str] = {}  # name in the file → name of the buffer
+        self.sizes: dict[
+            str, list[int]
+        ] = {}  # name in the file → shape, axes, or places of a slice
+        self.buffer_names: dict[str, str] = {}  # name in the file → name of the buffer
         for name in sorted(used & known.keys()):
-            self.constants[name] = f"constant_{len(self.constants)}"
-            self.register_buffer(self.constants[name], known[name])
+            if isinstance(known[name], list):
+                self.sizes[name] = known[name]
+            else:
+                self.buffer_names[name] = f"constant_{len(self.buffer_names)}"
+                self.register_buffer(self.buffer_names[name], known[name])
 
     def forward(self, x: Tensor) -> Tensor:
         """x (B, dim) → Δa (B, n) rad."""
-        values = {name: getattr(self, buffer) for name, buffer in self.constants.items()}
+        values: dict[str, Any] = dict(self.sizes)
+        for name, buffer in self.buffer_names.items():
+            values[name] = getattr(self, buffer)
         values[self.input] = x
         for operator, names, attributes, output in self.steps:
             values[output] = operator([values[name] for name in names], attributes)
         return values[self.output]
 
 
-def _weights(graph: Any) -> dict[str, Tensor]:
-    """Return the stored tensors by name."""
+def _weights(graph: Any) -> dict[str, Any]:
+    """Return the stored constants by name."""
     from onnx import numpy_helper
 
-    weights = {i.name: _tensor(numpy_helper.to_array(i)) for i in graph.initializer}
+    weights = {i.name: _constant(numpy_helper.to_array(i)) for i in graph.initializer}
     for sparse in graph.sparse_initializer:
         dense = np.zeros(int(np.prod(sparse.dims)), np.float32)
         dense[numpy_helper.to_array(sparse.indices)] = numpy_helper.to_array(sparse.values)
-        weights[sparse.values.name] = _tensor(dense.reshape(tuple(sparse.dims)))
+        weights[sparse.values.name] = _constant(dense.reshape(tuple(sparse.dims)))
     return weights
 
 
@@ -169,9 +177,12 @@ def _attribute(attribute: Any) -> Any:
 
     value = onnx.helper.get_attribute_value(attribute)
     if isinstance(value, onnx.TensorProto):
-        return _tensor(numpy_helper.to_array(value))
+        return _constant(numpy_helper.to_array(value))
     return value
 
 
-def _tensor(array: np.ndarray) -> Tensor:
+def _constant(array: np.ndarray) -> Any:
+    """Return weights as a tensor, and int64 (shapes, axes) as a list of numbers."""
+    if array.dtype == np.int64:
+        return array.reshape(-1).tolist()
     return torch.from_numpy(np.array(array))

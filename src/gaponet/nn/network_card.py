@@ -11,7 +11,8 @@ from annotated_types import Ge, Len
 from gaponet.base.errors import ModelError
 from gaponet.base.structure import validated
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.packaged_networks import CARD, PACKAGE_FOLDER, packaged_networks
+from gaponet.nn.packaged_networks import CARD, packaged_folders
+from gaponet.robot.folder import PackagedRobot
 
 PUBLISHED = "published"  # field of card.json with a Published
 HEADINGS = (
@@ -117,8 +118,6 @@ class NetworkCard:
         Raises:
             ModelError: A file or field is missing or damaged.
         """
-        from gaponet.robot.folder import PackagedRobot
-
         file = folder / CARD
         mend = "ship the network again with benchmarks/ship_networks.py"
         card, config = GapModel.read_card(file)
@@ -176,7 +175,7 @@ def folder_size(folder: Path) -> int:
 
 def network_cards() -> tuple[NetworkCard, ...]:
     """Return the cards of the networks in the package, by name."""
-    return tuple(NetworkCard.read(PACKAGE_FOLDER / name) for name in packaged_networks())
+    return tuple(NetworkCard.read(folder) for folder in packaged_folders())
 
 
 def markdown_table(cards: tuple[NetworkCard, ...]) -> str:

@@ -19,9 +19,14 @@ MAX_TOTAL_BYTES = 2_000_000  # of all networks together, so that the wheel stays
 CARD = "card.json"
 
 
+def packaged_folders() -> tuple[Path, ...]:
+    """Return the folders of the networks in the package, by name."""
+    return tuple(sorted(file.parent for file in PACKAGE_FOLDER.glob(f"*/{CARD}")))
+
+
 def packaged_networks() -> tuple[str, ...]:
     """Return the names of the networks in the package."""
-    return tuple(sorted(file.parent.name for file in PACKAGE_FOLDER.glob(f"*/{CARD}")))
+    return tuple(folder.name for folder in packaged_folders())
 
 
 def network_folder(name_or_path: str | Path) -> Path:
