@@ -52,8 +52,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "network.md"
 TABLE = re.compile(r"(?<=<!-- networks -->\n)\n.*?(?=\n<!-- end of networks -->)", re.DOTALL)
 FLOAT32_BYTES = 400_000  # a network up to this size keeps all digits of its weights
 MAX_RECORDINGS = 8  # in which the stored network is compared with the trained one
-# A path of a machine has a home or a temporary folder, or a drive letter.
-PRIVATE = re.compile(r"/(home|root|Users|tmp|work|mnt|var|private)/|[A-Z]:\\\\")
+HOMES = ("/home/", "/Users/", ":\\\\Users")  # in a path of some machine
 DROPPED = ("parity_rad", "seconds")  # of a card: facts of the machine, not of the network
 
 
@@ -140,7 +139,7 @@ def write_network(run: Path, folder: Path, dataset: str, source: Source) -> None
         largest_difference_rad=difference,
     )
     write_json_line(folder / CARD, card | {PUBLISHED: asdict(published)})
-    require_public(folder)
+    require_public(folder, run)
     require_same_outputs(folder, content, inputs)
     NetworkCard.read(folder)
 
@@ -242,16 +241,17 @@ def test_error(folder: Path, dataset: str) -> TestError:
     )
 
 
-def require_public(folder: Path) -> None:
-    """Refuse files that name a path of a machine."""
+def require_public(folder: Path, run: Path) -> None:
+    """Refuse files that name a path of a machine: a home, or where this run and its programs lie."""
+    here = (Path.home(), Path.cwd(), run.resolve().parent, Path(tempfile.gettempdir()))
+    private = [*HOMES, *(str(place) for place in here if place != Path("/"))]
     for file in sorted(folder.iterdir()):
         text = words_of_network(file) if file.name == WEIGHTS else file.read_text(encoding="utf-8")
-        found = PRIVATE.search(text)
-        if found:
-            around = text[max(found.start() - 20, 0) : found.end() + 40]
-            raise UsageError(
-                f"{file.name} names a path of this machine: …{around}…; remove it from the run's files"
-            )
+        for path in private:
+            if path in text:
+                raise UsageError(
+                    f"{file.name} names '{path}', a path of a machine; remove it from the run's files"
+                )
 
 
 def words_of_network(file: Path) -> str:

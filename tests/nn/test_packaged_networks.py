@@ -234,7 +234,7 @@ def test_a_card_that_names_a_path_is_not_shipped(tmp_path):
     robot = gp.load_robot("so101")
     data = make_dataset(tmp_path / "data", robot)
     run = make_run(tmp_path / "run", robot, data, SMALL, source="/home/anna/logs")
-    with pytest.raises(UsageError, match=r"card\.json names a path of this machine"):
+    with pytest.raises(UsageError, match=r"card\.json names .*home"):
         ship(run, data, tmp_path / "package")
 
 
