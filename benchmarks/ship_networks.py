@@ -30,10 +30,10 @@ from gaponet.data.split import SPLITS
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.nn.network_card import (
     PUBLISHED,
+    ErrorOnTest,
     NetworkCard,
     Published,
     SourceOfData,
-    TestError,
     folder_size,
     markdown_table,
     network_cards,
@@ -89,9 +89,7 @@ def ship(
         folder = Path(place) / name
         folder.mkdir()
         write_network(run, folder, dataset, source)
-        others = sum(
-            folder_size(PACKAGE_FOLDER / card.name) for card in network_cards() if card.name != name
-        )
+        others = sum(card.size_bytes for card in network_cards() if card.name != name)
         total = others + folder_size(folder)
         if total > MAX_TOTAL_BYTES:
             raise UsageError(
@@ -120,6 +118,8 @@ def write_network(run: Path, folder: Path, dataset: str, source: Source) -> None
         GAPONetError: A check failed; the message says which.
     """
     model = GapModel.load(run)
+    if model.card.get("interrupted", False):
+        raise UsageError(f"{run}: its training was interrupted; finish it with --resume")
     packaged_robot(model).write(folder)
     shutil.copyfile(run / "delay_offset.json", folder / "delay_offset.json")
     write_json_line(folder / "split.json", without_names(split_of_run(run)))
@@ -134,7 +134,7 @@ def write_network(run: Path, folder: Path, dataset: str, source: Source) -> None
         licence=source.licence,
         date=datetime.now(UTC).strftime("%Y-%m-%d"),
         data=SourceOfData(source.title, source.address, source.data_licence),
-        test=test_error(folder, dataset),
+        test=measure_error(folder, dataset),
         limits_of_use=source.limits,
         largest_difference_rad=difference,
     )
@@ -172,11 +172,9 @@ def visited_inputs(model: GapModel, run: Path, dataset: str) -> np.ndarray:
     """Return inputs x of the network in rollouts with it, (k, dim) float32, of test and training recordings."""
     data, _ = open_dataset(dataset, None, run)
     split = split_of_run(run)
-    wanted = {
-        digest
-        for part in ("test", "train")
-        for digest in list(split[part].values())[: MAX_RECORDINGS // 2]
-    }
+    wanted = set()
+    for part in ("test", "train"):
+        wanted |= set(list(split[part].values())[: MAX_RECORDINGS // 2])
     entries = [entry for entry in data.entries if entry.hash in wanted]
     if not entries:
         raise UsageError(
@@ -220,7 +218,7 @@ def stored_form(trained: bytes, inputs: np.ndarray) -> tuple[bytes, float]:
     return short, difference
 
 
-def test_error(folder: Path, dataset: str) -> TestError:
+def measure_error(folder: Path, dataset: str) -> ErrorOnTest:
     """Measure a network on its test motions.
 
     Raises:
@@ -233,7 +231,7 @@ def test_error(folder: Path, dataset: str) -> TestError:
             f"{dataset}: some test motions were used in training; split the dataset by motion"
         )
     method = next(iter(result["artifacts"]))
-    return TestError(
+    return ErrorOnTest(
         recordings=result["sequences"],
         motions=tuple(result["motions"]),
         nominal_mrad=round(1e3 * result["methods"]["nominal"]["mpjae"], 3),

@@ -364,7 +364,7 @@ def networks(name: tyro.conf.Positional[str] = "", json: Json = False) -> None:
         raise UsageError(f"no network has '{name}' in its name; the package has {names}")
     out.table("Networks", list(HEADINGS), [card.row() for card in cards])
     for card in cards:
-        out.say(f"{card.name} ({card.published.licence}): {card.published.limits_of_use}")
+        out.say(f": {card.details()}", card.name)
     out.next(f"gaponet eval {cards[0].name} DATASET")
     out.result({"networks": [asdict(card) for card in cards]})
 

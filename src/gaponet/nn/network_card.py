@@ -39,7 +39,7 @@ class SourceOfData:
 
 
 @dataclass(frozen=True)
-class TestError:
+class ErrorOnTest:
     """Mean |q − q_real| in open-loop rollouts of whole motions that training never saw.
 
     Attributes:
@@ -72,7 +72,7 @@ class Published:
     licence: Text
     date: Text
     data: SourceOfData
-    test: TestError
+    test: ErrorOnTest
     limits_of_use: Text
     largest_difference_rad: Annotated[float, Ge(0)] = 0.0
 
@@ -159,13 +159,25 @@ class NetworkCard:
         return [
             self.name,
             f"{robot}, {self.kind}",
-            f"{data.title} ({data.licence}), {data.address}",
+            f"{data.title} ({data.licence})",
             f"{test.recordings} recordings of {len(test.motions)} motions",
             f"{test.nominal_mrad:.2f} → {test.model_mrad:.2f}",
             ", ".join(f"{mass:g}" for mass in self.payloads_kg),
             ", ".join(f"{rate:g}" for rate in self.rates_hz),
             f"{self.steps:,} control steps, seed {self.seed}, {self.published.date}",
         ]
+
+    def details(self) -> str:
+        """Return a line below the table: licence, version, data, units, limits of use, and what storage changed."""
+        published = self.published
+        text = (
+            f"licence {published.licence}, gaponet {self.gaponet}; data: {published.data.address}, "
+            f"units {', '.join(self.units)}. {published.limits_of_use}"
+        )
+        if published.largest_difference_rad:
+            difference = published.largest_difference_rad
+            text += f" Stored as int16: differs by at most {difference:.1e} rad from training."
+        return text
 
 
 def folder_size(folder: Path) -> int:
@@ -179,7 +191,7 @@ def network_cards() -> tuple[NetworkCard, ...]:
 
 
 def markdown_table(cards: tuple[NetworkCard, ...]) -> str:
-    """Return the cards as the text of docs/network.md: a table, and the limits of use of each network."""
+    """Return the cards as the text of docs/network.md: a table, and a line with the details of each network."""
     if not cards:
         return "This version of the package has no networks.\n"
     lines = [f"| {' | '.join(HEADINGS)} |", "|---" * len(HEADINGS) + "|"]
@@ -189,5 +201,5 @@ def markdown_table(cards: tuple[NetworkCard, ...]) -> str:
         lines.append(f"| {' | '.join(cells)} |")
     lines.append("")
     for card in cards:
-        lines.append(f"- `{card.name}` ({card.published.licence}): {card.published.limits_of_use}")
+        lines.append(f"- `{card.name}`: {card.details()}")
     return "\n".join(lines) + "\n"

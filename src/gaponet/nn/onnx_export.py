@@ -25,8 +25,11 @@ from gaponet.nn.onnx_network import CARD_FACTS, TRUSTED, OnnxNetwork
 
 MAX_DIFFERENCE_RAD = 1e-5  # between ONNX and torch
 # Of matrices that `with_small_matrices` changes.
-MIN_ELEMENTS = 2048  # smaller ones do not count
+MIN_SPARSE_ELEMENTS = 2048  # smaller ones are not worth an index
 MAX_DENSITY = 0.1  # share of elements that are not zero, for storage as a sparse matrix
+MIN_INT16_ELEMENTS = (
+    32_768  # the small first layers matter most for the output and little for the size
+)
 
 
 def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) -> float:
@@ -116,7 +119,7 @@ def with_small_matrices(content: bytes, *, int16: bool) -> bytes:
 
     Args:
         content: ONNX file with float32 matrices.
-        int16: Store the other large matrices as int16 with one float32 scale a row, half of the size. Outputs then
+        int16: Store other matrices of MIN_INT16_ELEMENTS and more as int16 with one float32 scale a row. Outputs then
             change: a weight by up to 1/65,534 of the largest one in its row. float16 would change it by up to 1/4,096
             of itself, which changes outputs some eight times as much.
     """
@@ -127,11 +130,12 @@ def with_small_matrices(content: bytes, *, int16: bool) -> bytes:
     decoding = []
     for tensor in list(graph.initializer):
         matrix = onnx.numpy_helper.to_array(tensor)
-        if matrix.ndim != 2 or matrix.size < MIN_ELEMENTS:
+        if matrix.ndim != 2:
             continue
-        if np.count_nonzero(matrix) <= MAX_DENSITY * matrix.size:
+        few = np.count_nonzero(matrix) <= MAX_DENSITY * matrix.size
+        if few and matrix.size >= MIN_SPARSE_ELEMENTS:
             graph.sparse_initializer.append(_sparse(tensor.name, matrix))
-        elif int16:
+        elif int16 and matrix.size >= MIN_INT16_ELEMENTS:
             stored, nodes = _as_int16(tensor.name, matrix)
             graph.initializer.extend(stored)
             decoding += nodes
