@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from gaponet.hw.targets.client import RemoteRobot as RemoteRobot
     from gaponet.nn.artifact import GapModel as GapModel
     from gaponet.nn.config import ModelConfig as ModelConfig
+    from gaponet.nn.network_card import NetworkCard as NetworkCard
     from gaponet.nn.training.config import TrainConfig as TrainConfig
     from gaponet.robot.spec import RobotSpec as RobotSpec
     from gaponet.robot.spec import load_robot as load_robot
@@ -46,8 +47,8 @@ else:
     _MODULES = {  # public name → module
         **dict.fromkeys(
             ("adapt_model", "adapt_robot", "check", "collect", "doctor", "evaluate", "excite", "export_network",
-             "export_robot", "gap", "identify", "identify_torque", "import_logs", "pair", "randomization", "replay",
-             "train"),
+             "export_robot", "gap", "identify", "identify_torque", "import_logs", "networks", "pair", "randomization",
+             "replay", "train"),
             "gaponet.api",
         ),
         **dict.fromkeys(
@@ -72,6 +73,7 @@ else:
         "ModelConfig": "gaponet.nn.config",
         "TrainConfig": "gaponet.nn.training.config",
         "GapModel": "gaponet.nn.artifact",
+        "NetworkCard": "gaponet.nn.network_card",
         "AlignedSim": "gaponet.deploy.aligned_sim",
         "MujocoAligner": "gaponet.deploy.mujoco_loop",
         "Compensator": "gaponet.deploy.compensator",

@@ -46,6 +46,8 @@ assert_type(gp.adapt_robot(robot, "logs", out="today"), gp.AdaptResult)
 assert_type(gp.adapt_model("run", data, unit="a"), gp.AdaptResult)
 
 assert_type(gp.export_robot("robot", to="mjcf"), gp.ExportResult)
+assert_type(gp.networks(), tuple[gp.NetworkCard, ...])
+assert_type(gp.GapModel.load("so101-sage"), gp.GapModel)
 assert_type(gp.export_network("run", to="onnx").parity, float | None)
 gp.randomization("robot", out="ranges")
 

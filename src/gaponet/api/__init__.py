@@ -21,3 +21,4 @@ from gaponet.api.measure import check as check
 from gaponet.api.measure import evaluate as evaluate
 from gaponet.api.measure import gap as gap
 from gaponet.api.measure import replay as replay
+from gaponet.api.networks import networks as networks

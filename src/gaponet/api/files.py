@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Literal
 
 from gaponet.api.opening import Place
 from gaponet.api.results import ExportResult
+from gaponet.base.errors import UsageError
 from gaponet.base.progress import Progress, no_progress
+from gaponet.nn.packaged_networks import is_packaged, network_folder, require_run_folder
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot
 from gaponet.robot.spec import load_robot
 
@@ -50,7 +52,12 @@ def export_robot(
     from gaponet.export import export_folder as files
     from gaponet.export.plain_servos import read_recordings
 
-    holder = Path(robot)
+    holder = network_folder(robot)
+    require_run_folder(
+        holder,
+        f"--to {to}",
+        "its simulator is a robot of the package, with the gain_scale that gaponet robot networks shows: export that",
+    )
     spec, source = load_robot(simulator_folder(holder)), None if into is None else Path(into)
     recordings, folder = (
         read_recordings(simulator_folder(holder), data, spec),
@@ -71,7 +78,7 @@ def export_network(
     """Write the trained network of a run for another program.
 
     Args:
-        run: Run folder of `train`.
+        run: Run folder of `train`, or a network of the package by name; for that give `out`.
         to: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac Lab),
             actuator-net (one network per joint: past of target − position and speed in, torque out; the form of mjlab,
             Newton and Isaac Lab).
@@ -80,12 +87,20 @@ def export_network(
         payload_mass: kg in each hand.
 
     Raises:
-        ModelError, UsageError: The run holds no such model, or its payload is beyond those trained on.
+        ModelError, UsageError: The run holds no such model, its payload is beyond those trained on, or a network of the
+            package has no `out`, or not what actuator-net needs.
     """
     from gaponet.export.export_folder import export_model, export_networks
     from gaponet.nn.artifact import GapModel
 
-    holder = Path(run)
+    holder = network_folder(run)
+    if is_packaged(holder) and out is None:
+        raise UsageError(
+            f"'{holder.name}' is a network of the package, where nothing is written; give a folder with --out"
+        )
+    if to == "actuator-net":
+        instead = "actuator networks are fitted to the recordings of a run: train one"
+        require_run_folder(holder, f"--to {to}", instead)
     if to == "onnx":
         return _export_onnx(holder, None if out is None else Path(out))
     model, folder = GapModel.load(holder), Path(out) if out else holder / to
@@ -157,6 +172,8 @@ def _export_onnx(run: Path, out: Path | None) -> ExportResult:
     from gaponet.nn.onnx_export import sample_inputs, trained_network
     from gaponet.robot.folder import load_stored_robot, save_robot
 
+    if out is not None and is_packaged(run):
+        return _copy_packaged(run, out)
     path = out or run / "model"
     card, config = GapModel.read_card(run / "model" / CARD)
     net = trained_network(run, config, len(card["joint_names"]))
@@ -166,3 +183,24 @@ def _export_onnx(run: Path, out: Path | None) -> ExportResult:
             load_stored_robot(run, card["robot"]), path / STORED_ROBOT
         )  # commands can then be transferred
     return ExportResult(path=path, to="onnx", robot=card["robot"], parity=parity)
+
+
+def _copy_packaged(network: Path, out: Path) -> ExportResult:
+    """Copy a network of the package into a folder of the user's, with its simulator as a robot folder."""
+    import shutil
+
+    from gaponet.base.files import lock_folder
+    from gaponet.nn.artifact import GapModel
+    from gaponet.nn.network_card import NetworkCard
+    from gaponet.robot.folder import PACKAGED_ROBOT_FILE, save_robot
+
+    model = GapModel.load(network)
+    robot = model.simulator()
+    card = NetworkCard.read(network)
+    with lock_folder(out, "run"):
+        for file in sorted(network.iterdir()):
+            if file.name != PACKAGED_ROBOT_FILE:
+                shutil.copyfile(file, out / file.name)
+        save_robot(robot, out / STORED_ROBOT)
+    parity = card.published.largest_difference_rad
+    return ExportResult(path=out, to="onnx", robot=robot.name, parity=parity)

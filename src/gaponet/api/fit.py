@@ -26,6 +26,7 @@ from gaponet.base.errors import NoGainError, UsageError
 from gaponet.base.files import write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
+from gaponet.nn.packaged_networks import require_run_folder
 from gaponet.robot.folder import (
     ADAPTATION_FILE,
     OLD_UNCERTAINTY_FILE,
@@ -377,6 +378,11 @@ def adapt_model(
     from gaponet.report.candidate import corrected_robot
 
     folder = as_run(run)
+    require_run_folder(
+        folder,
+        "an adaptation",
+        f"copy it with gaponet export {folder.name} --to onnx --out FOLDER and adapt the copy",
+    )
     data, spec = as_dataset(dataset, robot, folder)
     data.require_robot(spec)
     model, simulator = GapModel.load(folder), corrected_robot(folder, spec)

@@ -15,6 +15,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import FOLDER_MARKER, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
+from gaponet.nn.packaged_networks import is_packaged, network_folder
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -38,9 +39,9 @@ def gap(
             was pushed to a bucket.
         robot: Another robot than the one that the dataset keeps. An identified one is measured as `run` is.
         motions: Only these.
-        run: Robot folder that `identify` wrote, or a run of `train`. The result then says how much each identified
-            cause and the model reduce the error, and the floor, on motions that were not used in training; the folder
-            keeps it as gap.json, gap.svg and gap.png.
+        run: Robot folder that `identify` wrote, a run of `train`, or a network of the package by name. The result then
+            says how much each identified cause and the model reduce the error, and the floor, on motions that were not
+            used in training; a folder of yours keeps it as gap.json, gap.svg and gap.png.
         executor: Where recordings are simulated: local, ray or ray:ADDRESS (docs/install.md).
     """
     from gaponet.sim.metrics import Run, summary
@@ -82,11 +83,20 @@ def _gap_by_cause(
         Candidate(spec.folder, spec, None) if folder is None else Candidate.load(folder, spec)
     )
     table = gap_by_step(candidate, data, motions, progress)
-    if (
-        folder is not None or (candidate.folder / FOLDER_MARKER).is_file()
-    ):  # a folder of the user's own is not written to
+    if _may_be_written(candidate.folder, given=folder is not None):
         write_gap(table, candidate.folder)
     return GapResult(methods=table["methods"], table=table)
+
+
+def _may_be_written(folder: Path, *, given: bool) -> bool:
+    """Return True if a result may be stored in the folder of a candidate.
+
+    Args:
+        given: The user named the folder as the candidate. Other folders are written to only if gaponet made them.
+    """
+    if is_packaged(folder):
+        return False
+    return given or (folder / FOLDER_MARKER).is_file()
 
 
 def evaluate(
@@ -102,7 +112,8 @@ def evaluate(
     """Measure simulators on recordings that were not used in training: nominal, identified, and with the model.
 
     Args:
-        run: Robot folder that `identify` wrote; or run folder, or a trained model. The result is kept in it.
+        run: Robot folder that `identify` wrote; run folder; network of the package by name; or a trained model. The
+            result is kept in a folder of yours.
         dataset: The dataset trained on (its test motions are used) or another.
         also: Further runs to compare, e.g. the MLP's.
         motions: Only these.
@@ -127,9 +138,10 @@ def evaluate(
     if model_hash(own) != model_hash(spec):
         target, spec = spec, own.nominal or own
     evaluation = measuring.evaluate(
-        [folder, *map(Path, also)], data, spec, motions, progress, target, units
+        [folder, *map(network_folder, also)], data, spec, motions, progress, target, units
     )
-    evaluation.save(folder)
+    if not is_packaged(folder):
+        evaluation.save(folder)
     return EvalResult(
         methods=evaluation.result["methods"], unseen=evaluation.result["unseen"], evaluation=evaluation
     )  # fmt: skip

@@ -98,7 +98,7 @@ class RunOptions(ControlOptions):
     payload_mass: float | None = None
     """Payload, kg in each hand. Compensation estimates it if it is not given."""
     model: Path | None = None
-    """Run or artifact folder whose network corrects the commands in addition."""
+    """Run or artifact folder, or name of a network of the package, whose network corrects the commands in addition."""
     compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
     """Settings of the compensation."""
     unit_id: str = ""

@@ -32,6 +32,7 @@ from gaponet.hw.control.recording import Recording
 from gaponet.hw.drivers.dry import DryRun, summarize_commands
 from gaponet.hw.drivers.open import driver_names, open_driver, supported_options
 from gaponet.hw.targets.live import LiveTargets, Transport
+from gaponet.nn.packaged_networks import network_folder
 from gaponet.robot.folder import has_stored_robot, load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_stored_robot
@@ -223,7 +224,7 @@ def resolve_robot(request: RunRequest) -> RobotSpec:
     """
     options = request.options
     if options.model is not None:
-        model = Path(options.model)
+        model = network_folder(options.model)
         run = model.parent if model.name == "model" else model
         if request.robot is not None:
             return require_stored_robot(

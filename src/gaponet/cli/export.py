@@ -15,6 +15,7 @@ from gaponet.base.files import write_text
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
+from gaponet.nn.packaged_networks import is_packaged, network_folder
 from gaponet.report.tables import mrad
 from gaponet.robot.spec import load_robot
 
@@ -24,7 +25,11 @@ if TYPE_CHECKING:
 POLICY_FILE, POLICY_STEP = "policy_postprocessor.json", "gaponet_correct"  # of a LeRobot policy
 CHECKED_IN = {"mjcf": "MuJoCo", "actuator-net": "mjlab"}
 Holder = Annotated[
-    Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.", metavar="ROBOT|RUN")
+    Folder,
+    tyro.conf.arg(
+        help="Robot folder, run folder of gaponet train, or a network of the package.",
+        metavar="ROBOT|RUN|NAME",
+    ),
 ]
 
 
@@ -155,7 +160,10 @@ def _attach(
     except (ValueError, KeyError, TypeError, AttributeError):
         raise UsageError(f"{file}: is no processor of LeRobot") from None
     config: dict[str, object] = {}
-    if holder is not None:
+    if holder is not None and is_packaged(network_folder(holder)):
+        config = {"model": holder.name, "payload_mass": payload_mass, "dynamics": dynamics}
+        steps.append({"registry_name": POLICY_STEP, "config": config})
+    elif holder is not None:
         is_robot = (holder / "robot.toml").is_file()
         if is_robot:
             load_robot(holder)

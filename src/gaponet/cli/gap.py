@@ -12,6 +12,7 @@ from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.cli.show import show_methods, show_verdict
+from gaponet.nn.packaged_networks import network_folder
 from gaponet.report.methods import title
 from gaponet.report.tables import mrad
 from gaponet.share.reading import open_dataset
@@ -27,6 +28,7 @@ def gap(
     Without --robot the nominal simulator is measured. With an identified robot the causes of the error are shown.
     """
     out = Out(json)
+    run = None if run is None else network_folder(run)
     data, spec = open_dataset(dataset, robot, run)
     with progress_bar("gap") as update:
         result = api.gap(

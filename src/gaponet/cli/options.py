@@ -28,8 +28,9 @@ Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.", metav
 Known = Annotated[
     Folder,
     tyro.conf.arg(
-        help="Robot folder of gaponet identify, or run folder of gaponet train.",
-        metavar="ROBOT|RUN",
+        help="Robot folder of gaponet identify, run folder of gaponet train, or name of a network of the package "
+        "(gaponet robot networks).",
+        metavar="ROBOT|RUN|NAME",
     ),
 ]
 Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these motions.")]

@@ -1,4 +1,4 @@
-"""gaponet robot new, check, list, link, show, servos."""
+"""gaponet robot new, check, list, link, show, servos, networks."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from gaponet import api
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.cli.options import Flag, Folder, Json, Model, actions
 from gaponet.cli.out import Out
+from gaponet.nn.packaged_networks import packaged_networks
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument, servo_table
 from gaponet.robot.toml_file import MEASURED_FIELDS
 from gaponet.share.reading import open_dataset
@@ -357,6 +359,28 @@ def servos(
     out.result({"version": table.version, "servos": [asdict(servo) for servo in types]})
 
 
-@actions(new=new, check=check, list=list_robots, link=link, show=show, servos=servos)
+def networks(name: tyro.conf.Positional[str] = "", json: Json = False) -> None:
+    """Trained networks in the package: data, errors on test motions, limits of use.
+
+    Args:
+        name: Only networks with this in their names.
+    """
+    from gaponet.nn.network_card import HEADINGS
+
+    out = Out(json)
+    cards = [card for card in api.networks() if name.lower() in card.name.lower()]
+    if not cards:
+        names = ", ".join(packaged_networks()) or "no networks"
+        raise UsageError(f"no network has '{name}' in its name; the package has {names}")
+    out.table("Networks", list(HEADINGS), [card.row() for card in cards])
+    for card in cards:
+        out.say(f": {card.details()}", card.name)
+    out.next(f"gaponet eval {cards[0].name} DATASET")
+    out.result({"networks": [asdict(card) for card in cards]})
+
+
+@actions(
+    new=new, check=check, list=list_robots, link=link, show=show, servos=servos, networks=networks
+)
 def robot(action: None) -> None:
-    """Make, check or show a robot folder; list servo types."""
+    """Make, check or show a robot folder; list servos and networks."""

@@ -10,6 +10,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Robot
 from gaponet.cli.out import Out
+from gaponet.nn.packaged_networks import network_folder
 from gaponet.report.methods import title
 from gaponet.report.tables import mrad
 from gaponet.share.reading import open_dataset
@@ -30,7 +31,8 @@ def view(
     """Watch a recording beside its simulations: browser, film.
 
     Args:
-        model: Robot folders of gaponet identify and run folders of gaponet train; each adds a copy of the robot.
+        model: Robot folders of gaponet identify, run folders of gaponet train, or networks of the package by name; each
+            adds a copy of the robot.
         motion: Motion name. Default: one that the model was not trained on, if there is one.
         unit: Unit, where several recorded the motion.
         payload_mass: Payload of the recording, kg.
@@ -52,6 +54,7 @@ def view(
     from gaponet.report.view.side_by_side import Clip, select_entry, side_by_side
 
     out = Out(json)
+    model = tuple(network_folder(folder) for folder in model)
     data, spec = open_dataset(dataset, robot, model[0] if model else None)
     entry = select_entry(
         data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass

@@ -17,9 +17,11 @@ from torch import Tensor, nn
 
 from gaponet.base.errors import ModelError
 from gaponet.base.files import atomic_write
+from gaponet.export.onnx_to_torch import OnnxModule
 from gaponet.export.shipped.gaponet_action import PROGRAM, Past
-from gaponet.nn.artifact import GapModel
+from gaponet.nn.artifact import WEIGHTS, GapModel
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, trained_network
+from gaponet.nn.packaged_networks import is_packaged
 
 CHECK_PERIODS = 12  # control periods
 CHECK_WORLDS = 3
@@ -94,7 +96,7 @@ class DeltaStep(nn.Module):
 
 
 def delta_step(model: GapModel, run: Path) -> DeltaStep:
-    """Load the step of a run's network from its checkpoint.
+    """Load the step of a run's network from its checkpoint, and of a network of the package from its ONNX file.
 
     Raises:
         ModelError: There is no checkpoint, or the model holds corrections, has sensors or reads the recorded state.
@@ -113,7 +115,12 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
             f"{model.path}: the recorded state is an input that torch exports lack; train without real_state, and "
             "with predictor_inputs observation"
         )
-    return DeltaStep(trained_network(run, model.config, len(model.card["joint_names"])), model)
+    net: nn.Module
+    if is_packaged(model.path):
+        net = OnnxModule(model.path / WEIGHTS)
+    else:
+        net = trained_network(run, model.config, len(model.card["joint_names"]))
+    return DeltaStep(net, model)
 
 
 def program(step: DeltaStep) -> torch.export.ExportedProgram:

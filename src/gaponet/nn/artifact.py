@@ -1,4 +1,7 @@
-"""GapModel: a trained model as a folder with model.onnx (normalisers inside) and card.json. It does not need torch."""
+"""GapModel: a trained model as a folder with model.onnx (normalisers inside) and card.json. It does not need torch.
+
+The package has some of them by name (nn/packaged_networks.py).
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,18 @@ from gaponet.base.structure import Json, Name, Number, Sha256, read_format, read
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.onnx_network import Network, OnnxNetwork
-from gaponet.robot.folder import has_stored_robot, load_stored_robot, stored_robot_holder
+from gaponet.nn.packaged_networks import CARD as CARD
+from gaponet.nn.packaged_networks import network_folder
+from gaponet.robot.folder import (
+    PackagedRobot,
+    has_stored_robot,
+    load_stored_robot,
+    stored_robot_holder,
+)
 from gaponet.robot.spec import RobotSpec
 
-WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
+WEIGHTS = "model.onnx"
+FORMAT = 1
 # Fields of the card that export also writes into the ONNX file: what the network's inputs and outputs mean, and for
 # which robots they hold.
 FACTS_IN_NETWORK = (
@@ -165,17 +176,18 @@ class GapModel:
 
     @classmethod
     def load(cls, path: str | Path, threads: int = 1) -> GapModel:
-        """Load a model, or the model of a run folder.
+        """Load a model: of the package by name, or of a run or export folder.
 
         Args:
-            path: Folder.
+            path: Name of a network of the package, such as those of gaponet.networks(), or a folder.
             threads: Threads of onnxruntime; 0 for all cores, which is faster for hundreds of robots at once.
 
         Raises:
             ModelError: A file is missing, damaged, or from a newer version; or the card contradicts the network in
                 shapes, joints, gains, ranges, rate, payload or largest correction.
+            UsageError: The name is that of a network of the package and of a folder in the working directory.
         """
-        folder = Path(path)
+        folder = network_folder(path)
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
         for name in (CARD, WEIGHTS):
             if not (folder / name).is_file():
@@ -241,14 +253,24 @@ class GapModel:
             trained, given = self.card["simulator"], model_hash(robot)
             raise ModelError(
                 f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {given} "
-                "(MJCF, gains or limits differ, or it is of before friction held); use the robot folder that the run "
-                "keeps, or train again"
+                f"(MJCF, gains or limits differ, or it is of before friction held); {self._how_to_get_simulator()}"
             )
         if dt is not None:
             self.require_rate(dt)
 
+    def _how_to_get_simulator(self) -> str:
+        """Return what to do if a robot is not the simulator of training, for an error."""
+        packaged = PackagedRobot.read(self.path)
+        if packaged is None:
+            return "use the robot folder that the run keeps, or train again"
+        version = self.card.get("versions", {}).get("gaponet", "of its training")
+        return (
+            f"it needs the package's {packaged.name} with gain_scale {packaged.gain_scale:g}, as in gaponet {version}: "
+            "use that robot or that version, or train again"
+        )
+
     def simulator(self) -> RobotSpec:
-        """Load the simulator of training from the run or export folder.
+        """Load the simulator of training: of the run or export folder, or for a network of the package of the package.
 
         Raises:
             ModelError: The folder has no simulator, or another one.

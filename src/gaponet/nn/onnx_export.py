@@ -24,6 +24,12 @@ from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_network import CARD_FACTS, TRUSTED, OnnxNetwork
 
 MAX_DIFFERENCE_RAD = 1e-5  # between ONNX and torch
+# Of matrices that `with_small_matrices` changes.
+MIN_SPARSE_ELEMENTS = 2048  # smaller ones are not worth an index
+MAX_DENSITY = 0.1  # share of elements that are not zero, for storage as a sparse matrix
+MIN_INT16_ELEMENTS = (
+    32_768  # the small first layers matter most for the output and little for the size
+)
 
 
 def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) -> float:
@@ -104,6 +110,72 @@ def _with_facts(content: bytes, card: dict[str, Any]) -> bytes:
     facts = json.dumps(facts_in_network(card), ensure_ascii=False)
     onnx.helper.set_model_props(graph, {CARD_FACTS: facts})
     return graph.SerializeToString()
+
+
+def with_small_matrices(content: bytes, *, int16: bool) -> bytes:
+    """Return an ONNX file whose large matrices need less space.
+
+    A matrix that selects features has few elements; only these are stored, and all outputs stay equal bit for bit.
+
+    Args:
+        content: ONNX file with float32 matrices.
+        int16: Store other matrices of MIN_INT16_ELEMENTS and more as int16 with one float32 scale a row. Outputs then
+            change: a weight by up to 1/65,534 of the largest one in its row. float16 would change it by up to 1/4,096
+            of itself, which changes outputs some eight times as much.
+    """
+    import onnx
+
+    model = onnx.load_model_from_string(content)
+    graph = model.graph
+    decoding = []
+    for tensor in list(graph.initializer):
+        matrix = onnx.numpy_helper.to_array(tensor)
+        if matrix.ndim != 2:
+            continue
+        few = np.count_nonzero(matrix) <= MAX_DENSITY * matrix.size
+        if few and matrix.size >= MIN_SPARSE_ELEMENTS:
+            graph.sparse_initializer.append(_sparse(tensor.name, matrix))
+        elif int16 and matrix.size >= MIN_INT16_ELEMENTS:
+            stored, nodes = _as_int16(tensor.name, matrix)
+            graph.initializer.extend(stored)
+            decoding += nodes
+        else:
+            continue
+        graph.initializer.remove(tensor)
+    nodes = [*decoding, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+    return bytes(model.SerializeToString())
+
+
+def _sparse(name: str, matrix: Array) -> Any:
+    """Return a matrix as a sparse tensor of ONNX."""
+    import onnx
+
+    index = np.flatnonzero(matrix)
+    values = onnx.numpy_helper.from_array(matrix.ravel()[index], name)
+    indices = onnx.numpy_helper.from_array(index.astype(np.int64), f"{name}_index")
+    return onnx.helper.make_sparse_tensor(values, indices, list(matrix.shape))
+
+
+def _as_int16(name: str, matrix: Array) -> tuple[list[Any], list[Any]]:
+    """Return a matrix as int16 steps with a scale for each row, and the nodes that compute it from these."""
+    import onnx
+
+    scale = np.abs(matrix).max(axis=1, keepdims=True) / np.iinfo(np.int16).max
+    scale = np.where(scale > 0, scale, 1.0).astype(np.float32)
+    steps = np.round(matrix / scale).astype(np.int16)
+    stored = [
+        onnx.numpy_helper.from_array(steps, f"{name}_steps"),
+        onnx.numpy_helper.from_array(scale, f"{name}_scale"),
+    ]
+    nodes = [
+        onnx.helper.make_node(
+            "Cast", [f"{name}_steps"], [f"{name}_float"], to=onnx.TensorProto.FLOAT
+        ),
+        onnx.helper.make_node("Mul", [f"{name}_float", f"{name}_scale"], [name]),
+    ]
+    return stored, nodes
 
 
 def trained_network(run: Path, config: ModelConfig, n: int) -> DeltaNet:

@@ -16,6 +16,7 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import SequenceMeta
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
+from gaponet.nn.packaged_networks import network_folder, require_run_folder
 from gaponet.report.candidate import is_robot, read_origin
 from gaponet.report.methods import method, title
 from gaponet.report.page import inline_image, page_figure, render
@@ -94,6 +95,12 @@ def write_report(
         ModelError: The folder is damaged or incomplete.
         DatasetError: The dataset of an evaluation is not there.
     """
+    run = network_folder(run)
+    require_run_folder(
+        run,
+        "a report",
+        f"gaponet eval {run.name} DATASET prints its errors, gaponet gap their causes",
+    )
     model = None if is_robot(run) else GapModel.load(run)
     given = (
         None

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 
 from gaponet.nn.config import ModelKind
+from gaponet.nn.packaged_networks import is_packaged, network_folder
 from gaponet.report.methods import IDENTIFIED, title
 from gaponet.report.tables import mrad, mrad_with_error
 from gaponet.robot.folder import STORED_ROBOT
@@ -97,11 +98,17 @@ def next_step(
     """Return the next command: identify, or export without a useful network, else report.
 
     Args:
-        folder: Folder of the identified robot or of the run.
+        folder: Folder of the identified robot or of the run, or a network of the package by name or folder.
         reported: The report exists; a run's model is exported.
     """
     networks = [own for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
-    if any(network_gain(methods, own).helps for own in networks):
+    helps = any(network_gain(methods, own).helps for own in networks)
+    if folder is not None and is_packaged(network_folder(folder)):
+        if helps:
+            name = folder.name
+            return f"gaponet export {name} --to torch --out {name}-torch"
+        return shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
+    if helps:
         return shlex.join(
             [
                 "gaponet",

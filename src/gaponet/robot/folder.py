@@ -1,20 +1,28 @@
-"""Robot folders inside runs and datasets: complete copies that may be moved."""
+"""Robot folders inside runs and datasets: complete copies that may be moved.
+
+A network of the package has no copy. A file beside it names a robot of the package and the factor on its gains.
+"""
 
 from __future__ import annotations
 
 import json
 import re
 import tomllib
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
 from gaponet.base.errors import RobotError, UsageError
-from gaponet.base.files import lock_folder, write_text
+from gaponet.base.files import lock_folder, write_json, write_text
+from gaponet.base.structure import Name, read_json
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, TERMS
 from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_robots
 
 STORED_ROBOT = "robot"  # subfolder of a run or a dataset
+PACKAGED_ROBOT_FILE = "packaged_robot.json"  # beside a network of the package, instead of that
 MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"
 PROVENANCE_FILE = "identified.json"  # what a robot was identified from (report/candidate.py)
 ADAPTATION_FILE = (
@@ -36,6 +44,48 @@ IDENTIFIED_TABLES = re.compile(
     r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL
 )
 FILE_REFERENCES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
+
+
+@dataclass(frozen=True)
+class PackagedRobot:
+    """Names a simulator without a copy of its folder.
+
+    Attributes:
+        name: Robot of the package.
+        gain_scale: Factor on kp and kd of its operated joints.
+    """
+
+    name: Name
+    gain_scale: Annotated[float, Interval(gt=0, le=1e3)] = 1.0
+
+    def load(self) -> RobotSpec:
+        """Load the robot.
+
+        Raises:
+            RobotError: The package has no robot of that name.
+        """
+        if self.name not in packaged_robots():
+            raise RobotError(
+                f"no robot '{self.name}' in the package, which has {', '.join(packaged_robots())}; "
+                "install the gaponet of the network's card"
+            )
+        return load_robot(PACKAGE_FOLDER / self.name).with_gain_scale(self.gain_scale)
+
+    def write(self, holder: Path) -> None:
+        """Write the file that names the robot into the folder of a network."""
+        write_json(holder / PACKAGED_ROBOT_FILE, asdict(self))
+
+    @classmethod
+    def read(cls, holder: Path) -> PackagedRobot | None:
+        """Read the file in the folder of a network; None if there is none.
+
+        Raises:
+            RobotError: It is damaged.
+        """
+        file = holder / PACKAGED_ROBOT_FILE
+        if not file.is_file():
+            return None
+        return read_json(cls, file, RobotError, "copy the network again")
 
 
 def save_robot(robot: RobotSpec, folder: Path) -> None:
@@ -110,12 +160,15 @@ def require_self_contained(folder: Path) -> None:
 
 
 def load_stored_robot(holder: Path, name: str) -> RobotSpec:
-    """Load the robot that a run or a dataset stores.
+    """Load the robot that a run, a network of the package or a dataset stores.
 
     Older ones store none; for them, return the packaged robot of that name, but never another folder of that name.
     """
-    if has_stored_robot(holder):
+    if has_robot_folder(holder):
         return load_robot(holder / STORED_ROBOT)
+    packaged = PackagedRobot.read(holder)
+    if packaged is not None:
+        return packaged.load()
     if name in packaged_robots():
         return load_robot(PACKAGE_FOLDER / name)
     raise RobotError(
@@ -124,7 +177,12 @@ def load_stored_robot(holder: Path, name: str) -> RobotSpec:
 
 
 def has_stored_robot(holder: Path) -> bool:
-    """Return True if a run or a dataset stores its robot."""
+    """Return True if a run or a dataset stores its robot, or names a robot of the package."""
+    return has_robot_folder(holder) or (holder / PACKAGED_ROBOT_FILE).is_file()
+
+
+def has_robot_folder(holder: Path) -> bool:
+    """Return True if a run or a dataset stores its robot as a folder."""
     return (holder / STORED_ROBOT / "robot.toml").is_file()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gaponet.data.store import Dataset
-from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot
+from gaponet.robot.folder import has_stored_robot, load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import model_hash
 
@@ -17,10 +17,13 @@ def dataset_robot(data: Dataset, run: Path | None = None) -> RobotSpec:
         run: Run or robot folder that is used with the dataset. Its robot is used if the dataset stores none, and the
             gains of the dataset's robot.toml if it was fitted with them.
     """
-    stored = None if run is None else run if (run / "robot.toml").is_file() else run / STORED_ROBOT
-    own = load_robot(stored) if stored is not None and (stored / "robot.toml").is_file() else None
-    if own is not None and stored != run and not has_stored_robot(data.path):
-        return own
+    own: RobotSpec | None = None
+    if run is not None and (run / "robot.toml").is_file():
+        own = load_robot(run)
+    elif run is not None and has_stored_robot(run):
+        own = load_stored_robot(run, data.robot_name)
+        if not has_stored_robot(data.path):
+            return own
     robot, gains = (
         load_stored_robot(data.path, data.robot_name),
         {e.meta.recorded_gains for e in data.entries},

@@ -14,7 +14,12 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import GAPONetError, RobotError, UsageError
 from gaponet.robot.fingerprint import model_fingerprint
-from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot
+from gaponet.robot.folder import (
+    STORED_ROBOT,
+    has_robot_folder,
+    has_stored_robot,
+    load_stored_robot,
+)
 from gaponet.robot.freeze import freeze, units_per_si
 from gaponet.robot.mjcf import compile_spec, read_mjcf
 from gaponet.robot.servo_fields import SERVO_TERMS, TERMS
@@ -176,7 +181,9 @@ def require_stored_robot(
     """
     if not has_stored_robot(holder):
         return robot
-    use = f"--robot {holder / STORED_ROBOT} where that is the right one, or {hint}"
+    use = hint
+    if has_robot_folder(holder):
+        use = f"--robot {holder / STORED_ROBOT} where that is the right one, or {hint}"
     return require_same_robot(load_stored_robot(holder, robot.name), robot, holder, error, use)
 
 

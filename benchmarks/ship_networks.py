@@ -1,0 +1,290 @@
+"""Put the network of a run into the package, as src/gaponet/nn/trained/NAME, and the table into docs/network.md.
+
+    python benchmarks/ship_networks.py RUN NAME DATASET --title TITLE --address ADDRESS --data-licence LICENCE \\
+        --limits SENTENCE
+
+Copied from the run: model.onnx, card.json, split.json without names of recordings, delay_offset.json. The errors of the
+card are measured here, with the network as it is shipped, on the test motions of the run in DATASET. Nothing is shipped
+if a check fails: the simulator must be a robot of the package, motions of the test must be unseen, files must name no
+path of this machine, and all networks together must be at most MAX_TOTAL_BYTES.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tempfile
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import onnx
+import tyro
+
+from gaponet.base.errors import UsageError
+from gaponet.base.files import write_text
+from gaponet.data.split import SPLITS
+from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
+from gaponet.nn.network_card import (
+    PUBLISHED,
+    ErrorOnTest,
+    NetworkCard,
+    Published,
+    SourceOfData,
+    folder_size,
+    markdown_table,
+    network_cards,
+)
+from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, with_small_matrices
+from gaponet.nn.onnx_network import OnnxNetwork
+from gaponet.nn.packaged_networks import MAX_TOTAL_BYTES, PACKAGE_FOLDER
+from gaponet.report.candidate import split_of_run
+from gaponet.report.evaluate import evaluate
+from gaponet.robot.folder import PackagedRobot, load_stored_robot
+from gaponet.share.reading import open_dataset
+from gaponet.sim.model import model_hash
+from gaponet.sim.replay import replay
+
+PAGE = Path(__file__).parents[1] / "docs" / "network.md"
+TABLE = re.compile(r"(?<=<!-- networks -->\n)\n.*?(?=\n<!-- end of networks -->)", re.DOTALL)
+FLOAT32_BYTES = 400_000  # a network up to this size keeps all digits of its weights
+MAX_RECORDINGS = 8  # in which the stored network is compared with the trained one
+HOMES = ("/home/", "/Users/", ":\\\\Users")  # in a path of some machine
+DROPPED = ("parity_rad", "seconds")  # of a card: facts of the machine, not of the network
+
+
+@dataclass(frozen=True)
+class Source:
+    """What the run does not say about its network."""
+
+    title: str
+    """Name of the data set."""
+    address: str
+    """Where the data set is, or the command that makes it."""
+    data_licence: str
+    """SPDX identifier of the data set's licence."""
+    limits: str
+    """What the network is not for, a sentence."""
+    licence: str = "Apache-2.0"
+    """SPDX identifier of the network's licence."""
+
+
+def ship(
+    run: Annotated[Path, tyro.conf.Positional],
+    name: Annotated[str, tyro.conf.Positional],
+    dataset: Annotated[str, tyro.conf.Positional],
+    source: Annotated[Source, tyro.conf.arg(name="")],
+) -> None:
+    """Put the network of a run into the package.
+
+    Args:
+        run: Run folder of gaponet train.
+        name: Name in the package. A network of that name is replaced.
+        dataset: The dataset of the run, for the errors on its test motions.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / name
+        folder.mkdir()
+        write_network(run, folder, dataset, source)
+        others = sum(card.size_bytes for card in network_cards() if card.name != name)
+        total = others + folder_size(folder)
+        if total > MAX_TOTAL_BYTES:
+            raise UsageError(
+                f"{name} has {folder_size(folder):,} bytes, all networks together would have {total:,} of at most "
+                f"{MAX_TOTAL_BYTES:,}; train a smaller network"
+            )
+        shutil.rmtree(PACKAGE_FOLDER / name, ignore_errors=True)
+        shutil.copytree(folder, PACKAGE_FOLDER / name)
+    write_page(PAGE)
+    card = NetworkCard.read(PACKAGE_FOLDER / name)
+    test = card.published.test
+    print(f"{name}: {card.size_bytes:,} bytes, {total:,} of {MAX_TOTAL_BYTES:,} in all networks")
+    print(f"differs by at most {card.published.largest_difference_rad:.1e} rad from {run}")
+    print(
+        f"test: nominal {test.nominal_mrad:.2f} → {test.model_mrad:.2f} mrad, {test.recordings} recordings"
+    )
+
+
+def write_network(run: Path, folder: Path, dataset: str, source: Source) -> None:
+    """Write a network as it is shipped.
+
+    Args:
+        folder: Empty folder, whose name is that of the network.
+
+    Raises:
+        GAPONetError: A check failed; the message says which.
+    """
+    model = GapModel.load(run)
+    if model.card.get("interrupted", False):
+        raise UsageError(f"{run}: its training was interrupted; finish it with --resume")
+    packaged_robot(model).write(folder)
+    shutil.copyfile(run / "delay_offset.json", folder / "delay_offset.json")
+    write_json_line(folder / "split.json", without_names(split_of_run(run)))
+    trained = (model.path / WEIGHTS).read_bytes()
+    inputs = visited_inputs(model, run, dataset)
+    content, difference = stored_form(trained, inputs)
+    (folder / WEIGHTS).write_bytes(content)
+    card = {key: value for key, value in model.card.items() if key not in DROPPED}
+    card["sha256"] = {WEIGHTS: sha256(folder / WEIGHTS)}
+    write_json_line(folder / CARD, card)
+    published = Published(
+        licence=source.licence,
+        date=datetime.now(UTC).strftime("%Y-%m-%d"),
+        data=SourceOfData(source.title, source.address, source.data_licence),
+        test=measure_error(folder, dataset),
+        limits_of_use=source.limits,
+        largest_difference_rad=difference,
+    )
+    write_json_line(folder / CARD, card | {PUBLISHED: asdict(published)})
+    require_public(folder, run)
+    require_same_outputs(folder, content, inputs)
+    NetworkCard.read(folder)
+
+
+def packaged_robot(model: GapModel) -> PackagedRobot:
+    """Return the robot of the package that is the simulator of a model's training.
+
+    Raises:
+        UsageError: There is none: it was identified, or its figures were changed.
+    """
+    simulator = model.simulator()
+    named = PackagedRobot(model.card["robot"], simulator.gain_scale)
+    found = model_hash(named.load())
+    if found != model.card["simulator"]:
+        raise UsageError(
+            f"{model.path}: trained in simulator {model.card['simulator']}, the package's {named.name} with gain_scale "
+            f"{named.gain_scale:g} is {found}; train in the nominal robot of the package"
+        )
+    return named
+
+
+def without_names(split: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
+    """Return a split with numbers in place of the names of recordings; the hashes tell what was seen."""
+    return {
+        part: {str(i): digest for i, digest in enumerate(split[part].values())} for part in SPLITS
+    }
+
+
+def visited_inputs(model: GapModel, run: Path, dataset: str) -> np.ndarray:
+    """Return inputs x of the network in rollouts with it, (k, dim) float32, of test and training recordings."""
+    data, _ = open_dataset(dataset, None, run)
+    split = split_of_run(run)
+    wanted = set()
+    for part in ("test", "train"):
+        wanted |= set(list(split[part].values())[: MAX_RECORDINGS // 2])
+    entries = [entry for entry in data.entries if entry.hash in wanted]
+    if not entries:
+        raise UsageError(
+            f"{dataset}: has no recording of {run}; give the dataset that it was trained on"
+        )
+    inputs: list[np.ndarray] = []
+
+    def recording(x: np.ndarray) -> Any:
+        inputs.append(np.array(x))
+        return model.infer(x)
+
+    observed = GapModel(model.path, model.card, model.config, recording)
+    simulator = load_stored_robot(run, model.card["robot"])
+    replay(data.sequences(entries), simulator, observed.corrector(simulator), lock_idle=True)
+    return np.concatenate(inputs)
+
+
+def stored_form(trained: bytes, inputs: np.ndarray) -> tuple[bytes, float]:
+    """Return the ONNX file as it is shipped, and its largest difference from the trained one, rad.
+
+    A small network keeps all digits, so that its outputs are equal bit for bit.
+
+    Raises:
+        UsageError: The difference is above MAX_DIFFERENCE_RAD.
+    """
+    before = OnnxNetwork(trained)(inputs)
+    exact = with_small_matrices(trained, int16=False)
+    if len(exact) <= FLOAT32_BYTES:
+        if not np.array_equal(OnnxNetwork(exact)(inputs), before):
+            raise UsageError(
+                "outputs changed although no weight did; report this with the version of onnxruntime"
+            )
+        return exact, 0.0
+    short = with_small_matrices(trained, int16=True)
+    difference = float(np.abs(OnnxNetwork(short)(inputs) - before).max())
+    if not difference <= MAX_DIFFERENCE_RAD:
+        raise UsageError(
+            f"with int16 weights outputs change by {difference:.1e} rad (limit {MAX_DIFFERENCE_RAD:.0e}); train a "
+            f"network of at most {FLOAT32_BYTES:,} bytes"
+        )
+    return short, difference
+
+
+def measure_error(folder: Path, dataset: str) -> ErrorOnTest:
+    """Measure a network on its test motions.
+
+    Raises:
+        UsageError: A motion was used in training.
+    """
+    data, robot = open_dataset(dataset, None, folder)
+    result = evaluate([folder], data, robot).result
+    if not result["unseen"]:
+        raise UsageError(
+            f"{dataset}: some test motions were used in training; split the dataset by motion"
+        )
+    method = next(iter(result["artifacts"]))
+    return ErrorOnTest(
+        recordings=result["sequences"],
+        motions=tuple(result["motions"]),
+        nominal_mrad=round(1e3 * result["methods"]["nominal"]["mpjae"], 3),
+        model_mrad=round(1e3 * result["methods"][method]["mpjae"], 3),
+    )
+
+
+def require_public(folder: Path, run: Path) -> None:
+    """Refuse files that name a path of a machine: a home, or where this run and its programs lie."""
+    here = (Path.home(), Path.cwd(), run.resolve().parent, Path(tempfile.gettempdir()))
+    private = [*HOMES, *(str(place) for place in here if place != Path("/"))]
+    for file in sorted(folder.iterdir()):
+        text = words_of_network(file) if file.name == WEIGHTS else file.read_text(encoding="utf-8")
+        for path in private:
+            if path in text:
+                raise UsageError(
+                    f"{file.name} names '{path}', a path of a machine; remove it from the run's files"
+                )
+
+
+def words_of_network(file: Path) -> str:
+    """Return an ONNX file as text without its weights."""
+    model = onnx.load(str(file))
+    del model.graph.initializer[:]
+    del model.graph.sparse_initializer[:]
+    return str(model)
+
+
+def require_same_outputs(folder: Path, content: bytes, inputs: np.ndarray) -> None:
+    """Refuse a folder that does not load, or answers otherwise than its content, bit for bit."""
+    stored = GapModel.load(folder)
+    stored.simulator()
+    if not np.array_equal(stored.infer(inputs), OnnxNetwork(content)(inputs)):
+        raise UsageError(f"{folder}: answers otherwise than what was written; write it again")
+
+
+def write_page(page: Path) -> None:
+    """Write the table of all networks into a page, between its two comments."""
+    text = page.read_text(encoding="utf-8")
+    if not TABLE.search(text):
+        raise UsageError(
+            f"{page}: has no place for the table; restore the comments <!-- networks -->"
+        )
+    table = "\n" + markdown_table(network_cards())
+    write_text(page, TABLE.sub(lambda _: table, text))
+
+
+def write_json_line(file: Path, value: Any) -> None:
+    """Write JSON without blanks."""
+    file.write_text(
+        json.dumps(value, ensure_ascii=False, separators=(",", ":")) + "\n", encoding="utf-8"
+    )
+
+
+if __name__ == "__main__":
+    tyro.cli(ship)
