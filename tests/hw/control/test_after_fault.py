@@ -21,7 +21,6 @@ from gaponet.hw.control.safety import FAULTS
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, UnitreeDriver
 from gaponet.robot.spec import RobotSpec, load_robot
 
-QUICK = ControlConfig(blend=0.5, blend_speed=2.0, settle=0.0, damp=0.5)
 FAULT_PERIOD = 30  # of the run: the elbows are at their fastest
 TORSO = MOTOR_NAMES.index("torso_joint")
 DOMAIN = 200 + os.getpid() % 30
@@ -32,8 +31,15 @@ def robot() -> RobotSpec:
     return load_robot("h1_2")
 
 
-def swing(robot: RobotSpec, clock: RobotClock, kind: str, source: str) -> Recording:
-    """Both elbows swing until a fault that the robot, the sender of targets or the policy makes."""
+def swing(
+    robot: RobotSpec,
+    clock: RobotClock,
+    kind: str,
+    source: str = "robot",
+    size: float = 0.3,
+    damp: float = 0.5,
+) -> Recording:
+    """Both elbows swing by `size` rad until a fault that the robot, the sender of targets or the policy makes."""
     fault = Fault(kind, "made by a test")
     elbows = robot.index(["left_elbow_joint", "right_elbow_joint"])
     driver = UnitreeDriver(robot, domain=DOMAIN)
@@ -54,11 +60,12 @@ def swing(robot: RobotSpec, clock: RobotClock, kind: str, source: str) -> Record
         if source == "policy" and k >= FAULT_PERIOD:
             raise RuntimeError(fault.text)
         target = robot.qpos_home.copy()
-        target[elbows] += 0.3 * np.sin(0.1 * k)
+        target[elbows] += size * np.sin(0.1 * k)
         return target
 
     driver.read = spoiled  # type: ignore[method-assign]
-    controller = Controller(driver, robot, config=QUICK, clock=clock, watchdog=False)
+    config = ControlConfig(blend=0.5, blend_speed=2.0, settle=0.0, damp=damp)
+    controller = Controller(driver, robot, config=config, clock=clock, watchdog=False)
     try:
         return controller.run(policy)
     except RuntimeError:
@@ -83,6 +90,19 @@ def test_after_a_fault_commanded_positions_stand_still_without_stiffness(
     assert heard["time"][last] <= recording.fault.time + 1.0 / clock.robot.rate
     assert len(stiff) - last > 20, "it is damped for half a second"
     np.testing.assert_array_equal(np.ptp(heard["ctrl"][last:], axis=0), 0.0)
+
+
+def test_joints_that_move_fast_at_a_fault_are_braked_within_a_tenth_of_a_second(robot, monkeypatch):
+    """A measurement on a simulated robot with empty hands, and no promise."""
+    clock = living(monkeypatch, robot)
+
+    recording = swing(robot, clock, "stop", size=0.9, damp=2.0)
+
+    times = np.array([time for time, _ in clock.truth])
+    speeds = np.abs(np.gradient([qpos for _, qpos in clock.truth], times, axis=0)).max(axis=1)
+    since = times - recording.fault.time
+    assert speeds[np.abs(since) < 0.01].max() > 2.0
+    assert speeds[since > 0.1].max() < 0.5
 
 
 def watching(robot: RobotSpec) -> UnitreeDriver:
