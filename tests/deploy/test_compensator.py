@@ -125,6 +125,21 @@ def test_commands_blend_in(robot, model):
     assert np.abs(np.diff(u, axis=0)).max() < 0.1 * np.abs(u[-1] - target).max()
 
 
+def test_by_default_half_of_the_compensation_is_there_after_half_a_second_and_all_after_one(robot):
+    target = np.array([0.5, 0.3])
+    whole = Compensator(robot, config=NOW)
+    default = Compensator(robot)
+    for compensator in (whole, default):
+        compensator.reset(target, 0.4)
+
+    wanted = np.array([whole.step(target, None) - target for _ in range(60)])
+    given = np.array([default.step(target, None) - target for _ in range(60)])
+
+    assert np.abs(wanted[25]).max() > 0.01
+    np.testing.assert_allclose(given[25], wanted[25] / 2, atol=1e-9)
+    np.testing.assert_allclose(given[50:], wanted[50:], atol=1e-9)
+
+
 @pytest.mark.parametrize(("late", "lost"), [(0, 0.0), (4, 0.2)])
 def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
     targets = np.repeat([[0.3, -0.2], [-0.4, 0.5], [0.2, 0.2]], 150, axis=0)

@@ -89,11 +89,12 @@ def test_what_cannot_be_is_refused_with_what_is_in_the_way(so101, planner):
         finish_search(planner.begin(under, FOLDED))
 
 
-def test_a_motion_is_slowed_until_no_joint_accelerates_beyond_the_limit(so101):
+def test_a_motion_is_slowed_until_no_joint_accelerates_beyond_the_limit_and_no_further(so101):
     planner = Planner(so101, so101.joint_names, safety=SafetyConfig(acceleration=1.0))
     plan = planner.plan(motion(so101, OVER), OVER)
     assert "times slower" in plan.changed
-    assert np.abs(np.diff(plan.motion.sample(0.02), 2, axis=0)).max() <= 1.0 * 0.02**2
+    acceleration = np.abs(np.diff(plan.motion.sample(0.02), 2, axis=0)).max() / 0.02**2
+    assert 0.8 < acceleration <= 1.0
 
 
 def test_a_way_begins_and_ends_at_rest_and_keeps_its_speed():
