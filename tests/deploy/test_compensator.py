@@ -186,6 +186,35 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     assert np.abs(np.diff(q[-50:], axis=0)).max() < 1e-3
 
 
+def test_a_payload_is_estimated_from_the_moment_on_at_which_its_torques_suffice(robot):
+    """At rest the leverage is the integral of the squared torque per kg, with forgetting, in (N·m/kg)² s."""
+    estimate = Compensator(robot).payload_estimate
+    estimate.reset(1)
+    posture = np.array([[1.2, 0.3]])
+    empty, full = estimate.gravity(posture[0])
+    leverage = float(np.sum(((full - empty) / estimate.max_mass) ** 2))
+    needed_s = -np.log(1.0 - 0.4 / leverage)
+
+    periods = 0
+    while not estimate.certain[0]:
+        estimate.update(posture, 0.0 * posture, posture, None, np.array([True]))
+        periods += 1
+
+    assert periods * estimate.dt == pytest.approx(needed_s, abs=1.1 * estimate.dt)
+
+
+@pytest.mark.parametrize(("mass", "contradicts"), [(1.5, False), (1.6, True)])
+def test_torques_contradict_a_payload_that_is_wrong_by_more_than_half_of_the_largest(
+    robot, mass, contradicts
+):
+    estimate = Compensator(robot, config=CompensatorConfig(payload_max=3.0)).payload_estimate
+    estimate.reset(1)
+    estimate.certain = np.array([True])
+    estimate.latest = np.array([mass])
+
+    assert bool(estimate.contradiction(0.0)) == contradicts
+
+
 @pytest.mark.parametrize(
     ("held", "told", "doubted"), [(0, 0.4, True), (1, 0.0, True), (0, 0.0, False), (1, 0.4, False)]
 )
