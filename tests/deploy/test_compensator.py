@@ -125,6 +125,21 @@ def test_commands_blend_in(robot, model):
     assert np.abs(np.diff(u, axis=0)).max() < 0.1 * np.abs(u[-1] - target).max()
 
 
+def test_by_default_half_of_the_compensation_is_there_after_half_a_second_and_all_after_one(robot):
+    target = np.array([0.5, 0.3])
+    whole = Compensator(robot, config=NOW)
+    default = Compensator(robot)
+    for compensator in (whole, default):
+        compensator.reset(target, 0.4)
+
+    wanted = np.array([whole.step(target, None) - target for _ in range(60)])
+    given = np.array([default.step(target, None) - target for _ in range(60)])
+
+    assert np.abs(wanted[25]).max() > 0.01
+    np.testing.assert_allclose(given[25], wanted[25] / 2, atol=1e-9)
+    np.testing.assert_allclose(given[50:], wanted[50:], atol=1e-9)
+
+
 @pytest.mark.parametrize(("late", "lost"), [(0, 0.0), (4, 0.2)])
 def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
     targets = np.repeat([[0.3, -0.2], [-0.4, 0.5], [0.2, 0.2]], 150, axis=0)
@@ -169,6 +184,35 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     )  # the servo law overrates torque by 1 / 0.8
     assert np.abs(q[-20:] - targets[-20:]).max() < 0.02
     assert np.abs(np.diff(q[-50:], axis=0)).max() < 1e-3
+
+
+def test_a_payload_is_estimated_from_the_moment_on_at_which_its_torques_suffice(robot):
+    """At rest the leverage is the integral of the squared torque per kg, with forgetting, in (N·m/kg)² s."""
+    estimate = Compensator(robot).payload_estimate
+    estimate.reset(1)
+    posture = np.array([[1.2, 0.3]])
+    empty, full = estimate.gravity(posture[0])
+    leverage = float(np.sum(((full - empty) / estimate.max_mass) ** 2))
+    needed_s = -np.log(1.0 - 0.4 / leverage)
+
+    certain = []
+    for _ in range(500):
+        estimate.update(posture, 0.0 * posture, posture, None, np.array([True]))
+        certain.append(bool(estimate.certain[0]))
+
+    assert certain.count(False) * estimate.dt == pytest.approx(needed_s, abs=1.1 * estimate.dt)
+
+
+@pytest.mark.parametrize(("mass", "contradicts"), [(1.5, False), (1.6, True)])
+def test_torques_contradict_a_payload_that_is_wrong_by_more_than_half_of_the_largest(
+    robot, mass, contradicts
+):
+    estimate = Compensator(robot, config=CompensatorConfig(payload_max=3.0)).payload_estimate
+    estimate.reset(1)
+    estimate.certain = np.array([True])
+    estimate.latest = np.array([mass])
+
+    assert bool(estimate.contradiction(0.0)) == contradicts
 
 
 @pytest.mark.parametrize(

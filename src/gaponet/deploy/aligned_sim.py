@@ -90,10 +90,6 @@ class AlignedSim:
         elif model is not None:
             inverse = AnalyticInverse.of(BatchSim(robot, own, nthread, locked))
             self.transfer = Transfer(model, inverse, conditions, locked, nthread, extrapolate)
-        delay = max(
-            robot.delay.max(), 0.0 if self.transfer is None else self.transfer.sim.robot.delay.max()
-        )
-        self._depth = 1 + int(np.ceil(delay / self.dt))  # past targets that delayed servos need
         self.target = np.zeros((self.num_envs, self.n))
         self._uncorrected = self.target[:, self.op]
         self.reset()
@@ -135,11 +131,12 @@ class AlignedSim:
         )
         v = np.broadcast_to(np.asarray(qvel, float), (count, self.n))
         u = q if ctrl is None else np.broadcast_to(np.asarray(ctrl, float), (count, self.n))
-        self.sim.reset(ids, q, v, past=self._past(u))
+        past = u[:, None]  # delayed servos hold the oldest target that is given
+        self.sim.reset(ids, q, v, past=past)
         if self.loop is not None:
             self.loop.reset(ids)
         if self.transfer is not None:
-            self.transfer.reset(ids, q, v, self._past(u))
+            self.transfer.reset(ids, q, v, past)
         self.target[ids] = u
         self._uncorrected = self.target[:, self.op]
 
@@ -154,6 +151,3 @@ class AlignedSim:
         if self.transfer is not None:
             target[:] = self.transfer.command(sim.qpos, sim.qvel, target)
         sim.step(target)
-
-    def _past(self, target: Array) -> Array:
-        return np.repeat(target[:, None], self._depth, axis=1)

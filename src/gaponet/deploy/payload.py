@@ -12,7 +12,7 @@ from gaponet.sim.batch import BatchSim
 FORGETTING_TIME_S = 1.0  # time constant
 MAX_RATE_KG_S = 1.0  # of the estimate: a payload that appears at once must not make commands jump
 HALF_WEIGHT_SPEED = 0.5  # rad/s; samples at this speed have half the weight, faster ones less
-MIN_LEVERAGE = 4.0  # (N·m/kg)²; below it, the estimate does not change
+MIN_LEVERAGE = 0.4  # (N·m/kg)² s; below it, the estimate does not change
 # Least share of the excess torque over the empty arm's that must look like the largest payload's. On a virtual H1-2,
 # 3 kg give 0.57 to 0.97, and no payload with positions wrong by 0.12 rad up to 0.56. Friction lowers the share of
 # smaller payloads.
@@ -82,7 +82,7 @@ class PayloadEstimate:
         estimate = np.where(
             similarity < MIN_SIMILARITY * (estimate / self.max_mass) ** 2, 0.0, estimate
         )
-        self.certain = self._leverage > MIN_LEVERAGE * FORGETTING_TIME_S * 0.1
+        self.certain = self._leverage > MIN_LEVERAGE
         self.latest = np.where(self.certain, estimate, self.mass)
         change = MAX_RATE_KG_S * self.dt
         self.mass = self.mass + np.clip(self.latest - self.mass, -change, change)

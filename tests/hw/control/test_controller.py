@@ -271,6 +271,24 @@ def test_an_error_of_other_code_is_raised_after_the_robot_has_damped_for_the_who
     assert driver.sent[-1][1] is None
 
 
+def test_an_error_while_it_looks_for_stops_is_raised_after_the_robot_has_damped(arm):
+    driver = NotedArm(arm)
+
+    def problem() -> str:
+        if len(driver.commands) > 20:
+            raise ZeroDivisionError
+        return ""
+
+    controller = control(driver)
+    controller.output.watchdog = fake_watchdog(problem=problem)
+    with pytest.raises(ZeroDivisionError):
+        controller.run(motion_policy(MOTION, DT))
+
+    damping = [t for t, ctrl in driver.sent if ctrl is None]
+    assert damping[-1] - damping[0] >= QUICK.damp
+    assert driver.closed == [False]
+
+
 @pytest.mark.parametrize("where", ["read", "policy", "compensator"])
 def test_a_period_that_stood_still_sends_nothing(arm, where):
     stood: list[float] = []

@@ -116,6 +116,16 @@ def test_a_disk_that_is_full_keeps_what_was_written_and_says_so(tmp_path, monkey
     assert path.exists()  # there was room for the table
 
 
+def test_a_summary_has_the_age_of_states_and_the_lateness_of_periods_in_ms():
+    made = recording(10)  # each state is 1 ms old
+    made.late = [0.002] * 10
+
+    summary = made.summary()
+
+    assert set(summary["state_age_ms"].values()) == {1.0}
+    assert set(summary["late_ms"].values()) == {2.0}
+
+
 def test_a_full_disk_without_room_for_the_header_either_ends_the_recording_only(
     tmp_path, monkeypatch
 ):

@@ -350,6 +350,39 @@ def test_the_watchdog_says_nothing_until_it_damps_and_then_asks_nothing(
     assert set(instructions(servos)) == {reg.WRITE, reg.SYNC_WRITE}
 
 
+def test_a_watchdog_that_takes_over_while_the_arm_sinks_raises_no_torque_limit(
+    so101, wire, servos, driver
+):
+    """Else the arm springs back to its last goal with full torque."""
+    from gaponet.hw.drivers.open import open_driver
+
+    other = open_driver(**driver.watchdog())
+    other.connect()
+    driver.write(driver.read().qpos)
+    driver.damp(share=0.4)
+    assert servos.get(1, "torque_limit") == 400
+
+    limits = []
+    for share in (1.0, 0.5, 0.1):
+        other.damp(share=share)
+        limits.append(servos.get(1, "torque_limit"))
+
+    assert limits == [400, 200, 40]
+
+
+def test_a_watchdog_lowers_also_a_servo_that_does_not_answer(so101, wire, servos, driver):
+    from gaponet.hw.drivers.open import open_driver
+
+    other = open_driver(**driver.watchdog())
+    other.connect()
+    driver.write(driver.read().qpos)
+    servos.silence(3)
+
+    other.damp(share=0.5)
+
+    assert [servos.get(number, "torque_limit") for number in (1, 3)] == [500, 500]
+
+
 # ---- calibration
 
 

@@ -203,23 +203,19 @@ class Controller:
         while self.phase is not Phase.STOPPED:
             self._now = self.clock.wait_until(start + self._k * self.dt)
             self.output.due = start + due * self.dt
-            if keys:
-                keys.poll()
-            watchdog = None if self.phase in ENDED else self.output.watchdog
-            if watchdog and (problem := watchdog.problem()):
-                self.stop(problem)
             self.recording.late.append(self._now - self.output.due)
-            self._period(policy)
+            self._period(policy, keys)
             lost = (
                 int((self.clock.now() - start) / self.dt) - self._k
             )  # whole periods by which this one ran over
             self.recording.missed += max(lost - 1, 0)
             self._k, due = self._k + max(1, lost), self._k + 1
 
-    def _period(self, policy: Policy) -> None:
-        """Read, check, send, record. After any error in it the robot damps."""
+    def _period(self, policy: Policy, keys: StopKeys | None) -> None:
+        """Look for stops, read, check, send, record. After any error in it the robot damps."""
         state = sent = None
         try:
+            self._look_for_stops(keys)
             state, fault = self._read()
             self._state = state or self._state
             if fault:
@@ -241,6 +237,14 @@ class Controller:
             if full and not self._reported_full_disk:
                 self._reported_full_disk = True
                 self._note(f"nothing more is recorded ({full.strerror}); what was written is kept")
+
+    def _look_for_stops(self, keys: StopKeys | None) -> None:
+        """Request a stop if a key was pressed, or if the watchdog could not damp the robot."""
+        if keys:
+            keys.poll()
+        watchdog = None if self.phase in ENDED else self.output.watchdog
+        if watchdog and (problem := watchdog.problem()):
+            self.stop(problem)
 
     def _read(self) -> tuple[State | None, Fault | None]:
         """Return the newest state, and the fault that stops the robot now."""

@@ -116,6 +116,7 @@ class Driver(Protocol):
         Args:
             weight: Our share of control; decreases to 0.
             share: Share of their torque that joints keep which cannot brake; decreases from 1 to 0, or is 0 at once.
+                The watchdog begins with 1 also where the controller has reduced the torque already: never raise it.
         """
 
     def confirm(self) -> str:

@@ -126,9 +126,10 @@ class Rows:
                 file.write(rows[at : at + CHUNK_ROWS].tobytes())
 
     def _flush(self) -> None:
-        if self._writer and self._count % CHUNK_ROWS:
-            self._enqueue(self._count % CHUNK_ROWS)
-            self._count += -self._count % CHUNK_ROWS
+        begun = self._count % CHUNK_ROWS  # rows of a chunk that is not full
+        if self._writer and begun:
+            self._enqueue(begun)
+            self._count += CHUNK_ROWS - begun
         self._pending.join()
 
     def __len__(self) -> int:

@@ -142,6 +142,7 @@ class SO101Driver:
         self._goal: dict[int, int] | None = (
             None  # in force; None: nothing was commanded, or the arm was let go
         )
+        self._lowered_from: list[int] | None = None  # torque limits, 0.1 %; None: not lowered yet
         self._torque_on: set[int] = set()  # servos that have reported it
         self._mismatches: Counter[tuple[str, int]] = Counter()
         self._settings: dict[int, dict[str, int]] = {}  # at the start, by servo
@@ -461,17 +462,35 @@ class SO101Driver:
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
         """Lower the arm: torque limits decrease with `share`; at 0 the torque of all servos on the bus is switched off.
 
-        Nothing is read, and everything is sent in every period, so that a lost packet does not matter.
+        Everything is sent in every period, so that a lost packet does not matter. Nothing is read, except by the
+        watchdog before it lowers: the controller may have died while it lowered.
         """
         self._goal, self._torque_on = None, set()
         bus = self._open()
         with self._port_errors():
             if share > 0:
-                limits = [round(share * limit) for limit in self._torque_limit]
+                if self._lowered_from is None:
+                    self._lowered_from = self._limits_in_force(bus)
+                limits = [round(share * limit) for limit in self._lowered_from]
                 bus.sync_write(reg.TORQUE_LIMIT, dict(zip(self.arm.servos, limits, strict=True)))
             else:
                 bus.broadcast(reg.TORQUE_ENABLE, 0)
                 bus.sync_write(reg.TORQUE_ENABLE, dict.fromkeys(self.arm.servos, 0))
+
+    def _limits_in_force(self, bus: reg.ServoBus) -> list[int]:
+        """Return the torque limits from which the arm is lowered, 0.1 %.
+
+        They are never raised: an arm that has sunk would spring back to its last goal. A silent driver asks the servos
+        for theirs; one that does not answer counts as not lowered yet.
+        """
+        if not self.silent:
+            return self._torque_limit
+        blocks = bus.sync_read(self.arm.servos, reg.TORQUE_LIMIT)
+        limits = []
+        for servo, limit in zip(self.arm.servos, self._torque_limit, strict=True):
+            in_force = reg.TORQUE_LIMIT.decode(blocks[servo]) if servo in blocks else limit
+            limits.append(min(in_force, limit))
+        return limits
 
     def confirm(self) -> str:
         """Check that the torque of all servos is off; only then set their torque limits back."""

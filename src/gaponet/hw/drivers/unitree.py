@@ -337,16 +337,28 @@ class UnitreeDriver:
         """Send stiffness 0 and damping gains, at most those that the effort limits allow at the present speed.
 
         The position in the message has no stiffness, but a robot may blend it with its own by the weight. So it is the
-        last command, not a reading, which may be what is wrong. A torso that is only held stays held until the weight
-        is 0: a trunk must not swing while the arms brake.
+        last command, not a reading, which may be what is wrong. The watchdog has sent no command: its position is the
+        one that it reads when it begins to damp. A torso that is only held stays held until the weight is 0: a trunk
+        must not swing while the arms brake.
         """
-        state = self._state
-        qpos = self._last_ctrl
-        if qpos is None:
-            qpos = np.nan_to_num(state.qpos) if state else np.zeros(len(self._motor))
-        qvel = state.qvel if state else np.zeros(len(self._motor))
+        state = self._newest_state()
+        qpos = np.zeros(len(self._motor)) if state is None else np.nan_to_num(state.qpos)
+        qvel = np.zeros(len(self._motor)) if state is None else state.qvel
+        if self._last_ctrl is None:
+            self._last_ctrl = qpos
         kd = damping_gains(KD_FACTOR * self.kd, qvel, self._effort_limit)
-        self._send(qpos, np.zeros_like(kd), kd, weight)
+        self._send(self._last_ctrl, np.zeros_like(kd), kd, weight)
+
+    def _newest_state(self) -> State | None:
+        """Return the newest state, or the last one if the bus gives none; None before `connect`.
+
+        The watchdog reads nothing until it damps. The state from its connection may be minutes old: a torso that is
+        held there, with stiffness, would jump back to it.
+        """
+        if self._states is not None and self._clock is not None:
+            with contextlib.suppress(DriverError):
+                self.read()
+        return self._state
 
     def _send(self, ctrl: Array, kp: Array, kd: Array, weight: float) -> None:
         if self._writer is None or self.silent:
