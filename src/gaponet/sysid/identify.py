@@ -131,6 +131,7 @@ def identify(
     stops: bool = False,
     folds: int = FOLDS,
     masses: bool = False,
+    joints_alone: bool = False,
 ) -> Identified:
     """Fit the parameters of all operated joints.
 
@@ -150,10 +151,22 @@ def identify(
         stops: Give joints that stayed behind several commands a stop there.
         folds: Folds of the cross-validation, at most; 1 for none.
         masses: Fit masses, centres of mass and inertias of the links too.
+        joints_alone: Fit each joint by itself, and skip the fit of the whole robot, which takes longest.
     """
     terms = default_terms(sequences, robot) if terms is None else terms
     splits = cross_validation(sequences, validation, folds)
-    options = (splits, validation, windows, terms, table, nthread, progress, stops, masses)
+    options = (
+        splits,
+        validation,
+        windows,
+        terms,
+        table,
+        nthread,
+        progress,
+        stops,
+        masses,
+        joints_alone,
+    )
 
     def fit(one: RobotSpec, seconds: float | None) -> Identified:
         fitted = _fit_robot(sequences, one, *options, seconds)
@@ -165,7 +178,7 @@ def identify(
 def _fit_robot(
     sequences: ListOf[Sequence], robot: RobotSpec, splits: ListOf[Split], validation: ListOf[Sequence], windows: int,
     terms: tuple[Term, ...], table: bool, nthread: int, progress: Progress, stops: bool,
-    masses: bool, budget: float | None,
+    masses: bool, joints_alone: bool, budget: float | None,
 ) -> Identified:  # fmt: skip
     """Fit to positions, with the speed limits that the robot's servos have; arguments as of `identify`."""
     given, robot = (
@@ -186,7 +199,8 @@ def _fit_robot(
     )
     searches = _SearchProgress(budget, len(terms) + masses, len(fits), progress)
     wholes, each = zip(
-        *(_classic_candidates(joints, searches, nthread) for joints in fits), strict=True
+        *(_classic_candidates(joints, searches, nthread, joints_alone) for joints in fits),
+        strict=True,
     )
     candidates = {name: [one[name] for one in each] for name in each[0]}
     identified = given.nominal is not None
@@ -253,9 +267,12 @@ def _fit_robot(
 
 
 def _classic_candidates(
-    joints: JointFit, searches: _SearchProgress, nthread: int
+    joints: JointFit, searches: _SearchProgress, nthread: int, joints_alone: bool
 ) -> tuple[RobotFit, dict[str, Values]]:
-    """Fit the classic fields, joints by themselves and then together; return the whole robot's fit and candidates."""
+    """Fit the classic fields, joints by themselves and then together; return the whole robot's fit and candidates.
+
+    With joints_alone, the candidates of the whole robot are those of the joints.
+    """
     bounds, names, residual = joints.bounds, joints.robot.operated, joints.prior.residual
     given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
     searches.begin()
@@ -267,6 +284,9 @@ def _classic_candidates(
     alone = joints.search(CLASSIC, bounds.start, joints.regressed(), report=report)
     joints.prior.update_correlation_time(joints.rollouts, alone)
     whole = joints.robot_fit(nthread)
+    if joints_alone:
+        fitted = {"limbs": alone, "joints": alone, "whole": alone}
+        return whole, {"given": given, **fitted, "delay and offset": late}
     searches.begin()
     report = searches.report("whole robot", names, whole.rollouts.rows)
     together = whole.descend(

@@ -44,7 +44,6 @@ STOP_FILE = (
     "stop"  # exists while the experiment is to end: running trainings store a checkpoint and end
 )
 LOCK_TIMEOUT_S = 60.0  # trainings of an experiment that was killed end within this time
-QUICK_IDENTIFY_S = 1.0  # time of its searches in a quick run
 
 Show = Callable[[Running, int], None]
 
@@ -214,9 +213,7 @@ def identified_robot(study: Study) -> RobotSpec:
         if (
             study.options.identify_windows < WINDOWS
         ):  # in a hurry: gains, friction, delay and offset alone
-            options |= {"terms": (), "table": False}
-        if study.options.quick:
-            options |= {"budget": QUICK_IDENTIFY_S}
+            options |= {"terms": (), "table": False, "joints_alone": True}
         judged = stratified_subset(splits["val"], MAX_VALIDATION_ROLLOUTS)  # as the networks are
         fitted = identify(
             study.data.sequences(splits["train"]),
