@@ -229,13 +229,16 @@ def _conclusions(found: list[Claim]) -> list[str]:
         if claim.printed is None or not claim.verdict:
             continue
         ours = claim.reductions["GAPONet"]
+        sentence = (
+            f"{claim.text} ({BLOCK_TITLES[claim.block]}): the paper claims {claim.printed:g} %; "
+            f"GAPONet {ours} %, {claim.verdict}."
+        )
         others = [
-            f"{name} {reduction}"
+            f"{name} {reduction} %"
             for name, reduction in claim.reductions.items()
             if name != "GAPONet"
         ]
-        sentences.append(
-            f"{claim.text} ({BLOCK_TITLES[claim.block]}): the paper claims {claim.printed:g} %; GAPONet {ours} %, "
-            f"{claim.verdict}. Beside it: {', '.join(others)}."
-        )
+        if others:
+            sentence = f"{sentence} Beside it: {', '.join(others)}."
+        sentences.append(sentence)
     return sentences

@@ -54,7 +54,7 @@ def draw_figure_3(results: Results, block: Block) -> Figure:
                 label=name,
             )
         ax.set_title(joint_label(results.study.robot.operated[joint], wrapped=False))
-        ax.set_ylim(bottom=0)
+    axes.flat[0].set_ylim(bottom=0)  # of all panels, after the last curve
     for ax in axes.flat[len(joints) :]:
         ax.set_visible(False)
     for ax in axes[-1]:
