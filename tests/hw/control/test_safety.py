@@ -237,3 +237,16 @@ def test_where_the_real_joints_end_earlier_commands_do(arm):
     mjcf = arm.qpos_range
     np.testing.assert_allclose(limits.low, [-0.4, mjcf[1, 0] + 0.1])
     np.testing.assert_allclose(limits.high, [mjcf[0, 1] - 0.1, 0.3])
+
+
+def test_a_joint_that_comes_nearer_between_slow_readings_is_tracked():
+    """At 4 Hz each command is reached before the next reading, which sees the joint stand."""
+    period = 0.25
+    monitor = StateMonitor(("elbow",), np.array([0]), period, SafetyConfig())
+    faults = []
+    for k in range(8):
+        qpos = np.array([0.1 * k])
+        state = State(k * period, qpos, np.zeros(1), np.full(1, 0.1 * k), np.full(1, 30.0), 0)
+        requested = qpos + 0.75
+        faults.append(monitor.check(k * period, state, qpos + 0.1, requested=requested))
+    assert faults == [None] * 8

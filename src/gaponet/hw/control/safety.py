@@ -514,7 +514,7 @@ class StateMonitor:
         error = np.abs(ctrl - qpos)
         if requested is not None:
             distance = requested - qpos
-            approach = np.sign(distance) * state.qvel[self.commanded]  # rad/s
+            approach = np.sign(distance) * self._mean_speed(state)  # rad/s
             stays = approach < MIN_APPROACH_RAD_S
             error = np.where(stays, np.maximum(error, np.abs(distance)), error)
         worst = int(error.argmax())
@@ -529,6 +529,18 @@ class StateMonitor:
                 f"{joint} is {error[worst]:.2f} rad from its command; is it blocked or unpowered?",
             )
         return None
+
+    def _mean_speed(self, state: State) -> Array:
+        """Return the speed of the commanded joints since the last state, rad/s.
+
+        At a low control rate a joint reaches each command and stands again when it is read: its velocity then says
+        nothing of how it moves.
+        """
+        qvel = state.qvel[self.commanded]
+        if self._last is None or state.time <= self._last.time:
+            return qvel
+        moved = state.qpos[self.commanded] - self._last.qpos[self.commanded]
+        return np.asarray(moved / (state.time - self._last.time))
 
     def _checksum(self, now: float, state: State) -> Fault | None:
         self._refused = [
