@@ -155,7 +155,8 @@ def cases(given: Path) -> dict[str, Case]:
     recipe = ["--recipe", str(given / "more.toml")]
 
     def train(out: Path) -> list[str]:
-        resume = ["--resume"] if (out / "checkpoint.pt").is_file() else []
+        begun = (out / "checkpoint.pt").is_file() or (out / "candidates").is_dir()
+        resume = ["--resume"] if begun else []
         return ["train", data, "--out", str(out), "--budget", "4000", *resume, *TRAIN]
 
     def experiment(out: Path) -> list[str]:
