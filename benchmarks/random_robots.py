@@ -136,9 +136,8 @@ class RandomRobot:
             )
             joint.frictionloss = servo.friction[j]
             joint.solref_friction = [2.5 * spec.option.timestep, 1.0]
-            if (
-                not servo.creeps
-            ):  # MuJoCo's own joints creep by milliradians a second where real ones stick
+            # MuJoCo's own joints creep by milliradians a second where real ones stick
+            if not servo.creeps:
                 joint.solimp_friction = [0.9999, 0.9999, 0.001, 0.5, 2.0]
             _servo(spec, name, servo.kp[j], servo.kd[j], servo.limit[j])
         return spec.compile()

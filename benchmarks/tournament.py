@@ -323,9 +323,8 @@ def main() -> None:
         write_text(journal, journal.read_text().rpartition("\n")[0] + "\n")
     seconds = args.seconds or (SMALL if args.small else None)
     for seed in args.seeds or range(args.first, args.first + args.robots):
-        if (
-            seed in known(journal) and not args.seeds
-        ):  # by another process on the same folder, perhaps
+        # by another process on the same folder, perhaps
+        if seed in known(journal) and not args.seeds:
             continue
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)

@@ -140,12 +140,10 @@ class GaponetSO101Config(RobotConfig):
     # Calibration file, compared with the servos; default that of --robot.id, without an id the servos' counts.
     calibration: Path | None = None
     known: Path | None = None  # robot folder of gaponet identify, for compensation
-    model: Path | None = (
-        None  # run of gaponet train, in addition; without both, targets are not corrected
-    )
-    fps: float | None = (
-        None  # control rate, Hz, equal to LeRobot's; default that of the model, else 30
-    )
+    # run of gaponet train, in addition; without both, targets are not corrected
+    model: Path | None = None
+    # control rate, Hz, equal to LeRobot's; default that of the model, else 30
+    fps: float | None = None
     yes: bool = False  # do not ask before the arm moves
     options: str = ""  # further options of gaponet run: "--payload-mass 0.1 --safety.speed 2"
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
@@ -416,9 +414,8 @@ class GaponetCorrect(ProcessorStep):
 
     def reset(self) -> None:
         self._delta: np.ndarray | None = None
-        self._chunk: np.ndarray | None = (
-            None  # rows of the last chunk, after those that it continued
-        )
+        # rows of the last chunk, after those that it continued
+        self._chunk: np.ndarray | None = None
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         transition = transition.copy()

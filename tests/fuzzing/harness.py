@@ -29,9 +29,8 @@ from fuzzing.mutate import Files, mutate
 from gaponet.base.errors import GAPONetError
 
 HANG_S = 5.0
-PATIENCE = (
-    12  # times HANG_S of waiting: a reader may start a process, on a machine that others use too
-)
+# times HANG_S of waiting: a reader may start a process, on a machine that others use too
+PATIENCE = 12
 MEMORY = 2 << 30  # bytes
 WHY = "WHY.txt"  # beside the files of a failed mutant
 RENEW = 4000  # mutants after which a worker is replaced: what it leaked is no mutant's fault

@@ -122,9 +122,8 @@ def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, del
             moved.append([*seen, bias.copy()])
         np.testing.assert_array_equal(sim.batch.get_data(1).qpos, sim.qpos[1])
         assert isinstance(sim.batch, OneByOne) == one_by_one
-        if (
-            one_by_one
-        ):  # a look at what follows from a state leaves each simulation the torque of its own step
+        # a look at what follows from a state leaves each simulation the torque of its own step
+        if one_by_one:
             sim.step(targets[0])
             torque = sim.torque.copy()
             sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)

@@ -30,9 +30,8 @@ from gaponet.data.sequence import ARRAYS
 from gaponet.data.statistics import Statistics, pool, statistics
 from gaponet.data.store import Dataset, Entry, dataset_hash
 
-PERCENTILE_ROWS = (
-    100_000  # about so many rows, evenly taken from the dataset, give the 1 % and 99 % percentiles
-)
+# about so many rows, evenly taken from the dataset, give the 1 % and 99 % percentiles
+PERCENTILE_ROWS = 100_000
 NOT_STATED = "not stated"
 # Property → its heading and its value; the card counts sequences by each.
 PROPERTIES: dict[str, tuple[str, Callable[[Entry], str]]] = {

@@ -14,9 +14,8 @@ from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 
 MAX_COMMAND_DIFFERENCE_RAD = 1e-3  # repetitions whose commands differ by more have another command
-MAX_COMMAND_DIFFERENCE_SHARE = (
-    0.02  # the same, of the command's range, on average: of commands computed twice
-)
+# the same, of the command's range, on average: of commands computed twice
+MAX_COMMAND_DIFFERENCE_SHARE = 0.02
 MAX_SHIFT_ROWS, MAX_PAIRS = 5, 100  # by which clocks differ; of recordings that are compared
 MIN_PERIOD_S = 0.5  # of a periodic motion
 MIN_MOTION_RAD = 0.02  # joints that are commanded to move by less are left out

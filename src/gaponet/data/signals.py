@@ -9,9 +9,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 SAME_INSTANT = 0.1  # of a period by which stamps of one instant may differ
-FAST_COMMAND_RAD_S = (
-    0.3  # fast_speed from which a lag is mostly delay; below, it is mostly stiction
-)
+# fast_speed from which a lag is mostly delay; below, it is mostly stiction
+FAST_COMMAND_RAD_S = 0.3
 # Of a Response: least step; span of the command before and after the state; parts of a recording; shifts of a part.
 MIN_STEP_S, BEFORE_S, AFTER_S, SPLITS = 0.01, 0.12, 0.6, 3
 SHIFTS_S = np.arange(-0.12, 0.1201, 0.002)
@@ -239,9 +238,8 @@ class Response:
             ) / residual
             progress = np.cumsum(weights) / weights.sum()
             first = int(np.argmax(progress > ONSET_SHARE))
-            if (
-                quick[j] and first
-            ):  # the earliest lag also stands for still earlier ones, or for chance
+            # the earliest lag also stands for still earlier ones, or for chance
+            if quick[j] and first:
                 before = progress[first - 1]
                 onset[j] = (
                     at[first]

@@ -261,9 +261,8 @@ def canonical_motions(dataset: Dataset) -> dict[str, str]:
     for entry in dataset.entries:
         of_motion = fingerprints.setdefault(entry.meta.motion, [])
         command = entry.command
-        if (
-            command is None and not of_motion
-        ):  # an old journal: one recording is enough for its motion
+        # an old journal: one recording is enough for its motion
+        if command is None and not of_motion:
             command = fingerprint(dataset.channels(entry, ("ctrl",))["ctrl"], entry.dt)
         if command is not None and command not in of_motion:
             of_motion.append(command)

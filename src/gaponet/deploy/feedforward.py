@@ -17,9 +17,8 @@ from gaponet.sim.inverse import Inertia
 from gaponet.sim.servo import friction_limit, present
 
 MAX_SPEED, MAX_ACCELERATION = 4.0, 40.0  # rad/s, rad/s²; a step of the targets would have more
-FRICTION_SPEED = (
-    0.05  # rad/s at which three quarters of the friction are fed forward; at rest none is
-)
+# rad/s at which three quarters of the friction are fed forward; at rest none is
+FRICTION_SPEED = 0.05
 
 
 class Feedforward:

@@ -36,9 +36,8 @@ FILE = "randomization.json"
 SHIPPED = Path(__file__).parent / "shipped"
 LEAST_INVERSE = 0.2  # of a drawn value on an inverse axis, over the mean
 RANGE_SAMPLES = 4096
-UNDETERMINED_STD = (
-    0.8  # of the prior's: logs with a larger standard deviation say nothing about a number
-)
+# of the prior's: logs with a larger standard deviation say nothing about a number
+UNDETERMINED_STD = 0.8
 MIN_ROBOTS = 3  # of a type
 
 

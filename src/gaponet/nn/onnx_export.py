@@ -27,9 +27,8 @@ MAX_DIFFERENCE_RAD = 1e-5  # between ONNX and torch
 # Of matrices that `with_small_matrices` changes.
 MIN_SPARSE_ELEMENTS = 2048  # smaller ones are not worth an index
 MAX_DENSITY = 0.1  # share of elements that are not zero, for storage as a sparse matrix
-MIN_INT16_ELEMENTS = (
-    32_768  # the small first layers matter most for the output and little for the size
-)
+# the small first layers matter most for the output and little for the size
+MIN_INT16_ELEMENTS = 32_768
 
 
 def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) -> float:

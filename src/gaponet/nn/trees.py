@@ -25,9 +25,8 @@ MIN_LEAF_ROWS, MAX_ROWS, MEASURED_ROWS = (
     60_000,
     2_000,
 )  # of a leaf; of the fit of a joint; of the error of a fit
-MAX_DIFFERENCE = (
-    1e-4  # between scikit-learn and the stored trees, in units of the RMS of the labels
-)
+# between scikit-learn and the stored trees, in units of the RMS of the labels
+MAX_DIFFERENCE = 1e-4
 
 
 def trees_available() -> bool:

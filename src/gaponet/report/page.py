@@ -16,9 +16,8 @@ from gaponet.base.text import escape
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_FITTING_WIDTH = (
-    6.0  # inches; a wider figure scrolls on a phone, so that its letters stay readable
-)
+# inches; a wider figure scrolls on a phone, so that its letters stay readable
+MAX_FITTING_WIDTH = 6.0
 MAX_SVG_CHARACTERS = 400_000  # a figure with more becomes a PNG
 
 

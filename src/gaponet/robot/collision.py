@@ -24,9 +24,8 @@ from gaponet.robot.toml_file import Metres
 
 Point = tuple[Metres, Metres, Metres]
 CLEARANCE_M = 0.03  # between capsules: a loaded arm sags by centimetres below its command
-POSTURE_STEP_RAD = (
-    0.03  # between checked postures: a hand at 0.7 m moves by less than the clearance
-)
+# between checked postures: a hand at 0.7 m moves by less than the clearance
+POSTURE_STEP_RAD = 0.03
 Radius = Annotated[float, Interval(ge=0, le=100)]
 Capsule = TypedDict("Capsule", {"body": str, "from": Point, "to": Point, "radius": Radius})
 

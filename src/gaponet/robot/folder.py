@@ -25,9 +25,8 @@ STORED_ROBOT = "robot"  # subfolder of a run or a dataset
 PACKAGED_ROBOT_FILE = "packaged_robot.json"  # beside a network of the package, instead of that
 MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"
 PROVENANCE_FILE = "identified.json"  # what a robot was identified from (report/candidate.py)
-ADAPTATION_FILE = (
-    "adapted.json"  # to which unit it was adapted, and what the doctor found in its recordings
-)
+# to which unit it was adapted, and what the doctor found in its recordings
+ADAPTATION_FILE = "adapted.json"
 UNCERTAINTY_FILE = "uncertainty.json"  # of its values (sysid/uncertainty.py)
 OLD_UNCERTAINTY_FILE = "known.json"  # the same in folders that older versions wrote
 COPIED_FILES = (

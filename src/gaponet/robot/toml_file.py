@@ -61,9 +61,8 @@ class ServoType:
     effort_limit: Gain | None = None  # N·m
     speed_limit: Gain | None = None  # rad/s
     limit_source: str = ""
-    damping: Spread | Gain | None = (
-        None  # N·m·s/rad beside the stated kd; below 0 the servo acts with less kd
-    )
+    # N·m·s/rad beside the stated kd; below 0 the servo acts with less kd
+    damping: Spread | Gain | None = None
     frictionloss: Spread | Gain | None = None  # N·m
     armature: Spread | Gain | None = None  # kg·m²
     stribeck: Spread | Gain | None = None  # N·m

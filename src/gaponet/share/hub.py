@@ -124,9 +124,8 @@ class Hub:
                 if error.response.status_code == PARENT_CHANGED:
                     raise lost_race(self.address) from None
                 raise
-            if (
-                index.kind == "dataset" and self.revision == "main"
-            ):  # LeRobot opens the tag of its version, not main
+            # LeRobot opens the tag of its version, not main
+            if index.kind == "dataset" and self.revision == "main":
                 with suppress(RevisionNotFoundError):
                     self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type)
                 self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type, exist_ok=True)

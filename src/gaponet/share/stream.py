@@ -127,9 +127,8 @@ class RemoteDataset(Dataset):
             sequence = to_sequence(
                 read_episode(part, episode, self.robot, table), self.robot, entry.meta
             )
-            if (
-                replace(sequence, meta=entry.meta).content_hash() != entry.hash
-            ):  # motion and unit as recorded
+            # motion and unit as recorded
+            if replace(sequence, meta=entry.meta).content_hash() != entry.hash:
                 raise RemoteError(
                     f"'{entry.id}' is not what was pushed, by its content hash; {AGAIN}"
                 )

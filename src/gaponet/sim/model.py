@@ -340,9 +340,8 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
 
 
 TABLE = "gaponet_table"
-IMPEDANCE = (
-    0.5  # of the contact: with a constant one its stiffness in N/m does not depend on the posture
-)
+# of the contact: with a constant one its stiffness in N/m does not depend on the posture
+IMPEDANCE = 0.5
 SIZE = 2.0  # m, for looking at
 
 

@@ -22,9 +22,8 @@ HOLD_S, HOLD_START_RAD = 60.0, 0.01  # of a hold at home, and distance from home
 MAX_REST_SPEED = 0.05  # rad/s in the last ten seconds of the hold
 MAX_CREEP_RAD, MAX_SAG_RAD = 1e-3, 0.1  # in the second half of the hold; at its end
 MAX_GROWTH = 1e-3  # relative, of a small motion in one physics step
-MIN_OSCILLATION_RAD = (
-    0.1  # phase per step: an unstable step oscillates, a joint that falls does not
-)
+# phase per step: an unstable step oscillates, a joint that falls does not
+MIN_OSCILLATION_RAD = 0.1
 MAX_POSTURES = 8  # in which small motions are examined
 MIN_ARMATURE = 1e-5  # kg·m²; less is none
 MIN_PENETRATION_M = 1e-4  # of links that collide

@@ -29,9 +29,8 @@ SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
 PLAY = SERVO_TERMS.index("backlash")
 OPENED = 1 - 1e-9  # of half the width: a gap that opens
-DEADBAND_STEPS = (
-    0.5  # encoder steps: a motor with a least torque rests while it reads a smaller error
-)
+# encoder steps: a motor with a least torque rests while it reads a smaller error
+DEADBAND_STEPS = 0.5
 
 
 def present(terms: ServoTerms) -> ServoTerms:

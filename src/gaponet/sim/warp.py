@@ -292,9 +292,8 @@ class WarpSim:
         torch.clamp(ctrl, self._low, self._high, out=self.ctrl)
         for worlds in self._each_rate():
             worlds.launch(worlds.period)
-        if (
-            self._delayed
-        ):  # a float32 tells physics steps apart for minutes only, so the clock starts again
+        # a float32 tells physics steps apart for minutes only, so the clock starts again
+        if self._delayed:
             self._commands.times -= self._commands.time[:, None, None]
             self._commands.time.zero_()
         if ids is not None:

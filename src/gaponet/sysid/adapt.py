@@ -27,9 +27,8 @@ from gaponet.sysid.robot_rollouts import WINDOW_S, RobotRollouts, cut
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
 FIELDS: tuple[Field, ...] = get_args(Field)
 PRIOR_RAD = 0.3  # price of a large change of one joint
-SHARED_PRIOR_RATIO = (
-    0.05  # the same where all joints change by the same share: a cold day, a slow bus
-)
+# the same where all joints change by the same share: a cold day, a slow bus
+SHARED_PRIOR_RATIO = 0.05
 SHARED_FIELDS = (
     "damping",
     "frictionloss",

@@ -30,9 +30,8 @@ from gaponet.sim.temperature import recorded_temperatures, warm_values
 
 advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
-ERROR_SCALE_RAD = (
-    0.01  # errors beyond count linearly (soft L1), so that one blocked joint does not decide
-)
+# errors beyond count linearly (soft L1), so that one blocked joint does not decide
+ERROR_SCALE_RAD = 0.01
 ROW_PERIOD_S = 0.01  # between rows that are compared
 SETTLE_S = 0.1  # after a window's start, where velocities are measured ones
 UNLIMITED_STOP_RAD = 7.0  # stops of a joint without any

@@ -30,9 +30,8 @@ from gaponet.sysid.torque import Gains, servo_gains
 MIN_MOVE_RAD = 0.05  # of a command that moves a joint
 MAX_END_DIFFERENCE = 0.05  # of two commands that count as one, over the range of a joint's commands
 SETTLE_S = 0.1
-MAX_REPETITION_STD = (
-    3.0  # standard deviations of a repetition within which neighbours are repetitions
-)
+# standard deviations of a repetition within which neighbours are repetitions
+MAX_REPETITION_STD = 3.0
 MIN_NM_PER_KG, MIN_BAND_DISTANCE = (
     0.3,
     2.5,

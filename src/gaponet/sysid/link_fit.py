@@ -220,9 +220,8 @@ class LinkFit:
         )
         slopes = slopes.reshape(*self._servos.unit.shape, -1) * self._servos.unit[..., None]
         by_field = dict(zip(self._servos.names, np.moveaxis(slopes, 1, 0), strict=True))
-        if (
-            "damping" in by_field
-        ):  # the fitted sum with kd over kp keeps its value, and kd does not change with kp
+        # the fitted sum with kd over kp keeps its value, and kd does not change with kp
+        if "damping" in by_field:
             by_field["damping"] += (self.whole.bounds.kd / result.values["kp"])[:, None] * by_field[
                 "kp"
             ]

@@ -25,9 +25,8 @@ from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import soft_l1
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
-CONTACT_CLEARANCE_M = (
-    0.045  # above the lowest tip, or the table, in which a joint's zero may hide a contact
-)
+# above the lowest tip, or the table, in which a joint's zero may hide a contact
+CONTACT_CLEARANCE_M = 0.045
 WINDOW_S = 5.0
 MAX_WINDOWS, MAX_WINDOWS_PER_MOTION = 14, 2
 START_HEIGHTS, START_HEIGHT_STEP_M = 10, 0.005  # from below the lowest tip upwards
@@ -36,9 +35,8 @@ CANDIDATES, GENERATIONS, START_STD = (
     10,
     1.5,
 )  # of the search; standard deviation of its start in large changes
-FIRST_COMPARISON = (
-    3  # generations after which a start goes on only if no other start cost less by then
-)
+# generations after which a start goes on only if no other start cost less by then
+FIRST_COMPARISON = 3
 ZERO_STD_RAD, ZERO_PRICE = 0.02, 2e-3  # of a usual zero; cost of a zero that large, per row
 # Table's friction, and logarithm of its stiffness in N/m: lowest, highest, a large change, first guess.
 FRICTION = (0.0, 1.5, 0.15, 0.3)

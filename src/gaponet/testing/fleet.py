@@ -72,9 +72,8 @@ class Fleet:
     seed: int
     distributions: tuple[Distribution, ...]
     units: dict[str, Physics]  # hidden physics by unit id
-    gain_scale: float | None = (
-        None  # gain scale of the robot (RobotSpec.gain_scale); None for the robot's own
-    )
+    # gain scale of the robot (RobotSpec.gain_scale); None for the robot's own
+    gain_scale: float | None = None
 
     def unit(self, unit_id: str) -> Physics:
         """Return the hidden physics of a unit."""

@@ -18,9 +18,8 @@ from gaponet.testing import motor
 from gaponet.testing.physics import Physics, stack
 
 MAX_PHYSICS_STEP_S = 0.001
-MAX_EFFECT_PERIOD_S = (
-    0.002  # of the hidden effects; bristles and current loops are evaluated at every physics step
-)
+# of the hidden effects; bristles and current loops are evaluated at every physics step
+MAX_EFFECT_PERIOD_S = 0.002
 NOISE_PERIODS = 50  # control periods of noise that are sampled at a time
 REST_STD = 0.1  # of the friction band: a joint that always arrives in the same way stops in nearly the same place
 SETTLING_STEPS = 40  # each reduces the error by gravity stiffness / kp, 0.4 at worst on H1-2

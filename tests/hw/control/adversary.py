@@ -156,9 +156,8 @@ class Adversary:
         q, v = (x[self.at] for x in self.truth(self.clock.true))
         u, limits, count = ctrl[self.at], self.limits, self.count
         torque = np.abs(limits.kp * (u - q) - limits.kd * v)
-        if (
-            self.before is None
-        ):  # the first goal is the measured place, also where that is beyond the margin
+        # the first goal is the measured place, also where that is beyond the margin
+        if self.before is None:
             found = self.last.qpos[self.at]
             self.low, self.high = np.minimum(limits.low, found), np.maximum(limits.high, found)
             if np.abs(u - found).max() > FIRST:

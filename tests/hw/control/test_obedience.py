@@ -192,9 +192,8 @@ def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(
         "crossed",
     ):  # each state tells; three in a row count
         assert recording.fault.time - bus.first - at <= 5 * 0.02
-    if (
-        recording.fault.phase == "damp"
-    ):  # else it was noticed at the very end, where the arm is held
+    # else it was noticed at the very end, where the arm is held
+    if recording.fault.phase == "damp":
         off = bus.get(reg.TORQUE_ENABLE) == [0] * 6
         assert off != recording.events[-1].text.startswith(
             "could NOT be damped: switch the supply off"

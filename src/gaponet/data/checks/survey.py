@@ -34,9 +34,8 @@ from gaponet.robot.spec import RobotSpec
 
 MAX_LAG_S = 0.4
 STANDSTILL_S, STANDSTILL_RAD = 0.2, 0.005  # a joint that moves less in this time stands still
-BLOCKED_ERROR_RAD = (
-    0.15  # distance of a blocked joint from its command; a loaded joint may be as far,
-)
+# distance of a blocked joint from its command; a loaded joint may be as far,
+BLOCKED_ERROR_RAD = 0.15
 BLOCKED_COMMAND_RAD = 0.1  # so that its command must also move by this
 REPEATED_COMMAND_RAD = 0.1  # the command must move by this while the state repeats itself
 SLOPE_MIN_RANGE_RAD = 0.2  # of the command; below, sag and stiction decide the slope

@@ -391,9 +391,8 @@ def _time(
             if clock in loaded
             else 0.0
         )
-        if (
-            periods > 0 and min(abs(periods * unit - 1) for unit in SECONDS.values()) > 0.1
-        ):  # in no unit of time
+        # in no unit of time
+        if periods > 0 and min(abs(periods * unit - 1) for unit in SECONDS.values()) > 0.1:
             raise LogError(
                 f"{where}: '{clock}' is not at rate = {specified['rate']:g} Hz; leave out one of them"
             )

@@ -25,9 +25,8 @@ from gaponet.data.log import CHANNELS, skipped_rows
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
-NOT_OBEYED = (
-    "gaponet.not_obeyed"  # metadata of a table that is no data, and why (hw/control/recording.py)
-)
+# metadata of a table that is no data, and why (hw/control/recording.py)
+NOT_OBEYED = "gaponet.not_obeyed"
 DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
 
 

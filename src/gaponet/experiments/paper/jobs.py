@@ -40,9 +40,8 @@ from gaponet.robot.spec import RobotSpec, load_robot
 BASELINES_FILE, RESULT_FILE = "baselines.json", "result.json"
 DELAY_OFFSET_FILE, LABELS_FILE = "delay_offset.json", "labels.npy"
 LABEL_SHARE_OF_BOUND = 0.99  # largest label, as a share of the largest correction
-STOP_FILE = (
-    "stop"  # exists while the experiment is to end: running trainings store a checkpoint and end
-)
+# exists while the experiment is to end: running trainings store a checkpoint and end
+STOP_FILE = "stop"
 LOCK_TIMEOUT_S = 60.0  # trainings of an experiment that was killed end within this time
 
 Show = Callable[[Running, int], None]
@@ -210,9 +209,8 @@ def identified_robot(study: Study) -> RobotSpec:
     if not (folder / "robot.toml").is_file():
         splits = study.splits()
         options: dict[str, Any] = {"nthread": 1, "windows": study.options.identify_windows}
-        if (
-            study.options.identify_windows < WINDOWS
-        ):  # in a hurry: gains, friction, delay and offset alone
+        # in a hurry: gains, friction, delay and offset alone
+        if study.options.identify_windows < WINDOWS:
             options |= {"terms": (), "table": False, "joints_alone": True}
         judged = stratified_subset(splits["val"], MAX_VALIDATION_ROLLOUTS)  # as the networks are
         fitted = identify(

@@ -39,9 +39,8 @@ class FittedSim:
 
     robot: RobotSpec
     corrector: Corrector | None = None  # changes the targets (gaponet.sim.replay.Corrector)
-    shift: Callable[[Sequence], Array] | None = (
-        None  # returns an offset of a recording's simulated positions, (n,) rad
-    )
+    # returns an offset of a recording's simulated positions, (n,) rad
+    shift: Callable[[Sequence], Array] | None = None
     note: str = ""  # remark for the reader of the table
 
     def positions(self, sequences: list[Sequence]) -> list[Array]:

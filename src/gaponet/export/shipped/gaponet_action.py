@@ -229,9 +229,8 @@ class CheckPlayer:
 
         def step(ctrl: Any) -> Any:
             target = torch.tensor(ctrl, dtype=torch.float)[:, columns]
-            term.standing_command = (
-                target  # check motions start under a command that has been in force for long
-            )
+            # check motions start under a command that has been in force for long
+            term.standing_command = target
             env.step(target)
             return tensor(robot.data.joint_pos)[:, order].clone().numpy()
 

@@ -38,9 +38,8 @@ from gaponet.hw.control.watchdog import Watchdog
 from gaponet.hw.targets.policy import Policy, motion_policy
 from gaponet.robot.spec import RobotSpec
 
-WATCHDOG_PERIODS = (
-    5.0  # control periods without a heartbeat after which the watchdog damps the robot
-)
+# control periods without a heartbeat after which the watchdog damps the robot
+WATCHDOG_PERIODS = 5.0
 
 
 class Controller:

@@ -21,9 +21,8 @@ from gaponet.sim.model import build_model, model_hash
 from gaponet.sysid.axes import MAX_ARMATURE_TIME_S
 
 ROBOT_OF_DRIVER = {"unitree": "h1_2", "so101": "so101"}
-MAX_OFFSET_RAD = (
-    0.1  # of an identified command offset; a larger one is a wrong zero, which calibration removes
-)
+# of an identified command offset; a larger one is a wrong zero, which calibration removes
+MAX_OFFSET_RAD = 0.1
 KP_RATIO_BOUNDS = (0.25, 4.0)  # of identified kp to nominal kp
 MAX_WEIGHT_SHARE, POSTURES = (
     0.5,
@@ -33,9 +32,8 @@ RELATIVE_TOLERANCE = 1e-6  # between values of two files
 RANGE_TOLERANCE_RAD = 1e-6  # between joint ranges of two files
 MAX_KP = 300.0  # N·m/rad of any joint; the H1-2's legs have 200
 MAX_KD = 10.0  # N·m·s/rad
-MAX_BEYOND_RANGE_RAD = (
-    0.051  # of a command: a joint may start 0.05 rad outside its range, and is commanded there
-)
+# of a command: a joint may start 0.05 rad outside its range, and is commanded there
+MAX_BEYOND_RANGE_RAD = 0.051
 
 
 def reference_robot(driver: str, limits_from: str | None) -> RobotSpec:

@@ -17,9 +17,8 @@ from gaponet.robot.spec import RobotSpec
 
 MAX_BEYOND_RANGE_RAD = 0.05  # at the start, where only the MJCF says where a joint's range ends
 MAX_SEND_DELAY_S = 0.001  # between the last reading of the clock and the sending of a command
-MAX_SUSPENDED_S = (
-    0.05  # less than any suspend, more than two clocks that are read in turn differ by
-)
+# less than any suspend, more than two clocks that are read in turn differ by
+MAX_SUSPENDED_S = 0.05
 
 
 @dataclass(frozen=True)

@@ -29,25 +29,21 @@ _T = TypeVar("_T")
 
 MAX_START_DRIFT_RAD = 0.02  # by which the robot may have moved since the plan was made
 MAX_APPROACH_M = 0.001  # by which shells that start nearer than the clearance may come nearer
-MAX_START_OVERLAP_M = (
-    0.03  # of shells at the start: they are generous, and an arm rests on its table
-)
+# of shells at the start: they are generous, and an arm rests on its table
+MAX_START_OVERLAP_M = 0.03
 NO_MOVEMENT = 1e-3  # rad, or m of free space
-APPROACH_TIME_S = (
-    0.1  # time constant with which a live target may use up the free space beyond the clearance
-)
+# time constant with which a live target may use up the free space beyond the clearance
+APPROACH_TIME_S = 0.1
 BACK_APPROACH_TIME_S = 1e-6  # the same on the way back, which is slow
 MAX_SAG_M = 0.05  # of the measured robot below its command that is added to the clearance
 STEP_SHARES = (1.0, 0.5, 0.2)  # of a step towards a live target that are tried
 MIN_SEARCH_PERIOD_S = 0.005  # shorter control periods have no time for going around
-COMMAND_CLEARANCE_SHARE = (
-    0.5  # of the clearance that commands keep: they lead the joints by what these sag
-)
+# of the clearance that commands keep: they lead the joints by what these sag
+COMMAND_CLEARANCE_SHARE = 0.5
 GRADIENT_STEP_RAD = 1e-4  # of numerical gradients of the free space
 GOAL_SHARES = 41  # places on the straight line to a first live target that are tried as its goal
-MAX_TORQUE_EXCESS = (
-    1.1  # of a plan's torque over the usable one, or over that of the start if this is larger
-)
+# of a plan's torque over the usable one, or over that of the start if this is larger
+MAX_TORQUE_EXCESS = 1.1
 
 
 class TargetCompensator(Protocol):

@@ -27,12 +27,10 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Fault, State
 from gaponet.robot.spec import RobotSpec
 
-RELATIVE_ROUNDING = (
-    1e-9  # of a bound: kept free, so that rounding does not exceed a limit that is computed back
-)
-MIN_STILL_STATES = (
-    4  # new states in which one joint must read the same; at a turn two may by chance
-)
+# of a bound: kept free, so that rounding does not exceed a limit that is computed back
+RELATIVE_ROUNDING = 1e-9
+# new states in which one joint must read the same; at a turn two may by chance
+MIN_STILL_STATES = 4
 CHECKSUM_WINDOW_S = 1.0  # in which wrong checksums are counted
 # More is degrees, milliseconds or Fahrenheit, and would switch the check off.
 MAX_OPTIONS = dict.fromkeys(
@@ -43,9 +41,8 @@ MAX_OPTIONS |= {
     "temperature": (150, "up to 150 °C"),
     "torque_share": (1, "to 1"),
 }
-MIN_APPROACH_RAD_S = (
-    0.2  # with which a joint comes nearer to where it is asked to be; less is standing
-)
+# with which a joint comes nearer to where it is asked to be; less is standing
+MIN_APPROACH_RAD_S = 0.2
 MIN_SPEED_RAD_S = 1e-6  # below it a joint counts as standing still for damping
 MAX_BELIEVED_SPEED_RAD_S = 12.0  # for damping; a joint that moves faster than this has jumped
 

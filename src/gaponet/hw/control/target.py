@@ -30,9 +30,8 @@ SEARCH_SHARE = 0.3  # of a period in which a search for a clear path is continue
 MAX_UNPROVEN_WEIGHT = 0.3  # until a joint has followed, where one goes …
 FAR_RAD = 0.4  # … this far to the first target: at that weight more than friction may hide
 FULL_WEIGHT = 1.0 - 1e-9
-PAYLOAD_CHECK_S = (
-    2.0  # of the run, after which the estimated payload is compared with the stated one
-)
+# of the run, after which the estimated payload is compared with the stated one
+PAYLOAD_CHECK_S = 2.0
 END_TEXTS = {
     "hand_over": "held while it is handed over",
     "hold": "hold",
@@ -66,9 +65,8 @@ class Readiness:
         if self._good_states < MIN_GOOD_STATES:
             never = Fault(self._fault.kind, f"never ready: {self._fault.text}")
             return never if now - self.since > MAX_WAIT_S else None
-        if (
-            compensator and not self._prepared
-        ):  # takes longer than a period; then wait for fresh states again
+        # takes longer than a period; then wait for fresh states again
+        if compensator and not self._prepared:
             compensator.reset(state.qpos, self.context.payload_mass)
             self._prepared, self._good_states = True, 0
             return None

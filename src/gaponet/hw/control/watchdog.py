@@ -56,9 +56,8 @@ class Watchdog:
         for pipe in (self._in, self._out):
             os.set_blocking(pipe.fileno(), False)
         self._fired, self._timeout = False, timeout
-        self._answer_time: float | None = (
-            None  # monotonic s of the last answer, or of the first heartbeat before it
-        )
+        # monotonic s of the last answer, or of the first heartbeat before it
+        self._answer_time: float | None = None
 
     def wait_ready(self) -> None:
         """Return when it could damp the robot.

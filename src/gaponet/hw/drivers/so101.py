@@ -63,9 +63,8 @@ CONNECT_TIMEOUT_S = 1.0  # for a first whole state
 FULL_TORQUE = 1000  # of TORQUE_LIMIT, 0.1 %
 SETTINGS_INTERVAL_S = 1.0  # in which the settings of all servos are read again, one after the other
 MAX_MISMATCHES = 3  # readings in a row that differ from what was sent: packets get lost
-REMEMBERED_GOALS = (
-    64  # sent last; a servo that misses packets holds one of them, or that before the run
-)
+# sent last; a servo that misses packets holds one of them, or that before the run
+REMEMBERED_GOALS = 64
 FOREIGN_WINDOW_S = 1.0  # in which signs of another program are counted
 MAX_FOREIGN_SIGNS = 2  # one may be noise on the cable
 RELATIVE_KP_TOLERANCE = 0.01
@@ -139,9 +138,8 @@ class SO101Driver:
         self._bus: reg.ServoBus | None = None  # of the open port
         self._state: State | None = None
         self._torque_limit = torque_limit or [FULL_TORQUE] * len(self.joint_names)
-        self._goal: dict[int, int] | None = (
-            None  # in force; None: nothing was commanded, or the arm was let go
-        )
+        # in force; None: nothing was commanded, or the arm was let go
+        self._goal: dict[int, int] | None = None
         self._lowered_from: list[int] | None = None  # torque limits, 0.1 %; None: not lowered yet
         self._torque_on: set[int] = set()  # servos that have reported it
         self._mismatches: Counter[tuple[str, int]] = Counter()

@@ -65,9 +65,8 @@ MOTOR_FIELDS = (
 )  # not all 0 in a slot with a motor
 STATES_TOPIC = "rt/lowstate"
 WEIGHT_MOTOR = 27
-KD_FACTOR = (
-    4.0  # of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
-)
+# of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
+KD_FACTOR = 4.0
 VIRTUAL_MARK = 0x54524956  # "VIRT" in LowState.reserve[0], written by our virtual robot
 TICK_PERIODS_S = (0.001, 0.002)  # that the robot's tick may have
 MAX_CLOCK_DRIFT = 2e-4  # of the robot's clock, relative to ours
@@ -153,9 +152,8 @@ class UnitreeDriver:
         self._held_qpos: Array | None = None  # of the held joints at the first command, rad
         self._command = hg.LowCmd.new()
         self._refused = self.received = self._machine = 0
-        self._fault: Fault | None = (
-            None  # the first one that the robot reported; it may be in one message only
-        )
+        # the first one that the robot reported; it may be in one message only
+        self._fault: Fault | None = None
         self._state: State | None = None
         self._clock: TickClock | None = None
         self._bus: Bus | None = None

@@ -24,12 +24,10 @@ from gaponet.hw.targets.policy import NotYet
 from gaponet.robot.spec import RobotSpec
 
 MAX_MESSAGE_BYTES = 1 << 14  # a message of 27 joints with long names has 1,500
-MAX_BEYOND_RANGE_RAD = (
-    0.2  # beyond a joint's range: up to this a target is clipped to the range, else rejected
-)
-MAX_CATCH_UP_PERIODS = (
-    5  # control periods for which the speed limit bounds the distance to the last target
-)
+# beyond a joint's range: up to this a target is clipped to the range, else rejected
+MAX_BEYOND_RANGE_RAD = 0.2
+# control periods for which the speed limit bounds the distance to the last target
+MAX_CATCH_UP_PERIODS = 5
 MAX_OPTIONS = {
     "hold": (60.0, "s"),
     "late": (60.0, "s"),

@@ -149,9 +149,8 @@ class DeltaEnv:
         self.rows = rows = RecordedRows(sequences, robot, config.delta_hold + 1, num_envs)
         conditions = [rows.conditions[g] for g in rows.group]
         sim = BatchSim(robot, conditions, nthread, rows.locked)
-        if (
-            rows.unobserved.any()
-        ):  # these joints stay where the recording says, as in identification
+        # these joints stay where the recording says, as in identification
+        if rows.unobserved.any():
             held = IMMOVABLE_ARMATURE * rows.unobserved[rows.group]
             sim.batch.expand("dof_armature")[:] += held
             if sim.servo_model is not None:

@@ -96,9 +96,8 @@ def _probe(
     env_of_state = np.tile(np.arange(env.num_envs), len(visited))
     chosen = rng.permutation(np.sort(rng.permutation(len(x))[:states]))
     origin = rng.integers(0, 3, len(x))
-    if (
-        refit
-    ):  # the same states repeat: the copies are moved, so that none is both fitted and held out
+    # the same states repeat: the copies are moved, so that none is both fitted and held out
+    if refit:
         origin[env.num_envs :] = NEAR + origin[env.num_envs :] % 2
     conditions = [env.rows.conditions[g] for g in env.rows.group[env_of_state[chosen]]]
     oracle = ProbeOracle(env.robot, net.config, conditions, nthread, env.rows.locked)

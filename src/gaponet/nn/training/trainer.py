@@ -265,9 +265,8 @@ class Trainer:
     def _choose_gain(self) -> None:
         """Reduce the correction if that reduces the validation error. A resumed run continues with gain 1."""
         state = self.state
-        if (
-            not np.isfinite(state.best_trained_error) or self.config.model.kind == "paper"
-        ):  # it has no gain
+        # it has no gain
+        if not np.isfinite(state.best_trained_error) or self.config.model.kind == "paper":
             return
         self.stage = "gain"
         self._tick()

@@ -41,12 +41,10 @@ MAX_SET_ASIDE = 0.4  # of the recordings; more of them contradict the others
 COMMON_FIELDS = ("delay",)  # of one bus: those of all joints change together
 EVERY_JOINT = "every joint"
 FRICTION_FIELDS = ("damping", "frictionloss", "stribeck")
-FAR_RATIO = (
-    2.5  # of half of the windows' errors over the residual of the identification: another robot
-)
-MAX_CHANGED_JOINTS = (
-    0.4  # of all joints: more with another kp or several changes are another robot's
-)
+# of half of the windows' errors over the residual of the identification: another robot
+FAR_RATIO = 2.5
+# of all joints: more with another kp or several changes are another robot's
+MAX_CHANGED_JOINTS = 0.4
 
 Verdict = Literal["same", "drifted", "contradictory"]
 

@@ -25,9 +25,8 @@ from gaponet.sysid.motion.motion import GRID, fade, through
 Sides = tuple[str, ...]
 MAX_IK_ITERATIONS = 80
 DURATION_S = 8.0  # of most whole-body motions
-KNOT_ROWS = (
-    10  # between postures on a path of the hands that are computed; a spline goes through them
-)
+# between postures on a path of the hands that are computed; a spline goes through them
+KNOT_ROWS = 10
 ROLES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll")
 
 

@@ -156,9 +156,8 @@ def stretch(ctrl: Array, factor: float) -> Array:
 
 GRID_POINTS = 41  # across the range
 MAX_POSTURES = 400
-ENOUGH_RANGE_SHARE = (
-    0.91  # of the joint's range: stop looking; the margins to the stops take 1 or 2 %
-)
+# of the joint's range: stop looking; the margins to the stops take 1 or 2 %
+ENOUGH_RANGE_SHARE = 0.91
 GRAVITY_SHARE = 0.9  # of the usable torque: leaves some to accelerate
 
 
