@@ -61,6 +61,7 @@ def test_the_same_command_goes_on_where_it_was_and_prints_the_same(words, place,
     assert again["tables"] == json.loads((place / "out" / "paper.json").read_text())["tables"]
 
 
-def test_results_of_another_experiment_are_not_mixed(words, first_run, capsys):
-    assert main([*words, "--fleet", "easy", "--unit", "virtual-2"]) == 2
-    assert "another unit" in capsys.readouterr().err
+@pytest.mark.parametrize("other", [("--fleet", "easy"), ("--unit", "virtual-2")])
+def test_results_of_another_experiment_are_not_mixed(words, first_run, capsys, other):
+    assert main([*words, *other]) == 2
+    assert f"another {other[0].removeprefix('--')}" in capsys.readouterr().err

@@ -23,7 +23,7 @@ from gaponet.data.paper_counts import count_as_paper, table_beside_paper
 from gaponet.data.store import Dataset
 from gaponet.experiments.paper.claims import Claim, claim_table, claims
 from gaponet.experiments.paper.figure3 import draw_figure_3, figure_3_table
-from gaponet.experiments.paper.jobs import Job, SharedInputs, run_jobs
+from gaponet.experiments.paper.jobs import Job, make_shared_inputs, run_jobs
 from gaponet.experiments.paper.measure import ShareDone, record_unit
 from gaponet.experiments.paper.options import Block, PaperOptions
 from gaponet.experiments.paper.page import Section, write_page
@@ -93,7 +93,7 @@ def run_paper_experiment(
         jobs = all_jobs(study)
         trainings = [job.training for job in jobs if job.training]
         with open_bar("labels of the recordings") as update:
-            SharedInputs.make(study, trainings[0].config, update)
+            make_shared_inputs(study, trainings[0].config, update)
         with open_bars("trainings", len(jobs)) as show:
             failures = run_jobs(jobs, show)
         if not jobs[0].result_file.is_file() or not any(

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, ModelError
 from gaponet.base.executor import open_pool
 from gaponet.base.files import atomic_write, lock_folder, write_json
@@ -47,46 +46,45 @@ LOCK_TIMEOUT_S = 60.0  # trainings of an experiment that was killed end within t
 Show = Callable[[Running, int], None]
 
 
-@dataclass(frozen=True)
-class SharedInputs:
-    """What all trainings at the slowest rate have in common: made once, because it takes as long as a training.
+def make_shared_inputs(study: Study, config: TrainConfig, progress: ShareDone) -> None:
+    """Store what all trainings at the slowest rate have in common: it takes as long as a training.
 
-    Attributes:
-        delay_offset: Delay and offset of the training recordings, a baseline of every run.
-        labels: Δa of each labelled row, (rows, n) rad.
+    OUT/delay_offset.json: delay and offset of the training recordings, a baseline of every run.
+    OUT/labels.npy: Δa of each labelled row, (rows, n) rad.
+
+    Args:
+        config: Settings of any of these trainings; they choose the recordings.
     """
+    from gaponet.nn.training.pretraining import ITERATIONS, trajectory_labels
+    from gaponet.nn.training.run_folder import TrainingData
 
-    delay_offset: DelayOffset
-    labels: Array
+    labels_file = study.out / LABELS_FILE
+    if labels_file.is_file():
+        return
+    data = TrainingData(study.data, study.robot, config, study.holdout_units)
+    write_json(study.out / DELAY_OFFSET_FILE, DelayOffset.fit(data.train, study.robot, 0))
+    iterations = 0
 
-    @classmethod
-    def make(cls, study: Study, config: TrainConfig, progress: ShareDone) -> None:
-        """Make and store what is missing in OUT, for trainings with this configuration."""
-        from gaponet.nn.training.pretraining import ITERATIONS, trajectory_labels
-        from gaponet.nn.training.run_folder import TrainingData
+    def tick() -> None:
+        nonlocal iterations
+        iterations += 1
+        progress(iterations / (ITERATIONS + 2))
 
-        labels_file = study.out / LABELS_FILE
-        if labels_file.is_file():
-            return
-        data = TrainingData(study.data, study.robot, config, study.holdout_units)
-        write_json(study.out / DELAY_OFFSET_FILE, DelayOffset.fit(data.train, study.robot, 0))
-        iterations = 0
+    sequences = data.labelled_subset(config.pretraining.rows)
+    largest = LABEL_SHARE_OF_BOUND * config.model.delta_max
+    labels = trajectory_labels(sequences, study.robot, largest, 0, tick)
+    with atomic_write(labels_file) as temporary, temporary.open("wb") as file:
+        np.save(file, labels)
 
-        def tick() -> None:
-            nonlocal iterations
-            iterations += 1
-            progress(iterations / (ITERATIONS + 2))
 
-        sequences = data.labelled_subset(config.pretraining.rows)
-        largest = LABEL_SHARE_OF_BOUND * config.model.delta_max
-        labels = trajectory_labels(sequences, study.robot, largest, 0, tick)
-        with atomic_write(labels_file) as temporary, temporary.open("wb") as file:
-            np.save(file, labels)
-
-    @classmethod
-    def read(cls, study: Study) -> SharedInputs:
-        """Read them."""
-        return cls(DelayOffset.read(study.out), np.load(study.out / LABELS_FILE))
+def shared_inputs(study: Study, training: Training) -> dict[str, Any]:
+    """Return what a training takes from `make_shared_inputs`, in the form of Trainer's `shared`."""
+    if training.config.rates != study.rates[:1]:
+        return {}
+    no_time = 0.0  # s that count for this training
+    baseline = DelayOffset.read(study.out)
+    labels = np.load(study.out / LABELS_FILE)
+    return {"baseline": (baseline, no_time), "labels": (labels, no_time)}
 
 
 @dataclass(frozen=True)
@@ -257,7 +255,6 @@ def train(job: Job, training: Training) -> dict[str, Any]:
     torch.set_num_threads(1)
     study = job.study
     stop = study.out / STOP_FILE
-
     ending = False
 
     def end_if_asked(status: Status) -> None:
@@ -266,10 +263,7 @@ def train(job: Job, training: Training) -> dict[str, Any]:
             ending = True  # once: the trainer then stores what it has
             raise KeyboardInterrupt
 
-    shared: dict[str, Any] = {}
-    if training.config.rates == study.rates[:1]:
-        inputs = SharedInputs.read(study)
-        shared = {"baseline": (inputs.delay_offset, 0.0), "labels": (inputs.labels, 0.0)}
+    resumed = (job.run_folder / "checkpoint.pt").is_file()
     began = time.process_time()
     with lock_folder(job.run_folder, "run", wait=LOCK_TIMEOUT_S):
         trainer = Trainer(
@@ -278,10 +272,10 @@ def train(job: Job, training: Training) -> dict[str, Any]:
             job.run_folder,
             training.config,
             Budget(steps=training.steps),
-            resume=(job.run_folder / "checkpoint.pt").is_file(),
+            resume=resumed,
             holdout_units=study.holdout_units,
             show=end_if_asked,
-            shared=shared,
+            shared=shared_inputs(study, training),
         )
         trainer.run()
     if trainer.interrupted:
@@ -296,7 +290,8 @@ def train(job: Job, training: Training) -> dict[str, Any]:
         "obs_dim": training.config.model.observation_dim(len(study.robot.operated)),
         "steps": card["steps"],
         "seconds": card["seconds"],
-        "cpu_s": round(time.process_time() - began, 1),
+        # Of a resumed training the time of the first part is not known.
+        "cpu_s": None if resumed else round(time.process_time() - began, 1),
         "val_mpjae": card["val_mpjae"],
         "gain": card["gain"],
         "sensor_r2": card["sensor_r2"],

@@ -162,6 +162,8 @@ class Study:
             "motions": self.options.motions,
             "goals": self.options.goals,
             "unit": self.unit_name if self.virtual else "",
+            "fleet": load_fleet(self.fleet, self.robot).digest() if self.virtual else "",
+            "identify_windows": self.options.identify_windows,
             "quick": self.options.quick,
             "despite_errors": self.options.despite_errors,
         }
