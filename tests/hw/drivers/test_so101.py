@@ -29,25 +29,6 @@ OFF = bytes.fromhex("ff ff fe 04 03 28 00 d2")  # write 0 to torque enable (40) 
 SILENCE = 0.001  # s; on a wire without time whatever comes is there
 
 
-@pytest.fixture
-def servos() -> Servos:
-    return Servos()
-
-
-@pytest.fixture
-def wire(servos: Servos, monkeypatch: pytest.MonkeyPatch) -> Wire:
-    wire = Wire(servos)
-    monkeypatch.setattr(serial, "Serial", lambda *_, **__: wire)
-    return wire
-
-
-@pytest.fixture
-def driver(so101: RobotSpec, wire: Wire) -> SO101Driver:
-    driver = SO101Driver(so101, timeout=SILENCE)
-    driver.connect()
-    return driver
-
-
 def instructions(servos: Servos) -> list[int]:
     return [request[4] for request in servos.heard]
 

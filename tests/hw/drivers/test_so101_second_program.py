@@ -10,13 +10,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from servos import Servos, Wire, on_port
+from servos import Wire, on_port
 
 from gaponet.hw.control.driver import DriverError
 from gaponet.hw.drivers import feetech as reg
 from gaponet.hw.drivers.serial_port import other_programs
 from gaponet.hw.drivers.so101 import SO101Driver
-from gaponet.robot.spec import RobotSpec
 
 serial = pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 
@@ -24,25 +23,6 @@ ELBOW = 3  # servo
 HOLDER = (
     "import os, sys; os.open(sys.argv[1], os.O_RDWR); print('open', flush=True); sys.stdin.read()"
 )
-
-
-@pytest.fixture
-def servos() -> Servos:
-    return Servos()
-
-
-@pytest.fixture
-def wire(servos: Servos, monkeypatch: pytest.MonkeyPatch) -> Wire:
-    wire = Wire(servos)
-    monkeypatch.setattr(serial, "Serial", lambda *_, **__: wire)
-    return wire
-
-
-@pytest.fixture
-def driver(so101: RobotSpec, wire: Wire) -> SO101Driver:
-    driver = SO101Driver(so101, timeout=0.001)
-    driver.connect()
-    return driver
 
 
 @pytest.fixture
