@@ -15,7 +15,8 @@ from gaponet.cli.experiment import share_bar, show_paper_result
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
 
-FLEET, RECIPE = "firm", "demo"
+FLEET = "firm"
+RECIPE = "demo"
 NEEDED_MODULES = ("torch", "onnx", "onnxruntime", "matplotlib", "jinja2")
 
 

@@ -36,8 +36,10 @@ from gaponet.nn.training.config import TrainConfig
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 
-BASELINES_FILE, RESULT_FILE = "baselines.json", "result.json"
-DELAY_OFFSET_FILE, LABELS_FILE = "delay_offset.json", "labels.npy"
+BASELINES_FILE = "baselines.json"
+RESULT_FILE = "result.json"
+DELAY_OFFSET_FILE = "delay_offset.json"
+LABELS_FILE = "labels.npy"
 LABEL_SHARE_OF_BOUND = 0.99  # largest label, as a share of the largest correction
 # exists while the experiment is to end: running trainings store a checkpoint and end
 STOP_FILE = "stop"

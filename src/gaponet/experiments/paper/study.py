@@ -31,7 +31,9 @@ from gaponet.testing.fleet import load_fleet
 
 SETUP_FILE = "experiment.json"
 SETUP_HINT = "delete it and run the same command again"
-QUICK_MOTIONS, QUICK_PAYLOADS, QUICK_UNITS = 4, 2, 2  # of the dataset, in a quick run
+# Of the dataset, in a quick run.
+QUICK_MOTIONS = 4
+QUICK_UNITS = 2
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,7 @@ def _quick_entries(data: Dataset, unseen_unit: str) -> list[Entry]:
         rows[entry.meta.motion] = max(rows.get(entry.meta.motion, 0), entry.rows)
     motions = sorted(rows, key=lambda motion: (rows[motion], motion))[:QUICK_MOTIONS]
     payloads = sorted({entry.meta.payload_mass for entry in data.entries})
-    payloads = [payloads[0], payloads[-1]][-QUICK_PAYLOADS:]
+    payloads = [payloads[0], payloads[-1]]
     units = sorted({entry.meta.unit_id for entry in data.entries} - {unseen_unit})[:QUICK_UNITS]
     repetition = min(entry.meta.repetition for entry in data.entries)
     chosen = []
