@@ -271,7 +271,7 @@ def _classic_candidates(
 ) -> tuple[RobotFit, dict[str, Values]]:
     """Fit the classic fields, joints by themselves and then together; return the whole robot's fit and candidates.
 
-    With joints_alone, the candidates of the whole robot are those of the joints.
+    With joints_alone nothing is fitted together: each limb has the values of its joints.
     """
     bounds, names, residual = joints.bounds, joints.robot.operated, joints.prior.residual
     given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
@@ -285,8 +285,7 @@ def _classic_candidates(
     joints.prior.update_correlation_time(joints.rollouts, alone)
     whole = joints.robot_fit(nthread)
     if joints_alone:
-        fitted = {"limbs": alone, "joints": alone, "whole": alone}
-        return whole, {"given": given, **fitted, "delay and offset": late}
+        return whole, {"given": given, "limbs": alone, "delay and offset": late}
     searches.begin()
     report = searches.report("whole robot", names, whole.rollouts.rows)
     together = whole.descend(

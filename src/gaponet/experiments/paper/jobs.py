@@ -41,6 +41,8 @@ RESULT_FILE = "result.json"
 DELAY_OFFSET_FILE = "delay_offset.json"
 LABELS_FILE = "labels.npy"
 LABEL_SHARE_OF_BOUND = 0.99  # largest label, as a share of the largest correction
+# recordings that judge a hurried identification
+HURRIED_JUDGES = 8
 # exists while the experiment is to end: running trainings store a checkpoint and end
 STOP_FILE = "stop"
 LOCK_TIMEOUT_S = 60.0  # trainings of an experiment that was killed end within this time
@@ -209,14 +211,15 @@ def identified_robot(study: Study) -> RobotSpec:
     if not (folder / "robot.toml").is_file():
         splits = study.splits()
         options: dict[str, Any] = {"nthread": 1, "windows": study.options.identify_windows}
-        # in a hurry: gains, friction, delay and offset alone
+        judges = MAX_VALIDATION_ROLLOUTS  # as many recordings as judge the networks
         if study.options.identify_windows < WINDOWS:
+            # In a hurry: gains, friction, delay and offset of each joint alone.
             options |= {"terms": (), "table": False, "joints_alone": True}
-        judged = stratified_subset(splits["val"], MAX_VALIDATION_ROLLOUTS)  # as the networks are
+            judges = HURRIED_JUDGES
         fitted = identify(
             study.data.sequences(splits["train"]),
             study.robot,
-            study.data.sequences(judged),
+            study.data.sequences(stratified_subset(splits["val"], judges)),
             **options,
         )
         save_robot(fitted.robot, folder)
