@@ -49,7 +49,7 @@ TABLE_2_CHANGES: dict[str, dict[str, object]] = {
 
 # A quick run shows that everything works: every network takes steps, and its numbers mean nothing.
 QUICK_PRETRAINING = PretrainingConfig(
-    rounds=1, num_envs=16, steps=40, gradient_steps=30, batch_size=128, sensor_states=128
+    rounds=1, num_envs=16, steps=40, gradient_steps=150, batch_size=128, sensor_states=128
 )
 QUICK_PPO = PPOConfig(
     num_envs=16, num_steps=16, epochs=2, mini_batches=1, critic_warmup=1, explained=-1e9

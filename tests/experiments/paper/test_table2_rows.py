@@ -1,0 +1,54 @@
+"""Each row of Table 2 trains, and its setting changes the network that comes out."""
+
+import numpy as np
+import pytest
+from arm import commands, record, write_dataset
+
+from gaponet.experiments.paper.experiment import all_jobs
+from gaponet.experiments.paper.jobs import make_shared_inputs, train
+from gaponet.experiments.paper.options import PaperOptions
+from gaponet.experiments.paper.study import Study
+from gaponet.experiments.paper.trainings import TABLE_2_CHANGES
+from gaponet.nn.artifact import GapModel
+from gaponet.sim.replay import rollout_errors
+
+OPTIONS = PaperOptions(quick=True, blocks=("table2",)).for_quick_run()
+
+
+@pytest.fixture(scope="module")
+def study(robot, tmp_path_factory):
+    """Recordings of a weak arm with two payloads; one rate, so there is no row of 100 Hz."""
+    folder = tmp_path_factory.mktemp("table2")
+    sequences = [
+        record(robot, commands(60, motion), f"motion{motion}", payload, kp=0.5, delay=2)
+        for motion in range(8)
+        for payload in (0.0, 0.2)
+    ]
+    dataset = write_dataset(folder / "data", robot, sequences)
+    return Study(str(dataset.path), robot, folder, OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def errors(robot, study):
+    """Row → error of the simulator with its network on two motions, (2,) rad."""
+    jobs = all_jobs(study)[1:]
+    make_shared_inputs(study, jobs[0].training.config, lambda share: None)
+    recordings = [record(robot, commands(60, 90 + k), "new", 0.2, kp=0.5, delay=2) for k in (0, 1)]
+    measured = {}
+    for job in jobs:
+        train(job, job.training)
+        corrector = GapModel.load(job.run_folder).corrector(robot)
+        measured[job.training.name] = rollout_errors(recordings, robot, 1, corrector)
+    return measured
+
+
+@pytest.mark.slow
+def test_every_row_that_the_data_allow_is_trained(errors):
+    assert errors.keys() == TABLE_2_CHANGES.keys() - {"100 Hz"}
+
+
+@pytest.mark.slow
+def test_every_row_differs_from_the_paper_s_own(errors):
+    own = errors.pop("payload out")
+    for row, error in errors.items():
+        assert not np.allclose(error, own, rtol=1e-6, atol=0), row
