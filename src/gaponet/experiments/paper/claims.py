@@ -180,14 +180,14 @@ def claim_table(found: list[Claim], block: Block) -> ResultTable:
         ]
         printed = "" if claim.printed is None else f"{claim.printed:g}"
         rows.append((claim.text, printed, *cells, claim.verdict))
-    seeds = max((one.seeds for claim in of_block for one in claim.reductions.values()), default=0)
-    motions = max(
-        (one.motions for claim in of_block for one in claim.reductions.values()), default=0
-    )
+    everything = [reduction for claim in of_block for reduction in claim.reductions.values()]
+    seeds = max((reduction.seeds for reduction in everything), default=0)
+    over = f"over {seeds} seeds and over motions or goals"
+    if seeds == 1:
+        over = "over motions or goals; of one seed the spread over seeds is not known"
     caption = (
-        f"Trained by {BLOCK_TITLES[block]}. Per cent less, ± the standard error over {seeds} seeds and over motions "
-        f"or goals (paired, jackknife; {motions} at most). The verdict is on GAPONet: reached or not by two standard "
-        "errors. An untrained network has 0 in every row."
+        f"Trained by {BLOCK_TITLES[block]}. Per cent less, ± the standard error {over} (paired, jackknife). The verdict "
+        "is on GAPONet: reached or not by two standard errors. An untrained network has 0 in every row."
     )
     columns = ("claim", "the paper", *methods, "verdict")
     return ResultTable(f"claims_{block}", columns, tuple(rows), caption, 0)

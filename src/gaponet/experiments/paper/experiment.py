@@ -172,8 +172,8 @@ def summarise(study: Study, jobs: list[Job], failures: list[str]) -> PaperResult
     sections.append(Section("", "Methods", tables=[method_table(results)]))
     gaps = [large_gaps_table(results, block) for block in BLOCKS if results.networks(block)]
     sections.append(Section("", "Large gaps by payload", tables=gaps))
+    page = write_page(study, sections, failures)
     sentences = [*_conclusions(found), *failures]
-    page = write_page(study, sections, sentences)
     tables = {table.name: table for section in sections for table in section.tables}
     return PaperResult(page, found, tables, sentences, failures)
 

@@ -47,11 +47,11 @@ class Section:
     tables: list[ResultTable] = field(default_factory=list)
 
 
-def write_page(study: Study, sections: list[Section], sentences: list[str]) -> Path:
+def write_page(study: Study, sections: list[Section], failures: list[str]) -> Path:
     """Write paper.html, paper.json, and the folders figures and tables; return the page.
 
     Args:
-        sentences: Conclusions, at the top of the page.
+        failures: A sentence for each training that failed, at the top of the page.
     """
     out = study.out
     for folder in ("figures", "tables"):
@@ -74,7 +74,7 @@ def write_page(study: Study, sections: list[Section], sentences: list[str]) -> P
     record: dict[str, Any] = {
         "provenance": provenance,
         "facts": facts,
-        "sentences": sentences,
+        "failures": failures,
         "tables": {t.name: t.record() for section in sections for t in section.tables},
     }
     write_json(out / "paper.json", record)
@@ -87,7 +87,7 @@ def write_page(study: Study, sections: list[Section], sentences: list[str]) -> P
             title="SimLifter and GAPONet: the paper's experiment",
             virtual=study.virtual,
             provenance=provenance,
-            sentences=sentences,
+            failures=failures,
             diagram=Markup(diagram),
             sections=shown,
             facts=[[name.replace("_", " "), str(value)] for name, value in facts.items()],
