@@ -186,8 +186,8 @@ def claim_table(found: list[Claim], block: Block) -> ResultTable:
     if seeds == 1:
         over = "over motions or goals; of one seed the spread over seeds is not known"
     caption = (
-        f"Trained by {BLOCK_TITLES[block]}. Per cent less, ± the standard error {over} (paired, jackknife). The verdict "
-        "is on GAPONet: reached or not by two standard errors. An untrained network has 0 in every row."
+        f"Trained by {BLOCK_TITLES[block]}. Per cent less, ± the standard error {over} (paired, jackknife). "
+        "The verdict is on GAPONet: reached or not by two standard errors. An untrained network has 0 in every row."
     )
     columns = ("claim", "the paper", *methods, "verdict")
     return ResultTable(f"claims_{block}", columns, tuple(rows), caption, 0)
