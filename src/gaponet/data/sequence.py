@@ -15,6 +15,7 @@ from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import Json
 from gaponet.data.log import COMMANDS, FEEDFORWARD, Log
 from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
+from gaponet.robot.simulator_change import SimulatorChange
 from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
@@ -100,6 +101,8 @@ class Sequence:
         dt: s.
         ctrl, qpos, qvel: (T, n), rad, rad, rad/s, float32.
         qacc, tau, tau_eq, temperature: (T, n) or None, rad/s², N·m, N·m, °C.
+        simulator: How the simulator in which the recording is replayed differs from the robot's own; None: not at all.
+            It is no part of the recording, and is not stored.
     """
 
     meta: SequenceMeta
@@ -112,6 +115,7 @@ class Sequence:
     tau: Array | None = None
     tau_eq: Array | None = None
     temperature: Array | None = None
+    simulator: SimulatorChange | None = None
 
     def __post_init__(self) -> None:
         if not MIN_PERIOD_S <= self.dt <= MAX_PERIOD_S:

@@ -156,7 +156,7 @@ class TransferCorrector:
         """Start one simulation per sequence at its first row."""
         locked = idle_limbs(start, self.robot)
         own = BatchSim(self.target, [Condition.of(s, self.target) for s in start], locked=locked)
-        reference = [Condition.of(s, self.robot) for s in start]
+        reference = [Condition.of(s, self.robot).without_change for s in start]
         self.transfer = Transfer(
             self.reference, AnalyticInverse.of(own), reference, locked, 0, self.extrapolate
         )
@@ -179,7 +179,7 @@ def _require_measured(
     inverse: AnalyticInverse, reference: AnalyticInverse, joints: tuple[str, ...]
 ) -> None:
     """Refuse a target outside the measured ranges."""
-    extra_delay = inverse.delay - reference.delay
+    extra_delay = (inverse.delay - reference.delay).max(axis=0)  # (n,)
     if extra_delay.max() > MAX_EXTRA_DELAY_S:
         joint = joints[extra_delay.argmax()]
         raise ModelError(

@@ -17,6 +17,8 @@ PAPER_ONLY = (  # options of kind "paper" alone
     "payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target", "branch_observation",
     "relative_action", "real_state", "predictor_inputs",
 )  # fmt: skip
+CONTEXT_VALUES = 8  # of a joint (nn/context.py)
+CONTEXT_KINDS = ("gaponet", "shared_mlp")
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,10 @@ class ModelConfig:
     sensors: Literal["off", "predicted"] = "off"
     """off: the branch input is the observation. predicted: predicted sensor values too, as in the paper; they did not
     reduce the error (docs/results/did-not-work.md)."""
+    context: bool = False
+    """gaponet, shared_mlp: the simulator's answers to fixed probes at rest are inputs (nn/context.py). In gaponet they
+    are the branch input, and the trunk sees the observation and the action, with the widths of branch_hidden.
+    gaponet train --simulators sets it."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
     branch_hidden: Layers = (64, 64)
@@ -99,6 +105,8 @@ class ModelConfig:
             raise UsageError(
                 f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them"
             )
+        if self.context and self.sensors != "off":
+            raise UsageError("context with predicted sensors: the network takes one of them")
         if self.sensor_source == "none":
             self._require_options_without_sensors()
         if self.predictor_inputs == "equation_1":
@@ -139,6 +147,10 @@ class ModelConfig:
         Raises:
             UsageError: An option belongs to kind "paper".
         """
+        if self.context and self.kind not in CONTEXT_KINDS:
+            raise UsageError(
+                f"context: model {self.kind} has no such input; use {' or '.join(CONTEXT_KINDS)}"
+            )
         for name in PAPER_ONLY if self.kind != "paper" else ():
             if (value := getattr(self, name)) != getattr(ModelConfig, name):
                 raise UsageError(
@@ -180,8 +192,14 @@ class ModelConfig:
         return self.num_probes * 2 * n
 
     def input_dim(self, n: int) -> int:
-        """Return the length of x = [o_t | a_t | the simulator's answers | recorded state] (nn/observation.py)."""
+        """Return the length of x = [o_t | a_t | the simulator's answers | recorded state | context]."""
         inputs = self.observation_dim(n) + n + self.real_state_dim(n)
         if self.needs_simulator:
             inputs += self.sensor_dim(n)
-        return inputs
+        return inputs + self.context_dim(n)
+
+    def context_dim(self, n: int) -> int:
+        """Return the number of answers to fixed probes in x, or 0 without context."""
+        if not self.context:
+            return 0
+        return CONTEXT_VALUES * n

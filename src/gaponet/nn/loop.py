@@ -13,14 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base.arrays import Array, array_module, copy_array, zeros_like
+from gaponet.base.arrays import Array, array_like, array_module, copy_array, zeros_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.bound import AnswerBound
 from gaponet.nn.config import ModelConfig
+from gaponet.nn.context import contexts
 from gaponet.nn.observation import History, Layout
 from gaponet.nn.onnx_network import Network, OnnxNetwork
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.batch import Condition
 
 
 class DeltaLoop:
@@ -87,6 +89,13 @@ class DeltaLoop:
     def refused_answers(self) -> int:
         """Number of the network's answers that were not finite, for which no correction was used (nn/bound.py)."""
         return self._bound.refused
+
+    def set_context(self, context: Any) -> None:
+        """Set the answers of each robot's simulator to fixed probes, (num_envs, 8n) or (8n) rad (nn/context.py)."""
+        if self._numpy:
+            self.x[:, self.layout.context] = context
+        else:
+            self.x[:, self.layout.context] = array_like(self.x, context)
 
     # ---- history
 
@@ -259,13 +268,13 @@ class DeltaCorrector:
             self.config, self.robot.qpos_range[self.operated], len(start), self.network
         )
         self.payload = np.array([s.meta.payload_mass for s in start], np.float32)
+        conditions = [Condition.of(s, self.robot) for s in start]
+        if self.config.context:
+            loop.set_context(contexts(self.robot, conditions, loaded=not self.config.payload_input))
         if self.config.needs_simulator:
             from gaponet.nn.sensor import ProbeOracle
-            from gaponet.sim.batch import Condition
 
-            oracle = ProbeOracle(
-                self.robot, self.config, [Condition.of(s, self.robot) for s in start]
-            )
+            oracle = ProbeOracle(self.robot, self.config, conditions)
 
             def answers() -> Array:
                 assert self._state is not None

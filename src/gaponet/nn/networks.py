@@ -12,10 +12,13 @@ from torch.nn.functional import pad
 
 from gaponet.base.arrays import Array
 from gaponet.nn.config import ModelConfig, ModelKind
-from gaponet.nn.layers import DeltaNet, dense, num_parameters
+from gaponet.nn.layers import DeltaNet, Standardise, dense, num_parameters
 from gaponet.nn.observation import Layout
 from gaponet.nn.paper import PaperNet, SensorPredictor
 from gaponet.nn.trees import TreesNet
+
+MIN_CONTEXT_STD_RAD = 1e-6
+MAX_CONTEXT = 3.0  # standard deviations; a product of two networks extrapolates badly
 
 
 class OperatorNet(DeltaNet):
@@ -24,6 +27,9 @@ class OperatorNet(DeltaNet):
     All joints share one branch and one trunk net. The branch input of joint j is its one-hot index, its sensor values,
     its state and history, the payload P, and q, q̇ and a − q of all joints. The trunk input is the one-hot index,
     a_j − q_j and the payload.
+
+    With a context (nn/context.py), the branch input is the one-hot index and the context of joint j, and the trunk has
+    all other inputs.
     """
 
     columns: Tensor
@@ -38,17 +44,26 @@ class OperatorNet(DeltaNet):
             "columns", torch.from_numpy(np.hstack([branch, trunk]).ravel()), persistent=False
         )
         self.branch_inputs, self.trunk_inputs = branch.shape[1], trunk.shape[1]
-        self.branch = dense(self.branch_inputs, config.branch_hidden, config.num_basis)
-        self.trunk = dense(
-            self.trunk_inputs, config.trunk_hidden, config.num_basis, zero_output=True
-        )
+        branch_hidden = config.branch_hidden
+        trunk_hidden = config.trunk_hidden
+        if config.context:  # the trunk has the many inputs
+            branch_hidden, trunk_hidden = trunk_hidden, branch_hidden
+            self.context_scale = Standardise(config.context_dim(n))
+        self.branch = dense(self.branch_inputs, branch_hidden, config.num_basis)
+        self.trunk = dense(self.trunk_inputs, trunk_hidden, config.num_basis, zero_output=True)
         self.bias = nn.Parameter(torch.zeros(n))
 
     @staticmethod
     def joint_columns(config: ModelConfig, n: int) -> tuple[Array, Array]:
-        """Return the inputs of branch and trunk as columns of [features | sensors | 0 | 1], (n, inputs) each."""
-        layout, sensors = Layout(config, n), config.sensor_dim(n) * (config.sensors != "off")
-        columns = np.arange(layout.query.stop + sensors)
+        """Return the inputs of branch and trunk, (n, inputs) each.
+
+        They are columns of [features | sensors or context | 0 | 1].
+        """
+        layout = Layout(config, n)
+        further = config.context_dim(n)
+        if config.sensors != "off":
+            further = config.sensor_dim(n)
+        columns = np.arange(layout.query.stop + further)
         joint_onehot = len(columns) + np.eye(n, dtype=int)
 
         def per_joint(part: slice) -> Array:
@@ -57,6 +72,13 @@ class OperatorNet(DeltaNet):
         def all_joints(part: slice) -> Array:
             return np.tile(columns[part], (n, 1))
 
+        if config.context:
+            branch = [joint_onehot, per_joint(slice(layout.query.stop, None))]
+            trunk = [
+                joint_onehot, per_joint(slice(layout.past.stop)), all_joints(layout.payload),
+                all_joints(layout.state), all_joints(layout.action), per_joint(layout.action),
+            ]  # fmt: skip
+            return np.hstack(branch), np.hstack(trunk)
         branch = [
             joint_onehot, per_joint(slice(layout.query.stop, None)), per_joint(slice(layout.past.stop)),
             all_joints(layout.payload), all_joints(layout.state), all_joints(layout.action),
@@ -64,8 +86,26 @@ class OperatorNet(DeltaNet):
         trunk = [joint_onehot, per_joint(layout.action), all_joints(layout.payload)]
         return np.hstack(branch), np.hstack(trunk)
 
+    def fit_inputs(self, x: Tensor) -> None:
+        super().fit_inputs(x)
+        if self.config.context:
+            self.context_scale.fit(x[:, self.features.layout.context], min_std=MIN_CONTEXT_STD_RAD)
+
+    def prepare(self, x: Tensor) -> Tensor:
+        z = self.features(x)
+        if self.config.context:
+            z = torch.cat([z, self.context(x)], dim=1)
+        return self.arrange(z)
+
+    def context(self, x: Tensor) -> Tensor:
+        """x → standardised answers of the simulator, (B, 8n), within the range in which they were trained."""
+        z = self.context_scale(x[:, self.features.layout.context]).clamp(-MAX_CONTEXT, MAX_CONTEXT)
+        if self.features.noise_std:
+            z = z + self.features.noise_std * torch.randn_like(z)
+        return z
+
     def arrange(self, z: Tensor) -> Tensor:
-        """Features of [o_t | a_t] → [branch inputs | trunk inputs] of each joint, (B, n, both)."""
+        """Features, and the context if there is one → [branch inputs | trunk inputs] of each joint, (B, n, both)."""
         if self.config.sensors != "off":
             z = torch.cat([z, self.sensors(z)], dim=1)
         z = pad(pad(z, (0, 1)), (0, 1), value=1.0)

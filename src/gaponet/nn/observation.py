@@ -5,6 +5,7 @@ o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q�
 
 x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more columns: with fixed probes
 S_t, then, if it observes the recorded state, [ q_real − q | q̇_real − q̇ | 1 ], all zero where that state is hidden.
+A network for many simulators has the context of nn/context.py as last columns.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ class Layout:
     """Columns of x as slices. Features of a network have the same columns.
 
     Attributes:
-        q, v, past, payload, action, sensors, real: The parts of x in their order.
+        q, v, past, payload, action, sensors, real, context: The parts of x in their order.
         state, observation, query: [q | q̇], o_t and [o_t | a_t].
     """
 
@@ -31,9 +32,27 @@ class Layout:
         o = config.observation_dim(n)
         answers = config.sensor_dim(n) if config.needs_simulator else 0
         real = config.real_state_dim(n)
-        sizes = (n, n, 3 * n * config.history, int(config.payload_input), n, answers, real)
+        sizes = (
+            n,
+            n,
+            3 * n * config.history,
+            int(config.payload_input),
+            n,
+            answers,
+            real,
+            config.context_dim(n),
+        )
         parts = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
-        self.q, self.v, self.past, self.payload, self.action, self.sensors, self.real = parts
+        (
+            self.q,
+            self.v,
+            self.past,
+            self.payload,
+            self.action,
+            self.sensors,
+            self.real,
+            self.context,
+        ) = parts
         self.state, self.observation, self.query = slice(0, 2 * n), slice(0, o), slice(0, o + n)
         self.dim = config.input_dim(n)
 

@@ -88,7 +88,10 @@ class _FusedFeatures(nn.Module):
 
 def onnx_content(net: DeltaNet) -> bytes:
     """Return a network in evaluation mode as an ONNX file: x (batch, dim) → delta (batch, n), float32."""
-    linear = net.config.kind not in ("paper", "trees") and net.config.sensors == "off"
+    config = net.config
+    linear = (
+        config.kind not in ("paper", "trees") and config.sensors == "off" and not config.context
+    )
     content, x = io.BytesIO(), torch.zeros(2, net.config.input_dim(net.n))
     exported: Any = _FusedFeatures(net) if linear else net
     with warnings.catch_warnings():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
@@ -14,7 +15,9 @@ from gaponet.base.arrays import Array, array_like, array_module
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_TERMS, STOP_FIELDS
+from gaponet.robot.simulator_change import SimulatorChange
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.changed_model import changed_model
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo import ServoModel
 
@@ -114,7 +117,8 @@ def speed_limited(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> 
 class Condition(NamedTuple):
     """Condition of a recording: payload, control period, and gains (n) where they are not the robot's own.
 
-    Also the mean temperature of each joint (n), °C, if it was recorded and changes the robot's friction.
+    Also the mean temperature of each joint (n), °C, if it was recorded and changes the robot's friction, and how the
+    simulator differs from the robot's own.
     """
 
     payload_mass: float
@@ -123,6 +127,7 @@ class Condition(NamedTuple):
     kp: tuple[float, ...] | None = None
     kd: tuple[float, ...] | None = None
     temperature: tuple[float, ...] | None = None
+    simulator: SimulatorChange | None = None
 
     @classmethod
     def of(cls, sequence: Sequence, robot: RobotSpec) -> Condition:
@@ -136,7 +141,13 @@ class Condition(NamedTuple):
             sequence.dt,
             *other,
             sequence.temperatures if warm else None,
+            sequence.simulator,
         )
+
+    @property
+    def without_change(self) -> Condition:
+        """The same condition in the robot's own simulator."""
+        return self._replace(simulator=None)
 
 
 class BatchSim:
@@ -157,13 +168,27 @@ class BatchSim:
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
         conditions = [Condition(*c) for c in conditions]
-        robots = {
-            c: robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
-            for c in dict.fromkeys(conditions)
-        }
-        self.models = {
-            c: build_model(r, *c[:3], locked, physics_only=True) for c, r in robots.items()
-        }
+        delays = [c.simulator.delay for c in conditions if c.simulator]
+        self.longest_delay = float(robot.delay.max()) + max(delays, default=0.0)  # s
+        robots: dict[Condition, RobotSpec] = {}
+        unchanged: dict[Condition, mujoco.MjModel] = {}
+        self.models: dict[Condition, mujoco.MjModel] = {}
+        for c in dict.fromkeys(conditions):
+            robots[c] = robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
+            own = c.without_change
+            if own not in unchanged:
+                buffered = robots[c]
+                if any(delays):  # every model has the buffer of the longest delay
+                    longest = np.full(len(robot.joint_names), self.longest_delay)
+                    buffered = replace(buffered, delay=longest)
+                model = build_model(buffered, *c[:3], locked, physics_only=True)
+                model.actuator_delay[:] = robots[c].delay[robot.index(self.joint_names)]
+                unchanged[own] = model
+            self.models[c] = unchanged[own]
+            if c.simulator is not None:
+                self.models[c] = changed_model(
+                    unchanged[own], robots[c], self.joint_names, c.simulator
+                )
         first = self.models[conditions[0]]
         kp_ratio = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
         self._kp_ratio = np.array([kp_ratio[c] for c in conditions])

@@ -96,12 +96,11 @@ class AnalyticInverse:
         act = np.array([_position_actuator(model, name) for name in joints])
         bias = _own(batch, model, "actuator_biasprm")[:, act]
         self.kp, self.kd = _own(batch, model, "actuator_gainprm")[:, act, 0], -bias[..., 2]
-        self.offset, self.delay = bias[..., 0] / self.kp, model.actuator_delay[act]
+        self.offset = bias[..., 0] / self.kp
+        self.delay = _own(batch, model, "actuator_delay")[:, act]
         self.low, self.high = _most_torque(model, joints, act)
-        self.frictionloss, self.damping = (
-            model.dof_frictionloss[self.dof],
-            model.dof_damping[self.dof],
-        )
+        self.frictionloss = _own(batch, model, "dof_frictionloss")[:, self.dof]
+        self.damping = _own(batch, model, "dof_damping")[:, self.dof]
         has_terms = model.nuser_actuator == len(SERVO_TERMS)
         self.terms = present(
             dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True)) if has_terms else {}

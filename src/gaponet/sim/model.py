@@ -81,7 +81,7 @@ def build_model(
             f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {order}"
         )
     stiffen_friction(model)
-    _soften_table(model, robot)
+    soften_table(model, robot)
     return model
 
 
@@ -272,7 +272,7 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
         model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     mujoco.mj_setConst(model, mujoco.MjData(model))
     stiffen_friction(model)
-    _soften_table(model, robot)
+    soften_table(model, robot)
     return model
 
 
@@ -376,7 +376,7 @@ def _add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
         )  # fmt: skip
 
 
-def _soften_table(model: mujoco.MjModel, robot: RobotSpec) -> None:
+def soften_table(model: mujoco.MjModel, robot: RobotSpec) -> None:
     """Give the contacts of a compiled model the table's stiffness, critically damped."""
     if robot.table is not None:
         model.pair_solref[:] = _solref(model, np.array(robot.table.stiffness))

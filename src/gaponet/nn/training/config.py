@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from annotated_types import Interval
 
 from gaponet.base.errors import UsageError
-from gaponet.nn.config import Layers, ModelConfig
+from gaponet.nn.config import CONTEXT_KINDS, Layers, ModelConfig
+from gaponet.robot.simulator_change import SimulatorRanges
 
 if TYPE_CHECKING:
     from gaponet.robot.spec import RobotSpec
@@ -132,6 +133,15 @@ class TrainConfig:
     """Control rates of the recordings that are used, Hz; default: all."""
     train_share: Annotated[float, Interval(gt=0, le=1)] = 1.0
     """Share of the training motions that is used. Validation and test motions stay the same."""
+    simulators: Annotated[int, Interval(ge=0, le=100_000)] = 0
+    """Number of simulators in which the network is trained; they are drawn from simulator_ranges by the seed. The
+    network is told the simulator's answers to fixed probes (nn/context.py), and then corrects simulators that it has
+    never seen. 0: the robot's own simulator alone."""
+    simulators_per_recording: Annotated[int, Interval(ge=1, le=1000)] = 4
+    """Number of these simulators in which each recording is replayed."""
+    simulator_ranges: SimulatorRanges = field(default_factory=SimulatorRanges)
+    without_context: bool = False
+    """Do not tell the network the simulator's answers, as a baseline."""
     mixed_gains: bool = False
     """Train on recordings with different kp or kd together."""
     validate_every: Annotated[int, Interval(ge=1, le=10000000)] = 10
@@ -183,12 +193,17 @@ class TrainConfig:
         )
 
     def sized(self) -> TrainConfig:
-        """Return this configuration with the device's number of simulations where num_envs is 0."""
-        num = 4096 if self.device == "cuda" else 256
+        """Return this configuration with the number of simulations where num_envs is 0, and the network's context."""
+        num = max(4096 if self.device == "cuda" else 256, 2 * self.simulators)
         pretraining = replace(self.pretraining, num_envs=self.pretraining.num_envs or num)
-        return replace(
-            self, pretraining=pretraining, ppo=replace(self.ppo, num_envs=self.ppo.num_envs or num)
-        )
+        ppo = replace(self.ppo, num_envs=self.ppo.num_envs or num)
+        return replace(self, model=self._model_with_context(), pretraining=pretraining, ppo=ppo)
+
+    def _model_with_context(self) -> ModelConfig:
+        """Return the network's options, with the context where there are many simulators to tell apart."""
+        if not self.simulators or self.without_context or self.model.kind not in CONTEXT_KINDS:
+            return self.model
+        return replace(self.model, context=True)
 
     def options(self) -> list[str]:
         """Return the options of gaponet train for this configuration."""

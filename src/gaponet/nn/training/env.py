@@ -13,6 +13,7 @@ from gaponet.base.arrays import Array, array_like, array_module, copy_array, zer
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.config import ModelConfig
+from gaponet.nn.context import contexts
 from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.observation import History
 from gaponet.nn.sensor import ProbeOracle
@@ -193,9 +194,12 @@ class DeltaEnv:
                     f"--model.sensor-source fixed asks C MuJoCo: use --device cpu, not {device}"
                 )
             self.oracle = ProbeOracle(robot, config, conditions, nthread, rows.locked)
+        if config.context:
+            loaded = not config.payload_input
+            self.loop.set_context(contexts(robot, conditions, loaded, nthread))
         if config.needs_simulator or config.observes_real_state:
             self.loop.extra = self._extra_inputs
-        max_delay_periods = int(np.ceil(sim.robot.delay.max() / min(c[2] for c in rows.conditions)))
+        max_delay_periods = int(np.ceil(sim.longest_delay / min(c[2] for c in rows.conditions)))
         self.depth = max(
             self.loop.history.depth, 1 + max_delay_periods
         )  # rows before the start that are used

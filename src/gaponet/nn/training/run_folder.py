@@ -23,6 +23,7 @@ from gaponet.data.store import Dataset, dataset_hash
 from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import CHECKPOINT
 from gaponet.nn.training.config import Budget, TrainConfig, command
+from gaponet.nn.training.simulators import in_many_simulators, in_validation_simulators
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot, save_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition
@@ -36,7 +37,8 @@ class TrainingData:
 
     Attributes:
         splits: Entries of "train", "val" and "test".
-        train: Training recordings.
+        recorded: Training recordings.
+        train: The same, each once for each of its simulators.
         val: Validation recordings, at most MAX_VALIDATION_ROLLOUTS.
     """
 
@@ -58,9 +60,11 @@ class TrainingData:
         if not config.mixed_gains:
             metas = (e.meta for entries in self.splits.values() for e in entries)
             require_same_gains(metas, dataset.joint_names, robot.operated)
-        self.train = dataset.sequences(self.splits["train"], optional=False)
+        self.config = config
+        self.recorded = dataset.sequences(self.splits["train"], optional=False)
+        self.train = in_many_simulators(self.recorded, robot, config)
         val = stratified_subset(self.splits["val"], MAX_VALIDATION_ROLLOUTS)
-        self.val = dataset.sequences(val, optional=False)
+        self.val = in_validation_simulators(dataset.sequences(val, optional=False), robot, config)
         if not config.mixed_gains and (
             other := next((c for c in self.conditions if c.kp or c.kd), None)
         ):
@@ -75,10 +79,16 @@ class TrainingData:
         return {Condition.of(s, self.robot) for s in self.train}
 
     def labelled_subset(self, max_rows: int) -> list[Sequence]:
-        """Return training recordings with about max_rows rows, stratified by payload, unit and rate."""
+        """Return training recordings with about max_rows rows, stratified by payload, unit and rate.
+
+        A recording counts once for each of its simulators.
+        """
         entries = self.splits["train"]
+        if self.config.simulators:
+            max_rows //= self.config.simulators_per_recording
         count = max(1, max_rows * len(entries) // sum(e.rows for e in entries))
-        return self.dataset.sequences(stratified_subset(entries, count), optional=False)
+        chosen = self.dataset.sequences(stratified_subset(entries, count), optional=False)
+        return in_many_simulators(chosen, self.robot, self.config)
 
 
 def training_splits(

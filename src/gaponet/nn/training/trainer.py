@@ -24,6 +24,7 @@ from gaponet.data.checks.gate import GateReport
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.context import KnownSimulators, contexts
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.networks import build_network
@@ -38,6 +39,7 @@ from gaponet.nn.training.run_folder import Loggers, TrainingData, require_suitab
 from gaponet.nn.training.sensor_fit import fit_inputs, fit_sensors
 from gaponet.nn.training.validation import Validator, choose_gain
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.batch import Condition
 
 UNLIMITED = 10**9  # control periods of an episode
 
@@ -154,7 +156,7 @@ class Trainer:
 
     def _write_baseline(self) -> DelayOffset:
         robot = self.robot.before_identification
-        fit = lambda: DelayOffset.fit(self.data.train, robot, self.rank_config.threads)  # noqa: E731
+        fit = lambda: DelayOffset.fit(self.data.recorded, robot, self.rank_config.threads)  # noqa: E731
         baseline = self.baseline or self._once("baseline", fit)
         write_json(self.out / "delay_offset.json", baseline)
         return baseline
@@ -359,17 +361,17 @@ class Trainer:
     def _card(self, improvement: dict[str, float]) -> dict[str, Any]:
         data, state = self.data, self.state
         assert self.baseline is not None
-        metas = [s.meta for s in data.train]
+        metas = [s.meta for s in data.recorded]
         return make_card(
             self.config.model,
             self.robot,
-            dt=sorted({s.dt for s in data.train}),
+            dt=sorted({s.dt for s in data.recorded}),
             payload_seen=sorted({m.payload_mass for m in metas}),
             units=sorted({m.unit_id for m in metas}),
             recorded=_recorded_gains(metas, self.robot),
             virtual=any(m.virtual for m in metas),
             dataset_hash=dataset_hash(data.dataset.entries),
-            hours=round(sum(s.duration for s in data.train) / 3600, 3),
+            hours=round(sum(s.duration for s in data.recorded) / 3600, 3),
             motions={
                 part: sorted({e.meta.motion for e in entries})
                 for part, entries in data.splits.items()
@@ -388,6 +390,7 @@ class Trainer:
             steps=state.steps,
             seconds=round(self.seconds(), 1),
             interrupted=self.interrupted,
+            **self._known_simulators(),
             stages={
                 "pretraining_rounds": [state.pretraining_rounds, self.config.pretraining.rounds],
                 "ppo_updates": state.ppo_updates,
@@ -396,6 +399,17 @@ class Trainer:
             versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch")}
             | {"python": platform.python_version()},
         )
+
+    def _known_simulators(self) -> dict[str, Any]:
+        """Return the card's range of contexts, if the network is told its simulator's."""
+        if not self.config.model.context:
+            return {}
+        loaded = not self.config.model.payload_input
+        nominal = Condition.of(self.data.recorded[0], self.robot)
+        threads = self.rank_config.threads
+        trained = contexts(self.robot, sorted(self.data.conditions, key=repr), loaded, threads)
+        known = KnownSimulators.of(contexts(self.robot, [nominal], loaded)[0], trained)
+        return {"context": known.to_card()}
 
 
 def _recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, list[float] | None]:

@@ -1,0 +1,67 @@
+"""The simulators of a training: which recording is replayed in which of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import replace
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+from gaponet.nn.training.config import TrainConfig
+from gaponet.robot.simulator_change import SimulatorChange
+from gaponet.robot.spec import RobotSpec
+
+VALIDATION_SEED_STEP = (
+    1_000_003  # validation has other simulators than training, and tests have others again
+)
+VALIDATION_SIMULATORS = 24
+
+
+def in_many_simulators(
+    sequences: ListOf[Sequence], robot: RobotSpec, config: TrainConfig
+) -> list[Sequence]:
+    """Return each training recording once for each of its simulators; all as they are if there is one simulator.
+
+    One of the simulators is the robot's own. Recordings with different payloads or rates share no simulator: there are
+    then as few groups of equal simulations as possible, and each simulator has one payload.
+    """
+    if not config.simulators:
+        return list(sequences)
+    ranges = config.simulator_ranges
+    drawn = ranges.draw(len(robot.joint_names), config.simulators - 1, config.seed)
+    simulators: list[SimulatorChange | None] = [None, *drawn]
+    conditions = list(dict.fromkeys(_condition(s) for s in sequences))
+    rng = np.random.default_rng(config.seed)
+    paired = []
+    for sequence in sequences:
+        place = conditions.index(_condition(sequence))
+        own = simulators[place :: len(conditions)] or simulators
+        count = min(config.simulators_per_recording, len(own))
+        for i in rng.permutation(len(own))[:count]:
+            paired.append(replace(sequence, simulator=own[i]))
+    return paired
+
+
+def in_validation_simulators(
+    sequences: ListOf[Sequence], robot: RobotSpec, config: TrainConfig
+) -> list[Sequence]:
+    """Return about VALIDATION_SIMULATORS validation recordings in as many simulators; a recording can be in several.
+
+    No training recording has these simulators, but for the first one, the robot's own.
+    """
+    if not config.simulators:
+        return list(sequences)
+    ranges = config.simulator_ranges
+    seed = config.seed + VALIDATION_SEED_STEP
+    drawn = ranges.draw(len(robot.joint_names), VALIDATION_SIMULATORS - 1, seed)
+    simulators: list[SimulatorChange | None] = [None, *drawn]
+    paired = []
+    for i in range(max(len(sequences), len(simulators))):
+        sequence = sequences[i % len(sequences)]
+        paired.append(replace(sequence, simulator=simulators[i % len(simulators)]))
+    return paired
+
+
+def _condition(sequence: Sequence) -> tuple[float, str, float]:
+    return sequence.meta.payload_mass, sequence.meta.payload_side, sequence.dt

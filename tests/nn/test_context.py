@@ -1,0 +1,82 @@
+"""Context: the simulator's answers to fixed probes at rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.context import KnownSimulators, contexts
+from gaponet.nn.networks import build_network
+from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
+from gaponet.robot.spec import load_robot
+from gaponet.sim.batch import Condition
+
+ROBOT = load_robot("so101")
+EMPTY = Condition(0.0, "both", ROBOT.dt)
+SAME = SimulatorChange(kp=(1.0,) * 6, damping=(1.0,) * 6)
+
+
+def test_a_softer_joint_answers_its_own_probe_less_and_no_other_joint_changes_its_answer_much() -> None:
+    softer = replace(SAME, kp=(0.25, *SAME.kp[1:]))
+
+    own, other = contexts(ROBOT, [EMPTY, EMPTY._replace(simulator=softer)], loaded=False)
+
+    by_joint = other.reshape(8, 5) - own.reshape(8, 5)
+    position_late = by_joint[5]  # the difference that the own probe makes, after 0.2 s
+    assert position_late[0] < -0.02
+    assert np.abs(position_late[1:]).max() < 0.005
+
+
+def test_a_later_servo_has_moved_less_when_it_is_read_first() -> None:
+    later = replace(SAME, delay=0.02)
+
+    own, other = contexts(ROBOT, [EMPTY, EMPTY._replace(simulator=later)], loaded=False)
+
+    assert (other.reshape(8, 5)[1] < own.reshape(8, 5)[1]).all()
+
+
+def test_the_payload_changes_the_answers_only_of_loaded_hands() -> None:
+    carrying = EMPTY._replace(payload_mass=0.5)
+
+    empty = contexts(ROBOT, [EMPTY, carrying], loaded=False)
+    loaded = contexts(ROBOT, [EMPTY, carrying], loaded=True)
+
+    assert np.array_equal(empty[0], empty[1])
+    assert np.abs(loaded[0] - loaded[1]).max() > 1e-3
+
+
+def test_a_rate_of_control_does_not_change_positions_read_at_the_same_time() -> None:
+    slow, fast = (contexts(ROBOT, [EMPTY._replace(dt=dt)], loaded=False)[0] for dt in (0.02, 0.01))
+
+    positions = [0, 1, 4, 5]
+    difference = slow.reshape(8, 5)[positions] - fast.reshape(8, 5)[positions]
+    assert np.abs(difference).max() < 1e-3
+
+
+def test_distance_is_zero_within_the_answers_of_training_and_grows_beyond() -> None:
+    conditions = [EMPTY._replace(simulator=s) for s in SimulatorRanges().draw(6, 30, seed=1)]
+    trained = contexts(ROBOT, conditions, loaded=False)
+    known = KnownSimulators.of(trained[0], trained)
+
+    assert known.distance(trained[3]) == 0.0
+    assert np.isclose(known.distance(known.high + (known.high - known.low)), 1.0)
+    again = KnownSimulators.from_card(known.to_card())
+    assert np.allclose(again.low, known.low, atol=1e-6)
+
+
+def test_the_branch_sees_the_context_alone_and_the_trunk_the_rest() -> None:
+    config = ModelConfig(context=True)
+    net = build_network(config, 5)
+    x = torch.randn(3, config.input_dim(5))
+    net.fit_inputs(torch.randn(50, config.input_dim(5)))
+
+    prepared = net.prepare(x)
+    x[:, net.features.layout.context] += 1.0
+    moved = net.prepare(x)
+
+    changed = (prepared != moved).any(0).any(0)
+    assert changed[5 : net.branch_inputs].all()  # after the joint's number
+    assert not changed[net.branch_inputs :].any()
