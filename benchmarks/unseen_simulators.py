@@ -36,7 +36,7 @@ from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.context import contexts
 from gaponet.nn.loop import DeltaCorrector
-from gaponet.nn.training.config import TrainConfig
+from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import open_dataset
@@ -48,6 +48,7 @@ WITHIN = 20  # simulators
 BEYOND = 10
 MAX_RECORDINGS = 24  # of the test, evenly spaced
 Array = np.ndarray
+PRETRAINING = PretrainingConfig(rounds=3, num_envs=400, steps=150, gradient_steps=800)
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ def train(arguments: argparse.Namespace) -> None:
                 continue
             config = TrainConfig(
                 model=ModelConfig(kind=row.kind),
+                pretraining=PRETRAINING,
                 seed=seed,
                 simulators=row.simulators,
                 without_context=not row.context,
@@ -200,7 +202,7 @@ class OtherContext(DeltaCorrector):
         super().reset(start)
         assert self.loop is not None
         conditions = [Condition.of(replace(s, simulator=self.other), self.robot) for s in start]
-        self.loop.set_context(contexts(self.robot, conditions, not self.config.payload_input))
+        self.loop.set_context(contexts(self.robot, conditions))
 
 
 def table(found: dict[str, dict[str, list[list[float]]]]) -> ResultTable:
@@ -234,7 +236,7 @@ def main() -> None:
         if name == "train":
             command.add_argument("--out", type=Path, required=True)
         command.add_argument("--seeds", type=int, default=3)
-        command.add_argument("--steps", type=int, default=400_000)
+        command.add_argument("--steps", type=int, default=240_000)
         command.add_argument("--simulators", type=int, default=200)
         command.add_argument("--rates", type=float, nargs="*", default=[])
         command.add_argument("--identified")

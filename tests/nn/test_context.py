@@ -8,21 +8,24 @@ import numpy as np
 import torch
 
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.context import KnownSimulators, contexts
+from gaponet.nn.context import KnownSimulators, contexts, scene_context
 from gaponet.nn.networks import build_network
 from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import load_robot
 from gaponet.sim.batch import Condition
+from gaponet.sim.model import build_model
 
 ROBOT = load_robot("so101")
 EMPTY = Condition(0.0, "both", ROBOT.dt)
 SAME = SimulatorChange(kp=(1.0,) * 6, damping=(1.0,) * 6)
 
 
-def test_a_softer_joint_answers_its_own_probe_less_and_no_other_joint_changes_its_answer_much() -> None:
+def test_a_softer_joint_answers_its_own_probe_less_and_no_other_joint_changes_its_answer_much() -> (
+    None
+):
     softer = replace(SAME, kp=(0.25, *SAME.kp[1:]))
 
-    own, other = contexts(ROBOT, [EMPTY, EMPTY._replace(simulator=softer)], loaded=False)
+    own, other = contexts(ROBOT, [EMPTY, EMPTY._replace(simulator=softer)])
 
     by_joint = other.reshape(8, 5) - own.reshape(8, 5)
     position_late = by_joint[5]  # the difference that the own probe makes, after 0.2 s
@@ -33,23 +36,37 @@ def test_a_softer_joint_answers_its_own_probe_less_and_no_other_joint_changes_it
 def test_a_later_servo_has_moved_less_when_it_is_read_first() -> None:
     later = replace(SAME, delay=0.02)
 
-    own, other = contexts(ROBOT, [EMPTY, EMPTY._replace(simulator=later)], loaded=False)
+    own, other = contexts(ROBOT, [EMPTY, EMPTY._replace(simulator=later)])
 
     assert (other.reshape(8, 5)[1] < own.reshape(8, 5)[1]).all()
 
 
-def test_the_payload_changes_the_answers_only_of_loaded_hands() -> None:
+def test_simulators_are_probed_with_empty_hands() -> None:
     carrying = EMPTY._replace(payload_mass=0.5)
 
-    empty = contexts(ROBOT, [EMPTY, carrying], loaded=False)
-    loaded = contexts(ROBOT, [EMPTY, carrying], loaded=True)
+    empty, told = contexts(ROBOT, [EMPTY, carrying])
 
-    assert np.array_equal(empty[0], empty[1])
-    assert np.abs(loaded[0] - loaded[1]).max() > 1e-3
+    assert np.array_equal(empty, told)
+
+
+def test_a_scene_answers_as_the_simulator_that_it_was_built_from() -> None:
+    scene = build_model(ROBOT)
+
+    in_scene = scene_context(scene, ROBOT, ROBOT.dt)
+
+    assert np.abs(in_scene - contexts(ROBOT, [EMPTY])[0]).max() < 1e-6
+
+
+def test_a_scene_with_late_servos_answers_as_the_simulator_that_it_was_built_from() -> None:
+    late = replace(ROBOT, delay=np.full(6, 0.015))
+
+    in_scene = scene_context(build_model(late), late, late.dt)
+
+    assert np.abs(in_scene - contexts(late, [EMPTY])[0]).max() < 1e-6
 
 
 def test_a_rate_of_control_does_not_change_positions_read_at_the_same_time() -> None:
-    slow, fast = (contexts(ROBOT, [EMPTY._replace(dt=dt)], loaded=False)[0] for dt in (0.02, 0.01))
+    slow, fast = (contexts(ROBOT, [EMPTY._replace(dt=dt)])[0] for dt in (0.02, 0.01))
 
     positions = [0, 1, 4, 5]
     difference = slow.reshape(8, 5)[positions] - fast.reshape(8, 5)[positions]
@@ -58,7 +75,7 @@ def test_a_rate_of_control_does_not_change_positions_read_at_the_same_time() -> 
 
 def test_distance_is_zero_within_the_answers_of_training_and_grows_beyond() -> None:
     conditions = [EMPTY._replace(simulator=s) for s in SimulatorRanges().draw(6, 30, seed=1)]
-    trained = contexts(ROBOT, conditions, loaded=False)
+    trained = contexts(ROBOT, conditions)
     known = KnownSimulators.of(trained[0], trained)
 
     assert known.distance(trained[3]) == 0.0

@@ -83,10 +83,11 @@ class AlignedSim:
         trained = model if isinstance(model, GapModel) and not other_payload else None
         if (
             trained is not None
-            and trained.is_trained_in(robot)
+            and trained.knows(robot, self.dt)
             and control_periods_of(trained, self.dt) == 1
         ):
-            self.loop = trained.loop(self.num_envs)
+            context = trained.context_of(robot, self.dt) if trained.config.context else None
+            self.loop = trained.loop(self.num_envs, context)
         elif model is not None:
             inverse = AnalyticInverse.of(BatchSim(robot, own, nthread, locked))
             self.transfer = Transfer(model, inverse, conditions, locked, nthread, extrapolate)

@@ -11,7 +11,9 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.deploy.transfer import Reference, Transfer, control_periods_of
 from gaponet.nn.artifact import GapModel
+from gaponet.nn.context import scene_context
 from gaponet.nn.loop import DeltaLoop
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse
 
@@ -26,6 +28,9 @@ class MujocoAligner:
     If the robot of the scene differs from the identified one or from the simulator of training, commands are
     transferred (deploy/transfer.py): other gains, friction, inertias, actuators, or a payload that the scene does not
     have. The base and the rest of the scene have their present state in each period.
+
+    A network for many simulators first measures the scene's answers to fixed probes (nn/context.py). If they lie within
+    those of its training, it corrects the scene directly.
     """
 
     def __init__(
@@ -73,10 +78,14 @@ class MujocoAligner:
         self.payload_mass = payload_mass
         self.loop: DeltaLoop | None = None
         self.transfer: Transfer | None = None
-        if not (unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range)):
-            self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
-        elif isinstance(model, GapModel):
+        equal = unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range)
+        context = _known_context(model, mj_model, robot, dt, prefix)
+        if equal and isinstance(model, GapModel):
             self.loop, joints = model.loop(), robot.operated
+        elif context is not None and isinstance(model, GapModel):
+            self.loop, joints = model.loop(context=context), robot.operated
+        elif not equal:
+            self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
         names = [prefix + name for name in joints]
         self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])
         self.qvel = np.array([mj_model.joint(name).dofadr[0] for name in names])
@@ -103,6 +112,19 @@ class MujocoAligner:
             out[self.actuator] = self.transfer.command(q, v, a)[0]
         self._fresh = False
         return out
+
+
+def _known_context(
+    model: Reference, scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: str
+) -> Array | None:
+    """Return the scene's answers to fixed probes if the network was trained in simulators with such answers."""
+    if not isinstance(model, GapModel) or control_periods_of(model, dt) != 1:
+        return None
+    known = model.known_simulators
+    if known is None:
+        return None
+    context = scene_context(scene, robot, dt, prefix)
+    return context if known.include(context) else None
 
 
 def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> AnalyticInverse:

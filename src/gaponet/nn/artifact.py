@@ -19,6 +19,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.structure import Json, Name, Number, Sha256, read_format, read_json, validated
 from gaponet.nn.config import ModelConfig
+from gaponet.nn.context import KnownSimulators, contexts
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.onnx_network import Network, OnnxNetwork
 from gaponet.nn.packaged_networks import CARD as CARD
@@ -30,13 +31,14 @@ from gaponet.robot.folder import (
     stored_robot_holder,
 )
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.batch import Condition
 
 WEIGHTS = "model.onnx"
 FORMAT = 1
 # Fields of the card that export also writes into the ONNX file: what the network's inputs and outputs mean, and for
 # which robots they hold.
 FACTS_IN_NETWORK = (
-    "robot", "joint_names", "kp", "kd", "qpos_range", "dt", "payload_seen", "recorded", "model",
+    "robot", "joint_names", "kp", "kd", "qpos_range", "dt", "payload_seen", "recorded", "model", "context",
 )  # fmt: skip
 GAIN_TOLERANCE = 0.02  # relative, between recorded and real gains
 RATE_TOLERANCE = 0.02  # relative: a clock of 49.85 Hz counts as 50 Hz
@@ -113,6 +115,7 @@ class _Card(TypedDict):
     val_mpjae: NotRequired[dict[Literal["model", "nominal", "start", "added", "error"], Number]]
     sensor_r2: NotRequired[_SensorR2 | None]
     versions: NotRequired[dict[str, str]]
+    context: NotRequired[dict[Literal["nominal", "low", "high"], tuple[float, ...]]]
     sha256: NotRequired[dict[str, Sha256]]
 
 
@@ -214,10 +217,42 @@ class GapModel:
             [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits]
         )
 
-    def loop(self, num_envs: int = 1) -> DeltaLoop:
+    @property
+    def known_simulators(self) -> KnownSimulators | None:
+        """Answers of the simulators of training to fixed probes, if the network is told them."""
+        if not self.config.context:
+            return None
+        return KnownSimulators.from_card(self.card["context"])
+
+    @property
+    def nominal_context(self) -> Array:
+        """Answers of the robot's own simulator to fixed probes, (8n) rad; (0) if the network is not told them."""
+        known = self.known_simulators
+        return np.zeros(0, np.float32) if known is None else known.nominal
+
+    def knows(self, robot: RobotSpec, dt: float) -> bool:
+        """Return true if the network was trained for this simulator: in it, or in simulators with such answers.
+
+        Raises:
+            ModelError: This is another robot.
+        """
+        if self.is_trained_in(robot):
+            return True
+        known = self.known_simulators
+        return known is not None and known.include(self.context_of(robot, dt))
+
+    def context_of(self, robot: RobotSpec, dt: float) -> Array:
+        """Measure a simulator's answers to fixed probes with empty hands, (8n) rad; dt is the control period, s."""
+        return contexts(robot, [Condition(0.0, "both", dt)])[0]
+
+    def loop(self, num_envs: int = 1, context: Array | None = None) -> DeltaLoop:
         """Return the control loop of num_envs robots: loop.delta(qpos, qvel, ctrl, payload_mass).
 
         Joints are those of the card (joint_names), in that order.
+
+        Args:
+            context: Answers of the simulators to fixed probes, (num_envs, 8n) or (8n) rad, for a network that is told
+                them; default: those of the robot's own simulator.
 
         Raises:
             ModelError: The model needs its simulator, which a control loop does not have.
@@ -227,7 +262,10 @@ class GapModel:
                 f"{self.path}: its sensor values are the simulator's answers (sensor_source fixed), for gaponet eval "
                 "alone; train with --model.sensor-source predicted"
             )
-        return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
+        loop = DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
+        if self.config.context:
+            loop.set_context(self.nominal_context if context is None else context)
+        return loop
 
     def is_trained_in(self, robot: RobotSpec) -> bool:
         """Return true if this is the simulator of training.
@@ -326,8 +364,9 @@ class GapModel:
             )
 
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
-        """Return the corrections for rollouts of sim.replay in the simulator of training; refuse another one."""
-        self.require(robot)
+        """Return the corrections for rollouts of sim.replay; refuse a simulator that the network does not know."""
+        if not self.knows(robot, robot.dt):
+            self.require(robot)
         return DeltaCorrector(self.infer, self.config, robot)
 
     def weights_hash(self) -> str:
@@ -352,6 +391,12 @@ class GapModel:
             if values is not None and len(values) != n:
                 raise ModelError(
                     f"{file}: {name}: should have one entry for each of {n} joints; {mend}"
+                )
+        answers = card.get("context", {})
+        for name in ("nominal", "low", "high") if config.context else ():
+            if len(answers.get(name, ())) != config.context_dim(n):
+                raise ModelError(
+                    f"{file}: context.{name}: should have {config.context_dim(n)} numbers; {mend}"
                 )
         for low, high in card.get("qpos_range", []):
             if low is not None and high is not None and not low < high:

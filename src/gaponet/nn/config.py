@@ -105,6 +105,10 @@ class ModelConfig:
             raise UsageError(
                 f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them"
             )
+        if self.context and not self.payload_input:
+            raise UsageError(
+                "context without payload_input: simulators are probed with empty hands"
+            )
         if self.context and self.sensors != "off":
             raise UsageError("context with predicted sensors: the network takes one of them")
         if self.sensor_source == "none":

@@ -10,71 +10,138 @@ fixed sensors. It is measured once per simulator and is constant while the netwo
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.batch import Batch, BatchSim, CommandHistory, Condition
 
 PROBE_RAD = 0.2
 READ_AFTER_S = (0.04, 0.2)  # the start of the motion, and most of it
+MAX_DISTANCE = 0.1  # beyond the answers of training, as a share of their range, at which the network is still used
 MIN_WIDTH_RAD = 1e-4  # narrower ranges of training are taken to be this wide
 
 
-def contexts(
-    robot: RobotSpec, conditions: list[Condition], loaded: bool, nthread: int = 1
-) -> Array:
-    """Measure the answers of simulators.
+def contexts(robot: RobotSpec, conditions: list[Condition], nthread: int = 1) -> Array:
+    """Measure the answers of simulators with empty hands.
 
     Args:
         robot: The simulator.
-        conditions: Simulations; their payload counts only if `loaded`.
-        loaded: The hands hold the payload while the simulator is probed. If the network is told the payload, they are
-            empty.
+        conditions: Simulations. Their payloads do not count: the network is told the payload.
         nthread: Threads, 0 for all cores.
 
     Returns:
         (conditions, 8n) float32, rad. The joint varies fastest.
     """
-    if not loaded:
-        conditions = [c._replace(payload_mass=0.0) for c in conditions]
+    empty = [c._replace(payload_mass=0.0) for c in conditions]
     known: dict[Condition, Array] = vars(robot).setdefault("_contexts", {})
-    unknown = [c for c in dict.fromkeys(conditions) if c not in known]
+    unknown = [c for c in dict.fromkeys(empty) if c not in known]
     for dt in dict.fromkeys(c.dt for c in unknown):
         same_rate = [c for c in unknown if c.dt == dt]
-        known.update(zip(same_rate, _measure(robot, same_rate, nthread), strict=True))
-    return np.stack([known[c] for c in conditions])
+        known.update(zip(same_rate, _of_simulators(robot, same_rate, nthread), strict=True))
+    return np.stack([known[c] for c in empty])
 
 
-def _measure(robot: RobotSpec, conditions: list[Condition], nthread: int) -> Array:
+def _of_simulators(robot: RobotSpec, conditions: list[Condition], nthread: int) -> Array:
     """Return the answers of simulations with one control period, (conditions, 8n) float32."""
-    operated = robot.operated_index
-    n = len(operated)
-    probes = n + 1  # of each simulation; the first is the null probe
+    count = len(conditions)
+    probes = len(robot.operated) + 1
     sim = BatchSim(robot, [c for c in conditions for _ in range(probes)], nthread)
-    home = np.tile(robot.qpos_home, (len(conditions) * probes, 1))
-    towards = np.where(robot.qpos_home + PROBE_RAD <= sim.range[:, 1], 1.0, -1.0)[operated]  # (n,)
-    target = home.copy()
-    for j, joint in enumerate(operated):
-        target[1 + j :: probes, joint] += PROBE_RAD * towards[j]
-
+    home = np.tile(robot.qpos_home, (count * probes, 1))
+    moved, towards = _probe_targets(robot.qpos_home, robot.operated_index, sim.range)
+    target = np.tile(moved, (count, 1))
     sim.reset(slice(None), home, np.zeros_like(home), past=home[:, None])
-    dt = conditions[0].dt
+
+    def step() -> tuple[Array, Array]:
+        sim.step(target)
+        return sim.qpos - home, sim.qvel
+
+    return _answers(step, conditions[0].dt, robot.operated_index, towards)
+
+
+def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: str = "") -> Array:
+    """Measure the answers of a robot in a scene, (8n) rad. Contacts are off, and all other bodies start as compiled.
+
+    Args:
+        scene: With a position actuator on each operated joint.
+        robot: Joints and home.
+        dt: Control period, s.
+        prefix: Prefix of the robot's names in the scene.
+    """
+    model = copy.copy(scene)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    driven = {model.joint(joint).name: i for i, joint in enumerate(model.actuator_trnid[:, 0])}
+    names = [name for name in robot.joint_names if prefix + name in driven]
+    home = robot.qpos_home[robot.index(names)]
+    operated = np.array([names.index(name) for name in robot.operated])
+    address = np.array([model.joint(prefix + name).qposadr[0] for name in names])
+    dof = np.array([model.joint(prefix + name).dofadr[0] for name in names])
+    actuator = np.array([driven[prefix + name] for name in names])
+    moved, towards = _probe_targets(home, operated, robot.qpos_range[robot.index(names)])
+
+    batch = Batch(model, nsim=len(moved), nthread=1)
+    qpos: Array = batch.bind("qpos")
+    qvel: Array = batch.bind("qvel")
+    ctrl: Array = batch.bind("ctrl")
+    qpos[:, address] = home
+    ctrl[:, actuator] = home
+    steps = round(dt / model.opt.timestep)
+    if model.nhistory:
+        history = CommandHistory(batch.bind("history"), batch.bind("time"), model)
+        everywhere = np.full(len(moved), 1)
+        history.fill(
+            slice(None), ctrl[:, None].copy(), steps * everywhere, model.opt.timestep * everywhere
+        )
+    ctrl[:, actuator] = moved
+
+    def step() -> tuple[Array, Array]:
+        batch.step(nstep=steps)
+        return qpos[:, address] - home, qvel[:, dof]
+
+    return _answers(step, dt, operated, towards)[0]
+
+
+def _probe_targets(home: Array, operated: Array, limits: Array) -> tuple[Array, Array]:
+    """Return the targets of all probes, (1 + n, joints) rad, and the direction of each joint's own, (n) ±1."""
+    towards = np.where(home + PROBE_RAD <= limits[:, 1], 1.0, -1.0)[operated]
+    targets = np.tile(home, (1 + len(operated), 1))  # the first is the null probe
+    for probe, joint in enumerate(operated):
+        targets[1 + probe, joint] += PROBE_RAD * towards[probe]
+    return targets, towards
+
+
+def _answers(
+    step: Callable[[], tuple[Array, Array]], dt: float, operated: Array, towards: Array
+) -> Array:
+    """Return the answers (simulators, 8n) float32 of simulations under all probes.
+
+    Args:
+        step: Simulates one control period, and returns positions relative to home and velocities, each
+            (simulators · (1 + n), joints), rad and rad/s.
+        dt: Control period, s.
+        operated: Operated joints among these, (n).
+        towards: Direction of each joint's own probe, (n) ±1.
+    """
     read_at = [max(1, round(seconds / dt)) for seconds in READ_AFTER_S]
     values = []
     for period in range(1, read_at[-1] + 1):
-        sim.step(target)
+        moved, speed = step()
         if period not in read_at:
             continue
-        for quantity in (sim.qpos - home, sim.qvel * dt):
-            answers = quantity[:, operated].reshape(len(conditions), probes, n)
+        for quantity in (moved, dt * speed):
+            answers = quantity[:, operated].reshape(-1, 1 + len(operated), len(operated))
             null = answers[:, 0]
             own = np.diagonal(answers[:, 1:], axis1=1, axis2=2)  # joint j under probe j
-            values += [null, (own - null) * towards]
-    return np.stack(values, axis=1).reshape(len(conditions), -1).astype(np.float32)
+            values.append(null)
+            values.append((own - null) * towards)
+    joined = np.stack(values, axis=1)  # (simulators, 8, n)
+    return joined.reshape(len(joined), -1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -92,14 +159,19 @@ class KnownSimulators:
 
     @classmethod
     def of(cls, nominal: Array, trained: Array) -> KnownSimulators:
-        """Return the range of answers (simulators, 8n)."""
-        return cls(nominal, trained.min(axis=0), trained.max(axis=0))
+        """Return the range of the robot's own answers, (8n), and those of training, (simulators, 8n)."""
+        answers = np.vstack([nominal, trained])
+        return cls(nominal, answers.min(axis=0), answers.max(axis=0))
 
     def distance(self, context: Array) -> float:
         """Return how far answers (…, 8n) lie outside those of training: 0 within, 1 a whole width of the range away."""
         beyond = np.maximum(self.low - context, context - self.high)
         width = np.maximum(self.high - self.low, MIN_WIDTH_RAD)
         return float(np.maximum(beyond / width, 0.0).max())
+
+    def include(self, context: Array) -> bool:
+        """Return true if answers (…, 8n) are so close to those of training that the network can be used."""
+        return self.distance(context) <= MAX_DISTANCE
 
     def to_card(self) -> dict[str, list[float]]:
         """Return the entry of card.json."""

@@ -25,6 +25,7 @@ from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.delay_offset import DelayOffset
+from gaponet.nn.loop import DeltaCorrector
 from gaponet.report.candidate import Candidate, is_robot, select_entries
 from gaponet.report.methods import IDENTIFIED, title
 from gaponet.report.verdict import LEARNED
@@ -36,7 +37,9 @@ from gaponet.sim.replay import Corrector, replay
 T = TypeVar("T")
 STORED_TRAJECTORIES = 8  # for the report
 # Of tables and figures.
-ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "adapted", "uncorrected", "transfer")
+ORDER = (
+    "nominal", "delay_offset", "identified", *LEARNED, "adapted", "uncorrected", "told", "transfer",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -204,6 +207,8 @@ def _methods(
     simulator = replace(target, nominal=target.nominal or nominal)
     if model_hash(target) != model_hash(nominal):
         yield "uncorrected", simulator, None
+    if first.model is not None and first.model.config.context:
+        yield "told", simulator, DeltaCorrector(first.model.infer, first.model.config, simulator)
     yield "transfer", simulator, TransferCorrector(first.model or first.robot, simulator)
 
 

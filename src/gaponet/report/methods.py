@@ -21,6 +21,7 @@ METHODS = {  # title, colour
     "paper": ("GAPONet, the paper's form", "#8e1b3a"),
     "adapted": ("adapted to the unit", "#6a1b9a"),
     "uncorrected": ("the other simulator, uncorrected", "#b0a18c"),
+    "told": ("told the other simulator's answers", "#8a6fb3"),
     "transfer": ("transferred into the other simulator", "#e07a1f"),
     "delay": ("delay", "#d99000"),
     "offset": ("offset", "#b36b00"),

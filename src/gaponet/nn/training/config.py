@@ -137,8 +137,8 @@ class TrainConfig:
     """Number of simulators in which the network is trained; they are drawn from simulator_ranges by the seed. The
     network is told the simulator's answers to fixed probes (nn/context.py), and then corrects simulators that it has
     never seen. 0: the robot's own simulator alone."""
-    simulators_per_recording: Annotated[int, Interval(ge=1, le=1000)] = 4
-    """Number of these simulators in which each recording is replayed."""
+    simulators_per_piece: Annotated[int, Interval(ge=1, le=1000)] = 2
+    """Number of these simulators in which each piece of a recording is replayed."""
     simulator_ranges: SimulatorRanges = field(default_factory=SimulatorRanges)
     without_context: bool = False
     """Do not tell the network the simulator's answers, as a baseline."""

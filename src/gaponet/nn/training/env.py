@@ -195,8 +195,7 @@ class DeltaEnv:
                 )
             self.oracle = ProbeOracle(robot, config, conditions, nthread, rows.locked)
         if config.context:
-            loaded = not config.payload_input
-            self.loop.set_context(contexts(robot, conditions, loaded, nthread))
+            self.loop.set_context(contexts(robot, conditions, nthread))
         if config.needs_simulator or config.observes_real_state:
             self.loop.extra = self._extra_inputs
         max_delay_periods = int(np.ceil(sim.longest_delay / min(c[2] for c in rows.conditions)))

@@ -38,7 +38,7 @@ class TrainingData:
     Attributes:
         splits: Entries of "train", "val" and "test".
         recorded: Training recordings.
-        train: The same, each once for each of its simulators.
+        train: The same, or their pieces in many simulators.
         val: Validation recordings, at most MAX_VALIDATION_ROLLOUTS.
     """
 
@@ -81,11 +81,11 @@ class TrainingData:
     def labelled_subset(self, max_rows: int) -> list[Sequence]:
         """Return training recordings with about max_rows rows, stratified by payload, unit and rate.
 
-        A recording counts once for each of its simulators.
+        A row counts once for each of its simulators.
         """
         entries = self.splits["train"]
         if self.config.simulators:
-            max_rows //= self.config.simulators_per_recording
+            max_rows //= self.config.simulators_per_piece
         count = max(1, max_rows * len(entries) // sum(e.rows for e in entries))
         chosen = self.dataset.sequences(stratified_subset(entries, count), optional=False)
         return in_many_simulators(chosen, self.robot, self.config)

@@ -1,4 +1,9 @@
-"""The simulators of a training: which recording is replayed in which of them."""
+"""The simulators of a training: which piece of a recording is replayed in which of them.
+
+Recordings are cut into pieces, and each piece starts at its recorded state. Whole recordings are worse for two reasons.
+With few of them a simulator has one or two, so that the network can tell the motion by the simulator. And a simulation
+that starts at the recorded state shows what brings it back there. docs/simulators.md has the measurement.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +21,18 @@ VALIDATION_SEED_STEP = (
     1_000_003  # validation has other simulators than training, and tests have others again
 )
 VALIDATION_SIMULATORS = 24
+PIECE_S = 5.0
 
 
 def in_many_simulators(
     sequences: ListOf[Sequence], robot: RobotSpec, config: TrainConfig
 ) -> list[Sequence]:
-    """Return each training recording once for each of its simulators; all as they are if there is one simulator.
+    """Return the pieces of each training recording, once for each of its simulators.
 
     One of the simulators is the robot's own. Recordings with different payloads or rates share no simulator: there are
     then as few groups of equal simulations as possible, and each simulator has one payload.
+
+    With one simulator, the result is the recordings as they are.
     """
     if not config.simulators:
         return list(sequences)
@@ -37,10 +45,20 @@ def in_many_simulators(
     for sequence in sequences:
         place = conditions.index(_condition(sequence))
         own = simulators[place :: len(conditions)] or simulators
-        count = min(config.simulators_per_recording, len(own))
-        for i in rng.permutation(len(own))[:count]:
-            paired.append(replace(sequence, simulator=own[i]))
+        count = min(config.simulators_per_piece, len(own))
+        for piece in pieces(sequence):
+            for i in rng.permutation(len(own))[:count]:
+                paired.append(replace(piece, simulator=own[i]))
     return paired
+
+
+def pieces(sequence: Sequence) -> list[Sequence]:
+    """Cut a recording into pieces of PIECE_S; the last one is longer by what remains."""
+    rows = round(PIECE_S / sequence.dt)
+    count = max(len(sequence) // rows, 1)
+    starts = [i * rows for i in range(count)]
+    ends = [*starts[1:], len(sequence)]
+    return [sequence.rows(slice(start, end)) for start, end in zip(starts, ends, strict=True)]
 
 
 def in_validation_simulators(

@@ -404,11 +404,10 @@ class Trainer:
         """Return the card's range of contexts, if the network is told its simulator's."""
         if not self.config.model.context:
             return {}
-        loaded = not self.config.model.payload_input
         nominal = Condition.of(self.data.recorded[0], self.robot)
         threads = self.rank_config.threads
-        trained = contexts(self.robot, sorted(self.data.conditions, key=repr), loaded, threads)
-        known = KnownSimulators.of(contexts(self.robot, [nominal], loaded)[0], trained)
+        trained = contexts(self.robot, sorted(self.data.conditions, key=repr), threads)
+        known = KnownSimulators.of(contexts(self.robot, [nominal])[0], trained)
         return {"context": known.to_card()}
 
 

@@ -1,0 +1,110 @@
+"""A network that was trained in many simulators corrects one that it has never seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from arm import recordings, write_arm, write_dataset
+
+from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.mujoco_loop import MujocoAligner
+from gaponet.export.torch_program import export_program
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.trainer import Trainer
+from gaponet.report.evaluate import evaluate
+from gaponet.robot.simulator_change import SimulatorRanges
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.model import build_model
+
+SIMULATORS = 30
+OTHER_KP = 0.7  # of the robot's
+CONFIG = TrainConfig(
+    model=ModelConfig(history=2, branch_hidden=(32,), trunk_hidden=(16,)),
+    pretraining=PretrainingConfig(
+        rounds=2, num_envs=48, steps=60, gradient_steps=200, batch_size=256
+    ),
+    ppo=PPOConfig(num_envs=48, num_steps=8, epochs=1, critic_warmup=1, explained=-1e9),
+    simulators=SIMULATORS,
+    simulator_ranges=SimulatorRanges(kp=(0.4, 2.5), damping=(0.4, 2.5), delay=0.0),
+    threads=1,
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    place = tmp_path_factory.mktemp("many")
+    robot = write_arm(place)
+    data = write_dataset(place / "data", robot, recordings(robot, 8, kp=0.5, delay=2))
+    run = place / "run"
+    model = Trainer(data, robot, run, CONFIG, Budget(steps=2 * 48 * 60)).run()
+    return SimpleNamespace(robot=robot, data=data, run=run, model=model)
+
+
+def with_kp(robot: RobotSpec, factor: float) -> RobotSpec:
+    """Return the robot as another simulator has it, with other stiffness."""
+    return replace(robot, kp=factor * robot.kp)
+
+
+def positions(robot: RobotSpec, step) -> np.ndarray:
+    """Return what `step`, target → positions, does under a moving target, (30, n) rad."""
+    wave = 0.3 * np.sin(0.3 * np.arange(30))[:, None] * np.ones(len(robot.joint_names))
+    return np.array([step(robot.qpos_home + target) for target in wave])
+
+
+def test_it_corrects_a_simulator_with_other_gains_that_it_has_not_seen(trained) -> None:
+    other = with_kp(trained.robot, OTHER_KP)
+
+    methods = evaluate([trained.run], trained.data, trained.robot, target=other).result["methods"]
+
+    assert methods["told"]["mpjae"] < 0.8 * methods["uncorrected"]["mpjae"]
+
+
+def test_an_aligned_simulator_with_known_answers_needs_no_transfer(trained) -> None:
+    sim = AlignedSim(with_kp(trained.robot, OTHER_KP), trained.model)
+
+    assert sim.transfer is None
+    assert (
+        np.abs(sim.loop.x[0, sim.loop.layout.context] - trained.model.nominal_context).max() > 1e-3
+    )
+
+
+def test_a_simulator_whose_answers_no_training_had_gets_the_exact_transfer(trained) -> None:
+    far = with_kp(trained.robot, 4.0)
+
+    assert not trained.model.knows(far, far.dt)
+    assert AlignedSim(far, trained.model).transfer is not None
+
+
+def test_a_scene_moves_like_the_aligned_simulator(trained) -> None:
+    robot = with_kp(trained.robot, OTHER_KP)
+    aligned = AlignedSim(robot, trained.model)
+    scene = build_model(robot)
+    data = mujoco.MjData(scene)
+    align = MujocoAligner(trained.model, scene, robot.dt, 0.0)
+
+    def step_aligned(target: np.ndarray) -> np.ndarray:
+        aligned.step(target)
+        return aligned.qpos.copy()
+
+    def step_scene(target: np.ndarray) -> np.ndarray:
+        data.ctrl[:] = align(data, target)
+        mujoco.mj_step(scene, data, round(robot.dt / scene.opt.timestep))
+        return data.qpos.copy()
+
+    aligned.reset(robot.qpos_home)
+    data.qpos[:] = robot.qpos_home
+    difference = positions(robot, step_aligned) - positions(robot, step_scene)
+
+    assert align.transfer is None
+    assert np.abs(difference).max() < 1e-5
+
+
+def test_the_torch_program_equals_the_network_in_the_simulator_of_training(
+    trained, tmp_path
+) -> None:
+    assert export_program(trained.model, trained.run, tmp_path) < 1e-5
