@@ -313,9 +313,9 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
         notes |= (
             {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}} if largest else {}
         )
-    return Sequence(
-        SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays
-    )
+    meta = SequenceMeta(**(asdict(meta) | gains | {"notes": notes}))
+    channels: dict[str, Any] = dict(arrays)
+    return Sequence(meta, robot.joint_names, dt, **channels)
 
 
 def _require_both_ends(log: Log) -> None:

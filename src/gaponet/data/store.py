@@ -309,7 +309,8 @@ class Dataset:
     def read(self, entry: Entry, optional: bool = True) -> Sequence:
         """Load one sequence, with or without its optional channels."""
         names = tuple(c for c in entry.channels if optional or c not in OPTIONAL)
-        return Sequence(entry.meta, self.joint_names, entry.dt, **self.channels(entry, names))
+        arrays: dict[str, Any] = dict(self.channels(entry, names))
+        return Sequence(entry.meta, self.joint_names, entry.dt, **arrays)
 
     def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, Array]:
         """Load some channels of one sequence, (T, n) float32 each."""

@@ -32,12 +32,12 @@ class DeltaStep(nn.Module):
 
     Attributes:
         depth: Frames in the past; a frame is [q | q̇ | applied target], 3n numbers.
-        context: Answers of the simulator to fixed probes, (8n) rad, or (0) if the network has no such input. They are
+        context: Answers of the simulator to fixed probes, (8n) rad, or None if the network has no such input. They are
             those of the simulator of training; write others into it for another simulator (nn/context.py).
         refused: Number of answers of the network that were not finite, () int64; there Δa is zero, as in nn/bound.py.
     """
 
-    context: Tensor
+    context: Tensor | None
     low: Tensor
     high: Tensor
     refused: Tensor
@@ -53,7 +53,10 @@ class DeltaStep(nn.Module):
         self.payload_max: float = config.payload_max
         self.delta_max: float = config.delta_max
         low, high = torch.from_numpy(model.qpos_range.T.copy()).float()
-        self.register_buffer("context", torch.from_numpy(model.nominal_context.copy()))
+        context = None
+        if config.context:
+            context = torch.from_numpy(model.nominal_context.copy())
+        self.register_buffer("context", context)
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.register_buffer("refused", torch.zeros((), dtype=torch.int64))
@@ -86,7 +89,7 @@ class DeltaStep(nn.Module):
         if self.payload_input:
             inputs.append((payload_mass / self.payload_max)[:, None])
         inputs.append(ctrl)
-        if len(self.context):
+        if self.context is not None:
             inputs.append(self.context.expand(qpos.shape[0], -1))
         delta = self._bounded(self.net(torch.cat(inputs, dim=1)))
         applied = torch.minimum(torch.maximum(ctrl + delta, self.low), self.high)

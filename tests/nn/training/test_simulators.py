@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from arm import record
-
 import numpy as np
 import pytest
+from arm import record
 
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
