@@ -33,10 +33,13 @@ from gaponet.base.result_table import ResultTable
 from gaponet.data.sequence import Sequence
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.config import ModelConfig
 from gaponet.nn.context import contexts
 from gaponet.nn.loop import DeltaCorrector
-from gaponet.nn.training.config import PretrainingConfig, TrainConfig
+from gaponet.nn.training.config import (
+    MANY_SIMULATORS_MODEL,
+    MANY_SIMULATORS_PRETRAINING,
+    TrainConfig,
+)
 from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import open_dataset
@@ -48,7 +51,6 @@ WITHIN = 20  # simulators
 BEYOND = 10
 MAX_RECORDINGS = 24  # of the test, evenly spaced
 Array = np.ndarray
-PRETRAINING = PretrainingConfig(rounds=3, num_envs=400, steps=150, gradient_steps=800)
 
 
 @dataclass(frozen=True)
@@ -103,8 +105,8 @@ def train(arguments: argparse.Namespace) -> None:
             if (folder / "model" / "card.json").is_file():
                 continue
             config = TrainConfig(
-                model=ModelConfig(kind=row.kind),
-                pretraining=PRETRAINING,
+                model=replace(MANY_SIMULATORS_MODEL, kind=row.kind),
+                pretraining=MANY_SIMULATORS_PRETRAINING,
                 seed=seed,
                 simulators=row.simulators,
                 without_context=not row.context,

@@ -80,15 +80,16 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     """Print the verdict, the servos as a table, and what each term gave."""
     fit, errors, values = made.fit, made.errors, made.values()
     nominal, left = (mrad_with_error(e.mean(), standard_error(e)) for e in errors.values())
-    ratio, count, folds = (
-        errors["identified"].mean() / errors["nominal"].mean(),
-        len(errors["nominal"]),
-        fit.held_out,
-    )
-    judges = f"{count} independent motions judge."
+    ratio = errors["identified"].mean() / errors["nominal"].mean()
+    count = len(errors["nominal"])
+    folds = fit.held_out
+    measured_on = f"Measured on {count} independent validation motions, which chose among the fits."
     if count == 1:
-        judges = "A single motion judges: the error of other motions is not known. Record three motions or more."
-    screen.say(f"nominal {nominal} → identified {left} ({ratio:.2f} of nominal). {judges}")
+        measured_on = (
+            "Measured on a single validation motion: the error of other motions is not known. "
+            "Record three motions or more."
+        )
+    screen.say(f"nominal {nominal} → identified {left} ({ratio:.2f} of nominal). {measured_on}")
     if len(folds) > 1:
         screen.say(
             f"These are errors of {len(folds)}-fold cross-validation, since few motions validate. "

@@ -11,7 +11,6 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
@@ -22,22 +21,26 @@ from gaponet.sim.metrics import Comparison, by_motion
 from gaponet.sim.model import write_table
 from gaponet.sim.replay import rollout_errors
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
-from gaponet.sysid.least_squares import soft_l1
+from gaponet.sysid.least_squares import descend, soft_l1
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
 # above the lowest tip, or the table, in which a joint's zero may hide a contact
 CONTACT_CLEARANCE_M = 0.045
-WINDOW_S = 5.0
+WINDOW_S = 2.5  # of a rollout; longer ones cost more and do not find a better table
 MAX_WINDOWS, MAX_WINDOWS_PER_MOTION = 14, 2
 START_HEIGHTS, START_HEIGHT_STEP_M = 10, 0.005  # from below the lowest tip upwards
-CANDIDATES, GENERATIONS, START_STD = (
-    16,
-    10,
-    1.5,
-)  # of the search; standard deviation of its start in large changes
-# generations after which a start goes on only if no other start cost less by then
-FIRST_COMPARISON = 3
-ZERO_STD_RAD, ZERO_PRICE = 0.02, 2e-3  # of a usual zero; cost of a zero that large, per row
+ITERATIONS = 6  # of the search from one start
+FIRST_COMPARISON = (
+    2  # iterations after which a start goes on only if no other start cost less by then
+)
+HEIGHT_CHANGE_M = 0.004  # a large change
+MAX_HEIGHT_CHANGE_M = 0.03  # from the start
+ZERO_STD_RAD = 0.02  # of a usual zero
+ZERO_CHANGE_RAD = 0.01  # a large change
+MAX_ZERO_RAD = 0.1
+ZERO_DECIMALS = 6  # of rad; a joint that turns no tip keeps a zero of exactly 0
+ZERO_PRICE = 2e-3  # cost of a zero of ZERO_STD_RAD, per row
+PRIOR_ROWS = 1000  # into which the price of the zeros is divided, so that its soft L1 cost is nearly quadratic
 # Table's friction, and logarithm of its stiffness in N/m: lowest, highest, a large change, first guess.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
 STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
@@ -162,50 +165,53 @@ def _searched(
 ) -> tuple[Array, float]:
     """Return the best table and zeros (3 + n,) near a start, and their cost. A measured height stays.
 
-    The search ends after FIRST_COMPARISON generations if another start cost less by then; `pace` lists such costs.
+    The search ends after FIRST_COMPARISON iterations if another start cost less by then; `pace` lists such costs.
     """
-    n, rows = scene.n, len(scene.window) * scene.n
-    unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO_STD_RAD)])
-    low = np.array(
-        [
-            start[0] - 0.03 * (not measured),
-            FRICTION[0],
-            STIFFNESS[0],
-            *np.full(n, -5 * ZERO_STD_RAD),
-        ]
+    rows = len(scene.window) * scene.n
+    large_change = np.array(
+        [HEIGHT_CHANGE_M, FRICTION[2], STIFFNESS[2], *[ZERO_CHANGE_RAD] * scene.n]
     )
-    high = np.array(
-        [start[0] + 0.03 * (not measured), FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO_STD_RAD)]
+    height_range = 0.0 if measured else MAX_HEIGHT_CHANGE_M
+    low = np.array([start[0] - height_range, FRICTION[0], STIFFNESS[0], *[-MAX_ZERO_RAD] * scene.n])
+    high = np.array([start[0] + height_range, FRICTION[1], STIFFNESS[1], *[MAX_ZERO_RAD] * scene.n])
+    price_of_zero = np.sqrt(2 * ZERO_PRICE * rows / PRIOR_ROWS) / ZERO_STD_RAD
+    costs: list[float] = []
+
+    def errors(changes: Array) -> Array:
+        """Return errors and the price of the zeros, (k, 1, …), of changes (k, 1, 3 + n) in large changes."""
+        xs = start + large_change * changes[:, 0]
+        priced = np.repeat(price_of_zero * xs[:, 3:], PRIOR_ROWS, axis=1)
+        both = np.concatenate([scene.soft_errors(xs), priced], axis=1)
+        return both[:, None].astype(np.float32)
+
+    def report(cost: Array) -> bool:
+        """Show the error, and return whether another start was better after as many iterations."""
+        costs.append(float(cost.sum()))
+        progress(ERROR_SCALE_RAD * float(np.sqrt(2 * costs[-1] / rows)))
+        if len(costs) != FIRST_COMPARISON:
+            return False
+        behind = costs[-1] > min(pace)
+        if not behind:
+            pace.append(costs[-1])
+        return behind
+
+    changes, cost = descend(
+        np.zeros((1, 1, len(start))),
+        ((low - start) / large_change)[None],
+        ((high - start) / large_change)[None],
+        errors,
+        ITERATIONS,
+        report,
     )
-
-    def cost(xs: Array) -> Array:
-        """Return the costs of tables and zeros, (3 + n, k)."""
-        return soft_l1(scene.soft_errors(xs.T)) + ZERO_PRICE * rows * np.square(
-            xs[3:] / ZERO_STD_RAD
-        ).sum(axis=0)
-
-    def report(intermediate_result: OptimizeResult) -> None:
-        progress(ERROR_SCALE_RAD * float(np.sqrt(2 * intermediate_result.fun / rows)))
-        if intermediate_result.nit == FIRST_COMPARISON:
-            if intermediate_result.fun > min(pace):
-                raise StopIteration
-            pace.append(intermediate_result.fun)
-
-    # Contacts come and go, so the cost has no useful derivatives.
-    rng = np.random.default_rng(0)
-    population = start + START_STD * unit * rng.standard_normal((CANDIDATES, len(unit)))
-    population[0] = start
-    best = differential_evolution(
-        cost, Bounds(low, high), init=np.clip(population, low, high), maxiter=GENERATIONS, tol=0, polish=False,
-        vectorized=True, updating="deferred", callback=report, rng=rng,
-    )  # fmt: skip
-    return best.x, float(best.fun)
+    return start + large_change * changes[0, 0], float(cost[0, 0])
 
 
 def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
     """Return the robot with a table and zeros (3 + n,)."""
     zeros = robot.zero[robot.operated_index] + x[3:]
-    servos = {j: {"zero": float(f"{z:.4g}")} for j, z in zip(robot.operated, zeros, strict=True)}
+    servos = {}
+    for joint, zero in zip(robot.operated, zeros, strict=True):
+        servos[joint] = {"zero": round(float(zero), ZERO_DECIMALS)}
     height, friction, stiffness = (float(f"{v:.4g}") for v in (x[0], x[1], np.exp(x[2])))
     return replace(robot.with_servos(servos), table=Table(height, friction, stiffness))
 

@@ -11,7 +11,12 @@ from arm import record
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.config import TrainConfig
+from gaponet.nn.training.config import (
+    MANY_SIMULATORS_MODEL,
+    MANY_SIMULATORS_PRETRAINING,
+    PretrainingConfig,
+    TrainConfig,
+)
 from gaponet.nn.training.simulators import in_many_simulators, in_validation_simulators, pieces
 from gaponet.robot.spec import load_robot
 
@@ -81,3 +86,13 @@ def test_the_network_is_told_its_simulator_where_there_are_many() -> None:
 def test_ranges_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(UsageError, match="smaller"):
         replace(MANY.simulator_ranges, kp=(2.0, 0.5))
+
+
+def test_what_somebody_changes_stays_in_the_recipe_for_many_simulators() -> None:
+    chosen = PretrainingConfig(gradient_steps=77)
+
+    recipe = TrainConfig(simulators=5, pretraining=chosen).sized()
+
+    assert recipe.pretraining.gradient_steps == 77
+    assert recipe.pretraining.noise == MANY_SIMULATORS_PRETRAINING.noise
+    assert recipe.model.branch_hidden == MANY_SIMULATORS_MODEL.branch_hidden

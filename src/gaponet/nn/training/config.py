@@ -7,7 +7,7 @@ import re
 import shlex
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from annotated_types import Interval
 
@@ -112,6 +112,25 @@ PAPER_PPO = PPOConfig(
     refit_sensors=50,
 )  # fmt: skip
 
+# For many simulators: wider networks, less noise and more steps than for one.
+MANY_SIMULATORS_MODEL = ModelConfig(branch_hidden=(160, 128), trunk_hidden=(64, 64), num_basis=32)
+MANY_SIMULATORS_PRETRAINING = PretrainingConfig(
+    num_envs=400, steps=150, noise=0.2, gradient_steps=2500
+)
+
+Options = TypeVar("Options", ModelConfig, PretrainingConfig, PPOConfig)
+
+
+def _keep_changed(given: Options, recipe: Options) -> Options:
+    """Return a recipe's options; those of `given` that differ from the defaults stay."""
+    default = type(given)()
+    changed = {}
+    for field_ in fields(default):
+        value = getattr(given, field_.name)
+        if value != getattr(default, field_.name):
+            changed[field_.name] = value
+    return replace(recipe, **changed)
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -182,28 +201,27 @@ class TrainConfig:
 
         PPO settings that differ from the defaults stay.
         """
-        default = PPOConfig()
-        changed = {
-            f.name: x
-            for f in fields(default)
-            if (x := getattr(self.ppo, f.name)) != getattr(default, f.name)
-        }
-        return replace(
-            self, ppo=replace(PAPER_PPO, **changed), pretraining=replace(self.pretraining, rounds=0)
-        )
+        ppo = _keep_changed(self.ppo, PAPER_PPO)
+        return replace(self, ppo=ppo, pretraining=replace(self.pretraining, rounds=0))
+
+    def many_simulators_recipe(self) -> TrainConfig:
+        """Return this configuration with what training in many simulators needs.
+
+        Options that differ from the defaults stay. The network is told its simulator's answers, if its kind can be.
+        """
+        model = _keep_changed(self.model, MANY_SIMULATORS_MODEL)
+        if not self.without_context and self.model.kind in CONTEXT_KINDS:
+            model = replace(model, context=True)
+        pretraining = _keep_changed(self.pretraining, MANY_SIMULATORS_PRETRAINING)
+        return replace(self, model=model, pretraining=pretraining)
 
     def sized(self) -> TrainConfig:
-        """Return this configuration with the number of simulations where num_envs is 0, and the network's context."""
+        """Return this configuration with the number of simulations where num_envs is 0, and its recipe."""
+        config = self.many_simulators_recipe() if self.simulators else self
         num = max(4096 if self.device == "cuda" else 256, 2 * self.simulators)
-        pretraining = replace(self.pretraining, num_envs=self.pretraining.num_envs or num)
-        ppo = replace(self.ppo, num_envs=self.ppo.num_envs or num)
-        return replace(self, model=self._model_with_context(), pretraining=pretraining, ppo=ppo)
-
-    def _model_with_context(self) -> ModelConfig:
-        """Return the network's options, with the context where there are many simulators to tell apart."""
-        if not self.simulators or self.without_context or self.model.kind not in CONTEXT_KINDS:
-            return self.model
-        return replace(self.model, context=True)
+        pretraining = replace(config.pretraining, num_envs=config.pretraining.num_envs or num)
+        ppo = replace(config.ppo, num_envs=config.ppo.num_envs or num)
+        return replace(config, pretraining=pretraining, ppo=ppo)
 
     def options(self) -> list[str]:
         """Return the options of gaponet train for this configuration."""
