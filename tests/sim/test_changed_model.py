@@ -94,3 +94,13 @@ def test_a_change_for_another_number_of_joints_is_refused() -> None:
 
     with pytest.raises(UsageError, match="joints"):
         BatchSim(robot, [condition], 1)
+
+
+def test_a_robot_with_a_servo_model_has_no_changed_simulators() -> None:
+    sticky = load_robot("so101").with_servos(
+        {"shoulder_pan": {"stribeck": 0.1, "stribeck_speed": 0.1}}
+    )
+    condition = Condition(0.0, "both", sticky.dt, simulator=CHANGE)
+
+    with pytest.raises(UsageError, match="servo"):
+        BatchSim(sticky, [condition], 1)

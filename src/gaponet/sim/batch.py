@@ -170,25 +170,12 @@ class BatchSim:
         conditions = [Condition(*c) for c in conditions]
         delays = [c.simulator.delay for c in conditions if c.simulator]
         self.longest_delay = float(robot.delay.max()) + max(delays, default=0.0)  # s
-        robots: dict[Condition, RobotSpec] = {}
-        unchanged: dict[Condition, mujoco.MjModel] = {}
-        self.models: dict[Condition, mujoco.MjModel] = {}
-        for c in dict.fromkeys(conditions):
-            robots[c] = robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
-            own = c.without_change
-            if own not in unchanged:
-                buffered = robots[c]
-                if any(delays):  # every model has the buffer of the longest delay
-                    longest = np.full(len(robot.joint_names), self.longest_delay)
-                    buffered = replace(buffered, delay=longest)
-                model = build_model(buffered, *c[:3], locked, physics_only=True)
-                model.actuator_delay[:] = robots[c].delay[robot.index(self.joint_names)]
-                unchanged[own] = model
-            self.models[c] = unchanged[own]
-            if c.simulator is not None:
-                self.models[c] = changed_model(
-                    unchanged[own], robots[c], self.joint_names, c.simulator
-                )
+        robots = {
+            c: robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
+            for c in dict.fromkeys(conditions)
+        }
+        buffer_s = self.longest_delay if any(delays) else 0.0
+        self.models = _compiled(robots, self.joint_names, locked, buffer_s)
         first = self.models[conditions[0]]
         kp_ratio = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
         self._kp_ratio = np.array([kp_ratio[c] for c in conditions])
@@ -362,6 +349,45 @@ class BatchSim:
             if (play := self.servo_model.play) is not None:
                 state |= {"servo_gap": play.gap, "servo_rotor": play.rotor, "servo_seen": play.seen}
         return state if self.max_change is None else state | {"ctrl": self.ctrl}
+
+
+def _compiled(
+    robots: dict[Condition, RobotSpec],
+    joint_names: tuple[str, ...],
+    locked: tuple[str, ...],
+    buffer_s: float,
+) -> dict[Condition, mujoco.MjModel]:
+    """Return the model of each condition. Conditions that differ in their simulator alone share one compilation.
+
+    Args:
+        robots: Condition → robot with its gains, at its temperature.
+        joint_names: Joints that are not locked.
+        buffer_s: Every model gets buffers for servos that are so late, s; 0 for those that its robot needs.
+
+    Raises:
+        UsageError: A changed simulator of a robot with a servo model, whose terms are not changed with it.
+    """
+    unchanged: dict[Condition, mujoco.MjModel] = {}
+    models: dict[Condition, mujoco.MjModel] = {}
+    for condition, robot in robots.items():
+        own = condition.without_change
+        if own not in unchanged:
+            buffered = robot
+            if buffer_s:
+                buffered = replace(robot, delay=np.full(len(robot.joint_names), buffer_s))
+            model = build_model(buffered, *condition[:3], locked, physics_only=True)
+            model.actuator_delay[:] = robot.delay[robot.index(joint_names)]
+            unchanged[own] = model
+        models[condition] = unchanged[own]
+        if condition.simulator is None:
+            continue
+        if robot.has_servo_model:
+            raise UsageError(
+                f"{robot.name} has a servo model (friction at rest or by load, backlash, …), which other simulators do "
+                "not have: train in many simulators with the robot before identification"
+            )
+        models[condition] = changed_model(unchanged[own], robot, joint_names, condition.simulator)
+    return models
 
 
 def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:

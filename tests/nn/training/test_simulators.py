@@ -96,3 +96,8 @@ def test_what_somebody_changes_stays_in_the_recipe_for_many_simulators() -> None
     assert recipe.pretraining.gradient_steps == 77
     assert recipe.pretraining.noise == MANY_SIMULATORS_PRETRAINING.noise
     assert recipe.model.branch_hidden == MANY_SIMULATORS_MODEL.branch_hidden
+
+
+def test_many_simulators_on_a_gpu_are_refused() -> None:
+    with pytest.raises(UsageError, match="--device cpu"):
+        TrainConfig(simulators=5, device="cuda").sized()

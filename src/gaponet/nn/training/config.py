@@ -216,7 +216,15 @@ class TrainConfig:
         return replace(self, model=model, pretraining=pretraining)
 
     def sized(self) -> TrainConfig:
-        """Return this configuration with the number of simulations where num_envs is 0, and its recipe."""
+        """Return this configuration with the number of simulations where num_envs is 0, and its recipe.
+
+        Raises:
+            UsageError: Many simulators on a GPU.
+        """
+        if self.simulators and self.device != "cpu":
+            raise UsageError(
+                f"--simulators with --device {self.device}: many simulators step in C MuJoCo; use --device cpu"
+            )
         config = self.many_simulators_recipe() if self.simulators else self
         num = max(4096 if self.device == "cuda" else 256, 2 * self.simulators)
         pretraining = replace(config.pretraining, num_envs=config.pretraining.num_envs or num)
