@@ -25,13 +25,17 @@ def wave(
     return amplitude * np.sin(2 * np.pi * hertz * t * (1 + 0.37 * np.arange(n)) + np.arange(n))
 
 
+FOLLOWING_ERROR = (
+    2e-5  # of the distance from home; a servo never repeats its commands to the last digit
+)
+
+
 def late(ctrl: np.ndarray, steps: int) -> np.ndarray:
-    """The same `steps` rows later, first row held."""
-    return (
-        np.concatenate([np.repeat(ctrl[:1], steps, axis=0), ctrl[:-steps]])
-        if steps
-        else ctrl.copy()
-    )
+    """Nearly the same `steps` rows later, first row held: what a good servo does. Without steps, a copy."""
+    if not steps:
+        return ctrl.copy()
+    delayed = np.concatenate([np.repeat(ctrl[:1], steps, axis=0), ctrl[:-steps]])
+    return (1 - FOLLOWING_ERROR) * delayed
 
 
 def write_sage(

@@ -71,7 +71,7 @@ def import_logs(
         format: Format of the logs; default by inspection.
         joint_map: Joint name in the logs → joint name of the robot.
         logs: A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder of the logs.
-        position_unit: rad, deg, fraction or signed_percent, where the format leaves it open.
+        position_unit: rad, deg, fraction, ticks or signed_percent, where the format leaves it open.
         time_unit: s, ms, us or ns, where the format leaves it open.
         rate: Hz, of logs without a clock.
         cut: Cut long recordings into equal pieces of about this length, s; each is a motion of its own.

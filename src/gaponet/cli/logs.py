@@ -33,7 +33,7 @@ def import_logs(
     src: tyro.conf.Positional[Path | None] = None, robot: str = "", out: Path | None = None, unit_id: str | None = None,
     payload_mass: float | None = None, payload_side: str | None = None,
     map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (), format: str | None = None,
-    logs: Path | None = None, position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
+    logs: Path | None = None, position_unit: Literal["rad", "deg", "fraction", "ticks", "signed_percent"] | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] | None = None, rate: float | None = None, cut: float | None = None,
     level: Literal["joint", "upper_body", "whole_body"] | None = None, kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (), skip_bad: bool = False, strict: bool = False, allow_pickle: bool = False,

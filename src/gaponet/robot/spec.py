@@ -46,7 +46,7 @@ __all__ = [
 ]
 
 PACKAGE_FOLDER = Path(__file__).parent / "robots"
-LOG_UNITS = ("rad", "deg", "fraction")
+LOG_UNITS = ("rad", "deg", "fraction", "ticks")
 MAX_SUGGESTIONS = 3  # similar joint names in an error
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are equal
 
@@ -320,7 +320,10 @@ class RobotSpec:
         )
         if len(matches) != 1:
             message, nearest = self._unknown(short, where)
-            raise JointMismatchError(f"{message}. Map it with --map {short}={nearest}")
+            raise JointMismatchError(
+                f'{message}. Map it with --map {short}={nearest}, or leave it out with ignore = ["{short}"] in '
+                "logs.toml (--logs)"
+            )
         return matches[0]
 
     def _unknown(self, name: str, where: str) -> tuple[str, str]:

@@ -60,12 +60,11 @@ from gaponet.sysid.torque import TorqueFit, with_torque
 ONE_PAYLOAD = (
     "masses and gains are known up to a common factor: record two payloads before you trust a third"
 )
+# In the judge's order: the given robot, then the default, which others replace only where they are clearly better.
+CANDIDATES = ("given", "limbs", "joints", "whole", "delay and offset")
 FOLDS = 3  # of the cross-validation
 WINDOWS = 40  # of joints by themselves
-FIRST_ROBOT_ITERATIONS = (
-    2,
-)  # of the whole robot, from both starts; they say whether more are worth it
-MORE_ROBOT_ITERATIONS = (3,)
+ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
 POLISH_ITERATIONS = 2  # of the whole robot with a term of the servo model
 JOINTS_TIME_SHARE, ROBOT_TIME_SHARE, TERMS_TIME_SHARE = 0.3, 0.4, 0.3  # of a time budget
 
@@ -80,7 +79,7 @@ class _SearchProgress:
     def __init__(self, seconds: float | None, terms: int, fits: int, progress: Progress) -> None:
         """Begin the time of the searches of so many terms in so many fits, s; None for no limit."""
         joints = sum(SEARCH_ITERATIONS)
-        robot = sum(FIRST_ROBOT_ITERATIONS + MORE_ROBOT_ITERATIONS) + CHAIN_ITERATIONS
+        robot = sum(ROBOT_ITERATIONS) + CHAIN_ITERATIONS
         each = [joints] * fits + [robot * fits] + [joints + POLISH_ITERATIONS] * (fits * terms)
         term = TERMS_TIME_SHARE / (terms + 1)
         shares = [JOINTS_TIME_SHARE] * fits + [ROBOT_TIME_SHARE * fits] + [term] * (fits * terms)
@@ -218,6 +217,7 @@ def _fit_robot(
     if not joints_alone:
         together = _robot_candidates(wholes, judge, candidates["joints"], searches)
     candidates |= together
+    candidates = {name: candidates[name] for name in CANDIDATES if name in candidates}
     identified = given.nominal is not None
     chosen, values = judge.best_by_joint(candidates) if identified else judge.best(candidates)
     base = values
@@ -310,30 +310,30 @@ def _robot_candidates(
     0.2 mrad worse.
     """
     names = wholes[0].robot.operated
-    first = []
-    for whole, own in zip(wholes, alone, strict=True):
-        report = searches.report("whole robot", names, whole.rollouts.rows)
-        starts = (own, whole.bounds.start)
-        first.append(
-            whole.descend(CLASSIC, starts[1], starts, FIRST_ROBOT_ITERATIONS, report=report)
-        )
-    enough_judges = len(set(judge.names.tolist())) >= MIN_JUDGES
-    if enough_judges and judge.errors(first).mean() >= judge.errors(alone).mean():
-        return {}
-    together, chains = [], []
-    for whole, own, start in zip(wholes, alone, first, strict=True):
-        report = searches.report("whole robot", names, whole.rollouts.rows)
-        values = whole.descend(CLASSIC, start, (start, own), MORE_ROBOT_ITERATIONS, report=report)
-        together.append(values)
-        if searches.expired():
-            chains.append(values)
-            continue
+
+    def together(iterations: tuple[int, ...]) -> list[Values]:
+        fitted = []
+        for whole, own in zip(wholes, alone, strict=True):
+            report = searches.report("whole robot", names, whole.rollouts.rows)
+            starts = (own, whole.bounds.start)
+            fitted.append(whole.descend(CLASSIC, starts[1], starts, iterations, report=report))
+        return fitted
+
+    if len(set(judge.names.tolist())) >= MIN_JUDGES:
+        first = together(ROBOT_ITERATIONS[:1])
+        if judge.errors(first).mean() >= judge.errors(alone).mean():
+            return {}
+    whole_robot = together(ROBOT_ITERATIONS)
+    if searches.expired():
+        return {"whole": whole_robot, "limbs": whole_robot}
+    chains = []
+    for whole, values in zip(wholes, whole_robot, strict=True):
         chains.append(
             whole.descend_chains(
                 values, lambda joints, rows: searches.report("kinematic chains", joints, rows)
             )
         )
-    return {"whole": together, "limbs": chains}
+    return {"whole": whole_robot, "limbs": chains}
 
 
 def _with_terms(

@@ -7,6 +7,7 @@ import pytest
 from logs import arm_columns, table_text
 
 from gaponet.base.errors import LogError, UsageError
+from gaponet.data.describe.plausibility import require_plausible
 from gaponet.data.formats import detect, find_logs, read_logs
 
 SI = {"position_unit": "rad", "time_unit": "s"}
@@ -245,3 +246,78 @@ def test_names_in_a_parquet_file_that_are_no_text_are_refused(tmp_path, arm):
     file.write_bytes(file.read_bytes().replace(b"ctrl.elbow", b"ctrl.\xff\xfebow"))
     with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file"):
         only(file, arm)
+
+
+def test_a_git_lfs_pointer_is_named_as_one(tmp_path, arm):
+    for kind in ("csv", "parquet"):
+        file = tmp_path / f"wave.{kind}"
+        file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+        with pytest.raises(LogError, match="LFS"):
+            only(file, arm)
+
+
+def test_a_column_that_stands_twice_is_refused_only_if_it_is_read(tmp_path, arm):
+    plain = only(write(tmp_path / "plain.csv", arm_columns()), arm)
+    further = arm_columns() | {"current_a": np.arange(60.0), "current_b": np.arange(60.0)}
+    unused = write(tmp_path / "unused.csv", further, "current_a", "current_b")
+    used = write(tmp_path / "used.csv", further, "current_a", "qpos.elbow")
+
+    assert np.array_equal(only(unused, arm).channels["qpos"].values, plain.channels["qpos"].values)
+    with pytest.raises(LogError, match="twice"):
+        only(used, arm)
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas_are_read_as_numbers(tmp_path, arm, separator):
+    plain = only(write(tmp_path / "plain.csv", arm_columns()), arm)
+    text = table_text(arm_columns()).replace(",", separator)
+    header, _, rows = text.partition("\n")
+    file = tmp_path / "comma.csv"
+    file.write_text(header + "\n" + rows.replace(".", ","))
+
+    assert np.array_equal(only(file, arm).channels["qpos"].values, plain.channels["qpos"].values)
+
+
+def test_a_bad_cell_among_decimal_commas_is_refused_by_line(tmp_path, arm):
+    header, _, rows = table_text(arm_columns()).replace(",", ";").partition("\n")
+    file = tmp_path / "comma.csv"
+    file.write_text(header + "\n" + rows.replace(".", ",").replace("\n0,04;", "\n0,04;x", 1))
+
+    with pytest.raises(LogError, match=r"comma\.csv:4"):
+        only(file, arm)
+
+
+def test_ticks_of_an_encoder_are_named_and_2048_is_the_zero(tmp_path, arm):
+    columns = arm_columns()
+    for name in columns:
+        if name != "time":
+            columns[name] = np.round(2048 + np.degrees(columns[name]) / 360 * 4096)
+    file = write(tmp_path / "wave.csv", columns)
+
+    with pytest.raises(LogError, match="ticks"):
+        require_plausible(only(file, arm), arm)
+    with pytest.raises(LogError, match="ticks"):
+        require_plausible(only(file, arm, position_unit="deg"), arm)
+    positions = only(file, arm, position_unit="ticks").channels["qpos"].values
+    assert np.abs(positions[:, 1] - arm_columns()["qpos.elbow"]).max() < 2 * np.pi / 4096
+
+
+def test_rows_that_were_written_twice_count_once(tmp_path, arm):
+    once = arm_columns()
+    twice = {name: np.repeat(values, 2) for name, values in once.items()}
+    twice["time"][1::2] += 4e-4
+
+    log = only(write(tmp_path / "twice.csv", twice), arm)
+
+    assert np.allclose(log.channels["qpos"].time, once["time"])
+    assert log.meta["notes"]["repeated"] == {"rows": 60}
+
+
+def test_a_robot_at_rest_repeats_its_numbers_at_its_usual_period(tmp_path, arm):
+    resting = arm_columns()
+    for name in ("qpos.shoulder", "qpos.elbow"):
+        resting[name] = np.full(60, 0.25)
+
+    log = only(write(tmp_path / "rest.csv", resting), arm)
+
+    assert len(log.channels["qpos"].time) == 60

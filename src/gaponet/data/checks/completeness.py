@@ -121,6 +121,19 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("warning", "nonsense", text, joints, {"rows": rows})
 
 
+def _repeated_rows(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Were rows that the logger wrote twice left out at import?"""
+    hit = [s for s in surveys if "repeated" in s.entry.meta.notes]
+    if not hit:
+        return
+    rows = sum(s.entry.meta.notes["repeated"]["rows"] for s in hit)
+    text = (
+        f"{rows} rows of {_motions(hit)} repeat the row before within a fraction of a period: the logger wrote them "
+        "twice, and they were left out at import"
+    )
+    yield Finding("note", "repeated", text, values={"rows": rows})
+
+
 def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a joint run into a stop, or were all of them held?"""
     held = [s for s in surveys if s.standstill_s >= MIN_STANDSTILL_S]
@@ -270,6 +283,7 @@ CHECKS = (
     Check(_regularity, "jitter", ""),
     Check(_jumps, "jumps", "no joint jumps"),
     Check(_nonsense, "nonsense", "no value is implausible"),
+    Check(_repeated_rows, "repeated", "no row was written twice"),
     Check(_blocked, "blocked", "no joint ran into a stop"),
     Check(_saturation, "saturation", ""),
     Check(_resolution, "resolution", ""),

@@ -149,13 +149,17 @@ def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are command and state two signals, and does the command come first?"""
     copies: dict[str, list[str]] = {}
+    shifted: dict[int, list[str]] = {}  # rows by which the state repeats the command → joints
     usual: list[int] = []  # joints that follow their commands in most recordings
     for i, name in enumerate(robot.joint_names):
         moved = _moved(surveys, i)
         copied = [s.motion for s in moved if s.equals_command[i]]
         leads = [s.lead[i] for s in moved if np.isfinite(s.lead[i])]
+        repeats = [s.copied_rows[i] for s in moved if np.isfinite(s.copied_rows[i])]
         if copied:
             copies[name] = copied
+        elif 2 * len(repeats) > len(moved):
+            shifted.setdefault(round(float(np.median(repeats))), []).append(name)
         elif len(leads) > 0.5 * len(moved):
             lead = float(np.median(leads))
             text = (
@@ -172,6 +176,18 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "command and state are swapped there; leave these out, or import them with the columns exchanged"
         )
         yield Finding("error", "copied", text, (), {"recordings": [s.entry.id for s in early]})
+    for rows, joints in shifted.items():
+        count = f"{abs(rows)} row{'s' * (abs(rows) > 1)}"
+        text = (
+            f"the command of {abbreviate(joints)} is the recorded position {count} later, to the last digit: what was "
+            "sent to the servos is not in this log. Record the goal positions that the robot was sent"
+        )
+        if rows < 0:
+            text = (
+                f"the position of {abbreviate(joints)} is the command {count} later, to the last digit: the state was "
+                "not measured. Record the positions of the encoders"
+            )
+        yield Finding("error", "copied", text, tuple(joints), {"rows": rows})
     if copies:
         motions = [motion for of_joint in copies.values() for motion in of_joint]
         text = (

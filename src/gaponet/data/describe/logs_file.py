@@ -51,7 +51,7 @@ class LogsFile(TypedDict, total=False):
     time: Text  # column of the clock
     rate: Annotated[float, Interval(ge=1, le=10_000)]  # Hz, where the log has no clock
     time_unit: Text  # s, ms, us, ns
-    position_unit: Text  # rad, deg, fraction (0..1 of the joint's range); velocities: per second
+    position_unit: Text  # rad, deg, fraction (0..1 of the joint's range), ticks (4096 a turn); velocities: per s
     ctrl: Text  # columns of commanded positions, as "{joint}_des", or the name of an array
     qpos: Text
     qvel: Text

@@ -20,6 +20,10 @@ MOSTLY = 0.2  # of a joint's rows: more nonsense than this, and nothing of the c
 UNASKED = 1.0  # rad that no joint moves of itself while all are told to stand still
 
 
+TICKS_PER_TURN = 4096  # of the encoders of Feetech and Dynamixel servos
+LARGEST_DEG = 360.0  # larger positions of a limb are no degrees
+
+
 def to_radians(
     name: str, values: Array, joint_names: tuple[str, ...], units: list[str], robot: RobotSpec
 ) -> Array:
@@ -29,7 +33,8 @@ def to_radians(
         name: Channel: an offset applies to positions (ctrl, qpos) only; torques and temperatures pass untouched.
         values: (k, n), columns in the order of joint_names.
         joint_names: The robot's own names, (n).
-        units: Unit of each joint, (n): rad, deg, or fraction (0..1 of the robot's joint range).
+        units: Unit of each joint, (n): rad, deg, fraction (0..1 of the robot's joint range), or ticks (4096 a turn,
+            2048 at zero, as Feetech and Dynamixel servos count).
         robot: The robot whose joint ranges give a fraction its meaning.
     """
     if name not in ("ctrl", "qpos", "qvel") or set(units) == {"rad"}:
@@ -38,6 +43,9 @@ def to_radians(
     for column, (joint, unit) in enumerate(zip(joint_names, units, strict=True)):
         if unit == "deg":
             out[:, column] *= np.pi / 180
+        if unit == "ticks":
+            zero = 0.0 if name == "qvel" else TICKS_PER_TURN / 2
+            out[:, column] = (out[:, column] - zero) * 2 * np.pi / TICKS_PER_TURN
         if unit == "fraction":
             low, high = robot.qpos_range[robot.joint_names.index(joint)]
             out[:, column] = out[:, column] * (high - low) + (0.0 if name == "qvel" else low)
@@ -137,8 +145,20 @@ def require_radians(
         row = int(abs(values[:, column]).argmax())
         value, (low, high) = values[row, column], robot.qpos_range[robot.joint_names.index(joint)]
         if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
+            look_like = "degrees; logs state them with --position-unit deg"
+            stated_as_degrees = np.round(np.degrees(values[:, column]), 6)
+            if look_like_ticks(values[:, column]) or look_like_ticks(stated_as_degrees):
+                look_like = (
+                    "ticks of an encoder, whole numbers from 0 to 4095; logs state them with "
+                    "--position-unit ticks"
+                )
             raise LogError(
                 f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
-                "must be in radians: these look like degrees; logs state them with --position-unit deg, or for one "
-                "joint with [joint_units]"
+                f"must be in radians: these look like {look_like}, or for one joint with [joint_units]"
             )
+
+
+def look_like_ticks(values: Array) -> bool:
+    """Return True if positions can only be ticks of an encoder with TICKS_PER_TURN a turn."""
+    whole = np.array_equal(values, np.round(values))
+    return bool(whole and values.min() >= 0 and LARGEST_DEG < values.max() < TICKS_PER_TURN)

@@ -182,9 +182,30 @@ def restated(specified: Any, where: str) -> dict[str, Any]:
     return {name: meta[name] for name in fields if name != "robot"}
 
 
+GIT_LFS_POINTER = b"version https://git-lfs"  # how such a file begins
+
+
+def require_content(file: Path) -> None:
+    """Refuse a file that git put in the place of a large one.
+
+    Raises:
+        LogError: It is a Git LFS pointer.
+    """
+    if not file.is_file():
+        return
+    with file.open("rb") as stream:
+        beginning = stream.read(len(GIT_LFS_POINTER))
+    if beginning == GIT_LFS_POINTER:
+        raise LogError(
+            f"{file}: is a Git LFS pointer of some bytes, not the recording; run 'git lfs pull' in its repository, or "
+            "download the file itself"
+        )
+
+
 @contextmanager
 def reading(file: Path, what: str) -> Iterator[None]:
     """Turn any error of a library on a damaged file into one error with the file name."""
+    require_content(file)
     try:
         yield
     except (LogError, MemoryError, ImportError):

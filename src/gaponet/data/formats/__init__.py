@@ -38,6 +38,7 @@ from gaponet.base.errors import LogError, UsageError
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.plausibility import require_plausible
 from gaponet.data.describe.raw_recording import COMMAND, RawRecording
+from gaponet.data.describe.repeats import without_repeated_rows
 from gaponet.data.log import COMMANDS, Channel, Log, skipped_rows
 from gaponet.plugins import attempt
 from gaponet.robot.spec import RobotSpec
@@ -164,7 +165,8 @@ def read_logs(
     bad = skipped_rows()
     for name, load in _loaders(reader, path, robot, specified, names):
         try:
-            log = _corrected(require_plausible(load(), robot, strict), robot, specified, names)
+            once = without_repeated_rows(load())
+            log = _corrected(require_plausible(once, robot, strict), robot, specified, names)
         except LogError as error:
             if bad is None:
                 raise

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,7 @@ import numpy as np
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.raw_recording import RawRecording, Signal
+from gaponet.data.describe.raw_recording import RawRecording, Signal, require_content
 from gaponet.data.formats import files_under, joint_rows, parquet
 from gaponet.data.log import CHANNELS, skipped_rows
 
@@ -27,6 +27,7 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
 # metadata of a table that is no data, and why (hw/control/recording.py)
 NOT_OBEYED = "gaponet.not_obeyed"
+DECIMAL_SAMPLE_BYTES = 20_000  # of the first rows, by which decimal commas are told
 DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
 
 
@@ -63,15 +64,29 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         else:
             names, first = _csv_header(file, specified.get("header"))
             load, line = partial(_read_csv, file, names, first), first + 1
-        for name in names:
-            if names.count(name) > 1:
-                raise LogError(f"{file}:1: column '{name}' stands twice; rename one")
+        _refuse_twice(file, names, [name for name in names if name.split(".")[0] in DEFAULT])
+        load = partial(_load_once, file, names, load)
         if joint := joint_rows.joint_column(names, specified):
             yield joint_rows.recording(file, names, joint, specified)
             continue
         yield RawRecording(
             file.stem, str(file), dict.fromkeys(names, ()), load, f"{file}:1", (str(file),), line
         )
+
+
+def _refuse_twice(file: Path, names: list[str], wanted: list[str]) -> None:
+    """Refuse wanted columns whose name another column has too. Others may stand there twice."""
+    for name in wanted:
+        if names.count(name) > 1:
+            raise LogError(f"{file}:1: column '{name}' stands twice; rename one")
+
+
+def _load_once(
+    file: Path, names: list[str], load: Callable[[list[str]], dict[str, Signal]], wanted: list[str]
+) -> dict[str, Signal]:
+    """Load columns that stand in the file once."""
+    _refuse_twice(file, names, wanted)
+    return load(wanted)
 
 
 def _is_table(file: Path) -> bool:
@@ -84,8 +99,16 @@ def _is_table(file: Path) -> bool:
 
 
 def _delimiter(line: str) -> str:
-    """Return the separator of cells; a space for any white space."""
-    return next((d for d in (",", ";", "\t") if d in line), " ")
+    """Return the separator of cells; a space for any white space. Beside semicolons, commas are decimal commas."""
+    return next((d for d in (";", ",", "\t") if d in line), " ")
+
+
+def _has_decimal_commas(body: bytes, delimiter: str) -> bool:
+    """Return True if the numbers of a table have decimal commas, as spreadsheets of many countries write them."""
+    if delimiter == ",":
+        return False
+    first_rows = body[:DECIMAL_SAMPLE_BYTES]
+    return b"," in first_rows and not re.search(rb"\d\.\d", first_rows)
 
 
 def _numeric(cells: list[str]) -> bool:
@@ -97,6 +120,7 @@ def _numeric(cells: list[str]) -> bool:
 
 def _csv_header(file: Path, given: list[str] | None) -> tuple[list[str], int]:
     """Names of the columns, and how many lines stand before the first row."""
+    require_content(file)
     with file.open(encoding="utf-8-sig", errors="replace", newline="") as lines:
         try:
             line = lines.readline(1 << 20)
@@ -144,6 +168,7 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
                 include_columns=wanted,
                 column_types=dict.fromkeys(wanted, pa.float64()),
                 null_values=[""],
+                decimal_point="," if _has_decimal_commas(body, delimiter) else ".",
             ),
         )
         whole = not any(table.column(name).null_count for name in wanted)
@@ -166,6 +191,8 @@ def _read_slowly(
     """Line by line: raises for the first with too few cells or a cell that is no number; NaN where rows are cut."""
     places, bad = {name: names.index(name) for name in wanted}, skipped_rows()
     numbers: list[list[float]] = []
+    if _has_decimal_commas(body.encode(), delimiter):
+        body = body.replace(",", ".")
     rows = csv.reader(body.split("\n"), delimiter=delimiter)
     while True:
         where = f"{file}:{rows.line_num + first + 1}"

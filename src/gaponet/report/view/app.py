@@ -42,7 +42,7 @@ from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_r
 from gaponet.sim.dataset_robot import dataset_robot
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
-POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "signed_percent")
+POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "ticks", "signed_percent")
 TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
 POLL_S = 0.5
