@@ -18,7 +18,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -209,26 +209,21 @@ def _fit_robot(
         [held_out or fits[0].rollouts.parts for _, held_out in splits], robot, contact, nthread
     )
     searches = _SearchProgress(budget, len(terms) + masses, len(fits), progress)
-    each = [_joint_candidates(joints, searches) for joints in fits]
-    wholes = [joints.robot_fit(nthread) for joints in fits]
-    candidates = {name: [one[name] for one in each] for name in each[0]}
-    searches.begin()
-    together: dict[str, list[Values]] = {}
-    if not joints_alone:
-        together = _robot_candidates(wholes, judge, candidates["joints"], searches)
-    candidates |= together
-    candidates = {name: candidates[name] for name in CANDIDATES if name in candidates}
-    identified = given.nominal is not None
-    chosen, values = judge.best_by_joint(candidates) if identified else judge.best(candidates)
-    base = values
-    if chosen == "given" and not identified:
-        base = candidates["limbs"] if together else candidates["joints"]
+    classic = _fit_classic(fits, judge, given, nthread, searches, joints_alone)
+    wholes = classic.wholes
+    chosen = classic.chosen
     comparisons, values, gaps = _with_terms(
-        fits, wholes if together else [], judge, terms, values, base, searches
+        fits,
+        wholes if classic.together else [],
+        judge,
+        terms,
+        classic.values,
+        classic.base,
+        searches,
     )
     linked, links = None, list[Links]()
     if masses:
-        start = values if any(c.accepted for c in comparisons) else base
+        start = values if any(c.accepted for c in comparisons) else classic.base
         gains = [
             {j: (g.kp, g.error) for j, g in TorqueFit(one, robot).known.items()}
             for one in fitted_sets
@@ -283,6 +278,53 @@ def _fit_robot(
         dict(zip(robot.operated, by_joint, strict=True)), errors.covariance,
         errors.undetermined, tuple(held_out), (*findings, *(linked.sentences() if linked else ())), linked,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Classic:
+    """Fit of the classic fields. Lists have an item for each set of fitted recordings.
+
+    Attributes:
+        wholes: Fits in the simulator of the whole robot, for later steps.
+        together: All joints were fitted together, because that helps.
+        chosen: Best candidate.
+        values: Its values, (n,) each.
+        base: Values from which terms of the servo model are fitted.
+    """
+
+    wholes: list[RobotFit]
+    together: bool
+    chosen: str
+    values: list[Values]
+    base: list[Values]
+
+
+def _fit_classic(
+    fits: ListOf[JointFit],
+    judge: Judge,
+    given: RobotSpec,
+    nthread: int,
+    searches: _SearchProgress,
+    joints_alone: bool,
+) -> _Classic:
+    """Fit the classic fields, joints by themselves and then together, and choose among the candidates."""
+    each = [_joint_candidates(joints, searches) for joints in fits]
+    wholes = [joints.robot_fit(nthread) for joints in fits]
+    candidates = {name: [one[name] for one in each] for name in each[0]}
+    searches.begin()
+    together: dict[str, list[Values]] = {}
+    if not joints_alone:
+        together = _robot_candidates(wholes, judge, candidates["joints"], searches)
+    candidates |= together
+    candidates = {name: candidates[name] for name in CANDIDATES if name in candidates}
+    if given.nominal is not None:
+        chosen, values = judge.best_by_joint(candidates)
+        return _Classic(wholes, bool(together), chosen, values, values)
+    chosen, values = judge.best(candidates)
+    base = values
+    if chosen == "given":
+        base = candidates["limbs"] if together else candidates["joints"]
+    return _Classic(wholes, bool(together), chosen, values, base)
 
 
 def _joint_candidates(joints: JointFit, searches: _SearchProgress) -> dict[str, Values]:
