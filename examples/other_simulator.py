@@ -1,4 +1,4 @@
-"""Correct a simulator that no training has seen: an SO-101 with servos 2.2 times as stiff, and three times the friction.
+"""Correct a simulator that no training has seen: an SO-101 with stiffer servos and three times the friction.
 
     python examples/other_simulator.py DATASET        recordings of an SO-101, in gaponet's form
 

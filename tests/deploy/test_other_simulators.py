@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from arm import recordings, write_arm, write_dataset
 
+from gaponet.base.errors import ModelError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
 from gaponet.export.torch_program import export_program
@@ -30,7 +31,7 @@ CONFIG = TrainConfig(
     ),
     ppo=PPOConfig(num_envs=48, num_steps=8, epochs=1, critic_warmup=1, explained=-1e9),
     simulators=SIMULATORS,
-    simulator_ranges=SimulatorRanges(kp=(0.4, 2.5), damping=(0.4, 2.5), delay=0.0),
+    simulator_ranges=SimulatorRanges(kp=(0.4, 2.5), damping=(0.4, 2.5)),
     threads=1,
 )
 
@@ -64,8 +65,19 @@ def test_it_corrects_a_simulator_with_other_gains_that_it_has_not_seen(trained) 
     assert methods["told"]["mpjae"] < 0.8 * methods["uncorrected"]["mpjae"]
 
 
-def test_an_aligned_simulator_with_known_answers_needs_no_transfer(trained) -> None:
+def late(robot: RobotSpec) -> RobotSpec:
+    """Return the robot with servos that are later than a transfer allows."""
+    return replace(with_kp(robot, OTHER_KP), delay=robot.delay + 0.012)
+
+
+def test_the_exact_transfer_comes_first(trained) -> None:
     sim = AlignedSim(with_kp(trained.robot, OTHER_KP), trained.model)
+
+    assert sim.transfer is not None
+
+
+def test_a_simulator_that_cannot_be_transferred_is_corrected_by_its_answers(trained) -> None:
+    sim = AlignedSim(late(trained.robot), trained.model)
 
     assert sim.transfer is None
     assert (
@@ -73,15 +85,15 @@ def test_an_aligned_simulator_with_known_answers_needs_no_transfer(trained) -> N
     )
 
 
-def test_a_simulator_whose_answers_no_training_had_gets_the_exact_transfer(trained) -> None:
-    far = with_kp(trained.robot, 4.0)
+def test_a_simulator_with_neither_is_refused(trained) -> None:
+    far = replace(with_kp(trained.robot, 4.0), delay=trained.robot.delay + 0.1)
 
-    assert not trained.model.knows(far, far.dt)
-    assert AlignedSim(far, trained.model).transfer is not None
+    with pytest.raises(ModelError, match="later"):
+        AlignedSim(far, trained.model)
 
 
 def test_a_scene_moves_like_the_aligned_simulator(trained) -> None:
-    robot = with_kp(trained.robot, OTHER_KP)
+    robot = late(trained.robot)
     aligned = AlignedSim(robot, trained.model)
     scene = build_model(robot)
     data = mujoco.MjData(scene)

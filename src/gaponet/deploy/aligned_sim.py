@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.errors import UsageError
+from gaponet.base.errors import ModelError, UsageError
 from gaponet.deploy.transfer import Reference, Transfer, control_periods_of
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
@@ -81,16 +81,18 @@ class AlignedSim:
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
         self.loop, self.transfer = None, None
         trained = model if isinstance(model, GapModel) and not other_payload else None
-        if (
-            trained is not None
-            and trained.knows(robot, self.dt)
-            and control_periods_of(trained, self.dt) == 1
-        ):
-            context = trained.context_of(robot, self.dt) if trained.config.context else None
-            self.loop = trained.loop(self.num_envs, context)
+        same_period = trained is not None and control_periods_of(trained, self.dt) == 1
+        if trained is not None and same_period and trained.is_trained_in(robot):
+            self.loop = trained.loop(self.num_envs)
         elif model is not None:
             inverse = AnalyticInverse.of(BatchSim(robot, own, nthread, locked))
-            self.transfer = Transfer(model, inverse, conditions, locked, nthread, extrapolate)
+            try:
+                self.transfer = Transfer(model, inverse, conditions, locked, nthread, extrapolate)
+            except ModelError:
+                if trained is None or not same_period or not trained.knows(robot, self.dt):
+                    raise
+                context = trained.context_of(robot, self.dt)
+                self.loop = trained.loop(self.num_envs, context)
         self.target = np.zeros((self.num_envs, self.n))
         self._uncorrected = self.target[:, self.op]
         self.reset()

@@ -29,8 +29,8 @@ class MujocoAligner:
     transferred (deploy/transfer.py): other gains, friction, inertias, actuators, or a payload that the scene does not
     have. The base and the rest of the scene have their present state in each period.
 
-    A network for many simulators first measures the scene's answers to fixed probes (nn/context.py). If they lie within
-    those of its training, it corrects the scene directly.
+    Where commands cannot be transferred, a network for many simulators measures the scene's answers to fixed probes
+    (nn/context.py), and corrects the scene directly if they lie within those of its training.
     """
 
     def __init__(
@@ -79,13 +79,16 @@ class MujocoAligner:
         self.loop: DeltaLoop | None = None
         self.transfer: Transfer | None = None
         equal = unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range)
-        context = _known_context(model, mj_model, robot, dt, prefix)
         if equal and isinstance(model, GapModel):
             self.loop, joints = model.loop(), robot.operated
-        elif context is not None and isinstance(model, GapModel):
-            self.loop, joints = model.loop(context=context), robot.operated
         elif not equal:
-            self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
+            try:
+                self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
+            except ModelError:
+                context = _known_context(model, mj_model, robot, dt, prefix)
+                if context is None or not isinstance(model, GapModel):
+                    raise
+                self.loop, joints = model.loop(context=context), robot.operated
         names = [prefix + name for name in joints]
         self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])
         self.qvel = np.array([mj_model.joint(name).dofadr[0] for name in names])
