@@ -32,12 +32,12 @@ class DeltaStep(nn.Module):
 
     Attributes:
         depth: Frames in the past; a frame is [q | q̇ | applied target], 3n numbers.
-        context: Answers of the simulator to fixed probes, (8n) rad, or None if the network has no such input. They are
-            those of the simulator of training; write others into it for another simulator (nn/context.py).
+        told: The network is told the simulator's answers to fixed probes (nn/context.py).
+        context: If so, these answers, (8n) rad: of the robot's own simulator, until others are written into it.
         refused: Number of answers of the network that were not finite, () int64; there Δa is zero, as in nn/bound.py.
     """
 
-    context: Tensor | None
+    context: Tensor
     low: Tensor
     high: Tensor
     refused: Tensor
@@ -50,13 +50,12 @@ class DeltaStep(nn.Module):
         self.depth: int = (config.history - 1) * config.stride + 1
         self.stride: int = config.stride
         self.payload_input: bool = config.payload_input
+        self.told: bool = config.context
         self.payload_max: float = config.payload_max
         self.delta_max: float = config.delta_max
         low, high = torch.from_numpy(model.qpos_range.T.copy()).float()
-        context = None
         if config.context:
-            context = torch.from_numpy(model.nominal_context.copy())
-        self.register_buffer("context", context)
+            self.register_buffer("context", torch.from_numpy(model.nominal_context.copy()))
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.register_buffer("refused", torch.zeros((), dtype=torch.int64))
@@ -89,7 +88,7 @@ class DeltaStep(nn.Module):
         if self.payload_input:
             inputs.append((payload_mass / self.payload_max)[:, None])
         inputs.append(ctrl)
-        if self.context is not None:
+        if self.told:
             inputs.append(self.context.expand(qpos.shape[0], -1))
         delta = self._bounded(self.net(torch.cat(inputs, dim=1)))
         applied = torch.minimum(torch.maximum(ctrl + delta, self.low), self.high)
