@@ -33,7 +33,6 @@ from gaponet.base.result_table import ResultTable
 from gaponet.data.sequence import Sequence
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.context import contexts
 from gaponet.nn.loop import DeltaCorrector
 from gaponet.nn.training.config import (
     MANY_SIMULATORS_MODEL,
@@ -44,6 +43,7 @@ from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import open_dataset
 from gaponet.sim.batch import Condition
+from gaponet.sim.context import contexts
 from gaponet.sim.replay import Corrector, rollout_errors
 
 TEST_SEED = 20_261_128

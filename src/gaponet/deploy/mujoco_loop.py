@@ -11,10 +11,10 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.deploy.transfer import Reference, Transfer, control_periods_of
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.context import scene_context
 from gaponet.nn.loop import DeltaLoop
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
+from gaponet.sim.context import scene_context
 from gaponet.sim.inverse import AnalyticInverse
 
 
@@ -30,7 +30,7 @@ class MujocoAligner:
     have. The base and the rest of the scene have their present state in each period.
 
     Where commands cannot be transferred, a network for many simulators measures the scene's answers to fixed probes
-    (nn/context.py), and corrects the scene directly if they lie within those of its training.
+    (sim/context.py), and corrects the scene directly if they lie within those of its training.
     """
 
     def __init__(

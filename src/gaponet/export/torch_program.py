@@ -32,7 +32,7 @@ class DeltaStep(nn.Module):
 
     Attributes:
         depth: Frames in the past; a frame is [q | q̇ | applied target], 3n numbers.
-        told: The network is told the simulator's answers to fixed probes (nn/context.py).
+        told: The network is told the simulator's answers to fixed probes (sim/context.py).
         context: If so, these answers, (8n) rad: of the robot's own simulator, until others are written into it.
         refused: Number of answers of the network that were not finite, () int64; there Δa is zero, as in nn/bound.py.
     """

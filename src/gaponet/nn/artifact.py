@@ -19,7 +19,6 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.structure import Json, Name, Number, Sha256, read_format, read_json, validated
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.context import KnownSimulators, contexts
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.onnx_network import Network, OnnxNetwork
 from gaponet.nn.packaged_networks import CARD as CARD
@@ -31,7 +30,6 @@ from gaponet.robot.folder import (
     stored_robot_holder,
 )
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import Condition
 
 WEIGHTS = "model.onnx"
 FORMAT = 1
@@ -40,6 +38,8 @@ FORMAT = 1
 FACTS_IN_NETWORK = (
     "robot", "joint_names", "kp", "kd", "qpos_range", "dt", "payload_seen", "recorded", "model", "context",
 )  # fmt: skip
+MAX_DISTANCE = 0.1  # beyond the answers of training, as a share of their range, at which the network is still used
+MIN_WIDTH_RAD = 1e-4  # narrower ranges of training are taken to be this wide
 GAIN_TOLERANCE = 0.02  # relative, between recorded and real gains
 RATE_TOLERANCE = 0.02  # relative: a clock of 49.85 Hz counts as 50 Hz
 MAX_SHOWN = 80  # characters of a value in an error message
@@ -165,6 +165,45 @@ def _short(value: object) -> str:
 
 
 @dataclass(frozen=True)
+class KnownSimulators:
+    """Answers of the simulators of a training.
+
+    Attributes:
+        nominal: Of the robot's own simulator, (8n) rad.
+        low, high: Smallest and largest, (8n) rad.
+    """
+
+    nominal: Array
+    low: Array
+    high: Array
+
+    @classmethod
+    def of(cls, nominal: Array, trained: Array) -> KnownSimulators:
+        """Return the range of the robot's own answers, (8n), and those of training, (simulators, 8n)."""
+        answers = np.vstack([nominal, trained])
+        return cls(nominal, answers.min(axis=0), answers.max(axis=0))
+
+    def distance(self, context: Array) -> float:
+        """Return how far answers (…, 8n) lie outside those of training: 0 within, 1 a whole width of the range away."""
+        beyond = np.maximum(self.low - context, context - self.high)
+        width = np.maximum(self.high - self.low, MIN_WIDTH_RAD)
+        return float(np.maximum(beyond / width, 0.0).max())
+
+    def include(self, context: Array) -> bool:
+        """Return true if answers (…, 8n) are so close to those of training that the network can be used."""
+        return self.distance(context) <= MAX_DISTANCE
+
+    def to_card(self) -> dict[str, list[float]]:
+        """Return the entry of card.json."""
+        return {name: np.round(values, 7).tolist() for name, values in vars(self).items()}
+
+    @classmethod
+    def from_card(cls, entry: dict[str, Any]) -> KnownSimulators:
+        """Read the entry of card.json."""
+        return cls(*(np.array(entry[name], np.float32) for name in ("nominal", "low", "high")))
+
+
+@dataclass(frozen=True)
 class GapModel:
     """Delta-action model and its card. It has no state and can be shared.
 
@@ -243,6 +282,9 @@ class GapModel:
 
     def context_of(self, robot: RobotSpec, dt: float) -> Array:
         """Measure a simulator's answers to fixed probes with empty hands, (8n) rad; dt is the control period, s."""
+        from gaponet.sim.batch import Condition
+        from gaponet.sim.context import contexts
+
         return contexts(robot, [Condition(0.0, "both", dt)])[0]
 
     def loop(self, num_envs: int = 1, context: Array | None = None) -> DeltaLoop:

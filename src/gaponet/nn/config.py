@@ -17,7 +17,7 @@ PAPER_ONLY = (  # options of kind "paper" alone
     "payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target", "branch_observation",
     "relative_action", "real_state", "predictor_inputs",
 )  # fmt: skip
-CONTEXT_VALUES = 8  # of a joint (nn/context.py)
+CONTEXT_VALUES = 8  # of a joint (sim/context.py)
 CONTEXT_KINDS = ("gaponet", "shared_mlp")
 
 
@@ -77,7 +77,7 @@ class ModelConfig:
     """off: the branch input is the observation. predicted: predicted sensor values too, as in the paper; they did not
     reduce the error (docs/results/did-not-work.md)."""
     context: bool = False
-    """gaponet, shared_mlp: the simulator's answers to fixed probes at rest are inputs (nn/context.py). In gaponet they
+    """gaponet, shared_mlp: the simulator's answers to fixed probes at rest are inputs (sim/context.py). In gaponet they
     are the branch input, and the trunk sees the observation and the action, with the widths of branch_hidden.
     gaponet train --simulators sets it."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16

@@ -18,11 +18,9 @@ from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.bound import AnswerBound
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.context import contexts
 from gaponet.nn.observation import History, Layout
 from gaponet.nn.onnx_network import Network, OnnxNetwork
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import Condition
 
 
 class DeltaLoop:
@@ -91,7 +89,7 @@ class DeltaLoop:
         return self._bound.refused
 
     def set_context(self, context: Any) -> None:
-        """Set the answers of each robot's simulator to fixed probes, (num_envs, 8n) or (8n) rad (nn/context.py)."""
+        """Set the answers of each robot's simulator to fixed probes, (num_envs, 8n) or (8n) rad (sim/context.py)."""
         if self._numpy:
             self.x[:, self.layout.context] = context
         else:
@@ -268,6 +266,9 @@ class DeltaCorrector:
             self.config, self.robot.qpos_range[self.operated], len(start), self.network
         )
         self.payload = np.array([s.meta.payload_mass for s in start], np.float32)
+        from gaponet.sim.batch import Condition
+        from gaponet.sim.context import contexts
+
         conditions = [Condition.of(s, self.robot) for s in start]
         if self.config.context:
             loop.set_context(contexts(self.robot, conditions))

@@ -28,7 +28,7 @@ class OperatorNet(DeltaNet):
     its state and history, the payload P, and q, q̇ and a − q of all joints. The trunk input is the one-hot index,
     a_j − q_j and the payload.
 
-    With a context (nn/context.py), the branch input is the one-hot index and the context of joint j, and the trunk has
+    With a context (sim/context.py), the branch input is the one-hot index and the context of joint j, and the trunk has
     all other inputs.
     """
 

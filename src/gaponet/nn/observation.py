@@ -5,7 +5,7 @@ o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q�
 
 x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more columns: with fixed probes
 S_t, then, if it observes the recorded state, [ q_real − q | q̇_real − q̇ | 1 ], all zero where that state is hidden.
-A network for many simulators has the context of nn/context.py as last columns.
+A network for many simulators has the context of sim/context.py as last columns.
 """
 
 from __future__ import annotations

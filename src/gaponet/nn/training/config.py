@@ -154,7 +154,7 @@ class TrainConfig:
     """Share of the training motions that is used. Validation and test motions stay the same."""
     simulators: Annotated[int, Interval(ge=0, le=100_000)] = 0
     """Number of simulators in which the network is trained; they are drawn from simulator_ranges by the seed. The
-    network is told the simulator's answers to fixed probes (nn/context.py), and then corrects simulators that it has
+    network is told the simulator's answers to fixed probes (sim/context.py), and then corrects simulators that it has
     never seen. 0: the robot's own simulator alone."""
     simulators_per_piece: Annotated[int, Interval(ge=1, le=1000)] = 2
     """Number of these simulators in which each piece of a recording is replayed."""

@@ -13,13 +13,13 @@ from gaponet.base.arrays import Array, array_like, array_module, copy_array, zer
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.context import contexts
 from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.observation import History
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.config import RewardConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.context import contexts
 from gaponet.sim.replay import idle_limbs
 from gaponet.sysid.robot_rollouts import IMMOVABLE_ARMATURE
 

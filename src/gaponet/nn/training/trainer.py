@@ -23,8 +23,7 @@ from gaponet.base.structure import validated
 from gaponet.data.checks.gate import GateReport
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.context import KnownSimulators, contexts
+from gaponet.nn.artifact import GapModel, KnownSimulators, make_card
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.networks import build_network
@@ -40,6 +39,7 @@ from gaponet.nn.training.sensor_fit import fit_inputs, fit_sensors
 from gaponet.nn.training.validation import Validator, choose_gain
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition
+from gaponet.sim.context import contexts
 
 UNLIMITED = 10**9  # control periods of an episode
 

@@ -1,4 +1,4 @@
-"""Context of a network: how the simulator at hand answers fixed probes. It says which simulator this is.
+"""Context: how a simulator answers fixed probes. It tells a network which simulator this is.
 
 The robot rests at home. A null probe leaves the targets there. Another probe moves the target of one joint by
 PROBE_RAD. Each joint has eight values: the answer to the null probe, and the difference that its own probe makes, each
@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -24,8 +22,6 @@ from gaponet.sim.batch import Batch, BatchSim, CommandHistory, Condition
 
 PROBE_RAD = 0.2
 READ_AFTER_S = (0.04, 0.2)  # the start of the motion, and most of it
-MAX_DISTANCE = 0.1  # beyond the answers of training, as a share of their range, at which the network is still used
-MIN_WIDTH_RAD = 1e-4  # narrower ranges of training are taken to be this wide
 
 
 def contexts(robot: RobotSpec, conditions: list[Condition], nthread: int = 1) -> Array:
@@ -142,42 +138,3 @@ def _answers(
             values.append((own - null) * towards)
     joined = np.stack(values, axis=1)  # (simulators, 8, n)
     return joined.reshape(len(joined), -1).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class KnownSimulators:
-    """Answers of the simulators of a training.
-
-    Attributes:
-        nominal: Of the robot's own simulator, (8n) rad.
-        low, high: Smallest and largest, (8n) rad.
-    """
-
-    nominal: Array
-    low: Array
-    high: Array
-
-    @classmethod
-    def of(cls, nominal: Array, trained: Array) -> KnownSimulators:
-        """Return the range of the robot's own answers, (8n), and those of training, (simulators, 8n)."""
-        answers = np.vstack([nominal, trained])
-        return cls(nominal, answers.min(axis=0), answers.max(axis=0))
-
-    def distance(self, context: Array) -> float:
-        """Return how far answers (…, 8n) lie outside those of training: 0 within, 1 a whole width of the range away."""
-        beyond = np.maximum(self.low - context, context - self.high)
-        width = np.maximum(self.high - self.low, MIN_WIDTH_RAD)
-        return float(np.maximum(beyond / width, 0.0).max())
-
-    def include(self, context: Array) -> bool:
-        """Return true if answers (…, 8n) are so close to those of training that the network can be used."""
-        return self.distance(context) <= MAX_DISTANCE
-
-    def to_card(self) -> dict[str, list[float]]:
-        """Return the entry of card.json."""
-        return {name: np.round(values, 7).tolist() for name, values in vars(self).items()}
-
-    @classmethod
-    def from_card(cls, entry: dict[str, Any]) -> KnownSimulators:
-        """Read the entry of card.json."""
-        return cls(*(np.array(entry[name], np.float32) for name in ("nominal", "low", "high")))

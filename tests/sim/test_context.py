@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from gaponet.nn.artifact import KnownSimulators
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.context import KnownSimulators, contexts, scene_context
 from gaponet.nn.networks import build_network
 from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import load_robot
 from gaponet.sim.batch import Condition
+from gaponet.sim.context import contexts, scene_context
 from gaponet.sim.model import build_model
 
 ROBOT = load_robot("so101")
