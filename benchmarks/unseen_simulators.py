@@ -12,8 +12,8 @@ Networks with equal data, steps and nearly equal numbers of weights (the table s
     GAPONet + context         these answers are its branch input
 
 The test has twenty simulators within the ranges of training and ten beyond. Their seed was used for nothing else, and
-the motions are the dataset's test motions. Forms and settings are chosen by the validation error of training, in other
-simulators and on other motions. A number is the mean error over that of the uncorrected simulator, averaged over
+the motions are the dataset's test motions. Settings are chosen by the validation error of training, in other simulators
+and on other motions. A number is the mean error over that of the uncorrected simulator, averaged over
 simulators; ± is the standard error over simulators of the mean over seeds.
 """
 
