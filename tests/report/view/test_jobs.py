@@ -223,11 +223,20 @@ def wait_until_ended(*processes):
         time.sleep(0.05)
 
 
+def obey_signals():
+    """Undo what nohup and background jobs of a shell do: programs that they start ignore these signals."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @pytest.fixture
 def serving(tmp_path):
     """A server of the page, its command and what the command started: (process, process number, process number)."""
     server = subprocess.Popen(
-        [sys.executable, "-c", SERVER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", SERVER, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=obey_signals,
     )
     command = int(server.stdout.readline())
     grandchild = int(first_line(tmp_path / "jobs" / "001-gap" / "result.json"))
