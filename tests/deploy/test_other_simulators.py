@@ -51,6 +51,11 @@ def with_kp(robot: RobotSpec, factor: float) -> RobotSpec:
     return replace(robot, kp=factor * robot.kp)
 
 
+def late(robot: RobotSpec) -> RobotSpec:
+    """Return the robot with servos that are later than a transfer allows."""
+    return replace(with_kp(robot, OTHER_KP), delay=robot.delay + 0.012)
+
+
 def positions(robot: RobotSpec, step) -> np.ndarray:
     """Return what `step`, target → positions, does under a moving target, (30, n) rad."""
     wave = 0.3 * np.sin(0.3 * np.arange(30))[:, None] * np.ones(len(robot.joint_names))
@@ -65,9 +70,20 @@ def test_it_corrects_a_simulator_with_other_gains_that_it_has_not_seen(trained) 
     assert methods["told"]["mpjae"] < 0.8 * methods["uncorrected"]["mpjae"]
 
 
-def late(robot: RobotSpec) -> RobotSpec:
-    """Return the robot with servos that are later than a transfer allows."""
-    return replace(with_kp(robot, OTHER_KP), delay=robot.delay + 0.012)
+def test_where_no_transfer_is_possible_the_evaluation_says_so_and_shows_the_rest(trained) -> None:
+    result = evaluate([trained.run], trained.data, trained.robot, target=late(trained.robot)).result
+
+    assert "told" in result["methods"]
+    assert "transfer" not in result["methods"]
+    assert "later" in " ".join(result["notes"])
+
+
+def test_another_robot_is_refused_at_any_rate(trained) -> None:
+    other = replace(trained.robot, name="another")
+
+    for dt in (trained.robot.dt, trained.robot.dt / 2):
+        with pytest.raises(ModelError, match="made for"):
+            AlignedSim(other, trained.model, dt=dt)
 
 
 def test_the_exact_transfer_comes_first(trained) -> None:

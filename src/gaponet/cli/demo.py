@@ -26,7 +26,7 @@ def demo(out: Path = Path("demo_run"), json: Json = False) -> None:
 
     It records three units of an H1-2 and an unseen fourth with 0 and 3 kg, shows how far the simulator is from them,
     identifies the robot, trains GAPONet and an MLP on three units, and measures both on the fourth. Lengths are counted
-    in control steps, so that every machine gets the same result. It takes five minutes on two cores; an interrupted
+    in control steps, so that every machine gets the same result. It takes four minutes on two cores; an interrupted
     demo continues.
 
     Args:

@@ -116,6 +116,8 @@ def evaluate(
             out.say(
                 f"{title(name)}: {delta['at_limit']:.2%} of the corrections are at the limit (--model.delta-max)"
             )
+    for note in table["notes"]:
+        out.say(note)
     show_methods(out, table)
     show_verdict(out, result.methods, dataset, run)
     out.result(table)

@@ -44,7 +44,8 @@ class AlignedSim:
     ) -> None:
         """
         Args:
-            robot: The simulator. If the model was trained in another one, commands are transferred.
+            robot: The simulator. If the model was trained in another one, commands are transferred; where that is
+                refused, a model for many simulators is told this one's answers to fixed probes (`transfer` is None).
             model: A trained model, or an identified robot that the simulator then moves like; None for the simulator
                 without correction.
             payload_mass: kg in each hand of payload_side, one number or one per simulation.
@@ -81,15 +82,20 @@ class AlignedSim:
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
         self.loop, self.transfer = None, None
         trained = model if isinstance(model, GapModel) and not other_payload else None
-        same_period = trained is not None and control_periods_of(trained, self.dt) == 1
-        if trained is not None and same_period and trained.is_trained_in(robot):
+        if (
+            trained is not None
+            and trained.is_trained_in(robot)
+            and control_periods_of(trained, self.dt) == 1
+        ):
             self.loop = trained.loop(self.num_envs)
         elif model is not None:
             inverse = AnalyticInverse.of(BatchSim(robot, own, nthread, locked))
             try:
                 self.transfer = Transfer(model, inverse, conditions, locked, nthread, extrapolate)
             except ModelError:
-                if trained is None or not same_period or not trained.knows(robot, self.dt):
+                if trained is None or not trained.knows(robot, self.dt):
+                    raise
+                if control_periods_of(trained, self.dt) != 1:
                     raise
                 context = trained.context_of(robot, self.dt)
                 self.loop = trained.loop(self.num_envs, context)

@@ -262,13 +262,13 @@ class DeltaCorrector:
 
     def reset(self, start: ListOf[Sequence]) -> None:
         """Start one simulation per sequence at its first row. That row is repeated as history."""
+        from gaponet.sim.batch import Condition
+        from gaponet.sim.context import contexts
+
         loop = DeltaLoop(
             self.config, self.robot.qpos_range[self.operated], len(start), self.network
         )
         self.payload = np.array([s.meta.payload_mass for s in start], np.float32)
-        from gaponet.sim.batch import Condition
-        from gaponet.sim.context import contexts
-
         conditions = [Condition.of(s, self.robot) for s in start]
         if self.config.context:
             loop.set_context(contexts(self.robot, conditions))

@@ -10,7 +10,6 @@ A network for many simulators has the context of sim/context.py as last columns.
 
 from __future__ import annotations
 
-from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -29,31 +28,33 @@ class Layout:
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         self.n, self.history = n, config.history
-        o = config.observation_dim(n)
         answers = config.sensor_dim(n) if config.needs_simulator else 0
-        real = config.real_state_dim(n)
-        sizes = (
-            n,
-            n,
-            3 * n * config.history,
-            int(config.payload_input),
-            n,
-            answers,
-            real,
-            config.context_dim(n),
-        )
-        parts = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
-        (
-            self.q,
-            self.v,
-            self.past,
-            self.payload,
-            self.action,
-            self.sensors,
-            self.real,
-            self.context,
-        ) = parts
-        self.state, self.observation, self.query = slice(0, 2 * n), slice(0, o), slice(0, o + n)
+        sizes = {
+            "q": n,
+            "v": n,
+            "past": 3 * n * config.history,
+            "payload": int(config.payload_input),
+            "action": n,
+            "sensors": answers,
+            "real": config.real_state_dim(n),
+            "context": config.context_dim(n),
+        }
+        parts = {}
+        start = 0
+        for name, size in sizes.items():
+            parts[name] = slice(start, start + size)
+            start += size
+        self.q = parts["q"]
+        self.v = parts["v"]
+        self.past = parts["past"]
+        self.payload = parts["payload"]
+        self.action = parts["action"]
+        self.sensors = parts["sensors"]
+        self.real = parts["real"]
+        self.context = parts["context"]
+        self.state = slice(0, self.v.stop)
+        self.observation = slice(0, self.payload.stop)
+        self.query = slice(0, self.action.stop)
         self.dim = config.input_dim(n)
 
     def shifted(self, shift: Array) -> Array:

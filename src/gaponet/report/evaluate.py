@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.errors import UsageError
+from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.files import atomic_write, lock_folder, write_json
 from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.pair import SimulatedReplay
@@ -24,6 +24,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.adaptation import Adaptation
+from gaponet.nn.artifact import GapModel
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.loop import DeltaCorrector
 from gaponet.report.candidate import Candidate, is_robot, select_entries
@@ -128,11 +129,20 @@ def evaluate(
     ctrl = [s.ctrl[:, op] for s in sequences]
     moved = [np.ptp(c, axis=0) > MIN_MOTION_RAD for c in ctrl]
     simulators: dict[str, str] = {}
+    notes: list[str] = []
     for name, simulator, corrector in _methods(candidates, nominal, target):
+        try:
+            replays = replay(
+                sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True
+            )
+        except ModelError as error:
+            if name != "transfer" or "told" not in done_runs:
+                raise
+            notes.append(f"no transfer: {error}")
+            continue
         simulators[name] = model_hash(simulator)
-        replays = replay(
-            sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True
-        )
+        if name == "told" and first.model is not None:
+            notes.append(_distance_note(first.model, simulator, sequences[0].dt))
         done_runs[name] = runs(sequences, [t.qpos for t in replays], robot)
         if name in models:
             deltas[name] = [
@@ -154,11 +164,28 @@ def evaluate(
         "unseen": unseen, "virtual": any(s.meta.virtual for s in sequences), "robot": robot.name,
         "simulator_hash": model_hash(nominal), "simulators": simulators,
         "delta": {k: _delta_summary(parts, sequences, models[k].config.delta_max) for k, parts in deltas.items()},
+        "notes": notes,
         "adapted_units": sorted(set(adapted) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
         "command": _command(folders, dataset.address or os.path.normpath(dataset.path), motions),
     }  # fmt: skip
     return Evaluation(result, done_runs, ctrl, deltas)
+
+
+def _distance_note(model: GapModel, simulator: RobotSpec, dt: float) -> str:
+    """Return whether a simulator's answers to fixed probes lie within those of a network's training."""
+    known = model.known_simulators
+    assert known is not None
+    context = model.context_of(simulator, dt)
+    distance = known.distance(context)
+    if distance == 0:
+        return "the other simulator's answers lie within those of training"
+    note = (
+        f"the other simulator's answers lie {distance:.2f} of their range outside those of training"
+    )
+    if known.include(context):
+        return note
+    return f"{note}: AlignedSim and MujocoAligner would not use the network there"
 
 
 def _command(folders: ListOf[Path], dataset: str, motions: tuple[str, ...]) -> str:

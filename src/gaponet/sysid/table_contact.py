@@ -30,9 +30,8 @@ WINDOW_S = 2.5  # of a rollout; longer ones cost more and do not find a better t
 MAX_WINDOWS, MAX_WINDOWS_PER_MOTION = 14, 2
 START_HEIGHTS, START_HEIGHT_STEP_M = 10, 0.005  # from below the lowest tip upwards
 ITERATIONS = 6  # of the search from one start
-FIRST_COMPARISON = (
-    2  # iterations after which a start goes on only if no other start cost less by then
-)
+# iterations after which a start goes on only if no other start cost less by then
+FIRST_COMPARISON = 2
 HEIGHT_CHANGE_M = 0.004  # a large change
 MAX_HEIGHT_CHANGE_M = 0.03  # from the start
 ZERO_STD_RAD = 0.02  # of a usual zero

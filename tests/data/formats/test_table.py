@@ -321,3 +321,20 @@ def test_a_robot_at_rest_repeats_its_numbers_at_its_usual_period(tmp_path, arm):
     log = only(write(tmp_path / "rest.csv", resting), arm)
 
     assert len(log.channels["qpos"].time) == 60
+
+
+def test_decimal_commas_between_spaces_are_read_as_numbers(tmp_path, arm):
+    plain = only(write(tmp_path / "plain.csv", arm_columns()), arm)
+    header, _, rows = table_text(arm_columns()).replace(",", " ").partition("\n")
+    file = tmp_path / "comma.txt"
+    file.write_text(header + "\n" + rows.replace(".", ","))
+
+    assert np.array_equal(only(file, arm).channels["qpos"].values, plain.channels["qpos"].values)
+
+
+def test_a_semicolon_in_a_name_does_not_separate_columns(tmp_path, arm):
+    columns = arm_columns() | {"current [A; rms]": np.arange(60.0)}
+
+    log = only(write(tmp_path / "wave.csv", columns), arm)
+
+    assert log.joint_names == ("shoulder", "elbow")

@@ -59,10 +59,11 @@ MOVING_RAD = 0.05
 JOB_ROWS, MIN_PARALLEL_ROWS = 40_000, 600_000  # of one job; from which starting processes pays
 OVERHEAD_ROWS = 1500  # rows that take as long as the fixed costs of a recording
 MAX_COPIED_ROWS = 3  # in both directions
-MIN_COPIED_CHANGES = (
-    20  # changes of the command; fewer can be equal by chance where positions are counted in steps
+# changes of the command; fewer can be equal by chance where positions are counted in steps
+MIN_COPIED_CHANGES = 20
+COPIED_SHARE = (
+    0.99  # of these changes; a stiff servo with a coarse encoder can repeat most of a slow motion
 )
-COPIED_SHARE = 0.95  # of these changes
 LEVELS, LEVEL_TOLERANCE = (
     8,
     0.1,

@@ -18,8 +18,6 @@ MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1
 FASTER = 50.0  # rad/s beyond ten times as fast as the positions ever move
 MOSTLY = 0.2  # of a joint's rows: more nonsense than this, and nothing of the channel is believed
 UNASKED = 1.0  # rad that no joint moves of itself while all are told to stand still
-
-
 TICKS_PER_TURN = 4096  # of the encoders of Feetech and Dynamixel servos
 LARGEST_DEG = 360.0  # larger positions of a limb are no degrees
 

@@ -165,8 +165,8 @@ def read_logs(
     bad = skipped_rows()
     for name, load in _loaders(reader, path, robot, specified, names):
         try:
-            once = without_repeated_rows(load())
-            log = _corrected(require_plausible(once, robot, strict), robot, specified, names)
+            log = _corrected(require_plausible(load(), robot, strict), robot, specified, names)
+            log = without_repeated_rows(log)  # after the checks, which name lines of the file
         except LogError as error:
             if bad is None:
                 raise

@@ -99,8 +99,14 @@ def _is_table(file: Path) -> bool:
 
 
 def _delimiter(line: str) -> str:
-    """Return the separator of cells; a space for any white space. Beside semicolons, commas are decimal commas."""
-    return next((d for d in (";", ",", "\t") if d in line), " ")
+    """Return the separator of cells; a space for any white space.
+
+    Cells between semicolons can hold a decimal comma each.
+    """
+    semicolons = line.count(";")
+    if semicolons and semicolons >= line.count(",") - 1:
+        return ";"
+    return next((d for d in (",", ";", "\t") if d in line), " ")
 
 
 def _has_decimal_commas(body: bytes, delimiter: str) -> bool:
@@ -112,8 +118,9 @@ def _has_decimal_commas(body: bytes, delimiter: str) -> bool:
 
 
 def _numeric(cells: list[str]) -> bool:
+    """Return True if all cells are numbers, with a decimal point or a decimal comma."""
     try:
-        return bool([float(cell) for cell in cells if cell.strip()])
+        return bool([float(cell.replace(",", ".")) for cell in cells if cell.strip()])
     except ValueError:
         return False
 
@@ -155,10 +162,11 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
     if not body:
         raise LogError(f"{file}: holds a header and no rows; delete it or record again")
     if delimiter == " ":
-        body, delimiter = (
-            re.sub(rb"[ \t]+", b",", re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", body)),
-            ",",
-        )
+        if _has_decimal_commas(body, delimiter):
+            body = body.replace(b",", b".")
+        without_margins = re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", body)
+        body = re.sub(rb"[ \t]+", b",", without_margins)
+        delimiter = ","
     try:
         table = pc.read_csv(
             pa.py_buffer(body),

@@ -17,11 +17,12 @@ from gaponet.nn.training.config import TrainConfig
 from gaponet.robot.simulator_change import SimulatorChange
 from gaponet.robot.spec import RobotSpec
 
-VALIDATION_SEED_STEP = (
-    1_000_003  # validation has other simulators than training, and tests have others again
-)
+# Validation has other simulators than training, and tests have others again.
+VALIDATION_SEED_STEP = 1_000_003
 VALIDATION_SIMULATORS = 24
-PIECE_S = 5.0
+PIECE_S = (
+    5.0  # long against the lag of a servo, and short enough for several simulators a recording
+)
 
 
 def in_many_simulators(
@@ -32,7 +33,7 @@ def in_many_simulators(
     One of the simulators is the robot's own. Recordings with different payloads or rates share no simulator: there are
     then as few groups of equal simulations as possible, and each simulator has one payload.
 
-    With one simulator, the result is the recordings as they are.
+    Without --simulators, the result is the recordings as they are.
     """
     if not config.simulators:
         return list(sequences)
