@@ -31,8 +31,8 @@ from gaponet.robot.spec import Link, RobotSpec, load_robot
 from gaponet.sim.model import build_model, stiffen_friction
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
-from gaponet.testing.physics import Physics, neutral
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.physics import Physics, neutral
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 JOINTS, DT, SECONDS, TRAIN, VALIDATION, TEST = 2, 0.02, 8.0, 4, 3, 3
 SHIFT_M, LOG_MASS = 0.05, np.log(1.5)  # a large change of the rival's parameters

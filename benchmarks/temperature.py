@@ -23,8 +23,8 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
-from gaponet.testing.physics import Physics, neutral
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.physics import Physics, neutral
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 DT, ROWS, FITTED, VALIDATED, MOTIONS = 0.02, 200, 6, 10, 16
 NORMAL_90, KT_PER_KELVIN, DERATING_PER_KELVIN, COUNT_RAD = 1.645, 0.001, 0.005, 2 * np.pi / 4096

@@ -25,8 +25,8 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
 from gaponet.sysid.motion_limits import default_terms
-from gaponet.testing.physics import neutral
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.physics import neutral
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 DT, ROWS, FITTED, TEST, VALIDATION = 0.01, 500, 8, 6, 3
 NORMAL_90 = 1.645

@@ -34,9 +34,9 @@ from gaponet.sysid.evidence.drift import drift
 from gaponet.sysid.evidence.evidence import estimate_uncertainty
 from gaponet.sysid.identify import identify
 from gaponet.sysid.uncertainty import ParameterUncertainty
-from gaponet.testing.fleet import load_fleet, sample_unit
-from gaponet.testing.physics import Physics
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.fleet import load_fleet, sample_unit
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from arm import write_arm

@@ -34,8 +34,8 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
 from gaponet.sysid.motion.library import Library
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 Array = np.ndarray
 

@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.robot.spec import RobotSpec
-from gaponet.testing.physics import Physics, neutral
+from gaponet.virtual.physics import Physics, neutral
 
 WEAK = 0.8  # of the gain: what such a servo does with u, the nominal one does with u + (0.8 − 1) (u − q)
 CONFIG = ModelConfig(history=2, payload_max=0.4)

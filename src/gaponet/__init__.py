@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from gaponet.robot.spec import RobotSpec as RobotSpec
     from gaponet.robot.spec import load_robot as load_robot
     from gaponet.share.reading import open_dataset as open_dataset
-    from gaponet.testing.collect import CollectResult as CollectResult
+    from gaponet.virtual.collect import CollectResult as CollectResult
 else:
     _MODULES = {  # public name → module
         **dict.fromkeys(
@@ -63,7 +63,7 @@ else:
         "RunOptions": "gaponet.api.run_options",
         "Connection": "gaponet.api.run_options",
         "progress_bar": "gaponet.base.progress",
-        "CollectResult": "gaponet.testing.collect",
+        "CollectResult": "gaponet.virtual.collect",
         "DoctorResult": "gaponet.data.doctor",
         "ImportResult": "gaponet.data.importer",
         "Dataset": "gaponet.data.store",

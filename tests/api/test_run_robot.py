@@ -28,8 +28,8 @@ from gaponet.hw.drivers.open import open_driver
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.motion.motion import Motion
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_driver import VirtualDriver
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.virtual_driver import VirtualDriver
 
 QUICK = ControlConfig(blend=0.2, blend_speed=4.0, settle=0.1, damp=0.1)
 FAST = gp.RunOptions(connection=gp.Connection(fast=True), control=QUICK)

@@ -44,8 +44,8 @@ def test_the_feed_forward_it_is_told_is_right_for_the_nominal_simulator(robot, t
 
 
 def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task, monkeypatch):
-    from gaponet.testing.fleet import Fleet
-    from gaponet.testing.physics import neutral
+    from gaponet.virtual.fleet import Fleet
+    from gaponet.virtual.physics import neutral
 
     monkeypatch.setattr(
         example, "load_fleet", lambda *_: Fleet("none", 0, (), {"unit": neutral(2)})

@@ -27,7 +27,7 @@ from gaponet.report.candidate import split_of_run as read_run_split
 from gaponet.robot.collision import Collision
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
-from gaponet.testing.fleet import FLEETS, load_fleet
+from gaponet.virtual.fleet import FLEETS, load_fleet
 
 COLLISION = """same_limb = ["upper fore"]
 [[capsule]]

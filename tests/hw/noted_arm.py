@@ -17,8 +17,8 @@ from gaponet.hw.control.recording import Recording
 from gaponet.hw.targets.policy import Policy, motion_policy
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.motion import Motion
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_driver import VirtualDriver
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.virtual_driver import VirtualDriver
 
 DT = 0.02
 QUICK = ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1, damp=0.1)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gaponet.data.sequence import Sequence
     from gaponet.sysid.motion.plan import Plan
     from gaponet.sysid.uncertainty import ParameterUncertainty
-    from gaponet.testing.collect import CollectResult
+    from gaponet.virtual.collect import CollectResult
 
 DEFAULT_MINUTES, DEFAULT_FURTHER_MINUTES = (
     10.0,
@@ -187,8 +187,8 @@ def collect(
     """
     from dataclasses import replace
 
-    from gaponet.testing import collect as recording
-    from gaponet.testing.fleet import load_fleet
+    from gaponet.virtual import collect as recording
+    from gaponet.virtual.fleet import load_fleet
 
     spec, plan = as_robot(robot), recording.load_recipe(recipe)
     plan = replace(plan, payloads=payloads or plan.payloads, units=units or plan.units)

@@ -339,8 +339,8 @@ def make_driver(request: RunRequest, robot: RobotSpec, clock: Clock) -> tuple[Dr
 
 def make_virtual_driver(request: RunRequest, robot: RobotSpec, clock: Clock) -> tuple[Driver, Unit]:
     """Return the driver of a virtual robot in this process, and its unit."""
-    from gaponet.testing.fleet import load_fleet
-    from gaponet.testing.virtual_driver import VirtualDriver
+    from gaponet.virtual.fleet import load_fleet
+    from gaponet.virtual.virtual_driver import VirtualDriver
 
     options = request.options
     connection = options.connection

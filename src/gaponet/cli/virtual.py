@@ -16,10 +16,10 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.cli.out import Out
 from gaponet.hw.control.stop import STOP_SIGNALS
-from gaponet.testing.unitree_virtual import FaultKind, VirtualH12
+from gaponet.virtual.unitree_virtual import FaultKind, VirtualH12
 
 if TYPE_CHECKING:
-    from gaponet.testing.so101_virtual import VirtualSO101
+    from gaponet.virtual.so101_virtual import VirtualSO101
 
 
 def virtual(
@@ -48,8 +48,8 @@ def virtual(
         frame: Serial: simulated time per goal, s, instead of real time, for programs without a clock.
     """
     from gaponet.robot.spec import load_robot
-    from gaponet.testing.fleet import load_fleet
-    from gaponet.testing.so101_virtual import VirtualSO101
+    from gaponet.virtual.fleet import load_fleet
+    from gaponet.virtual.so101_virtual import VirtualSO101
 
     out, spec = Out(), load_robot(robot)
     name = f"virtual-{unit}" if unit.isdigit() else unit

@@ -16,8 +16,8 @@ from gaponet.hw.control.safety import Limits, SafetyConfig
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import MOTOR_NAMES
 from gaponet.robot.spec import RobotSpec
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.unitree_virtual import VirtualH12
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.unitree_virtual import VirtualH12
 
 RATE = 100.0  # states per second
 DRIFT_RAD_S = 0.2  # of an encoder

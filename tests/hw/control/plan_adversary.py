@@ -27,8 +27,8 @@ from gaponet.hw.control.driver import State
 from gaponet.hw.control.plan import Planner
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.motion.library import Library
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_driver import VirtualDriver
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.virtual_driver import VirtualDriver
 
 Array = np.ndarray
 ROBOTS = {"so101": 0.0, "h1_2": 3.0}  # kg per hand that motions must be possible with

@@ -42,8 +42,8 @@ class RobotProcess:
 
 def main(domain: int) -> None:
     from gaponet.robot.spec import load_robot
-    from gaponet.testing.fleet import load_fleet
-    from gaponet.testing.unitree_virtual import VirtualH12
+    from gaponet.virtual.fleet import load_fleet
+    from gaponet.virtual.unitree_virtual import VirtualH12
 
     robot = load_robot("h1_2")
     served = VirtualH12(

@@ -27,9 +27,9 @@ from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.drivers import feetech as reg
 from gaponet.hw.drivers.unitree import UnitreeDriver
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.so101_virtual import PERIOD, VirtualSO101
-from gaponet.testing.unitree_virtual import VirtualH12
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.so101_virtual import PERIOD, VirtualSO101
+from gaponet.virtual.unitree_virtual import VirtualH12
 
 serial = pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 

@@ -24,8 +24,8 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.motion.files import read_motion
 from gaponet.sysid.motion.motion import Motion
 from gaponet.sysid.motion.path_planner import Trajectory, find_points, finish_search
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_driver import VirtualDriver
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.virtual_driver import VirtualDriver
 
 FOLDED = np.array(
     [0.2, -1.70, 1.65, 0.9, 0.4, 1.2]

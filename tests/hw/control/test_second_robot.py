@@ -16,7 +16,7 @@ from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.recording import Recording
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, UnitreeDriver
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.testing.unitree_virtual import VirtualH12
+from gaponet.virtual.unitree_virtual import VirtualH12
 
 PERIOD_S = 0.02
 ELBOW = MOTOR_NAMES.index("left_elbow_joint")

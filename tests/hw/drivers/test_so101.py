@@ -20,8 +20,8 @@ from gaponet.hw.drivers import feetech as reg
 from gaponet.hw.drivers.so101 import FULL_TORQUE, SO101Driver
 from gaponet.hw.drivers.so101_calibration import JOINTS, STEP_RAD, read_calibration
 from gaponet.robot.spec import RobotSpec
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.so101_virtual import PERIOD, VirtualSO101
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.so101_virtual import PERIOD, VirtualSO101
 
 serial = pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 

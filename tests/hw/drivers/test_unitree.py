@@ -22,8 +22,8 @@ from gaponet.hw.control.driver import DriverError, State
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, WEIGHT_MOTOR, TickClock, UnitreeDriver
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.unitree_virtual import VirtualH12
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.unitree_virtual import VirtualH12
 
 
 @pytest.fixture(scope="module")

@@ -24,8 +24,8 @@ from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
-from gaponet.testing.physics import Physics
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 DELTA = CompensatorConfig(aim="simulator", feedback=0.0)
 FEEDFORWARD = CompensatorConfig(dynamics=True, feedback=0.0)

@@ -27,7 +27,7 @@ from gaponet.experiments.paper.unseen_motions import UnseenMotion
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
-from gaponet.testing.physics import Physics
+from gaponet.virtual.physics import Physics
 
 REST_S = 2.0  # under the first target before a motion begins, for a compensator to blend in
 HOLD_S = 3.0  # at each goal

@@ -26,8 +26,8 @@ from gaponet.experiments.paper.unseen_motions import make_unseen_motions
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import load_dataset
 from gaponet.sim.model import model_hash
-from gaponet.testing.collect import fleet_name
-from gaponet.testing.fleet import load_fleet
+from gaponet.virtual.collect import fleet_name
+from gaponet.virtual.fleet import load_fleet
 
 SETUP_FILE = "experiment.json"
 SETUP_HINT = "delete it and run the same command again"

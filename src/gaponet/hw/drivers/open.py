@@ -42,7 +42,7 @@ def open_driver(
     """Return a driver that is not yet connected.
 
     Args:
-        kind: One of driver_names(). Virtual robots live in the caller's process (testing.virtual_driver).
+        kind: One of driver_names(). Virtual robots live in the caller's process (virtual.virtual_driver).
         robot: The robot, its name or its folder.
         limits_from: Robot folder whose gains and ranges hold instead of the package's; read it first. The robot must
             equal it, but for identified values.

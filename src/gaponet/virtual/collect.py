@@ -28,8 +28,8 @@ from gaponet.sim.model import require_stored_robot
 from gaponet.sim.replay import pair_dataset, replay
 from gaponet.sysid.motion.files import read_motion
 from gaponet.sysid.motion.recipe import Recipe, Take, load_recipe, takes
-from gaponet.testing.fleet import Fleet
-from gaponet.testing.play import Job, library, play
+from gaponet.virtual.fleet import Fleet
+from gaponet.virtual.play import Job, library, play
 
 __all__ = ["CollectResult", "Recipe", "collect", "load_recipe"]
 

@@ -6,8 +6,8 @@ from arm import write_arm
 
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.driver import DriverError
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_driver import VirtualDriver
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.virtual_driver import VirtualDriver
 
 LONG_PLANNING_S = 30.0
 START_S = 12_345.0  # of the clock: absolute times must not matter

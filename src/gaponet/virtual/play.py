@@ -17,9 +17,9 @@ from gaponet.sim.model import build_model, idle_joints
 from gaponet.sysid.motion.library import Library
 from gaponet.sysid.motion.motion import Motion
 from gaponet.sysid.motion.recipe import Recipe, Take
-from gaponet.testing.fleet import Fleet
-from gaponet.testing.physics import Physics
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.fleet import Fleet
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from gaponet.robot.spec import load_robot
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model, idle_joints
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.physics import EFFECTS, Physics, neutral
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.physics import EFFECTS, Physics, neutral
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 KP = 20.0  # of both joints of the test arm
 FIELDS = {e: [f.name for f in fields(Physics) if f.metadata["effect"] == e] for e in EFFECTS}

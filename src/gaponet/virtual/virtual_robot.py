@@ -14,8 +14,8 @@ from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, expand_differences
 from gaponet.sim.model import build_model, qpos_range, stiffen_friction
-from gaponet.testing import motor
-from gaponet.testing.physics import Physics, stack
+from gaponet.virtual import motor
+from gaponet.virtual.physics import Physics, stack
 
 MAX_PHYSICS_STEP_S = 0.001
 # of the hidden effects; bristles and current loops are evaluated at every physics step

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from gaponet.sim.batch import OneByOne
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 MECHANICAL = [
     "gain",

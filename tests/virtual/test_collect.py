@@ -19,10 +19,10 @@ from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sysid.motion.library import Library
 from gaponet.sysid.motion.recipe import takes
-from gaponet.testing.collect import Recipe, collect, load_recipe
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.physics import Physics
-from gaponet.testing.play import equivalent_torque
+from gaponet.virtual.collect import Recipe, collect, load_recipe
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.play import equivalent_torque
 
 RECIPE = Recipe(
     "test",
@@ -124,12 +124,12 @@ def test_repetitions_differ_a_little(whole):
 
 CHILD = """
 import sys
-import gaponet.testing.collect
-from gaponet.testing.collect import Recipe, collect
+import gaponet.virtual.collect
+from gaponet.virtual.collect import Recipe, collect
 from gaponet.robot.spec import load_robot
-from gaponet.testing.fleet import load_fleet
+from gaponet.virtual.fleet import load_fleet
 if __name__ == "__main__":
-    gaponet.testing.collect.TAKES_PER_JOB = (4, 4)  # four jobs: two are still being played when two are written
+    gaponet.virtual.collect.TAKES_PER_JOB = (4, 4)  # four jobs: two are still being played when two are written
     robot = load_robot(sys.argv[1])
     recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 25.0), 2)
     collect(robot, load_fleet("easy", robot), recipe, sys.argv[2], seed=5, nproc=2)

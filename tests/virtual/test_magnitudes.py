@@ -5,8 +5,8 @@ import numpy as np
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay
 from gaponet.sysid.motion.recipe import Recipe, takes
-from gaponet.testing.fleet import load_fleet
-from gaponet.testing.play import Job, play
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.play import Job, play
 
 MOTIONS = ("reach-both-0", "pick_and_place-both-0", "sweep-left_shoulder_roll")
 

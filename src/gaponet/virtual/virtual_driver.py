@@ -12,8 +12,8 @@ from gaponet.hw.control.clock import Clock
 from gaponet.hw.control.driver import DriverError, EndAction, State
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
-from gaponet.testing.physics import Physics
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 STATE_PERIOD_S = 0.002  # 500 Hz, as the H1-2
 DAMPING_FACTOR = 4.0  # of the robot's kd while damping; see drivers.unitree
@@ -97,7 +97,7 @@ class VirtualDriver:
     ) -> None:
         """
         Args:
-            physics: Hidden parameters (testing.fleet).
+            physics: Hidden parameters (virtual.fleet).
             clock: Clock of the controller.
             payload: kg per hand, and side.
             period: Time between two states, s.

@@ -19,7 +19,7 @@ from typing_extensions import TypedDict
 from gaponet.base.errors import UsageError
 from gaponet.base.structure import Extended, Name, load_toml, validated
 from gaponet.robot.spec import RobotSpec
-from gaponet.testing.physics import Physics, neutral
+from gaponet.virtual.physics import Physics, neutral
 
 FLEETS = Path(__file__).parent / "fleets"
 UNITS = 4

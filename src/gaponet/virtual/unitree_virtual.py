@@ -17,8 +17,8 @@ from gaponet.hw.control.clock import MonotonicClock, no_garbage_collection
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
 from gaponet.robot.spec import RobotSpec
-from gaponet.testing.physics import Physics
-from gaponet.testing.virtual_driver import LiveUnit
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.virtual_driver import LiveUnit
 
 FaultKind = Literal[
     "none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum", "clock",

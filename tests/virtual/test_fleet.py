@@ -7,9 +7,9 @@ import pytest
 from gaponet.base.errors import UsageError
 from gaponet.experiments.paper.goals import GoalPlanner
 from gaponet.robot.spec import load_robot
-from gaponet.testing.fleet import FLEETS, load_fleet
-from gaponet.testing.physics import Physics, neutral
-from gaponet.testing.virtual_robot import VirtualRobot
+from gaponet.virtual.fleet import FLEETS, load_fleet
+from gaponet.virtual.physics import Physics, neutral
+from gaponet.virtual.virtual_robot import VirtualRobot
 
 DIGESTS = {
     "easy": "470699a7d760",

@@ -9,7 +9,7 @@ import gaponet
 
 PACKAGE = Path(gaponet.__file__).parent
 OPEN = (
-    "testing",
+    "virtual",
     "experiments",
     "api",
     "cli",
@@ -43,7 +43,7 @@ def test_no_blind_module_imports_the_virtual_robots(trees):
     assert len(trees) > 150
     for file, nodes in trees.items():
         for name in imported(nodes):
-            assert not name.startswith("gaponet.testing"), f"{file} imports {name}"
+            assert not name.startswith("gaponet.virtual"), f"{file} imports {name}"
 
 
 def test_no_blind_module_names_the_fleet_files(trees):
@@ -55,4 +55,4 @@ def test_no_blind_module_names_the_fleet_files(trees):
                 and "\n" not in node.value
             ):
                 assert "fleets" not in node.value, file
-                assert "gaponet.testing" not in node.value, file
+                assert "gaponet.virtual" not in node.value, file

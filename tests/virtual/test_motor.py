@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gaponet.testing.motor import (
+from gaponet.virtual.motor import (
     COPPER_COEFFICIENT,
     Backlash,
     Bristles,
@@ -16,7 +16,7 @@ from gaponet.testing.motor import (
     speed_factor,
     supply_factor,
 )
-from gaponet.testing.physics import Physics, neutral, stack
+from gaponet.virtual.physics import Physics, neutral, stack
 
 
 def one(**values: float) -> Physics:

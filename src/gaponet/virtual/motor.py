@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.sim.batch import Batch
-from gaponet.testing.physics import Physics
+from gaponet.virtual.physics import Physics
 
 DERATING_TEMPERATURE = 40.0  # °C above which a drive reduces its gain
 STUCK_SPEED = 1e-3  # rad/s below which a joint counts as stuck

@@ -29,8 +29,8 @@ from gaponet.hw.drivers.so101_calibration import (
 )
 from gaponet.robot.spec import RobotSpec
 from gaponet.robot.toml_file import Table
-from gaponet.testing.physics import Physics
-from gaponet.testing.virtual_driver import LiveUnit
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.virtual_driver import LiveUnit
 
 PERIOD = 0.005  # s between two steps of the physics
 MAX_LAG_S = 0.5  # behind real time; a longer lag, as of an interrupted process, is dropped
