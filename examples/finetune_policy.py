@@ -29,11 +29,11 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.motion.library import Library
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
-from gaponet.sysid.motion.library import Library
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.virtual_robot import VirtualRobot
 

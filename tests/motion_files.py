@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gaponet.motion.files import SAGE_DT
+from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.files import SAGE_DT
-from gaponet.sysid.motion.motion import Motion
 
 
 def write_motion(path: str | Path, motion: Motion, robot: RobotSpec) -> None:

@@ -332,8 +332,8 @@ class GaponetMotion(Teleoperator):
         """
         from gaponet.hw.control.phases import ControlConfig
         from gaponet.hw.control.plan import Planner
-        from gaponet.sysid.motion.files import SUFFIXES, read_motion
-        from gaponet.sysid.motion.library import Library
+        from gaponet.motion.files import SUFFIXES, read_motion
+        from gaponet.motion.library import Library
 
         given, dt = self.config.motions, 1 / self.config.fps
         files = (

@@ -25,9 +25,9 @@ from gaponet.hw.control.plan import Planner
 from gaponet.hw.control.recording import Recording
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.drivers.open import open_driver
+from gaponet.motion.motion import Motion
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.motion.motion import Motion
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.virtual_driver import VirtualDriver
 

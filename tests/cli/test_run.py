@@ -18,8 +18,8 @@ from gaponet.data.store import Dataset
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.driver import State
 from gaponet.hw.targets.policy import NotYet
+from gaponet.motion.motion import Motion
 from gaponet.robot.folder import save_robot
-from gaponet.sysid.motion.motion import Motion
 
 FAST = [
     "--fast",

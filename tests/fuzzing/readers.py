@@ -28,10 +28,10 @@ from fuzzing.mutate import Files
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
 from gaponet.data.writers import export
+from gaponet.motion.files import read_motion
+from gaponet.motion.motion import Motion
+from gaponet.motion.recipe import load_recipe, takes
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sysid.motion.files import read_motion
-from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.recipe import load_recipe, takes
 
 PLACE = tempfile.TemporaryDirectory(
     prefix="fuzz-"

@@ -15,8 +15,8 @@ from gaponet.hw.control.driver import State
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.recording import Recording
 from gaponet.hw.targets.policy import Policy, motion_policy
+from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.motion import Motion
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.virtual_driver import VirtualDriver
 

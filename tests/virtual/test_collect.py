@@ -14,11 +14,11 @@ from arm import write_arm
 
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.data.store import Dataset
+from gaponet.motion.library import Library
+from gaponet.motion.recipe import takes
 from gaponet.robot.spec import load_robot
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model, model_hash
-from gaponet.sysid.motion.library import Library
-from gaponet.sysid.motion.recipe import takes
 from gaponet.virtual.collect import Recipe, collect, load_recipe
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.physics import Physics

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from gaponet.motion.recipe import Recipe, takes
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay
-from gaponet.sysid.motion.recipe import Recipe, takes
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.play import Job, play
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from gaponet.data.doctor import DoctorResult
     from gaponet.data.importer import ImportResult
     from gaponet.data.sequence import Sequence
-    from gaponet.sysid.motion.plan import Plan
+    from gaponet.motion.plan import Plan
     from gaponet.sysid.uncertainty import ParameterUncertainty
     from gaponet.virtual.collect import CollectResult
 
@@ -226,8 +226,8 @@ def excite(
         UsageError: No motion fits, or the robot folder holds no parameter uncertainty.
     """
     from gaponet.base.files import lock_folder, write_text
-    from gaponet.sysid.motion.files import write_motion
-    from gaponet.sysid.motion.plan import make_plan, sheet
+    from gaponet.motion.files import write_motion
+    from gaponet.motion.plan import make_plan, sheet
 
     spec, masses, folder = as_robot(robot), tuple(sorted(set(payloads))), Path(out)
     prediction = None
@@ -256,14 +256,14 @@ def _further_motions(
     spec: RobotSpec, seconds: float, payloads: tuple[float, ...], seed: int, progress: Progress
 ) -> tuple[Plan, Prediction]:
     """Choose the motions that reduce the standard errors most."""
-    from gaponet.sysid.motion.experiment_design import (
+    from gaponet.motion.library import Library
+    from gaponet.motion.plan import Plan
+    from gaponet.sysid.evidence.experiment_design import (
         ExperimentDesign,
         candidate_motions,
         simulated_recordings,
         undetermined_gains,
     )  # fmt: skip
-    from gaponet.sysid.motion.library import Library
-    from gaponet.sysid.motion.plan import Plan
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
     uncertainty = ParameterUncertainty.require(spec)

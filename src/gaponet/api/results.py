@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from gaponet.export.rollout import RolloutPrediction
     from gaponet.hw.control.plan import Plan
     from gaponet.hw.control.recording import Recording
+    from gaponet.motion.motion import Motion
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.config import ModelKind
     from gaponet.report.evaluate import Evaluation
     from gaponet.robot.spec import RobotSpec
     from gaponet.sysid.acceptance import Identified
     from gaponet.sysid.evidence.drift import Drift, ParameterChange
-    from gaponet.sysid.motion.motion import Motion
     from gaponet.sysid.torque_motors import TorqueDrivenFit
 
 __all__ = [

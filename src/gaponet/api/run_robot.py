@@ -32,17 +32,17 @@ from gaponet.hw.control.recording import Recording
 from gaponet.hw.drivers.dry import DryRun, summarize_commands
 from gaponet.hw.drivers.open import driver_names, open_driver, supported_options
 from gaponet.hw.targets.live import LiveTargets, Transport
+from gaponet.motion.files import SUFFIXES, read_motion
+from gaponet.motion.library import Library
+from gaponet.motion.motion import Motion
 from gaponet.nn.packaged_networks import network_folder
 from gaponet.robot.folder import has_stored_robot, load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_stored_robot
-from gaponet.sysid.motion.files import SUFFIXES, read_motion
-from gaponet.sysid.motion.library import Library
-from gaponet.sysid.motion.motion import Motion
 
 if TYPE_CHECKING:
+    from gaponet.motion.feasible import Feasibility
     from gaponet.nn.artifact import GapModel
-    from gaponet.sysid.motion.feasible import Feasibility
 
 VIRTUAL = "virtual"
 ROBOTS = ROBOT_OF_DRIVER | {VIRTUAL: "h1_2"}  # driver → robot, where none is given

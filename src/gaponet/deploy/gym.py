@@ -15,9 +15,9 @@ from gaponet.base.errors import UsageError, missing_extra
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
 from gaponet.deploy.transfer import Reference
+from gaponet.motion.library import Library
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.motion.library import Library
 
 try:
     import gymnasium
@@ -108,7 +108,7 @@ def _tracking(
     Args:
         robot: Name, or folder with a slash; an identified one is played as identified.
         model: Run or artifact that aligns; without one the robot is played as it is.
-        motions: Names of motions (gaponet.sysid.motion.library); default all.
+        motions: Names of motions (gaponet.motion.library); default all.
         payload_mass: kg in each hand.
         options: What TrackingEnv takes.
     """

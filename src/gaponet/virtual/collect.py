@@ -22,12 +22,12 @@ from gaponet.base.structure import read_json, validated
 from gaponet.data.pair import SimulatedReplay
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import KIND, Dataset
+from gaponet.motion.files import read_motion
+from gaponet.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.robot.folder import MOVE_STORED_ROBOT
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import require_stored_robot
 from gaponet.sim.replay import pair_dataset, replay
-from gaponet.sysid.motion.files import read_motion
-from gaponet.sysid.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.virtual.fleet import Fleet
 from gaponet.virtual.play import Job, library, play
 

@@ -11,12 +11,12 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import differentiate, lowpass
+from gaponet.motion.library import Library
+from gaponet.motion.motion import Motion
+from gaponet.motion.recipe import Recipe, Take
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
-from gaponet.sysid.motion.library import Library
-from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.recipe import Recipe, Take
 from gaponet.virtual.fleet import Fleet
 from gaponet.virtual.physics import Physics
 from gaponet.virtual.virtual_robot import VirtualRobot

@@ -25,8 +25,8 @@ from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.driver import State
 from gaponet.hw.control.plan import Planner
+from gaponet.motion.library import Library
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sysid.motion.library import Library
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.virtual_driver import VirtualDriver
 

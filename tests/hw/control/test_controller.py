@@ -22,9 +22,9 @@ from gaponet.hw.control.driver import DriverError, Fault
 from gaponet.hw.control.phases import COMMANDING, ControlConfig
 from gaponet.hw.control.plan import Plan
 from gaponet.hw.targets.policy import motion_policy
+from gaponet.motion.motion import Motion
+from gaponet.motion.path_planner import Trajectory
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.path_planner import Trajectory
 
 FAULT_S = 0.801  # after the connection: in the middle of the motion
 

@@ -19,9 +19,9 @@ from gaponet.hw.control.hardware import hardware_robot, reference_robot, robot_h
 from gaponet.hw.control.plan import Planner
 from gaponet.hw.control.safety import Limits, SafetyConfig
 from gaponet.hw.drivers.unitree import UnitreeDriver
+from gaponet.motion.motion import Motion
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sysid.motion.motion import Motion
 
 JOINT = "left_shoulder_pitch_joint"
 RUN = ["run", "--driver", "unitree", "--motion", "sweep-left_elbow", "--yes"]

@@ -22,8 +22,8 @@ pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
 from environments import environment
 from motion_files import write_motion
 
+from gaponet.motion.motion import Motion
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.motion.motion import Motion
 
 pytestmark = pytest.mark.peers
 

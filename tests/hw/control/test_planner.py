@@ -19,11 +19,11 @@ from gaponet.hw.control.driver import Fault, State
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.plan import GOAL_SHARES, CollisionGuard, Planner
 from gaponet.hw.control.safety import SafetyConfig
+from gaponet.motion.files import read_motion
+from gaponet.motion.motion import Motion
+from gaponet.motion.path_planner import Trajectory, find_points, finish_search
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sysid.motion.files import read_motion
-from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.path_planner import Trajectory, find_points, finish_search
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.virtual_driver import VirtualDriver
 

@@ -23,7 +23,7 @@ from gaponet.hw.targets.live import (
     decode,
     next_step,
 )
-from gaponet.sysid.motion.motion import Motion
+from gaponet.motion.motion import Motion
 
 FAULT, HOLD = 1.5, 0.5  # s; from FAULT on a sender goes wrong; HOLD is the default
 NAN = float("nan")

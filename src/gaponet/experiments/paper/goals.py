@@ -9,10 +9,10 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
+from gaponet.motion.coordinated import Arm, HandIK, Kit
+from gaponet.motion.feasible import Feasibility, carriers
+from gaponet.motion.motion import GRID, move_time, through
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.coordinated import Arm, HandIK, Kit
-from gaponet.sysid.motion.feasible import Feasibility, carriers
-from gaponet.sysid.motion.motion import GRID, move_time, through
 
 GOALS_PER_TRAJECTORY = 2  # held one after the other
 REST_S = 1.5  # at the start, for the compensator to blend in

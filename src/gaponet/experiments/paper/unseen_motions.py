@@ -10,11 +10,11 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
+from gaponet.motion.coordinated import BUILDERS, available
+from gaponet.motion.library import Library
+from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
-from gaponet.sysid.motion.coordinated import BUILDERS, available
-from gaponet.sysid.motion.library import Library
-from gaponet.sysid.motion.motion import Motion
 
 VARIANT = 90  # recipes count variants from 0 and never get this far
 MAX_VARIANTS = 10  # of each kind, for a robot without hands

@@ -19,11 +19,11 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.clock import Clock
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig, limit_delta
+from gaponet.motion.feasible import MAX_STATIC_SHARE, Feasibility, stretch
+from gaponet.motion.motion import GRID, Motion
+from gaponet.motion.path_planner import Search, Trajectory, find_points, finish_search
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import static_torque
-from gaponet.sysid.motion.feasible import MAX_STATIC_SHARE, Feasibility, stretch
-from gaponet.sysid.motion.motion import GRID, Motion
-from gaponet.sysid.motion.path_planner import Search, Trajectory, find_points, finish_search
 
 _T = TypeVar("_T")
 

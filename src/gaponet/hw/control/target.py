@@ -20,8 +20,8 @@ from gaponet.hw.control.plan import (
     advance,
 )
 from gaponet.hw.targets.policy import NotYet, Policy
-from gaponet.sysid.motion.motion import blend
-from gaponet.sysid.motion.path_planner import Search, Trajectory
+from gaponet.motion.motion import blend
+from gaponet.motion.path_planner import Search, Trajectory
 
 MIN_GOOD_STATES = 5  # periods in a row without a fault before anything is commanded
 MAX_WAIT_S = 5.0  # for them

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from gaponet.base.arrays import Array
 from gaponet.hw.control.driver import Fault, State
-from gaponet.sysid.motion.motion import Motion
+from gaponet.motion.motion import Motion
 
 # Period since the start of the run, state → targets (n) rad; None: the end; a fault: the robot damps.
 Policy = Callable[[int, State], "Array | Fault | None"]

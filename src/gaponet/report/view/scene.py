@@ -14,12 +14,12 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.structure import read_toml
+from gaponet.motion.feasible import carriers
 from gaponet.report.methods import colour as method_colour
 from gaponet.report.view.side_by_side import SideBySide
 from gaponet.robot.collision import Shapes
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_spec
-from gaponet.sysid.motion.feasible import carriers
 
 PAYLOAD_RGBA = (0.93, 0.60, 0.10, 1.0)
 GHOST_RGBA = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy

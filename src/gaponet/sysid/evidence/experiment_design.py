@@ -19,12 +19,12 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.motion.coordinated import ANY
+from gaponet.motion.library import SIGNALS, Library, short
+from gaponet.motion.motion import GRID, Motion
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
 from gaponet.sysid.evidence.evidence import evidence
-from gaponet.sysid.motion.coordinated import ANY
-from gaponet.sysid.motion.library import SIGNALS, Library, short
-from gaponet.sysid.motion.motion import GRID, Motion
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 MOTIONS_OF_ALL_JOINTS, VARIANTS = (

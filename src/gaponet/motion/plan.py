@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from gaponet.base.errors import UsageError
+from gaponet.motion.library import Library, short
+from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.library import Library, short
-from gaponet.sysid.motion.motion import Motion
 
 SIGNAL_ORDER = (
     "multisine",

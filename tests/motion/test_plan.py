@@ -8,9 +8,9 @@ from contacts import Contacts
 
 from gaponet.base.errors import UsageError
 from gaponet.cli.main import main
+from gaponet.motion.files import read_motion, write_motion
+from gaponet.motion.plan import make_plan
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.motion.files import read_motion, write_motion
-from gaponet.sysid.motion.plan import make_plan
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.sysid.motion.recipe import load_recipe, takes
+from gaponet.motion.recipe import load_recipe, takes
 
 GOOD = 'payloads = [0.0]\nunits = ["a"]\nmotions = ["x"]\n'
 

@@ -18,9 +18,9 @@ import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.motion.feasible import Feasibility
+from gaponet.motion.motion import GRID, fade, through
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.feasible import Feasibility
-from gaponet.sysid.motion.motion import GRID, fade, through
 
 Sides = tuple[str, ...]
 MAX_IK_ITERATIONS = 80

@@ -16,8 +16,8 @@ from gaponet.base.files import atomic_write, write_text
 from gaponet.base.structure import read_npz
 from gaponet.data.describe.plausibility import require_radians
 from gaponet.data.sequence import MAX_PERIOD_S, MIN_PERIOD_S
+from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.motion import Motion
 
 SAGE_DT = 0.02  # s: the format has no time column, its files are at 50 Hz
 LARGEST = 64 << 20  # bytes of a file, unpacked: 10 hours of 27 joints at 10 Hz

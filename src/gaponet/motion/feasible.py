@@ -14,11 +14,11 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
+from gaponet.motion.motion import GRID, Motion
 from gaponet.robot.collision import Collision
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import inverse_dynamics, static_torque
 from gaponet.sim.model import build_model
-from gaponet.sysid.motion.motion import GRID, Motion
 
 MAX_PAYLOAD = 3.0  # kg per hand: the heaviest of the SimLifter recipe, and the default
 MAX_SPEED = 4.0  # rad/s: under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.sysid.motion.feasible import MAX_SPEED, TORQUE_SHARE, Feasibility
-from gaponet.sysid.motion.motion import GRID, PEAK_SPEED, Motion, blend, move_time, through
+from gaponet.motion.feasible import MAX_SPEED, TORQUE_SHARE, Feasibility
+from gaponet.motion.motion import GRID, PEAK_SPEED, Motion, blend, move_time, through
 
 
 def test_a_move_starts_and_ends_at_rest_and_passes_the_middle_in_the_middle():

@@ -10,15 +10,15 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.motion.coordinated import BUILDERS, WHOLE_BODY, Kit, available
-from gaponet.sysid.motion.feasible import (
+from gaponet.motion.coordinated import BUILDERS, WHOLE_BODY, Kit, available
+from gaponet.motion.feasible import (
     MAX_PAYLOAD,
     ExcitationRange,
     Feasibility,
     find_excitation_range,
 )
-from gaponet.sysid.motion.motion import GRID, Motion, fade, move_time, through
+from gaponet.motion.motion import GRID, Motion, fade, move_time, through
+from gaponet.robot.spec import RobotSpec
 
 Signal = Callable[
     [float, float, np.random.Generator, float], Array

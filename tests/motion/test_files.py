@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import JointMismatchError, LogError
+from gaponet.motion.files import read_motion
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.motion.files import read_motion
 
 
 def test_sage_names_may_be_paths_and_missing_joints_stay_at_home(tmp_path):
@@ -23,7 +23,7 @@ def test_sage_names_may_be_paths_and_missing_joints_stay_at_home(tmp_path):
 def test_a_public_sage_motion_is_read_and_can_be_fitted():
     from conftest import SHARED
 
-    from gaponet.sysid.motion.feasible import Feasibility
+    from gaponet.motion.feasible import Feasibility
 
     file = SHARED / "sage_motions/motion_files/h1_2/amass/0-Subject_4_F_5_poses_action_sequence.txt"
     if not file.is_file():

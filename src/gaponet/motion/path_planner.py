@@ -9,8 +9,8 @@ from typing import TypeVar
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.motion.motion import PEAK_ACCELERATION, blend, move_time
 from gaponet.robot.collision import POSTURE_STEP_RAD
-from gaponet.sysid.motion.motion import PEAK_ACCELERATION, blend, move_time
 
 Free = Callable[[Array], bool]  # whether all postures (T, n) rad are
 _T = TypeVar("_T")

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import UsageError
+from gaponet.motion.feasible import MAX_PAYLOAD
+from gaponet.motion.library import SIGNALS, Library, short
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.motion.feasible import MAX_PAYLOAD
-from gaponet.sysid.motion.library import SIGNALS, Library, short
 
 SOME = [
     "sweep-left_shoulder_roll",

@@ -8,19 +8,19 @@ import pytest
 from arm import TOML, XML, commands, record, write_arm
 
 from gaponet.cli.main import main
+from gaponet.motion.feasible import Feasibility
+from gaponet.motion.files import read_motion
+from gaponet.motion.library import Library
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
+from gaponet.sysid.evidence import experiment_design
 from gaponet.sysid.evidence.evidence import estimate_uncertainty
-from gaponet.sysid.motion import experiment_design
-from gaponet.sysid.motion.experiment_design import (
+from gaponet.sysid.evidence.experiment_design import (
     ExperimentDesign,
     candidate_motions,
     simulated_recordings,
     undetermined_gains,
 )
-from gaponet.sysid.motion.feasible import Feasibility
-from gaponet.sysid.motion.files import read_motion
-from gaponet.sysid.motion.library import Library
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
 HELD = 0.3  # kg
