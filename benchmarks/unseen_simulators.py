@@ -11,9 +11,14 @@ Networks with equal data, steps and nearly equal numbers of weights (the table s
     MLP + context             also told the simulator's answers to fixed probes
     GAPONet + context         these answers are its branch input
 
+With --payload-unknown, the networks for many simulators are also trained without the payload as an input; the
+answers are then those of simulators that carry it. With --literal, the paper's network is trained in one simulator,
+and its sensor predictor alone is fitted again, in the simulators of training (which it is not told) or in the
+simulator of the test: the two means that the authors name.
+
 The test has twenty simulators within the ranges of training and ten beyond. Their seed was used for nothing else, and
-the motions are the dataset's test motions. Settings are chosen by the validation error of training, in other simulators
-and on other motions. A number is the mean error over that of the uncorrected simulator, averaged over
+the motions are the test motions of training. Settings are chosen by the validation error of training, in other
+simulators and on other motions. A number is the mean error over that of the uncorrected simulator, averaged over
 simulators; ± is the standard error over simulators of the mean over seeds.
 """
 
@@ -26,19 +31,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import gaponet as gp
 from gaponet.base.files import write_json
 from gaponet.base.result_table import ResultTable
 from gaponet.data.sequence import Sequence
+from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.loop import DeltaCorrector
+from gaponet.nn.onnx_export import trained_network
+from gaponet.nn.onnx_network import Network
 from gaponet.nn.training.config import (
     MANY_SIMULATORS_MODEL,
     MANY_SIMULATORS_PRETRAINING,
+    RewardConfig,
     TrainConfig,
 )
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.sensor_fit import fit_sensors
+from gaponet.nn.training.simulators import pieces
+from gaponet.nn.training.trainer import UNLIMITED
 from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import open_dataset
@@ -51,7 +65,10 @@ WITHIN = 20  # simulators
 BEYOND = 10
 MAX_RECORDINGS = 24  # of the test, evenly spaced
 PIECE_S = (4.0, 16.0)  # of each: all methods in thirty simulators take ten minutes then
+LITERAL = "literal, one simulator"
+REFIT_STATES = 2048  # at which a simulator answers the probes; as in training
 Array = np.ndarray
+Errors = Callable[[list[Sequence]], float]  # recordings in a simulator → mean error, rad
 
 
 @dataclass(frozen=True)
@@ -62,22 +79,31 @@ class Row:
         kind: ModelConfig.kind.
         simulators: Number of simulators of training; 0 for the robot's own.
         context: The network is told the simulator's answers.
+        payload: The network is told the payload.
     """
 
     kind: str
     simulators: int
     context: bool = False
+    payload: bool = True
 
 
-def rows(simulators: int) -> dict[str, Row]:
+def rows(arguments: argparse.Namespace) -> dict[str, Row]:
     """Return the networks by name."""
-    return {
+    simulators = arguments.simulators
+    chosen = {
         "MLP, one simulator": Row("shared_mlp", 0),
         "GAPONet, one simulator": Row("gaponet", 0),
         "MLP": Row("shared_mlp", simulators),
         "MLP + context": Row("shared_mlp", simulators, context=True),
         "GAPONet + context": Row("gaponet", simulators, context=True),
     }
+    if arguments.payload_unknown:
+        for name in ("MLP", "MLP + context", "GAPONet + context"):
+            chosen[f"{name}, payload unknown"] = replace(chosen[name], payload=False)
+    if arguments.literal:
+        chosen[LITERAL] = Row("paper", 0)
+    return chosen
 
 
 def test_simulators(joints: int) -> dict[str, list[SimulatorChange]]:
@@ -101,12 +127,12 @@ def run_folder(out: Path, name: str, seed: int) -> Path:
 def train(arguments: argparse.Namespace) -> None:
     """Train all networks that are not there yet."""
     for seed in range(arguments.seeds):
-        for name, row in rows(arguments.simulators).items():
+        for name, row in rows(arguments).items():
             folder = run_folder(arguments.out, name, seed)
             if (folder / "model" / "card.json").is_file():
                 continue
             config = TrainConfig(
-                model=replace(MANY_SIMULATORS_MODEL, kind=row.kind),
+                model=replace(MANY_SIMULATORS_MODEL, kind=row.kind, payload_input=row.payload),
                 pretraining=MANY_SIMULATORS_PRETRAINING,
                 seed=seed,
                 simulators=row.simulators,
@@ -133,46 +159,56 @@ def test(arguments: argparse.Namespace) -> None:
     """Measure all networks in all simulators, and print the table."""
     dataset, robot = open_dataset(arguments.dataset)
     robot = robot.before_identification
-    split = json.loads((next(arguments.out.glob("*/split.json"))).read_text())
-    chosen = [e for e in dataset.entries if e.id in split["test"] or arguments.all]
-    chosen = [e for e in chosen if not arguments.rates or round(1 / e.dt) in arguments.rates]
-    steps = np.linspace(0, len(chosen) - 1, min(MAX_RECORDINGS, len(chosen)))
-    recordings = []
-    for whole in dataset.sequences([chosen[round(i)] for i in steps]):
-        start, end = (round(seconds / whole.dt) for seconds in PIECE_S)
-        recordings.append(whole.rows(slice(start, end)))
-    print(f"{len(recordings)} recordings of {len({s.meta.motion for s in recordings})} motions")
+    by_payload = test_recordings(dataset, arguments)
     groups = {"nominal": [None], **test_simulators(len(robot.joint_names))}
     methods = all_methods(arguments, robot)
     found: dict[str, dict[str, list[list[float]]]] = {name: {} for name in methods}
     for group, simulators in groups.items():
         for number, simulator in enumerate(simulators):
-            placed = [replace(s, simulator=simulator) for s in recordings]
-            uncorrected = rollout_errors(placed, robot, 1).mean()
-            for name, correctors in methods.items():
-                ratios = []
-                for errors in correctors:
-                    ratios.append(float(errors(placed) / uncorrected))
-                found[name].setdefault(group, []).append(ratios)
-            print(
-                f"{group} {number + 1} of {len(simulators)}: {1e3 * uncorrected:.1f} mrad",
-                flush=True,
-            )
-            write_json(arguments.out / "unseen_simulators.json", found)
+            for kg, recordings in by_payload.items():
+                column = group if len(by_payload) == 1 else f"{group}, {kg:g} kg"
+                placed = [replace(s, simulator=simulator) for s in recordings]
+                uncorrected = float(rollout_errors(placed, robot, 1).mean())
+                for name, correctors in methods.items():
+                    ratios = [errors(placed) / uncorrected for errors in correctors]
+                    found[name].setdefault(column, []).append(ratios)
+                print(
+                    f"{column}, {number + 1} of {len(simulators)}: {1e3 * uncorrected:.1f} mrad",
+                    flush=True,
+                )
+            write_json(arguments.out / f"{arguments.result}.json", found)
     print(table(found).markdown())
 
 
-def all_methods(
-    arguments: argparse.Namespace, robot: RobotSpec
-) -> dict[str, list[Callable[[list[Sequence]], float]]]:
-    """Return method → for each training seed, recordings in a simulator → mean error, rad."""
-    methods: dict[str, list[Callable[[list[Sequence]], float]]] = {}
+def test_recordings(dataset: Dataset, arguments: argparse.Namespace) -> dict[float, list[Sequence]]:
+    """Return payload, kg → pieces of the test recordings, at most MAX_RECORDINGS of each."""
+    split = json.loads(next(arguments.out.glob("*/model/card.json")).read_text())["motions"]
+    chosen = [e for e in dataset.entries if e.motion in split["test"] or arguments.all]
+    if arguments.rates:
+        chosen = [e for e in chosen if round(1 / e.dt) in arguments.rates]
+    by_payload: dict[float, list[Sequence]] = {}
+    for kg in sorted({e.payload_mass for e in chosen}):
+        same = [e for e in chosen if e.payload_mass == kg]
+        steps = np.linspace(0, len(same) - 1, min(MAX_RECORDINGS, len(same)))
+        cut = []
+        for whole in dataset.sequences([same[round(i)] for i in steps]):
+            start, end = (round(seconds / whole.dt) for seconds in PIECE_S)
+            cut.append(whole.rows(slice(start, end)))
+        by_payload[kg] = cut
+        motions = {s.meta.motion for s in cut}
+        print(f"{kg:g} kg: {len(cut)} recordings of {len(motions)} motions")
+    return by_payload
+
+
+def all_methods(arguments: argparse.Namespace, robot: RobotSpec) -> dict[str, list[Errors]]:
+    """Return method → for each training seed, its errors."""
+    methods: dict[str, list[Errors]] = {}
     models: dict[str, list[GapModel]] = {}
-    for name in rows(arguments.simulators):
+    for name in rows(arguments):
         folders = [run_folder(arguments.out, name, seed) for seed in range(arguments.seeds)]
         models[name] = [GapModel.load(f) for f in folders if (f / "model" / "card.json").is_file()]
 
-    def corrected(make: Callable[[], Corrector]) -> Callable[[list[Sequence]], float]:
+    def corrected(make: Callable[[], Corrector]) -> Errors:
         return lambda placed: float(rollout_errors(placed, robot, 1, make()).mean())
 
     for name, loaded in models.items():
@@ -187,6 +223,10 @@ def all_methods(
         corrected(lambda m=m: TransferCorrector(m, robot, extrapolate=True))
         for m in models["GAPONet, one simulator"]
     ]
+    if arguments.literal:
+        refits = literal_refits(arguments, robot, models[LITERAL])
+        methods["literal, predictor fitted in many simulators"] = [r.in_many for r in refits]
+        methods["literal, predictor fitted in the test's simulator"] = [r.in_own for r in refits]
     if arguments.identified:
         identified = gp.load_robot(arguments.identified)
         methods["identified robot (bound)"] = [
@@ -195,6 +235,86 @@ def all_methods(
             )
         ]
     return {name: correctors for name, correctors in methods.items() if correctors}
+
+
+def literal_refits(
+    arguments: argparse.Namespace, robot: RobotSpec, models: list[GapModel]
+) -> list[PredictorRefit]:
+    """Return the literal networks with the pieces of recordings at which their predictor is fitted again."""
+    dataset, _ = open_dataset(arguments.trained_on or arguments.dataset)
+    motions = models[0].card["motions"]["train"]
+    entries = [e for e in dataset.entries if e.motion in motions]
+    if arguments.rates:
+        entries = [e for e in entries if round(1 / e.dt) in arguments.rates]
+    steps = np.linspace(0, len(entries) - 1, min(MAX_RECORDINGS, len(entries)))
+    recordings = dataset.sequences([entries[round(i)] for i in steps])
+    cut = [piece for whole in recordings for piece in pieces(whole)]
+    return [PredictorRefit(model, robot, cut, arguments.simulators) for model in models]
+
+
+class PredictorRefit:
+    """The literal network with its sensor predictor fitted again to stepped probes; all else is frozen.
+
+    Attributes:
+        model: The trained network.
+        recordings: Pieces of its training recordings, whose states are probed.
+        simulators: Number of simulators of `in_many`.
+    """
+
+    def __init__(
+        self, model: GapModel, robot: RobotSpec, recordings: list[Sequence], simulators: int
+    ) -> None:
+        self.model = model
+        self.robot = robot
+        self.recordings = recordings
+        self.simulators = simulators
+        self.fitted_in_many: Network | None = None
+
+    def in_many(self, placed: list[Sequence]) -> float:
+        """Return the error with a predictor of all simulators of training, which it is not told apart, rad."""
+        if self.fitted_in_many is None:
+            joints = len(self.robot.joint_names)
+            drawn = SimulatorRanges().draw(joints, self.simulators, TEST_SEED + 4)
+            spread = [
+                replace(piece, simulator=drawn[i % len(drawn)])
+                for i, piece in enumerate(self.recordings)
+            ]
+            self.fitted_in_many = self._fit(spread)
+        return self._error(self.fitted_in_many, placed)
+
+    def in_own(self, placed: list[Sequence]) -> float:
+        """Return the error with a predictor of the simulator of the test, rad."""
+        simulator = placed[0].simulator
+        return self._error(
+            self._fit([replace(piece, simulator=simulator) for piece in self.recordings]), placed
+        )
+
+    def _fit(self, sequences: list[Sequence]) -> Network:
+        config = self.model.config
+        net = trained_network(self.model.path.parent, config, len(self.robot.operated))
+        groups = len({Condition.of(s, self.robot) for s in sequences})
+        env = DeltaEnv(
+            sequences,
+            self.robot,
+            config,
+            num_envs=2 * groups if groups > 128 else 256,
+            episode_steps=UNLIMITED,
+            reward=RewardConfig(),
+            nthread=1,
+        )
+        # As after training, the scale of the sensor values stays: the branch net has learned it.
+        fit_sensors(net, env, REFIT_STATES, seed=0, nthread=1, refit=True)
+
+        @torch.inference_mode()
+        def answer(x: Array) -> Array:
+            corrections: Array = net.eval()(torch.from_numpy(x)).numpy()
+            return corrections
+
+        return answer
+
+    def _error(self, network: Network, placed: list[Sequence]) -> float:
+        corrector = DeltaCorrector(network, self.model.config, self.robot)
+        return float(rollout_errors(placed, self.robot, 1, corrector).mean())
 
 
 class OtherContext(DeltaCorrector):
@@ -246,6 +366,12 @@ def main() -> None:
         command.add_argument("--simulators", type=int, default=200)
         command.add_argument("--rates", type=float, nargs="*", default=[])
         command.add_argument("--identified")
+        command.add_argument("--payload-unknown", action="store_true")
+        command.add_argument("--literal", action="store_true")
+        command.add_argument("--trained-on", help="the dataset of training, if DATASET is another")
+        command.add_argument(
+            "--result", default="unseen_simulators", help="name of the result file"
+        )
         command.add_argument(
             "--all", action="store_true", help="all recordings of DATASET, none of training"
         )

@@ -97,8 +97,7 @@ class AlignedSim:
                     raise
                 if control_periods_of(trained, self.dt) != 1:
                     raise
-                context = trained.context_of(robot, self.dt)
-                self.loop = trained.loop(self.num_envs, context)
+                self.loop = trained.loop(self.num_envs, trained.contexts_of(robot, own))
         self.target = np.zeros((self.num_envs, self.n))
         self._uncorrected = self.target[:, self.op]
         self.reset()

@@ -9,7 +9,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, cast
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -30,6 +30,9 @@ from gaponet.robot.folder import (
     stored_robot_holder,
 )
 from gaponet.robot.spec import RobotSpec
+
+if TYPE_CHECKING:
+    from gaponet.sim.batch import Condition
 
 WEIGHTS = "model.onnx"
 FORMAT = 1
@@ -283,9 +286,15 @@ class GapModel:
     def context_of(self, robot: RobotSpec, dt: float) -> Array:
         """Measure a simulator's answers to fixed probes with empty hands, (8n) rad; dt is the control period, s."""
         from gaponet.sim.batch import Condition
+
+        return self.contexts_of(robot, [Condition(0.0, "both", dt)])[0]
+
+    def contexts_of(self, robot: RobotSpec, conditions: list[Condition]) -> Array:
+        """Measure answers to fixed probes, (conditions, 8n) rad: with empty hands, or loaded if the network is not
+        told the payload."""
         from gaponet.sim.context import contexts
 
-        return contexts(robot, [Condition(0.0, "both", dt)])[0]
+        return contexts(robot, conditions, loaded=self.config.context_is_loaded)
 
     def loop(self, num_envs: int = 1, context: Array | None = None) -> DeltaLoop:
         """Return the control loop of num_envs robots: loop.delta(qpos, qvel, ctrl, payload_mass).

@@ -79,7 +79,7 @@ class ModelConfig:
     context: bool = False
     """gaponet, shared_mlp: the simulator's answers to fixed probes at rest are inputs (sim/context.py). In gaponet they
     are the branch input, and the trunk sees the observation and the action, with the widths of branch_hidden.
-    gaponet train --simulators sets it."""
+    gaponet train --simulators sets it. Without payload_input, simulators answer with their payload in hand."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
     branch_hidden: Layers = (64, 64)
@@ -104,10 +104,6 @@ class ModelConfig:
         if self.delta_hold > 1 and self.sensor_hold > 1:
             raise UsageError(
                 f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them"
-            )
-        if self.context and not self.payload_input:
-            raise UsageError(
-                "context without payload_input: simulators are probed with empty hands"
             )
         if self.context and self.sensors != "off":
             raise UsageError("context with predicted sensors: the network takes one of them")
@@ -170,6 +166,11 @@ class ModelConfig:
     def needs_simulator(self) -> bool:
         """True if the simulator gives the sensor values. They are then columns of x."""
         return self.sensor_source == "fixed"
+
+    @property
+    def context_is_loaded(self) -> bool:
+        """True if simulators answer the probes with their payload in hand, because the network is not told it."""
+        return self.context and not self.payload_input
 
     @property
     def observes_real_state(self) -> bool:

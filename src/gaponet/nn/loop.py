@@ -271,7 +271,7 @@ class DeltaCorrector:
         self.payload = np.array([s.meta.payload_mass for s in start], np.float32)
         conditions = [Condition.of(s, self.robot) for s in start]
         if self.config.context:
-            loop.set_context(contexts(self.robot, conditions))
+            loop.set_context(contexts(self.robot, conditions, loaded=self.config.context_is_loaded))
         if self.config.needs_simulator:
             from gaponet.nn.sensor import ProbeOracle
 

@@ -24,24 +24,30 @@ PROBE_RAD = 0.2
 READ_AFTER_S = (0.04, 0.2)  # the start of the motion, and most of it
 
 
-def contexts(robot: RobotSpec, conditions: list[Condition], nthread: int = 1) -> Array:
-    """Measure the answers of simulators with empty hands.
+def contexts(
+    robot: RobotSpec, conditions: list[Condition], nthread: int = 1, *, loaded: bool = False
+) -> Array:
+    """Measure the answers of simulators.
 
     Args:
         robot: The simulator.
-        conditions: Simulations. Their payloads do not count: the network is told the payload.
+        conditions: Simulations.
         nthread: Threads, 0 for all cores.
+        loaded: The hands carry the payload of the condition. Otherwise they are empty, for a network that is told the
+            payload.
 
     Returns:
         (conditions, 8n) float32, rad. The joint varies fastest.
     """
-    empty = [c._replace(payload_mass=0.0) for c in conditions]
+    probed = conditions
+    if not loaded:
+        probed = [c._replace(payload_mass=0.0) for c in conditions]
     known: dict[Condition, Array] = vars(robot).setdefault("_contexts", {})
-    unknown = [c for c in dict.fromkeys(empty) if c not in known]
+    unknown = [c for c in dict.fromkeys(probed) if c not in known]
     for dt in dict.fromkeys(c.dt for c in unknown):
         same_rate = [c for c in unknown if c.dt == dt]
         known.update(zip(same_rate, _of_simulators(robot, same_rate, nthread), strict=True))
-    return np.stack([known[c] for c in empty])
+    return np.stack([known[c] for c in probed])
 
 
 def _of_simulators(robot: RobotSpec, conditions: list[Condition], nthread: int) -> Array:

@@ -195,7 +195,9 @@ class DeltaEnv:
                 )
             self.oracle = ProbeOracle(robot, config, conditions, nthread, rows.locked)
         if config.context:
-            self.loop.set_context(contexts(robot, conditions, nthread))
+            self.loop.set_context(
+                contexts(robot, conditions, nthread, loaded=config.context_is_loaded)
+            )
         if config.needs_simulator or config.observes_real_state:
             self.loop.extra = self._extra_inputs
         max_delay_periods = int(np.ceil(sim.longest_delay / min(c[2] for c in rows.conditions)))

@@ -406,8 +406,10 @@ class Trainer:
             return {}
         nominal = Condition.of(self.data.recorded[0], self.robot)
         threads = self.rank_config.threads
-        trained = contexts(self.robot, sorted(self.data.conditions, key=repr), threads)
-        known = KnownSimulators.of(contexts(self.robot, [nominal])[0], trained)
+        loaded = self.config.model.context_is_loaded
+        conditions = sorted(self.data.conditions, key=repr)
+        trained = contexts(self.robot, conditions, threads, loaded=loaded)
+        known = KnownSimulators.of(contexts(self.robot, [nominal], loaded=loaded)[0], trained)
         return {"context": known.to_card()}
 
 
