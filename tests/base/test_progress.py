@@ -48,3 +48,11 @@ def test_in_a_notebook_progress_is_text_on_stderr(capfd, monkeypatch):
     with progress.progress_bar("training") as update:
         update(1, 2, "half")
     assert capfd.readouterr().err.startswith("training: 50 %")
+
+
+def test_a_pipe_shows_that_a_silent_task_is_alive(capfd, monkeypatch):
+    monkeypatch.setenv(progress.LINE_INTERVAL_VARIABLE, "0.01")
+    printed = ""
+    with progress.progress_bar("labels"):
+        while printed.count("labels: 0 %") < 2:
+            printed += capfd.readouterr().err

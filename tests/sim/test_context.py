@@ -50,6 +50,17 @@ def test_simulators_are_probed_with_empty_hands() -> None:
     assert np.array_equal(empty, told)
 
 
+def test_a_loaded_arm_sags_before_its_probe() -> None:
+    carrying = EMPTY._replace(payload_mass=0.5)
+
+    empty, loaded = contexts(ROBOT, [EMPTY, carrying], loaded=True)
+
+    null_position = 4  # of the null probe, after 0.2 s
+    shoulder_lift = 1
+    sag = loaded.reshape(8, 5)[null_position] - empty.reshape(8, 5)[null_position]
+    assert abs(sag[shoulder_lift]) > 0.005
+
+
 def test_a_scene_answers_as_the_simulator_that_it_was_built_from() -> None:
     scene = build_model(ROBOT)
 

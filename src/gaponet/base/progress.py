@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -95,29 +96,69 @@ def _progress(title: str) -> Iterator[_Show]:
 
 @contextmanager
 def _lines(title: str, console: Console) -> Iterator[_Show]:
-    """Print progress as lines: the first update, then one per LINE_INTERVAL_S at most, and the end."""
-    start = time.monotonic()
+    """Print progress as lines: the first update, one every LINE_INTERVAL_S even if nothing is reported, and the end."""
     interval = float(os.environ.get(LINE_INTERVAL_VARIABLE, LINE_INTERVAL_S))
-    last, fraction, newest = start - interval, 0.0, ""
+    lines = _Lines(title, console, interval)
+    done = threading.Event()
+    heartbeat = threading.Thread(target=lines.print_until, args=(done,), daemon=True)
+    heartbeat.start()
+    try:
+        yield lines.show
+    finally:
+        done.set()
+        heartbeat.join()
+    if lines.fraction >= 1:
+        lines.print(1.0)
 
-    def show(running: Running, done: float, total: float, note: str = "") -> None:
-        nonlocal last, fraction, newest
-        tasks = [
-            note,
-            *(
-                f"{name} {100 * part:.0f} % {progress_text}".rstrip()
-                for name, (part, progress_text) in running.items()
-            ),
-        ]
-        fraction, newest = done / total if total else 0.0, "; ".join(task for task in tasks if task)
-        if time.monotonic() - last >= interval and (fraction < 1 or last >= start):
-            last = time.monotonic()
-            print_line(min(fraction, MAX_UNFINISHED))
 
-    def print_line(shown: float) -> None:
-        line = f"{title}: {100 * shown:.0f} %, {time.monotonic() - start:.0f} s{', ' + newest if newest else ''}"
-        console.print(escape(line), markup=False, soft_wrap=True)
+class _Lines:
+    """Progress as lines of text.
 
-    yield show
-    if fraction >= 1:
-        print_line(1.0)
+    Attributes:
+        fraction: What is done, 0 to 1.
+    """
+
+    def __init__(self, title: str, console: Console, interval: float) -> None:
+        """interval: Seconds between lines."""
+        self.fraction = 0.0
+        self._title = title
+        self._console = console
+        self._interval = interval
+        self._note = ""
+        self._start = time.monotonic()
+        self._last_line: float | None = None
+        self._lock = threading.Lock()
+
+    def show(self, running: Running, done: float, total: float, note: str = "") -> None:
+        """Take news, and print them if the last line is old enough."""
+        notes = [note]
+        for name, (part, progress_text) in running.items():
+            notes.append(f"{name} {100 * part:.0f} % {progress_text}".rstrip())
+        self._note = "; ".join(text for text in notes if text)
+        self.fraction = done / total if total else 0.0
+        is_first = self._last_line is None
+        if self.fraction < 1 or not is_first:
+            self._print_if_due()
+
+    def print_until(self, done: threading.Event) -> None:
+        """Print a line whenever the last one is old enough, until `done` is set."""
+        while not done.wait(min(self._interval, 1.0)):
+            since_start = time.monotonic() - self._start
+            if since_start >= self._interval:
+                self._print_if_due()
+
+    def print(self, shown: float) -> None:
+        """Print a line with what is done, 0 to 1."""
+        seconds = time.monotonic() - self._start
+        line = f"{self._title}: {100 * shown:.0f} %, {seconds:.0f} s"
+        if self._note:
+            line = f"{line}, {self._note}"
+        self._console.print(escape(line), markup=False, soft_wrap=True)
+
+    def _print_if_due(self) -> None:
+        with self._lock:
+            now = time.monotonic()
+            if self._last_line is not None and now - self._last_line < self._interval:
+                return
+            self._last_line = now
+        self.print(min(self.fraction, MAX_UNFINISHED))
