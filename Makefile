@@ -111,7 +111,7 @@ check: setup
 
 # What is promised on Windows: from logs to a report.
 windows: setup
-	$(BIN)/python -m pytest tests/test_api.py tests/base/test_files.py tests/whole/test_windows.py tests/data tests/sim tests/sysid/test_*.py tests/nn $(wildcard tests/report/test_*.py)
+	$(BIN)/python -m pytest tests/test_api.py tests/base/test_files.py tests/whole/test_windows.py tests/data tests/sim tests/sysid/test_*.py tests/nn $(wildcard tests/evaluation/test_*.py tests/report/test_*.py)
 
 # These three need the package index, and uv from it in .tools.
 .tools/.done:

@@ -27,6 +27,8 @@ import tyro
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.data.split import SPLITS
+from gaponet.evaluation.candidate import split_of_run
+from gaponet.evaluation.evaluate import evaluate
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.nn.network_card import (
     PUBLISHED,
@@ -41,8 +43,6 @@ from gaponet.nn.network_card import (
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, with_small_matrices
 from gaponet.nn.onnx_network import OnnxNetwork
 from gaponet.nn.packaged_networks import MAX_TOTAL_BYTES, PACKAGE_FOLDER
-from gaponet.report.candidate import split_of_run
-from gaponet.report.evaluate import evaluate
 from gaponet.robot.folder import PackagedRobot, load_stored_robot
 from gaponet.share.reading import open_dataset
 from gaponet.sim.model import model_hash

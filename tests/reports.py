@@ -12,7 +12,7 @@ from arm import recordings
 from runs import untrained
 
 from gaponet.data.store import Dataset
-from gaponet.report.evaluate import evaluate
+from gaponet.evaluation.evaluate import evaluate
 from gaponet.robot.spec import RobotSpec
 
 FACTS = {

@@ -13,11 +13,11 @@ from arm import recordings, write_arm, write_dataset
 from gaponet.base.errors import ModelError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
+from gaponet.evaluation.evaluate import evaluate
 from gaponet.export.torch_program import export_program
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
-from gaponet.report.evaluate import evaluate
 from gaponet.robot.simulator_change import SimulatorRanges
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model

@@ -19,11 +19,11 @@ from gaponet.data.offsets import read_offsets
 from gaponet.data.pair import SimulatedReplay
 from gaponet.data.split import make_split, read_split, write_split
 from gaponet.data.store import Dataset
+from gaponet.evaluation import run_files
+from gaponet.evaluation.candidate import split_of_run as read_run_split
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.delay_offset import DelayOffset
-from gaponet.report import run_files
-from gaponet.report.candidate import split_of_run as read_run_split
 from gaponet.robot.collision import Collision
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model

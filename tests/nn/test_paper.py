@@ -12,6 +12,7 @@ from arm import recordings, write_arm, write_dataset
 
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.cli.main import main
+from gaponet.evaluation.evaluate import evaluate
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import PAPER_ONLY, ModelConfig
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
@@ -30,7 +31,6 @@ from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO
 from gaponet.nn.training.sensor_fit import _probe, fit_inputs
 from gaponet.nn.training.trainer import Trainer
-from gaponet.report.evaluate import evaluate
 from gaponet.sim.replay import replay
 
 PAPER = ModelConfig(kind="paper", num_probes=4, history=2)

@@ -13,11 +13,11 @@ import gaponet as gp
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
+from gaponet.evaluation.run_files import read_gap
 from gaponet.nn.artifact import GapModel
 from gaponet.report import report
 from gaponet.report.figures import evaluation as figures
 from gaponet.report.report import warnings, write_report
-from gaponet.report.run_files import read_gap
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 

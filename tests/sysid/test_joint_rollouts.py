@@ -7,7 +7,7 @@ import pytest
 from arm import TOML, commands, recordings, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.report.verdict import verdict
+from gaponet.evaluation.verdict import verdict
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import load_robot
 from gaponet.sim.metrics import runs, summary

@@ -7,7 +7,7 @@ import pytest
 from arm import write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.report.gap import cause_steps
+from gaponet.evaluation.gap import cause_steps
 from gaponet.sim.replay import replay
 from gaponet.sysid.axes import WARM, Bounds, identified_joints
 from gaponet.sysid.joint_rollouts import JointRollouts

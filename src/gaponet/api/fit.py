@@ -373,9 +373,9 @@ def adapt_model(
     """
     from gaponet.data.checks.gate import pass_gate
     from gaponet.data.sequence import require_same_gains
+    from gaponet.evaluation.candidate import corrected_robot
     from gaponet.nn.adaptation import Adaptation
     from gaponet.nn.artifact import GapModel
-    from gaponet.report.candidate import corrected_robot
 
     folder = as_run(run)
     require_run_folder(

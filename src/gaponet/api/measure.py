@@ -74,9 +74,9 @@ def _gap_by_cause(
     motions: tuple[str, ...],
     progress: Progress,
 ) -> GapResult:
-    from gaponet.report.candidate import Candidate
+    from gaponet.evaluation.candidate import Candidate
+    from gaponet.evaluation.gap import gap_by_step
     from gaponet.report.figures.evaluation import write_gap
-    from gaponet.report.gap import gap_by_step
 
     data, spec = as_dataset(dataset, robot, folder)
     candidate = (
@@ -125,8 +125,8 @@ def evaluate(
         DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or
             transfer was never measured so far from the simulator of the run.
     """
-    from gaponet.report import evaluate as measuring
-    from gaponet.report.candidate import is_robot
+    from gaponet.evaluation import evaluate as measuring
+    from gaponet.evaluation.candidate import is_robot
     from gaponet.robot.folder import has_stored_robot, load_stored_robot
     from gaponet.sim.model import model_hash
 

@@ -18,13 +18,13 @@ from gaponet.base.arrays import Array
 if TYPE_CHECKING:
     from gaponet.data.checks.gate import GateReport
     from gaponet.data.store import Dataset
+    from gaponet.evaluation.evaluate import Evaluation
     from gaponet.export.rollout import RolloutPrediction
     from gaponet.hw.control.plan import Plan
     from gaponet.hw.control.recording import Recording
     from gaponet.motion.motion import Motion
     from gaponet.nn.artifact import GapModel
     from gaponet.nn.config import ModelKind
-    from gaponet.report.evaluate import Evaluation
     from gaponet.robot.spec import RobotSpec
     from gaponet.sysid.acceptance import Identified
     from gaponet.sysid.evidence.drift import Drift, ParameterChange

@@ -13,7 +13,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Folder, Json, Robot, Unit, like
 from gaponet.cli.out import Out
-from gaponet.report.tables import mrad
+from gaponet.evaluation.tables import mrad
 from gaponet.robot.spec import robot_argument
 
 Known = Annotated[

@@ -15,8 +15,8 @@ from gaponet.base.files import write_text
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
+from gaponet.evaluation.tables import mrad
 from gaponet.nn.packaged_networks import is_packaged, network_folder
-from gaponet.report.tables import mrad
 from gaponet.robot.spec import load_robot
 
 if TYPE_CHECKING:

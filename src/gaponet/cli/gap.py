@@ -12,9 +12,9 @@ from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.cli.show import show_methods, show_verdict
+from gaponet.evaluation.methods import title
+from gaponet.evaluation.tables import mrad
 from gaponet.nn.packaged_networks import network_folder
-from gaponet.report.methods import title
-from gaponet.report.tables import mrad
 from gaponet.share.reading import open_dataset
 
 

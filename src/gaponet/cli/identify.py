@@ -13,7 +13,7 @@ from gaponet.base.text import format_uncertainty
 from gaponet.cli import options
 from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import Out, writes
-from gaponet.report.tables import mrad, mrad_with_error
+from gaponet.evaluation.tables import mrad, mrad_with_error
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.servo_fields import PASSIVE_FIELDS, SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument

@@ -10,7 +10,7 @@ from gaponet import api
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json, Logs, like
 from gaponet.cli.out import Out
-from gaponet.report.tables import mrad
+from gaponet.evaluation.tables import mrad
 
 
 @like(api.replay)

@@ -11,10 +11,10 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Json, Known, Robot
 from gaponet.cli.out import Out
+from gaponet.evaluation.methods import method, title
+from gaponet.evaluation.run_files import read_config, read_metrics, read_progress
+from gaponet.evaluation.verdict import next_step, verdict
 from gaponet.nn.artifact import CARD, GapModel
-from gaponet.report.methods import method, title
-from gaponet.report.run_files import read_config, read_metrics, read_progress
-from gaponet.report.verdict import next_step, verdict
 from gaponet.report.view.gl import prepare
 from gaponet.robot.folder import load_stored_robot
 

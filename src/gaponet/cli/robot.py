@@ -261,7 +261,7 @@ def show(
     Args:
         out: Picture to write, .png or .svg.
     """
-    from gaponet.report.candidate import read_origin
+    from gaponet.evaluation.candidate import read_origin
     from gaponet.report.figures.evaluation import draw_uncertainty
     from gaponet.robot.servo_fields import SERVO_FIELDS
     from gaponet.sysid.uncertainty import ParameterUncertainty, sentences, summarize, table_rows

@@ -7,8 +7,8 @@ from typing import Any
 
 from gaponet.base.result_table import ResultTable
 from gaponet.cli.out import Out
-from gaponet.report.tables import by_group, totals
-from gaponet.report.verdict import next_step, verdict
+from gaponet.evaluation.tables import by_group, totals
+from gaponet.evaluation.verdict import next_step, verdict
 
 UNITS = {"payload": ", kg", "horizon": " (time since the start, s)"}
 GROUPS = ("joint", "payload", "unit", "horizon", "motion")

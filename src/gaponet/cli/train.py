@@ -15,11 +15,11 @@ from gaponet.base.progress import no_progress, progress_bar
 from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.cli.show import show_methods, show_verdict
+from gaponet.evaluation.methods import title
+from gaponet.evaluation.tables import mrad
+from gaponet.evaluation.verdict import NetworkGain
 from gaponet.nn.config import ModelKind
 from gaponet.nn.training.config import TrainConfig
-from gaponet.report.methods import title
-from gaponet.report.tables import mrad
-from gaponet.report.verdict import NetworkGain
 from gaponet.robot.folder import STORED_ROBOT
 
 

@@ -10,9 +10,9 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Robot
 from gaponet.cli.out import Out
+from gaponet.evaluation.methods import title
+from gaponet.evaluation.tables import mrad
 from gaponet.nn.packaged_networks import network_folder
-from gaponet.report.methods import title
-from gaponet.report.tables import mrad
 from gaponet.share.reading import open_dataset
 
 if TYPE_CHECKING:

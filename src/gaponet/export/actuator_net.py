@@ -27,10 +27,10 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import stratified_subset
+from gaponet.evaluation.candidate import split_of_run
+from gaponet.evaluation.run_files import read_config
 from gaponet.export.plain_servos import comparable, mean_error
 from gaponet.export.shipped.mujoco_servos import delay_weights
-from gaponet.report.candidate import split_of_run
-from gaponet.report.run_files import read_config
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import load_dataset
 from gaponet.sim.replay import Corrector, replay

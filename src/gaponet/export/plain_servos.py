@@ -23,7 +23,7 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json, validated
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
-from gaponet.report.candidate import read_origin
+from gaponet.evaluation.candidate import read_origin
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import load_dataset

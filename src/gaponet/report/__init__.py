@@ -1,1 +1,1 @@
-"""Evaluation of what ships on recordings it never saw, its tables, figures and pages, and the viewer."""
+"""Pictures of what was measured: reports, figures, pages and the viewer."""

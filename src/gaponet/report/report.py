@@ -15,12 +15,9 @@ from gaponet.base.files import write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import SequenceMeta
 from gaponet.data.store import Dataset
-from gaponet.nn.artifact import GapModel
-from gaponet.nn.packaged_networks import network_folder, require_run_folder
-from gaponet.report.candidate import is_robot, read_origin
-from gaponet.report.methods import method, title
-from gaponet.report.page import inline_image, page_figure, render
-from gaponet.report.run_files import (
+from gaponet.evaluation.candidate import is_robot, read_origin
+from gaponet.evaluation.methods import method, title
+from gaponet.evaluation.run_files import (
     REPAIR_HINT,
     read_config,
     read_gap,
@@ -28,8 +25,11 @@ from gaponet.report.run_files import (
     read_progress,
     read_trajectories,
 )
-from gaponet.report.tables import by_group, mrad, mrad_and_degrees, totals
-from gaponet.report.verdict import network_gain, verdict
+from gaponet.evaluation.tables import by_group, mrad, mrad_and_degrees, totals
+from gaponet.evaluation.verdict import network_gain, verdict
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.packaged_networks import network_folder, require_run_folder
+from gaponet.report.page import inline_image, page_figure, render
 from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.dataset_robot import dataset_robot
@@ -127,7 +127,7 @@ def write_report(
 
 
 def _evaluate(run: Path, dataset: Path | None, robot: RobotSpec | None, progress: Progress) -> None:
-    from gaponet.report.evaluate import evaluate
+    from gaponet.evaluation.evaluate import evaluate
 
     origin = read_origin(run) if is_robot(run) else read_config(run)
     fitted_to = "" if origin is None else origin["dataset"]

@@ -24,7 +24,7 @@ from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_r
 STORED_ROBOT = "robot"  # subfolder of a run or a dataset
 PACKAGED_ROBOT_FILE = "packaged_robot.json"  # beside a network of the package, instead of that
 MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"
-PROVENANCE_FILE = "identified.json"  # what a robot was identified from (report/candidate.py)
+PROVENANCE_FILE = "identified.json"  # what a robot was identified from (evaluation/candidate.py)
 # to which unit it was adapted, and what the doctor found in its recordings
 ADAPTATION_FILE = "adapted.json"
 UNCERTAINTY_FILE = "uncertainty.json"  # of its values (sysid/uncertainty.py)

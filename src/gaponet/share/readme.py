@@ -7,8 +7,8 @@ from typing import Any
 
 from gaponet.base.text import escape_markdown
 from gaponet.data.card import NOT_STATED
+from gaponet.evaluation.tables import totals
 from gaponet.nn.artifact import GapModel
-from gaponet.report.tables import totals
 
 LICENCES = (
     "apache-2.0",

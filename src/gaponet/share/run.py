@@ -9,8 +9,8 @@ from typing import Any
 
 from gaponet.base.errors import ModelError
 from gaponet.base.files import lock_folder, write_text
+from gaponet.evaluation.run_files import read_config, read_metrics
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
-from gaponet.report.run_files import read_config, read_metrics
 from gaponet.robot.folder import (
     STORED_ROBOT,
     has_stored_robot,

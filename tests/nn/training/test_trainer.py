@@ -11,14 +11,14 @@ import gaponet.sim.batch
 from gaponet.api.files import export_network
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.data.split import split_entries, write_split
+from gaponet.evaluation.evaluate import ORDER, evaluate
+from gaponet.evaluation.methods import METHODS
+from gaponet.evaluation.verdict import LEARNED
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
 from gaponet.nn.training.validation import Validator
-from gaponet.report.evaluate import ORDER, evaluate
-from gaponet.report.methods import METHODS
-from gaponet.report.verdict import LEARNED
 
 SMALL = TrainConfig(
     model=ModelConfig(

@@ -7,8 +7,8 @@ from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import DatasetError
 from gaponet.data.store import Dataset
-from gaponet.report.candidate import robot_label
-from gaponet.report.evaluate import evenly_spaced
+from gaponet.evaluation.candidate import robot_label
+from gaponet.evaluation.evaluate import evenly_spaced
 from gaponet.report.figures import dataset_figures as draw
 from gaponet.report.figures.dataset_figures import largest_torque_change, swing, write_figures
 from gaponet.report.figures.style import save

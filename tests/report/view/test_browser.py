@@ -7,7 +7,7 @@ import pytest
 from arm import recordings
 
 from gaponet.data.store import Dataset
-from gaponet.report.methods import colour
+from gaponet.evaluation.methods import colour
 
 pytestmark = pytest.mark.browser
 OFF = 60  # |difference| of one channel, of 255, by which a pixel is another

@@ -9,8 +9,8 @@ from arm import XML, commands, record, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.report.evaluate import ORDER
-from gaponet.report.methods import colour
+from gaponet.evaluation.evaluate import ORDER
+from gaponet.evaluation.methods import colour
 from gaponet.report.view.picture import Camera, require_writable, write
 from gaponet.report.view.player import _page_colour
 from gaponet.report.view.scene import GHOST_RGBA, Scene, View, rgb, visual_spec

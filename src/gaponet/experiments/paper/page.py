@@ -15,8 +15,8 @@ from markupsafe import Markup
 from gaponet.base.files import write_json, write_text
 from gaponet.base.result_table import ResultTable
 from gaponet.data.store import dataset_hash
+from gaponet.evaluation.candidate import describe_provenance
 from gaponet.experiments.paper.study import Study
-from gaponet.report.candidate import describe_provenance
 from gaponet.report.figures.style import save
 from gaponet.report.page import page_figure, render
 from gaponet.sim.model import model_hash

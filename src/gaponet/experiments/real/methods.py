@@ -15,12 +15,12 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
+from gaponet.evaluation.verdict import NetworkGain
 from gaponet.experiments.real.questions import Question, recorded_joints, train_val
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.config import Budget, PretrainingConfig, TrainConfig
-from gaponet.report.verdict import NetworkGain
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.metrics import runs

@@ -10,9 +10,9 @@ import numpy as np
 
 from gaponet.base.files import write_text
 from gaponet.base.result_table import ResultTable
+from gaponet.evaluation.methods import colour, shade
 from gaponet.experiments.real.methods import LEFT_OUT, METHODS
 from gaponet.report.figures.style import figure, legend, save, styled
-from gaponet.report.methods import colour, shade
 from gaponet.sim.metrics import standard_error
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.sequence import LEVELS, Sequence
 from gaponet.data.store import Dataset, Entry
-from gaponet.report.candidate import robot_label
-from gaponet.report.evaluate import evenly_spaced
+from gaponet.evaluation.candidate import robot_label
+from gaponet.evaluation.evaluate import evenly_spaced
 from gaponet.report.figures.style import figure, joint_label, legend, save, styled
 from gaponet.robot.finding import Finding
 from gaponet.robot.spec import RobotSpec

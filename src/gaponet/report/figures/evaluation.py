@@ -16,7 +16,8 @@ from gaponet.base.files import lock_folder, write_text
 from gaponet.base.result_table import MeanStd
 from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.signals import busiest_window
-from gaponet.report.candidate import is_robot
+from gaponet.evaluation.candidate import is_robot
+from gaponet.evaluation.methods import colour, shade, title
 from gaponet.report.figures.style import (
     DASHED,
     DOTTED,
@@ -27,7 +28,6 @@ from gaponet.report.figures.style import (
     save,
     styled,
 )
-from gaponet.report.methods import colour, shade, title
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
 
@@ -217,7 +217,7 @@ def _turn(command: Array, dt: float) -> slice:
 
 
 def write_gap(gap: dict[str, Any], folder: Path) -> None:
-    """Write the result of report.gap.gap_by_step as gap.json, gap.svg and gap.png into a robot folder or a run."""
+    """Write the result of evaluation.gap.gap_by_step as gap.json, gap.svg and gap.png into a robot folder or a run."""
     with lock_folder(folder, "robot" if is_robot(folder) else "run"):
         write_text(folder / "gap.json", json.dumps(gap, indent=1) + "\n")
         save(waterfall(gap), folder / "gap")

@@ -27,8 +27,8 @@ from gaponet.base.text import escape_markdown
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import look
 from gaponet.data.store import Dataset
-from gaponet.report.methods import colour
-from gaponet.report.verdict import NetworkGain
+from gaponet.evaluation.methods import colour
+from gaponet.evaluation.verdict import NetworkGain
 from gaponet.report.view.inside import read_inside
 from gaponet.report.view.jobs import OUT, PROGRESS_LINE, Job, Jobs
 from gaponet.report.view.player import Player, draw_curves

@@ -16,7 +16,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.report.methods import colour, title
+from gaponet.evaluation.methods import colour, title
 from gaponet.report.view.gl import INSTALL_HINT
 from gaponet.report.view.scene import Scene
 from gaponet.report.view.side_by_side import Clip, Copy, SideBySide, largest_error_time

@@ -12,7 +12,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.text import escape_markdown
-from gaponet.report.methods import colour, title
+from gaponet.evaluation.methods import colour, title
 from gaponet.report.view.scene import Scene
 from gaponet.report.view.side_by_side import Clip, largest_error_time
 

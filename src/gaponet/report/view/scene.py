@@ -14,8 +14,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.structure import read_toml
+from gaponet.evaluation.methods import colour as method_colour
 from gaponet.motion.feasible import carriers
-from gaponet.report.methods import colour as method_colour
 from gaponet.report.view.side_by_side import SideBySide
 from gaponet.robot.collision import Shapes
 from gaponet.robot.spec import RobotSpec

@@ -14,8 +14,8 @@ from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import busiest_window
 from gaponet.data.store import Dataset, Entry
-from gaponet.report.candidate import Candidate, FittedData
-from gaponet.report.methods import title
+from gaponet.evaluation.candidate import Candidate, FittedData
+from gaponet.evaluation.methods import title
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import Corrector, replay
 
@@ -24,7 +24,7 @@ from gaponet.sim.replay import Corrector, replay
 class Copy:
     """One copy of the robot."""
 
-    method: str  # key of report.methods.METHODS
+    method: str  # key of evaluation.methods.METHODS
     qpos: Array  # (T, n), rad; row t at t·dt
     error: Array  # mean |q − q_real| over the operated joints, (T), rad; row 0 is the common start
 

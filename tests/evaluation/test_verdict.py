@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gaponet.report.verdict import network_gain, verdict
+from gaponet.evaluation.verdict import network_gain, verdict
 
 
 def scores(*errors, motions):

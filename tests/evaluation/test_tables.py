@@ -1,6 +1,6 @@
 """How errors are written."""
 
-from gaponet.report.tables import mrad
+from gaponet.evaluation.tables import mrad
 from gaponet.sim.metrics import standard_error
 
 

@@ -10,8 +10,8 @@ import gaponet as gp
 from gaponet.base.errors import DatasetError, RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.report.candidate import Candidate, select_entries
-from gaponet.report.verdict import network_gain, next_step, verdict
+from gaponet.evaluation.candidate import Candidate, select_entries
+from gaponet.evaluation.verdict import network_gain, next_step, verdict
 from gaponet.report.view.side_by_side import select_entry, side_by_side
 from gaponet.robot.folder import PROVENANCE_FILE, save_robot
 

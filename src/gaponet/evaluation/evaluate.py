@@ -23,13 +23,13 @@ from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
+from gaponet.evaluation.candidate import Candidate, is_robot, select_entries
+from gaponet.evaluation.methods import IDENTIFIED, title
+from gaponet.evaluation.verdict import LEARNED
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.loop import DeltaCorrector
-from gaponet.report.candidate import Candidate, is_robot, select_entries
-from gaponet.report.methods import IDENTIFIED, title
-from gaponet.report.verdict import LEARNED
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Run, runs, summary
 from gaponet.sim.model import model_hash

@@ -12,7 +12,7 @@ from typing_extensions import TypedDict
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.base.structure import Count, Json, Number, parse_json, read_json, read_npz
-from gaponet.report.methods import IDENTIFIED, METHODS
+from gaponet.evaluation.methods import IDENTIFIED, METHODS
 
 REPAIR_HINT = "give a complete run folder of gaponet train, or evaluate again"
 Method = Annotated[str, Predicate(lambda name: name.removeprefix(IDENTIFIED) in METHODS)]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.result_table import ResultTable
-from gaponet.report.methods import title
+from gaponet.evaluation.methods import title
 
 
 def mrad(value: float | None) -> str:

@@ -11,12 +11,12 @@ from runs import untrained
 from gaponet.data.repeatability import Repetitions
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
-from gaponet.report.candidate import Candidate
+from gaponet.evaluation.candidate import Candidate
+from gaponet.evaluation.gap import CAUSES, cause_steps, error_floor, gap_by_step, reductions
+from gaponet.evaluation.methods import title
+from gaponet.evaluation.run_files import read_gap
+from gaponet.evaluation.verdict import LEARNED
 from gaponet.report.figures.evaluation import waterfall
-from gaponet.report.gap import CAUSES, cause_steps, error_floor, gap_by_step, reductions
-from gaponet.report.methods import title
-from gaponet.report.run_files import read_gap
-from gaponet.report.verdict import LEARNED
 from gaponet.sim.metrics import Run
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay, rollout_errors

@@ -11,9 +11,9 @@ from runs import untrained
 from gaponet.base.errors import DatasetError, ModelError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.report.candidate import Candidate, select_entries
-from gaponet.report.evaluate import evaluate
-from gaponet.report.gap import gap_by_step
+from gaponet.evaluation.candidate import Candidate, select_entries
+from gaponet.evaluation.evaluate import evaluate
+from gaponet.evaluation.gap import gap_by_step
 from gaponet.report.view.side_by_side import side_by_side
 from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.spec import load_robot

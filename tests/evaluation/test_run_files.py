@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import ModelError
-from gaponet.report.run_files import (
+from gaponet.evaluation.run_files import (
     read_config,
     read_gap,
     read_metrics,

@@ -18,8 +18,8 @@ from gaponet.data.repeatability import Repetitions, repetition_difference
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
+from gaponet.evaluation.candidate import Candidate, select_entries
 from gaponet.nn.delay_offset import DelayOffset
-from gaponet.report.candidate import Candidate, select_entries
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Run, mean_reduction, metrics, runs

@@ -13,10 +13,10 @@ from gaponet.base.errors import DatasetError, ModelError, RobotError, UsageError
 from gaponet.base.structure import read_json
 from gaponet.data.split import SplitHashes
 from gaponet.data.store import Dataset, Entry
+from gaponet.evaluation.methods import method
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.loop import DeltaCorrector
-from gaponet.report.methods import method
 from gaponet.robot.folder import PROVENANCE_FILE, STORED_ROBOT
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_same_robot, require_stored_robot
@@ -69,7 +69,7 @@ class Candidate:
 
     @property
     def method(self) -> str:
-        """Key of report.methods.METHODS."""
+        """Key of evaluation.methods.METHODS."""
         return "identified" if self.model is None else method(self.model.config.kind, self.robot)
 
     def corrector(self) -> DeltaCorrector | None:

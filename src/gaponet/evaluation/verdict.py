@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
+from gaponet.evaluation.methods import IDENTIFIED, title
+from gaponet.evaluation.tables import mrad, mrad_with_error
 from gaponet.nn.config import ModelKind
 from gaponet.nn.packaged_networks import is_packaged, network_folder
-from gaponet.report.methods import IDENTIFIED, title
-from gaponet.report.tables import mrad, mrad_with_error
 from gaponet.robot.folder import STORED_ROBOT
 from gaponet.sim.metrics import standard_error
 

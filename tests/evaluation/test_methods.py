@@ -2,9 +2,9 @@
 
 from typing import get_args, get_type_hints
 
+from gaponet.evaluation.evaluate import ORDER
+from gaponet.evaluation.methods import METHODS, colour, shade, title
 from gaponet.nn.config import ModelConfig
-from gaponet.report.evaluate import ORDER
-from gaponet.report.methods import METHODS, colour, shade, title
 
 
 def test_every_method_that_is_measured_has_a_name():
