@@ -25,10 +25,10 @@ from runs import random_run, untrained
 from strange_logs import write_bag
 
 import gaponet.api
+from gaponet.base.plugins import load
 from gaponet.cli.main import COMMANDS, main
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
-from gaponet.plugins import load
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model

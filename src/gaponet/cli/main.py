@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import GAPONetError, UsageError, missing_extra
+from gaponet.base.plugins import load
 from gaponet.base.text import escape
-from gaponet.plugins import load
 
 # Task → commands.
 TASKS = {

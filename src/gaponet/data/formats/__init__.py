@@ -33,14 +33,14 @@ from typing import Any, cast
 
 import numpy as np
 
-from gaponet import plugins
+from gaponet.base import plugins
 from gaponet.base.errors import LogError, UsageError
+from gaponet.base.plugins import attempt
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.plausibility import require_plausible
 from gaponet.data.describe.raw_recording import COMMAND, RawRecording
 from gaponet.data.describe.repeats import without_repeated_rows
 from gaponet.data.log import COMMANDS, Channel, Log, skipped_rows
-from gaponet.plugins import attempt
 from gaponet.robot.spec import RobotSpec
 
 FORMATS = {

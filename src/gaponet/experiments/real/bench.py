@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet import plugins
+from gaponet.base import plugins
 from gaponet.base.errors import GAPONetError, UsageError
 from gaponet.base.files import json_compatible, write_text
 from gaponet.experiments.real.cards import Card, Cards, prepare

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gaponet import plugins
+from gaponet.base import plugins
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Driver
 from gaponet.hw.control.hardware import hardware_robot, reference_robot

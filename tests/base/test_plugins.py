@@ -15,7 +15,7 @@ import pytest
 from arm import write_arm
 from logs import arm_columns
 
-from gaponet import plugins
+from gaponet.base import plugins
 from gaponet.base.errors import LogError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.formats import FORMATS, detect, formats
@@ -111,7 +111,7 @@ def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, c
 
 
 def test_the_format_of_the_architecture_page_is_listed_and_read(installed, tmp_path, capsys):
-    page = (Path(__file__).parents[1] / "docs/architecture.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs/architecture.md").read_text(encoding="utf-8")
     section = page.partition("## A package of your own")[2]
     project, module = (
         re.findall(rf"```{kind}\n(.*?)```", section, re.DOTALL)[0] for kind in ("toml", "python")
