@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping
@@ -39,8 +38,15 @@ T = TypeVar("T")
 STORED_TRAJECTORIES = 8  # for the report
 # Of tables and figures.
 ORDER = (
-    "nominal", "delay_offset", "identified", *LEARNED, "adapted", "uncorrected", "told", "transfer",
-)  # fmt: skip
+    "nominal",
+    "delay_offset",
+    "identified",
+    *LEARNED,
+    "adapted",
+    "uncorrected",
+    "told",
+    "transfer",
+)
 
 
 @dataclass(frozen=True)
@@ -89,9 +95,14 @@ class Evaluation:
 
 
 def evaluate(
-    folders: ListOf[Path], dataset: Dataset, robot: RobotSpec, motions: tuple[str, ...] = (),
-    progress: Progress = no_progress, target: RobotSpec | None = None, units: tuple[str, ...] = (),
-) -> Evaluation:  # fmt: skip
+    folders: ListOf[Path],
+    dataset: Dataset,
+    robot: RobotSpec,
+    motions: tuple[str, ...] = (),
+    progress: Progress = no_progress,
+    target: RobotSpec | None = None,
+    units: tuple[str, ...] = (),
+) -> Evaluation:
     """Roll out every method from the first recorded state under the recorded commands.
 
     Args:
@@ -108,6 +119,31 @@ def evaluate(
         ModelError, RobotError: A folder does not fit the robot.
     """
     dataset.require_robot(robot)
+    candidates = _load_candidates(folders, robot)
+    entries, unseen = select_entries(list(folders), dataset, motions, units)
+    sequences = dataset.sequences(entries)
+    for candidate in candidates.values():
+        _require_control_periods(candidate, sequences)
+    rollouts = _Rollouts(sequences, robot, candidates)
+    nominal = rollouts.first.robot.before_identification
+    for name, simulator, corrector in _methods(candidates, nominal, target):
+        rollouts.add_method(name, simulator, corrector, with_note(progress, name))
+    rollouts.add_adapted(with_note(progress, "adapted"))
+    command = _command(folders, dataset.address or os.path.normpath(dataset.path), motions)
+    result = rollouts.result() | {
+        "dataset": dataset.path.name,
+        "unseen": unseen,
+        "command": command,
+    }
+    return Evaluation(result, rollouts.runs, rollouts.ctrl, rollouts.deltas)
+
+
+def _load_candidates(folders: ListOf[Path], robot: RobotSpec) -> dict[str, Candidate]:
+    """Return method → what a folder holds, in the order of the folders.
+
+    Raises:
+        UsageError: Two runs of one method.
+    """
     candidates: dict[str, Candidate] = {}
     for path in folders:
         candidate = Candidate.load(path, robot)
@@ -116,60 +152,129 @@ def evaluate(
                 f"{path}: a second run of {title(candidate.method)}; give runs of different methods"
             )
         candidates[candidate.method] = candidate
-    first = next(iter(candidates.values()))
-    models = {name: c.model for name, c in candidates.items() if c.model is not None}
-    nominal = first.robot.before_identification
-    entries, unseen = select_entries(list(folders), dataset, motions, units)
-    sequences = dataset.sequences(entries)
-    for (name, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
-        model.require(candidates[name].robot, dt)
-    done_runs: dict[str, list[Run]] = {}
-    deltas: dict[str, list[Array]] = {}
-    op = robot.operated_index
-    ctrl = [s.ctrl[:, op] for s in sequences]
-    moved = [np.ptp(c, axis=0) > MIN_MOTION_RAD for c in ctrl]
-    simulators: dict[str, str] = {}
-    notes: list[str] = []
-    for name, simulator, corrector in _methods(candidates, nominal, target):
+    return candidates
+
+
+def _require_control_periods(candidate: Candidate, sequences: list[Sequence]) -> None:
+    """Refuse a network that does not run at the rates of the recordings."""
+    if candidate.model is None:
+        return
+    for dt in sorted({s.dt for s in sequences}):
+        candidate.model.require(candidate.robot, dt)
+
+
+class _Rollouts:
+    """Rollouts of all methods in the same recordings.
+
+    Attributes:
+        sequences: The recordings.
+        first: The first candidate.
+        ctrl: Recorded commands, (T, n operated) rad, one for each recording.
+        runs: Method → rollouts.
+        deltas: Method with a network → corrections applied, (T − 1, n operated) rad.
+        notes: Sentences about methods that could not be shown, or only with a reservation.
+    """
+
+    def __init__(
+        self, sequences: list[Sequence], robot: RobotSpec, candidates: dict[str, Candidate]
+    ) -> None:
+        self.sequences = sequences
+        self.first = next(iter(candidates.values()))
+        self.ctrl = [s.ctrl[:, robot.operated_index] for s in sequences]
+        self.runs: dict[str, list[Run]] = {}
+        self.deltas: dict[str, list[Array]] = {}
+        self.notes: list[str] = []
+        self._robot = robot
+        self._candidates = candidates
+        self._simulators: dict[str, str] = {}  # method → hash
+        self._adapted_units: list[str] = []
+
+    def add_method(
+        self,
+        name: str,
+        simulator: RobotSpec,
+        corrector: Corrector | None,
+        progress: Callable[[int, int], None],
+    ) -> None:
+        """Roll out a method. A transfer that is refused is a note if the network could be told its simulator."""
         try:
             replays = replay(
-                sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True
+                self.sequences, simulator, corrector, progress=progress, lock_idle=True
             )
         except ModelError as error:
-            if name != "transfer" or "told" not in done_runs:
+            if name != "transfer" or "told" not in self.runs:
                 raise
-            notes.append(f"no transfer: {error}")
-            continue
-        simulators[name] = model_hash(simulator)
-        if name == "told" and first.model is not None:
-            notes.append(_distance_note(first.model, simulator, sequences[0].dt))
-        done_runs[name] = runs(sequences, [t.qpos for t in replays], robot)
-        if name in models:
-            deltas[name] = [
-                (t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, replays, strict=True)
-            ]
-    adapted = (
-        Adaptation.load(first.folder, first.model.weights_hash()) if first.model is not None else {}
-    )
-    if any(s.meta.unit_id in adapted for s in sequences):
-        replays = _by_unit(sequences, first, adapted, with_note(progress, "adapted"))
-        done_runs["adapted"] = runs(sequences, [t.qpos for t in replays], robot)
-        simulators["adapted"] = simulators[first.method]
-    methods = {name: summary(part, robot) for name, part in done_runs.items()}
-    ratio = {name: m["mpjae"] / methods["nominal"]["mpjae"] for name, m in methods.items()}
-    result = {
-        "methods": methods, "ratio_to_nominal": ratio, "dataset": dataset.path.name, "sequences": len(sequences),
-        "motions": sorted({s.meta.motion for s in sequences}),
-        "moves": dict(zip(robot.operated, map(int, np.sum(moved, axis=0)), strict=True)),
-        "unseen": unseen, "virtual": any(s.meta.virtual for s in sequences), "robot": robot.name,
-        "simulator_hash": model_hash(nominal), "simulators": simulators,
-        "delta": {k: _delta_summary(parts, sequences, models[k].config.delta_max) for k, parts in deltas.items()},
-        "notes": notes,
-        "adapted_units": sorted(set(adapted) & {s.meta.unit_id for s in sequences}),
-        "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
-        "command": _command(folders, dataset.address or os.path.normpath(dataset.path), motions),
-    }  # fmt: skip
-    return Evaluation(result, done_runs, ctrl, deltas)
+            self.notes.append(f"no transfer: {error}")
+            return
+        self._add(name, simulator, replays)
+        if name == "told" and self.first.model is not None:
+            dt = self.sequences[0].dt
+            self.notes.append(_distance_note(self.first.model, simulator, dt))
+        if name in self._candidates and self._candidates[name].model is not None:
+            self.deltas[name] = self._corrections(replays)
+
+    def add_adapted(self, progress: Callable[[int, int], None]) -> None:
+        """Roll out the first network in the adapted simulators of the units that have one."""
+        if self.first.model is None:
+            return
+        adapted = Adaptation.load(self.first.folder, self.first.model.weights_hash())
+        self._adapted_units = sorted(set(adapted) & {s.meta.unit_id for s in self.sequences})
+        if self._adapted_units:
+            replays = _by_unit(self.sequences, self.first, adapted, progress)
+            self._add("adapted", self.first.robot, replays)
+
+    def result(self) -> dict[str, Any]:
+        """Return everything that is measured, in the form of Evaluation.result."""
+        methods = {name: summary(part, self._robot) for name, part in self.runs.items()}
+        nominal_error = methods["nominal"]["mpjae"]
+        ratios = {name: metrics["mpjae"] / nominal_error for name, metrics in methods.items()}
+        delta = {}
+        for name, parts in self.deltas.items():
+            model = self._candidates[name].model
+            assert model is not None
+            delta[name] = _delta_summary(parts, self.sequences, model.config.delta_max)
+        return {
+            "methods": methods,
+            "ratio_to_nominal": ratios,
+            "sequences": len(self.sequences),
+            "motions": sorted({s.meta.motion for s in self.sequences}),
+            "moves": self._recordings_that_move(),
+            "virtual": any(s.meta.virtual for s in self.sequences),
+            "robot": self._robot.name,
+            "simulator_hash": model_hash(self.first.robot.before_identification),
+            "simulators": self._simulators,
+            "delta": delta,
+            "notes": self.notes,
+            "adapted_units": self._adapted_units,
+            "artifacts": self._artifacts(),
+        }
+
+    def _add(self, name: str, simulator: RobotSpec, replays: list[SimulatedReplay]) -> None:
+        self._simulators[name] = model_hash(simulator)
+        self.runs[name] = runs(self.sequences, [r.qpos for r in replays], self._robot)
+
+    def _corrections(self, replays: list[SimulatedReplay]) -> list[Array]:
+        operated = self._robot.operated_index
+        corrections = []
+        for sequence, simulated in zip(self.sequences, replays, strict=True):
+            delta = simulated.ctrl - sequence.ctrl
+            corrections.append(delta[:-1, operated])
+        return corrections
+
+    def _recordings_that_move(self) -> dict[str, int]:
+        """Return joint → number of recordings in which it is commanded to move."""
+        moved = [np.ptp(c, axis=0) > MIN_MOTION_RAD for c in self.ctrl]
+        counts = np.sum(moved, axis=0)  # (n operated)
+        return {name: int(n) for name, n in zip(self._robot.operated, counts, strict=True)}
+
+    def _artifacts(self) -> dict[str, dict[str, Any]]:
+        """Return method → weights and seed of its network."""
+        artifacts = {}
+        for name, candidate in self._candidates.items():
+            model = candidate.model
+            if model is not None:
+                artifacts[name] = {"weights": model.weights_hash(), "seed": model.card.get("seed")}
+        return artifacts
 
 
 def _distance_note(model: GapModel, simulator: RobotSpec, dt: float) -> str:
@@ -190,15 +295,12 @@ def _distance_note(model: GapModel, simulator: RobotSpec, dt: float) -> str:
 
 def _command(folders: ListOf[Path], dataset: str, motions: tuple[str, ...]) -> str:
     """Return the shell command that repeats an evaluation."""
-    words = [
-        "gaponet",
-        "eval",
-        str(folders[0]),
-        dataset,
-        *["--also"] * (len(folders) > 1),
-        *map(str, folders[1:]),
-    ]
-    return shlex.join(words + (["--motions", ",".join(motions)] if motions else []))
+    words = ["gaponet", "eval", str(folders[0]), dataset]
+    if len(folders) > 1:
+        words += ["--also", *map(str, folders[1:])]
+    if motions:
+        words += ["--motions", ",".join(motions)]
+    return shlex.join(words)
 
 
 def evenly_spaced(items: list[T], limit: int) -> list[T]:
@@ -211,15 +313,19 @@ def evenly_spaced(items: list[T], limit: int) -> list[T]:
 def _methods(
     candidates: dict[str, Candidate], nominal: RobotSpec, target: RobotSpec | None
 ) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
-    """Yield name, simulator and corrector of every method, in the order of ORDER; then those of the simulator `target`,
-    where gains of a log change it by as much as they change the nominal one."""
+    """Yield name, simulator and corrector of every method, in the order of ORDER.
+
+    Raises:
+        UsageError: The candidates start from different identified simulators.
+    """
     yield "nominal", nominal, None
     first = next(iter(candidates.values()))
     if (first.folder / "delay_offset.json").is_file():
         yield "delay_offset", nominal, DelayOffset.read(first.folder).corrector(nominal)
-    identified = {
-        model_hash(c.robot): c.robot for c in candidates.values() if c.robot.nominal is not None
-    }
+    identified = {}
+    for candidate in candidates.values():
+        if candidate.robot.nominal is not None:
+            identified[model_hash(candidate.robot)] = candidate.robot
     if len(identified) > 1:
         raise UsageError(
             "these start from different identified simulators; compare those of one identification"
@@ -229,20 +335,29 @@ def _methods(
     for name in sorted(candidates, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):
         if candidates[name].model is not None:
             yield name, candidates[name].robot, candidates[name].corrector()
-    if target is None:
-        return
+    if target is not None:
+        yield from _methods_in(target, first, nominal)
+
+
+def _methods_in(
+    target: RobotSpec, first: Candidate, nominal: RobotSpec
+) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
+    """Yield the methods in another simulator. Gains of a log change it by as much as they change the nominal one."""
     simulator = replace(target, nominal=target.nominal or nominal)
     if model_hash(target) != model_hash(nominal):
         yield "uncorrected", simulator, None
-    if first.model is not None and first.model.config.context:
-        yield "told", simulator, DeltaCorrector(first.model.infer, first.model.config, simulator)
-    yield "transfer", simulator, TransferCorrector(first.model or first.robot, simulator)
+    model = first.model
+    if model is not None and model.config.context:
+        yield "told", simulator, DeltaCorrector(model.infer, model.config, simulator)
+    yield "transfer", simulator, TransferCorrector(model or first.robot, simulator)
 
 
 def _by_unit(
-    sequences: list[Sequence], candidate: Candidate, adapted: Mapping[str, Adaptation],
+    sequences: list[Sequence],
+    candidate: Candidate,
+    adapted: Mapping[str, Adaptation],
     progress: Callable[[int, int], None],
-) -> list[SimulatedReplay]:  # fmt: skip
+) -> list[SimulatedReplay]:
     """Roll out the model in each unit's adapted simulator, or in the common one for other units."""
     replays: dict[int, SimulatedReplay] = {}
     for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
